@@ -1,0 +1,1 @@
+"""What a calibration is: capture, keep, fit, validate, diagnose, report."""

@@ -1,0 +1,15 @@
+"""Errors that reach the user: one line that says what, where and how to mend it, and the exit code that goes with it."""
+
+from __future__ import annotations
+
+
+class InputError(Exception):
+    """The input can't be used (exit code 2). The message is one line: what, where, remedy."""
+
+    exit_code = 2
+
+
+class DeviceError(Exception):
+    """A device failed (exit code 3). The message is one line: which device, what, remedy."""
+
+    exit_code = 3

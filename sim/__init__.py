@@ -1,0 +1,1 @@
+"""How light becomes a raw frame: every stage once, pure numerics (arrays and a generator in, arrays out)."""

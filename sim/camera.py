@@ -1,0 +1,74 @@
+"""The camera model: every parameter declared once, with its unit, bounds and prior, and its uncertainty beside it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from sim.parameters import Frozen, Quantity
+from sim.spectrum import Spectrum
+
+Cfa = Literal["RGGB", "BGGR", "GRBG", "GBRG", "MONO"]
+Side = Literal["left", "right"]
+
+
+class Lens(Frozen):
+    """The optics: diffraction limited at `f_number`, with cos^4 illumination at `focal_length_mm`."""
+
+    f_number: Annotated[float, Quantity("1", "working f-number", lower=0.5, upper=64.0)]
+    focal_length_mm: Annotated[float, Quantity("mm", "focal length", lower=0.1, upper=5000.0)]
+    transmittance: Annotated[
+        float, Quantity("1", "share of the light on axis that the lens lets through", lower=0.0, upper=1.0)
+    ] = 1.0
+
+
+class Geometry(Frozen):
+    """Pinhole and Brown distortion, as OpenCV defines them (`k1 k2 p1 p2 k3`); points in px, x to the right."""
+
+    camera_matrix: tuple[tuple[float, float, float], ...]
+    distortion: tuple[float, ...] = ()
+
+
+class CameraModel(Frozen):
+    """What calibench knows of one camera. Fits fill it, `sim.forward` predicts with it.
+
+    `quantum_efficiency` is the sensor's with its colour filters, electrons a photon, per channel (`R`, `G`, `B`, or `Y` of
+    a MONO sensor), without the lens's transmittance and without any infrared filter that the maker left out. `std` holds
+    one standard uncertainty by field name; `quantum_efficiency_std` the same on the wavelengths of the curve.
+    """
+
+    rows: Annotated[int, Quantity("px", "rows of the frame", lower=1)]
+    cols: Annotated[int, Quantity("px", "columns of the frame", lower=1)]
+    pixel_pitch_um: Annotated[float, Quantity("um", "distance of neighbouring pixels", lower=0.1, upper=100.0)]
+    fill_factor: Annotated[
+        float,
+        Quantity("1", "share of the pixel's area that collects light, a centred square", lower=0.01, upper=1.0),
+    ]
+    cfa: Cfa
+    bit_depth: Annotated[int, Quantity("bit", "depth of the converter", lower=1, upper=16)]
+    black_level_dn: Annotated[float, Quantity("DN", "mean of a dark pixel at zero exposure", lower=0.0)]
+    white_level_dn: Annotated[float, Quantity("DN", "highest code of the converter", lower=1.0)]
+    conversion_gain_dn_per_e: Annotated[float, Quantity("DN/e", "codes an electron at 0 dB", lower=1e-6)]
+    full_well_e: Annotated[float, Quantity("e", "electrons at which the pixel saturates", lower=1.0)]
+    read_noise_e: Annotated[float, Quantity("e", "temporal noise of a dark pixel without quantisation", lower=0.0)]
+    dark_current_e_per_s: Annotated[float, Quantity("e/s", "mean dark current at the stated temperature", lower=0.0)]
+    dsnu_e: Annotated[float, Quantity("e", "spatial standard deviation of the dark signal", lower=0.0)]
+    prnu_percent: Annotated[float, Quantity("%", "spatial standard deviation of the response", lower=0.0)]
+    quantum_efficiency: dict[str, Spectrum]
+    lens: Lens
+    geometry: Geometry | None = None
+    std: dict[str, float] = {}
+    quantum_efficiency_std: dict[str, Spectrum] = {}
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the colour channels, in the order R, G, B; `("Y",)` for a MONO sensor."""
+        return ("Y",) if self.cfa == "MONO" else ("R", "G", "B")
+
+
+class StereoRig(Frozen):
+    """Two cameras in one frame: `x_right = rotation x_left + translation_mm` (OpenCV's convention)."""
+
+    left: CameraModel
+    right: CameraModel
+    rotation: tuple[tuple[float, float, float], ...]
+    translation_mm: tuple[float, float, float]

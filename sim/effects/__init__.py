@@ -1,0 +1,1 @@
+"""Physical effects that a first model leaves out, one file each."""

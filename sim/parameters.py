@@ -1,0 +1,68 @@
+"""Where a physical parameter is declared: its unit, its bounds, its prior and what it means, once.
+
+A model's field is annotated with a `Quantity`; fits, the REST schema, the pages and the documentation read it there:
+
+    read_noise_e: Annotated[float, Quantity("e", "temporal noise of a dark pixel", lower=0, prior=(2.0, 5.0))]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+
+class Frozen(BaseModel):
+    """Base of every spec and result: immutable, and an unknown field is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Declaration of one physical parameter.
+
+    `prior` is (centre, one standard deviation) of a normal distribution in the parameter's own unit, or None for a
+    flat prior between the bounds. `absent` is the value that means that the effect isn't there. `slope_power` says in
+    which power of the parameter the prediction has a slope at `absent`: 2 for a displacement d, which acts as d^2.
+    """
+
+    unit: str
+    meaning: str
+    lower: float | None = None
+    upper: float | None = None
+    prior: tuple[float, float] | None = None
+    absent: float | None = None
+    slope_power: int = 1
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        def check(value: Any) -> Any:
+            if isinstance(value, int | float):
+                if self.lower is not None and value < self.lower:
+                    raise ValueError(f"{value} {self.unit} is below the lower limit {self.lower} {self.unit}")
+                if self.upper is not None and value > self.upper:
+                    raise ValueError(f"{value} {self.unit} is above the upper limit {self.upper} {self.unit}")
+            return value
+
+        return core_schema.no_info_after_validator_function(check, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        described = dict(handler(schema))
+        described |= {"description": self.meaning, "unit": self.unit}
+        if self.lower is not None:
+            described["minimum"] = self.lower
+        if self.upper is not None:
+            described["maximum"] = self.upper
+        return described
+
+
+def declared(model: type[BaseModel]) -> dict[str, Quantity]:
+    """Field name -> its `Quantity`, for every field of `model` that declares one, in the order of declaration."""
+    found: dict[str, Quantity] = {}
+    for name, field in model.model_fields.items():
+        for item in field.metadata:
+            if isinstance(item, Quantity):
+                found[name] = item
+    return found
