@@ -13,3 +13,12 @@ class DeviceError(Exception):
     """A device failed (exit code 3). The message is one line: which device, what, remedy."""
 
     exit_code = 3
+
+
+class NotDetermined(Exception):
+    """The recordings don't determine what a step computes: it is skipped, and `reason` says why and what would settle it."""
+
+    def __init__(self, step: str, reason: str) -> None:
+        super().__init__(f"{step}: {reason}")
+        self.step = step
+        self.reason = reason
