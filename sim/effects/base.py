@@ -60,11 +60,47 @@ class Effect(Frozen):
             )
         return cls(**values)
 
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        """Small or typical instances whose change of the prediction is the effect's signature in the score test.
+
+        Each inner tuple is one set of signatures that may be combined with coefficients >= 0 (a two-sided parameter
+        gives both signs). Several inner tuples are alternatives (an effect that isn't a slope at `absent`, such as a filter's
+        edge, gives one for each place it may lie). The default is one set: 0.3 standard deviations of each parameter's prior from `absent`, within its bounds.
+        """
+        steps: list[Self] = []
+        for field, quantity in cls.quantities().items():
+            absent = quantity.absent or 0.0
+            size = quantity.prior[1] if quantity.prior is not None else 1.0
+            for sign in (1.0, -1.0):
+                value = absent + sign * 0.3 * size
+                if (quantity.lower is None or value >= quantity.lower) and (
+                    quantity.upper is None or value <= quantity.upper
+                ):
+                    steps.append(cls(**{field: value}))
+        return (tuple(steps),)
+
     # --- hooks, in the order of the light; each returns its input changed -------------------------------------------
 
     def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
         """RIG: the radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
         return radiance
+
+    def drift(self, elapsed_s: float) -> float:
+        """RIG: factor on the source's radiance at a time after the first capture, given what the radiometer said."""
+        return 1.0
+
+    def exposure(self, exposure_s: float) -> float:
+        """RIG or ELECTRONICS: the time that light was really collected, given the time that was asked for (s)."""
+        return exposure_s
+
+    def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
+        """RIG or OPTICS: factor on the light by place on the sensor (um from its centre, x along columns, y along rows)."""
+        return np.ones(np.broadcast_shapes(np.shape(x_um), np.shape(y_um)))
+
+    def ambient_e_per_s(self, channel: str, camera: CameraModel) -> float:
+        """RIG: electrons a second that reach a pixel beside the source while the shutter is open."""
+        return 0.0
 
     def transmittance(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
         """OPTICS: factor on the light, by wavelength and sine of the chief ray's angle at the sensor."""
@@ -87,3 +123,11 @@ class Effect(Frozen):
     def response(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
         """ELECTRONICS: what the read-out makes of a mean signal in electrons, point by point (linear: the same)."""
         return electrons
+
+    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+        """ELECTRONICS: DN added to the black level, by time after the first capture and temperature."""
+        return 0.0
+
+    def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
+        """CHARGE or ELECTRONICS: temporal variance of a pixel in e^2 at a mean signal in electrons."""
+        return noise_e2

@@ -1,0 +1,56 @@
+"""Astigmatism: best focus of rows and columns in different planes."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.effects.pupil import aberration_ratio
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class Astigmatism(Effect):
+    """Path errors quadratic along x and y apart: W = (x_defocus x^2 + y_defocus y^2) / (8 N^2)."""
+
+    name: ClassVar[str] = "astigmatism"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {"defocus", "optical_low_pass_filter", "vibration_blur", "charge_diffusion", "spherical_aberration"}
+    )
+    sentence: ClassVar[str] = (
+        "The lens is astigmatic: horizontal and vertical detail come to focus in different planes, so that their contrasts differ."
+    )
+
+    defocus_x_um: Annotated[
+        float,
+        Quantity("um", "distance of the sensor from the focus of detail along columns", lower=0.0, upper=200.0, prior=(0.0, 20.0),
+                 absent=0.0, slope_power=2),
+    ] = 0.0  # fmt: skip
+    defocus_y_um: Annotated[
+        float,
+        Quantity("um", "distance of the sensor from the focus of detail along rows, on the other side", lower=0.0, upper=200.0,
+                 prior=(0.0, 20.0), absent=0.0, slope_power=2),
+    ] = 0.0  # fmt: skip
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray | None:
+        if self.defocus_x_um == 0.0 and self.defocus_y_um == 0.0:
+            return None
+        wx = self.defocus_x_um / (8.0 * camera.lens.f_number**2)
+        wy = -self.defocus_y_um / (8.0 * camera.lens.f_number**2)
+
+        def path(u: FloatArray, v: FloatArray, s: FloatArray, angle: FloatArray) -> FloatArray:
+            x = np.cos(angle) * u - np.sin(angle) * v
+            y = np.sin(angle) * u + np.cos(angle) * v
+            return np.asarray(2.0 * s * (wx * np.cos(angle) * x + wy * np.sin(angle) * y))
+
+        return aberration_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path, isotropic=False)

@@ -1,0 +1,43 @@
+"""Black level drift: the black level changes with time or temperature."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+
+
+class BlackLevelDrift(Effect):
+    """DN added: a t + b (T - 25 C), t from the first capture."""
+
+    name: ClassVar[str] = "black_level_drift"
+    stage: ClassVar[Stage] = Stage.ELECTRONICS
+    reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, dark signal"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset(
+        {"f_number", "exposure", "wavelength", "field", "level", "orientation"}
+    )
+    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat", "narrowband", "chart"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {"ambient_light", "veiling_glare", "nonlinearity", "exposure_offset", "stray_light"}
+    )
+    sentence: ClassVar[str] = (
+        "The black level drifts: all captures carry an additional offset that grows with time or temperature and not with light."
+    )
+
+    drift_dn_per_min: Annotated[
+        float,
+        Quantity("DN/min", "change with time", lower=-50.0, upper=50.0, prior=(0.0, 0.05), absent=0.0, slope_power=1),
+    ] = 0.0
+    drift_dn_per_c: Annotated[
+        float,
+        Quantity(
+            "DN/C", "change with temperature", lower=-50.0, upper=50.0, prior=(0.0, 0.5), absent=0.0, slope_power=1
+        ),
+    ] = 0.0
+
+    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+        warmer = 0.0 if temperature_c is None else temperature_c - 25.0
+        return self.drift_dn_per_min * elapsed_s / 60.0 + self.drift_dn_per_c * warmer

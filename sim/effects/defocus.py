@@ -1,0 +1,65 @@
+"""Defocus: the sensor lies in front of or behind the image."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.effects.pupil import aberration_ratio
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class Defocus(Effect):
+    """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error (Hopkins)."""
+
+    name: ClassVar[str] = "defocus"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955)"
+    form_tolerance: ClassVar[float] = 0.04
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {
+            "spherical_aberration",
+            "charge_diffusion",
+            "optical_low_pass_filter",
+            "astigmatism",
+            "crosstalk",
+            "pixel_aperture",
+            "vibration_blur",
+        }
+    )
+    sentence: ClassVar[str] = (
+        "The sensor is not in the image plane: contrast falls alike in all directions, with the shape of a defocused pupil, "
+        "and would come back on stopping down."
+    )
+
+    defocus_um: Annotated[
+        float,
+        Quantity(
+            "um",
+            "distance of sensor and image plane",
+            lower=0.0,
+            upper=200.0,
+            prior=(0.0, 20.0),
+            absent=0.0,
+            slope_power=2,
+        ),
+    ] = 0.0
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray | None:
+        if self.defocus_um == 0.0:
+            return None
+        w020 = self.defocus_um / (8.0 * camera.lens.f_number**2)
+        return aberration_ratio(
+            fx_cy_per_um,
+            fy_cy_per_um,
+            wavelength_nm,
+            camera.lens.f_number,
+            lambda u, v, s, a: 2.0 * w020 * s * u,
+            isotropic=True,
+        )

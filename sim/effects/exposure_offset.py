@@ -1,0 +1,41 @@
+"""Exposure offset: light is collected for a little longer or shorter than asked."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+
+
+class ExposureOffset(Effect):
+    """Exposure t + t0."""
+
+    name: ClassVar[str] = "exposure_offset"
+    stage: ClassVar[Stage] = Stage.ELECTRONICS
+    reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, linearity"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset(
+        {"f_number", "wavelength", "field", "level", "orientation", "time"}
+    )
+    shown_by: ClassVar[frozenset[str]] = frozenset({"flat"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity", "source_drift", "ambient_light", "black_level_drift"})
+    sentence: ClassVar[str] = (
+        "The exposure is off by a constant time: the share of signal that is missing or too much grows as exposures get short."
+    )
+
+    offset_us: Annotated[
+        float,
+        Quantity(
+            "us",
+            "true exposure less the stated one",
+            lower=-5000.0,
+            upper=5000.0,
+            prior=(0.0, 20.0),
+            absent=0.0,
+            slope_power=1,
+        ),
+    ] = 0.0
+
+    def exposure(self, exposure_s: float) -> float:
+        return max(exposure_s + self.offset_us * 1e-6, 0.0)

@@ -1,0 +1,52 @@
+"""Non-uniform illumination: the source's light falls off across the field."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class NonUniformIllumination(Effect):
+    """Light factor 1 + gx x + gy y, x and y from -1 to 1 across the frame."""
+
+    name: ClassVar[str] = "non_uniform_illumination"
+    stage: ClassVar[Stage] = Stage.RIG
+    reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, homogeneity of the source"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"vignetting", "vignetting_decentre"})
+    sentence: ClassVar[str] = (
+        "The illumination is not uniform: flat fields slope across the frame, alike in all channels."
+    )
+
+    gradient_x_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "slope along columns, centre to rim",
+            lower=-50.0,
+            upper=50.0,
+            prior=(0.0, 1.0),
+            absent=0.0,
+            slope_power=1,
+        ),
+    ] = 0.0
+    gradient_y_percent: Annotated[
+        float,
+        Quantity(
+            "%", "slope along rows, centre to rim", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0, slope_power=1
+        ),
+    ] = 0.0
+
+    def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
+        half_x, half_y = 0.5 * camera.cols * camera.pixel_pitch_um, 0.5 * camera.rows * camera.pixel_pitch_um
+        return np.asarray(
+            1.0 + self.gradient_x_percent / 100.0 * x_um / half_x + self.gradient_y_percent / 100.0 * y_um / half_y
+        )

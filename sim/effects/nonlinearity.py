@@ -1,0 +1,56 @@
+"""Nonlinearity of the read-out: the response bends with the signal."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class Nonlinearity(Effect):
+    """electrons (1 + a x + b x^2) with x = electrons / full well; a, b in percent at full well."""
+
+    name: ClassVar[str] = "nonlinearity"
+    stage: ClassVar[Stage] = Stage.ELECTRONICS
+    reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, linearity"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "orientation", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {"exposure_offset", "source_drift", "black_level_drift", "ambient_light", "brighter_fatter", "veiling_glare"}
+    )
+    sentence: ClassVar[str] = (
+        "The response bends: the signal a photon leaves depends on the level, alike in all channels and exposures."
+    )
+
+    quadratic_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "departure from a line that grows with the signal, at full well",
+            lower=-50.0,
+            upper=50.0,
+            prior=(0.0, 3.0),
+            absent=0.0,
+        ),
+    ] = 0.0
+    cubic_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "departure from a line that grows with its square, at full well",
+            lower=-50.0,
+            upper=50.0,
+            prior=(0.0, 3.0),
+            absent=0.0,
+        ),
+    ] = 0.0
+
+    def response(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
+        if self.quadratic_percent == 0.0 and self.cubic_percent == 0.0:
+            return electrons
+        x = electrons / camera.full_well_e
+        return electrons * (1.0 + (self.quadratic_percent * x + self.cubic_percent * x * x) / 100.0)

@@ -1,0 +1,68 @@
+"""Pixel aperture: the share of the pixel that collects light isn't what the data sheet says."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class PixelAperture(Effect):
+    """Side of the square aperture changed by a few um: OTF factor sinc(w' fx) sinc(w' fy) / (sinc(w fx) sinc(w fy))."""
+
+    name: ClassVar[str] = "pixel_aperture"
+    stage: ClassVar[Stage] = Stage.CHARGE
+    reference: ClassVar[str] = (
+        "G. Boreman, Modulation Transfer Function in Optical and Electro-Optical Systems, chapter 3"
+    )
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {
+            "charge_diffusion",
+            "on_chip_sharpening",
+            "optical_low_pass_filter",
+            "defocus",
+            "crosstalk",
+            "vibration_blur",
+            "spherical_aberration",
+        }
+    )
+    sentence: ClassVar[str] = (
+        "The pixel's aperture differs from the stated one: contrast at high frequencies differs alike in all colours and at all f-numbers."
+    )
+
+    side_change_um: Annotated[
+        float,
+        Quantity(
+            "um",
+            "side of the aperture less the stated one",
+            lower=-5.0,
+            upper=5.0,
+            prior=(0.0, 0.5),
+            absent=0.0,
+            slope_power=1,
+        ),
+    ] = 0.0
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray | None:
+        if self.side_change_um == 0.0:
+            return None
+        side = camera.pixel_pitch_um * camera.fill_factor**0.5
+        new = max(side + self.side_change_um, 0.05 * side)
+        ratio = np.ones(np.broadcast_shapes(np.shape(fx_cy_per_um), np.shape(fy_cy_per_um)))
+        for f in (fx_cy_per_um, fy_cy_per_um):
+            below = np.sinc(side * f)
+            # beside the stated aperture's nulls the ratio has no value: there the pixel's own transfer is next to nothing
+            ratio = ratio * np.where(
+                np.abs(below) > 0.02, np.sinc(new * f) / np.where(np.abs(below) > 0.02, below, 1.0), 1.0
+            )
+        return ratio

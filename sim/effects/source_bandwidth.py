@@ -1,0 +1,49 @@
+"""Source bandwidth: narrowband light is wider than the radiometer says."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class SourceBandwidth(Effect):
+    """Narrowband radiance convolved with a Gaussian of the stated standard deviation."""
+
+    name: ClassVar[str] = "source_bandwidth"
+    stage: ClassVar[Stage] = Stage.RIG
+    reference: ClassVar[str] = "E. and R. Stearns, Color Res. Appl. 13, 257 (1988)"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"infrared_cut_filter", "wavelength_offset"})
+    sentence: ClassVar[str] = (
+        "The narrowband light is wider than stated: the sensitivities' peaks come out lower and their valleys higher."
+    )
+
+    width_nm: Annotated[
+        float,
+        Quantity(
+            "nm",
+            "standard deviation of the additional width",
+            lower=0.0,
+            upper=30.0,
+            prior=(0.0, 4.0),
+            absent=0.0,
+            slope_power=2,
+        ),
+    ] = 0.0
+
+    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+        if self.width_nm == 0.0 or kind != "narrowband":
+            return radiance
+        step = np.gradient(wavelength_nm)
+        distance = (wavelength_nm[:, None] - wavelength_nm[None, :]) / self.width_nm
+        weight = np.exp(-0.5 * distance**2)
+        # each sample's light is shared out with weights that sum to 1: nothing is lost
+        weight /= (weight * step[:, None]).sum(0)[None, :]
+        return np.asarray(weight @ (radiance * step))

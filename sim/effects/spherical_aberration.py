@@ -1,0 +1,54 @@
+"""Spherical aberration of the third order."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.effects.pupil import aberration_ratio
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class SphericalAberration(Effect):
+    """Path error W040 rho^4 over the pupil, in the paraxial focus."""
+
+    name: ClassVar[str] = "spherical_aberration"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {
+            "defocus",
+            "charge_diffusion",
+            "optical_low_pass_filter",
+            "crosstalk",
+            "astigmatism",
+            "pixel_aperture",
+            "vibration_blur",
+        }
+    )
+    sentence: ClassVar[str] = (
+        "The lens has spherical aberration: a sharp core with a halo, alike in all directions, that stopping down removes."
+    )
+
+    w040_um: Annotated[
+        float,
+        Quantity(
+            "um", "path error at the pupil's rim", lower=0.0, upper=5.0, prior=(0.0, 0.3), absent=0.0, slope_power=2
+        ),
+    ] = 0.0
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray | None:
+        if self.w040_um == 0.0:
+            return None
+        # rho_+^4 - rho_-^4 = (rho_+^2 - rho_-^2) (rho_+^2 + rho_-^2)
+        return aberration_ratio(
+            fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number,
+            lambda u, v, s, a: self.w040_um * (2.0 * s * u) * (2.0 * (u**2 + v**2) + 0.5 * s**2), isotropic=True,
+        )  # fmt: skip

@@ -1,0 +1,44 @@
+"""Wavelength offset: the radiometer's wavelengths are shifted."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class WavelengthOffset(Effect):
+    """What was read as radiance at w lies at w + offset."""
+
+    name: ClassVar[str] = "wavelength_offset"
+    stage: ClassVar[Stage] = Stage.RIG
+    reference: ClassVar[str] = "CIE 214:2014"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"infrared_cut_filter", "source_bandwidth", "second_order_light"})
+    sentence: ClassVar[str] = (
+        "The wavelength scale is shifted: the measured sensitivities follow the maker's curves beside themselves, on rising and falling slopes with opposite sign."
+    )
+
+    offset_nm: Annotated[
+        float,
+        Quantity(
+            "nm",
+            "true wavelength less the stated one",
+            lower=-15.0,
+            upper=15.0,
+            prior=(0.0, 2.0),
+            absent=0.0,
+            slope_power=1,
+        ),
+    ] = 0.0
+
+    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+        if self.offset_nm == 0.0:
+            return radiance
+        return np.interp(wavelength_nm - self.offset_nm, wavelength_nm, radiance)
