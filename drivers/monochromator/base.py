@@ -1,0 +1,130 @@
+"""The monochromator abstraction: light of one wavelength, with a shutter, slits and a wheel of order-sorting filters."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivers.errors import InstrumentError
+from drivers.instrument import Instrument
+
+
+@dataclass(frozen=True)
+class OrderSortingFilter:
+    """One place of the filter wheel, and the wavelengths (nm, the upper end excluded) for which it is the right one.
+
+    In first order at w a grating also passes w/2 in second order: the filter of a band must block half of every
+    wavelength in it and pass the band itself.
+    """
+
+    place: int
+    from_nm: float
+    to_nm: float
+
+
+#: Open up to 400 nm, then long-pass filters with cut-ons at about 375, 550 and 780 nm.
+ORDER_SORTING_FILTERS = (
+    OrderSortingFilter(1, 0.0, 400.0),
+    OrderSortingFilter(2, 400.0, 640.0),
+    OrderSortingFilter(3, 640.0, 1000.0),
+    OrderSortingFilter(4, 1000.0, 1400.0),
+)
+
+
+def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingFilter, ...]:
+    """The filter table of a station file (rows of `place`, `from_nm`, `to_nm`), checked; None: the default table.
+
+    Raises `InstrumentError` for a row that lacks a key, an empty or overlapping band.
+    """
+    if table is None:
+        return ORDER_SORTING_FILTERS
+    rows: list[OrderSortingFilter] = []
+    for row in table:
+        if isinstance(row, OrderSortingFilter):
+            rows.append(row)
+            continue
+        try:
+            rows.append(OrderSortingFilter(int(row["place"]), float(row["from_nm"]), float(row["to_nm"])))  # type: ignore[index]
+        except (KeyError, TypeError, ValueError) as error:
+            raise InstrumentError(
+                f"monochromator: row {row!r} of filters can't be used; give place, from_nm and to_nm"
+            ) from error
+    rows.sort(key=lambda row: row.from_nm)
+    for row in rows:
+        if not row.from_nm < row.to_nm:
+            raise InstrumentError(
+                f"monochromator: filter {row.place} serves {row.from_nm}..{row.to_nm} nm; give a band that isn't empty"
+            )
+    for before, after in zip(rows, rows[1:], strict=False):
+        if after.from_nm < before.to_nm:
+            raise InstrumentError(
+                f"monochromator: filters {before.place} and {after.place} both serve {after.from_nm} nm; give bands that don't overlap"
+            )
+    return tuple(rows)
+
+
+def filter_place(filters: Sequence[OrderSortingFilter], wavelength_nm: float) -> int:
+    """Place of the order-sorting filter for a wavelength (nm). Raises `InstrumentError` if the table has none for it."""
+    for row in filters:
+        if row.from_nm <= wavelength_nm < row.to_nm:
+            return row.place
+    bands = ", ".join(f"{row.from_nm:g}..{row.to_nm:g}" for row in filters)
+    raise InstrumentError(
+        f"monochromator: no order-sorting filter for {wavelength_nm:g} nm, the table serves {bands} nm; "
+        "without one, light of half the wavelength passes: extend `filters` in the station file"
+    )
+
+
+class Monochromator(Instrument):
+    """A monochromator behind a light source. `stop` and `close` leave the shutter closed."""
+
+    @abstractmethod
+    def move_nm(self, wavelength_nm: float) -> None:
+        """Go to a wavelength (nm; 0 is zero order, white light) through its order-sorting filter; returns on arrival."""
+
+    @abstractmethod
+    def wavelength_nm(self) -> float:
+        """Wavelength (nm) at which the instrument says it stands."""
+
+    @abstractmethod
+    def open_shutter(self) -> None:
+        """Let light out."""
+
+    @abstractmethod
+    def close_shutter(self) -> None:
+        """Keep light in."""
+
+    @abstractmethod
+    def shutter_is_open(self) -> bool:
+        """What the instrument says of its shutter."""
+
+    @abstractmethod
+    def select_filter(self, place: int) -> None:
+        """Turn the filter wheel to a place; `move_nm` does so by itself."""
+
+    @abstractmethod
+    def selected_filter(self) -> int:
+        """Place at which the filter wheel stands."""
+
+    @abstractmethod
+    def slit_um(self) -> float:
+        """Width (um) of the entrance slit; the exit slit is kept at the same width."""
+
+    @abstractmethod
+    def set_slit_um(self, width_um: float) -> None:
+        """Set entrance and exit slits to one width (um)."""
+
+    @abstractmethod
+    def bandwidth_nm(self) -> float:
+        """Full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion."""
+
+
+def checked_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:
+    """The wavelength (nm) if a grating can go there; raises `InstrumentError` if not (a NaN included)."""
+    if not (math.isfinite(wavelength_nm) and 0.0 <= wavelength_nm <= upper_nm):
+        raise InstrumentError(
+            f"monochromator: {wavelength_nm} nm is outside 0..{upper_nm:g} nm; ask for a wavelength in this range"
+        )
+    return wavelength_nm
