@@ -1,0 +1,1 @@
+"""The sensor: mosaic, electrons, noise, conversion to DN."""

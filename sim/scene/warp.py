@@ -1,0 +1,134 @@
+"""From a flat pattern to the camera: a homography, then the lens's distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import RectBivariateSpline
+
+from sim.camera import Geometry
+from sim.spectrum import FloatArray
+
+Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Warp:
+    """Pattern coordinates (u to the right, v down, in cells; cell [i, j] covers u = j..j+1, v = i..i+1) to camera px.
+
+    `homography` takes (u, v, 1) to a pinhole's (x, y, w): x = col, y = row after division by w. With `geometry`, the lens's
+    Brown distortion follows: x is undone by the camera matrix, distorted, and projected again.
+    """
+
+    homography: Matrix
+    geometry: Geometry | None = None
+
+    @classmethod
+    def of(cls, homography: ArrayLike, geometry: Geometry | None = None) -> Self:
+        """A warp from a (3, 3) array."""
+        a = np.asarray(homography, float)
+        if a.shape != (3, 3) or not np.all(np.isfinite(a)) or abs(np.linalg.det(a)) == 0.0:
+            raise ValueError(
+                f"homography {a.tolist()} has to be a finite, invertible 3 x 3 matrix: check the four points"
+            )
+        rows = [(float(r[0]), float(r[1]), float(r[2])) for r in a]
+        return cls((rows[0], rows[1], rows[2]), geometry)
+
+    @classmethod
+    def from_corners(cls, width: float, height: float, corners: ArrayLike, geometry: Geometry | None = None) -> Self:
+        """The homography that takes the pattern's corners (0, 0), (width, 0), (width, height), (0, height) to the four
+        `corners`, [row, col] in undistorted camera px."""
+        source = np.array([(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)])
+        target = np.asarray(corners, float)[:, ::-1]
+        system, right = np.zeros((8, 8)), np.zeros(8)
+        for i, ((u, v), (x, y)) in enumerate(zip(source, target, strict=True)):
+            system[2 * i] = [u, v, 1, 0, 0, 0, -u * x, -v * x]
+            system[2 * i + 1] = [0, 0, 0, u, v, 1, -u * y, -v * y]
+            right[2 * i : 2 * i + 2] = x, y
+        return cls.of(np.append(np.linalg.solve(system, right), 1.0).reshape(3, 3), geometry)
+
+    def to_camera(self, u: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Camera (row, col) in px of pattern points."""
+        col, row = _project(np.asarray(self.homography), np.asarray(u, float), np.asarray(v, float))
+        if self.geometry is not None:
+            col, row = distort(col, row, self.geometry)
+        return row, col
+
+    def to_pattern(self, row: ArrayLike, col: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Pattern (u, v) of camera points, the inverse of `to_camera` (to 1e-9 px)."""
+        x, y = np.asarray(col, float), np.asarray(row, float)
+        if self.geometry is not None:
+            x, y = undistort(x, y, self.geometry)
+        return _project(np.linalg.inv(np.asarray(self.homography)), x, y)
+
+    def grid_to_pattern(self, row: FloatArray, col: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pattern (u, v), each (len(row), len(col)), of the grid of ascending `row` and `col`.
+
+        The lens's distortion is smooth: it's undone on a grid of about 8 px and interpolated by quintic splines (1e-6 px).
+        """
+        if self.geometry is None or not any(self.geometry.distortion):
+            return self.to_pattern(row[:, None], col[None, :])
+        y0 = np.linspace(row[0], row[-1], max(8, int((row[-1] - row[0]) / 8) + 1))
+        x0 = np.linspace(col[0], col[-1], max(8, int((col[-1] - col[0]) / 8) + 1))
+        xs, ys = undistort(*np.meshgrid(x0, y0), self.geometry)
+        x = RectBivariateSpline(y0, x0, xs, kx=5, ky=5)(row, col)
+        y = RectBivariateSpline(y0, x0, ys, kx=5, ky=5)(row, col)
+        return _project(np.linalg.inv(np.asarray(self.homography)), x, y)
+
+
+def _project(homography: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    h = homography
+    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+
+
+def _brown(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * 5)[:5]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+    )
+
+
+def _check_distortion(geometry: Geometry) -> None:
+    if len(geometry.distortion) > 5 and any(geometry.distortion[5:]):
+        raise ValueError(
+            f"distortion has {len(geometry.distortion)} coefficients, and the model takes k1 k2 p1 p2 k3: fit with those five"
+        )
+
+
+def distort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
+    """Pinhole px (x = col, y = row) to px behind the lens: OpenCV's k1 k2 p1 p2 k3."""
+    _check_distortion(geometry)
+    k = np.asarray(geometry.camera_matrix, float)
+    yn = (np.asarray(y, float) - k[1, 2]) / k[1, 1]
+    xn = (np.asarray(x, float) - k[0, 2] - k[0, 1] * yn) / k[0, 0]
+    xd, yd = _brown(xn, yn, geometry.distortion)
+    return k[0, 0] * xd + k[0, 1] * yd + k[0, 2], k[1, 1] * yd + k[1, 2]
+
+
+def undistort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
+    """The inverse of `distort`: Newton's method with the exact Jacobian's numerical twin, to 1e-10 of the focal length."""
+    _check_distortion(geometry)
+    k = np.asarray(geometry.camera_matrix, float)
+    yd = (np.asarray(y, float) - k[1, 2]) / k[1, 1]
+    xd = (np.asarray(x, float) - k[0, 2] - k[0, 1] * yd) / k[0, 0]
+    xn, yn = xd.copy(), yd.copy()
+    h = 1e-6
+    for _ in range(12):
+        fx, fy = _brown(xn, yn, geometry.distortion)
+        ax, ay = _brown(xn + h, yn, geometry.distortion)
+        bx, by = _brown(xn, yn + h, geometry.distortion)
+        j00, j10, j01, j11 = (ax - fx) / h, (ay - fy) / h, (bx - fx) / h, (by - fy) / h
+        det = j00 * j11 - j01 * j10
+        ex, ey = xd - fx, yd - fy
+        dx, dy = (j11 * ex - j01 * ey) / det, (j00 * ey - j10 * ex) / det
+        xn, yn = xn + dx, yn + dy
+        if max(np.max(np.abs(dx), initial=0.0), np.max(np.abs(dy), initial=0.0)) < 1e-12:
+            break
+    return k[0, 0] * xn + k[0, 1] * yn + k[0, 2], k[1, 1] * yn + k[1, 2]

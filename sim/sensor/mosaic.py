@@ -1,0 +1,68 @@
+"""The colour-filter mosaic: which pixel is of which channel, taking planes out of a frame and putting channels in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.camera import Cfa
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+def step(cfa: Cfa) -> int:
+    """Period of the mosaic in px: 2, or 1 of a MONO sensor."""
+    return 1 if cfa == "MONO" else 2
+
+
+def phases(cfa: Cfa) -> dict[str, list[tuple[int, int]]]:
+    """Channel -> [(row0, col0), ...]: where in the mosaic's period the channel's pixels stand, read from pixel [0, 0].
+
+    R and B have one phase, G two (first the one on the red rows); MONO: `{"Y": [(0, 0)]}`. A phase's pixels are
+    `frame[row0::step, col0::step]` with `step(cfa)`.
+    """
+    if cfa == "MONO":
+        return {"Y": [(0, 0)]}
+    at = {(index // 2, index % 2): letter for index, letter in enumerate(cfa)}
+    red_row = next(row for (row, _), letter in at.items() if letter == "R")
+    greens = sorted((place for place, letter in at.items() if letter == "G"), key=lambda place: place[0] != red_row)
+    return {
+        "R": [place for place, letter in at.items() if letter == "R"],
+        "G": greens,
+        "B": [place for place, letter in at.items() if letter == "B"],
+    }
+
+
+def planes(frame: NDArray[Scalar], cfa: Cfa) -> dict[str, NDArray[Scalar]]:
+    """The mosaic taken apart, as views of `frame` (..., rows, cols): `R`, `G1` (green on red rows), `G2` (green on blue
+    rows), `B`; or `Y` of a MONO sensor."""
+    if cfa == "MONO":
+        return {"Y": frame}
+    at = phases(cfa)
+    where = {"R": at["R"][0], "G1": at["G"][0], "G2": at["G"][1], "B": at["B"][0]}
+    return {name: frame[..., row::2, col::2] for name, (row, col) in where.items()}
+
+
+def assemble(channels: Mapping[str, NDArray[Scalar]], cfa: Cfa) -> NDArray[Scalar]:
+    """One frame from full images of each channel (`R`, `G`, `B` or `Y`, all (rows, cols)): every pixel takes the value of
+    its own channel. The inverse of taking planes, on the channel's own pixels."""
+    places = phases(cfa)
+    missing = [channel for channel in places if channel not in channels]
+    if missing:
+        raise ValueError(
+            f"a {cfa} mosaic has the channels {', '.join(places)}, and no image came for {', '.join(missing)}: give one each"
+        )
+    shapes = {np.shape(channels[channel]) for channel in places}
+    if len(shapes) != 1:
+        raise ValueError(
+            f"the channels' images differ in shape ({', '.join(map(str, sorted(shapes)))}): give all the frame's"
+        )
+    period = step(cfa)
+    frame = np.empty_like(channels[next(iter(places))])
+    for channel, where in places.items():
+        for row, col in where:
+            frame[row::period, col::period] = channels[channel][row::period, col::period]
+    return frame
