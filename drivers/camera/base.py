@@ -1,0 +1,105 @@
+"""The camera abstraction: raw frames with the settings under which they were taken."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import InstrumentError
+from drivers.instrument import Instrument
+
+Trigger = Literal["software", "line"]
+
+
+@dataclass(frozen=True)
+class SensorInfo:
+    """What the camera itself says of its sensor. None: it doesn't say."""
+
+    rows: int
+    cols: int
+    pixel_format: str
+    cfa: str | None  # "RGGB" ..., "MONO"
+    bit_depth: int | None
+    pixel_pitch_um: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame as it left the converter, (rows, cols) DN, with the camera's own words on how it was taken.
+
+    `exposure_s` and `gain_db` are what the camera rounded the settings to. `time` (UTC) is when the exposure was started.
+    `frame_id` counts the frames since acquisition started.
+    """
+
+    raw: NDArray[np.uint16]
+    exposure_s: float
+    gain_db: float
+    temperature_c: float | None
+    time: datetime
+    pixel_format: str
+    frame_id: int
+
+
+class Camera(Instrument):
+    """A camera that takes one frame when told to.
+
+    A frame is `arm` (ready for a trigger), `fire` (a software trigger) and `collect` (wait for it and read it out):
+    `capture` does all three; `capture_together` interleaves them for cameras wired to trigger one another.
+    """
+
+    @abstractmethod
+    def sensor(self) -> SensorInfo:
+        """Size, format and colour filters as the camera reports them."""
+
+    @abstractmethod
+    def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
+        """Set exposure (s) and gain (dB) of the frames to come. Raises `InstrumentError` outside the camera's limits."""
+
+    @abstractmethod
+    def arm(self, trigger: Trigger = "software") -> None:
+        """Wait for a trigger: `fire()`, or a pulse on the camera's line."""
+
+    @abstractmethod
+    def fire(self) -> None:
+        """Give the software trigger."""
+
+    @abstractmethod
+    def collect(self) -> Frame:
+        """Read the frame that was triggered. Ends within exposure + time-out; afterwards the camera is ready again.
+
+        Raises `drivers.errors.NoAnswer` if no frame, or not all of it, came.
+        """
+
+    def capture(self) -> Frame:
+        """One frame on a software trigger."""
+        self.arm("software")
+        self.fire()
+        return self.collect()
+
+
+def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:
+    """One frame of each camera, exposed at the same time: the first is triggered by software and pulses the others' line.
+
+    All are read out even if one fails, so that none is left with an old frame; then the first failure is raised.
+    """
+    first, *others = cameras
+    for camera in others:
+        camera.arm("line")
+    first.arm("software")
+    first.fire()
+    frames: list[Frame] = []
+    failure: InstrumentError | None = None
+    for camera in cameras:
+        try:
+            frames.append(camera.collect())
+        except InstrumentError as error:
+            failure = failure or error
+    if failure is not None:
+        raise failure
+    return tuple(frames)
