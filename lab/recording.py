@@ -16,7 +16,8 @@ import shutil
 import tempfile
 import threading
 from collections import Counter, OrderedDict, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args, overload
@@ -219,11 +220,15 @@ def _locate(root: Path, path: str) -> Path:
     if not path or "\\" in path or pure.is_absolute() or (len(path) > 1 and path[1] == ":"):
         raise InputError("not a path relative to the folder with '/'; move the file into the folder and name it so")
     found = root / pure
-    if not found.resolve().is_relative_to(root.resolve()):
+    try:
+        inside, exists, is_file = found.resolve().is_relative_to(root.resolve()), found.exists(), found.is_file()
+    except (OSError, ValueError, RuntimeError) as error:  # a loop of links, a NUL, a name too long
+        raise InputError(f"no usable path ({_reason(error)}); rename the file") from error
+    if not inside:
         raise InputError("leads out of the folder; copy the file into the folder and name it by its relative path")
-    if not found.exists():
+    if not exists:
         raise InputError("no such file; add it, or take what needs it out of the manifest")
-    if not found.is_file():
+    if not is_file:
         raise InputError("not a file; name the file itself")
     return found
 
@@ -374,7 +379,8 @@ class _Memory:
     def __init__(
         self, frames: Mapping[str, NDArray[Any]], spectra: Mapping[str, Spectrum], targets: Mapping[str, NDArray[Any]]
     ) -> None:
-        self.frames, self.spectra, self.targets = dict(frames), dict(spectra), dict(targets)
+        # Not copied: an importer's frames may be a mapping that decodes on access.
+        self.frames, self.spectra, self.targets = frames, spectra, targets
 
     def file(self, path: str) -> Path | None:
         return None
@@ -510,7 +516,7 @@ class RecordingSet:
             if problem := _frame_problem(frame, camera):
                 raise InputError(problem)  # noqa: TRY301
         except InputError as error:
-            raise InputError(f"{self._store.where(capture.frame)} (capture {capture.id}): {error}") from error
+            raise InputError(f"{self.where(capture.frame)} (capture {capture.id}): {error}") from error
         frame.flags.writeable = False
         with self._lock:
             if capture.frame not in self._cache and frame.nbytes <= self.cache_bytes:
@@ -525,18 +531,22 @@ class RecordingSet:
         try:
             return self._store.spectrum(path)
         except InputError as error:
-            raise InputError(f"{self._store.where(path)}: {error}") from error
+            raise InputError(f"{self.where(path)}: {error}") from error
 
     def target(self, path: str) -> Target:
         """What was shown on the screen: uint8 (rows, cols) of 0 and 1."""
         try:
             return self._store.target(path)
         except InputError as error:
-            raise InputError(f"{self._store.where(path)}: {error}") from error
+            raise InputError(f"{self.where(path)}: {error}") from error
 
     def file(self, path: str) -> Path | None:
         """The file behind a path of the manifest, or None for a set in memory."""
         return self._store.file(path)
+
+    def where(self, path: str) -> str:
+        """How messages call what the manifest names `path`."""
+        return self._store.where(path)
 
 
 def _frame_problem(frame: Frame, camera: Camera) -> str | None:
@@ -552,3 +562,459 @@ def _frame_problem(frame: Frame, camera: Camera) -> str | None:
     if highest > camera.saturation_dn:
         return f"{highest} DN is above white_level_dn = {camera.saturation_dn:g} DN; correct white_level_dn, or save raw DN unscaled"
     return None
+
+
+# --- looking at everything, up front -----------------------------------------------------------------------------------
+
+
+def _unknown_keys(where: str, item: Open) -> Iterator[str]:
+    for key in item.unknown_keys():
+        yield f"{where}: unknown key '{key}' is kept but not used; check its spelling"
+    for name, value in item:
+        if isinstance(value, Open):
+            yield from _unknown_keys(f"{where}, {name}", value)
+
+
+def _spectra_of(capture: Capture) -> dict[str, str]:
+    """Key -> path of every spectrum that a capture names."""
+    named = {key: getattr(capture, key, None) for key in ("radiance", "dark_radiance", "light_radiance")}
+    screen = getattr(capture, "screen", None)
+    if isinstance(screen, Screen):
+        named["screen.radiance"] = screen.radiance
+    return {key: path for key, path in named.items() if path is not None}
+
+
+def _camera_problems(camera: Camera) -> Iterator[str]:
+    limit = 2**camera.bit_depth - 1
+    if camera.white_level_dn is not None and camera.white_level_dn > limit:
+        yield f"white_level_dn = {camera.white_level_dn:g} is above what {camera.bit_depth} bits hold ({limit}); correct one"
+    if camera.black_level_dn is not None and camera.black_level_dn >= camera.saturation_dn:
+        yield f"black_level_dn = {camera.black_level_dn:g} isn't below the white level {camera.saturation_dn:g}; correct one"
+    for channel in camera.quantum_efficiency or {}:
+        if channel not in camera.channels:
+            yield (
+                f"quantum_efficiency of a channel '{channel}', but a {camera.cfa} sensor has "
+                f"{', '.join(camera.channels)}; rename it"
+            )
+
+
+def _capture_problems(capture: Capture, camera: Camera) -> Iterator[str]:
+    if isinstance(capture, SlantedEdge):
+        row0, col0, row1, col1 = capture.region
+        if not (0 <= row0 < row1 <= camera.rows and 0 <= col0 < col1 <= camera.cols):
+            yield (
+                f"region {list(capture.region)} isn't inside the frame of {camera.rows} x {camera.cols}; "
+                "give [row0, col0, row1, col1], end excluded"
+            )
+    if isinstance(capture, Chart):
+        for row, col in capture.corners:
+            if not (-0.5 <= row <= camera.rows - 0.5 and -0.5 <= col <= camera.cols - 0.5):
+                yield f"corner [{row:g}, {col:g}] is outside the frame of {camera.rows} x {camera.cols}; give [row, col]"
+    if isinstance(capture, Charuco):
+        if capture.marker_mm is None and capture.dictionary != "none":
+            yield "marker_mm is missing; give the markers' side, or dictionary 'none' for a plain checkerboard"
+        if capture.marker_mm is not None and capture.marker_mm >= capture.square_mm and capture.dictionary != "none":
+            yield f"markers of {capture.marker_mm:g} mm don't fit squares of {capture.square_mm:g} mm; correct one"
+        if min(capture.squares) < 2:
+            yield f"squares {list(capture.squares)} make no board; give [rows, cols] of squares, 2 at least"
+
+
+#: More than this share of a channel's pixels clipped: the capture says nothing of that channel's level.
+CLIPPED_LIMIT = 0.5
+#: A saturated flat belongs to an exposure ladder when that many unsaturated levels lie below it ...
+LADDER_LEVELS = 3
+#: ... and these foretell at least this share of the white level for it (lamps and sensors aren't exactly linear).
+LADDER_REACH = 0.85
+
+
+@dataclass(frozen=True)
+class _FlatLevel:
+    """What the check of saturated flats keeps of one flat: means and clipped shares by channel."""
+
+    id: str
+    where: str
+    gain_db: float | None
+    light: float  # proportional to the photons, on the scale of that name
+    scale: str
+    mean_dn: dict[str, float]
+    clipped: dict[str, float]
+
+
+@dataclass
+class _Findings:
+    problems: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def _channel_planes(frame: Frame, camera: Camera) -> dict[str, list[Frame]]:
+    """Each channel's planes: both green phases for `G`, the whole frame for `Y`."""
+    step = 1 if camera.cfa == "MONO" else 2
+    planes: dict[str, list[Frame]] = defaultdict(list)
+    for row in range(step):
+        for col in range(step):
+            plane = frame[row::step, col::step]
+            if plane.size:
+                planes["Y" if step == 1 else camera.cfa[2 * row + col]].append(plane)
+    return planes
+
+
+def clipped_share(frame: Frame, camera: Camera) -> dict[str, float]:
+    """Share of each channel's pixels that are clipped: at the white level, or all at one value above half of the range.
+
+    A sensor whose full well lies below the converter's range saturates short of `white_level_dn`: photon noise never puts
+    half of the pixels on the highest value, so a channel that does is clipped as well.
+    """
+    black = camera.black_level_dn or 0.0
+    middle = black + (camera.saturation_dn - black) / 2
+    shares = {}
+    for channel, planes in _channel_planes(frame, camera).items():
+        highest = max(float(plane.max()) for plane in planes)
+        at = highest if highest > middle else camera.saturation_dn
+        shares[channel] = sum(int(np.count_nonzero(plane >= at)) for plane in planes) / sum(p.size for p in planes)
+    return shares
+
+
+def _light(recordings: RecordingSet, flat: Flat) -> tuple[float, str]:
+    """The light of a flat on a scale, and the scale's name: flats are comparable on one scale only."""
+    if flat.photons_per_pixel is not None:
+        return flat.photons_per_pixel, f"photons at {flat.wavelength_nm}"
+    if flat.radiance is None:
+        return flat.exposure_s, "exposure"
+    spectrum = recordings.spectrum(flat.radiance)
+    return flat.exposure_s * float(np.trapezoid(spectrum.value, spectrum.wavelength_nm)), "radiance"
+
+
+def _why_not_a_ladder(level: _FlatLevel, channel: str, levels: list[_FlatLevel], black: float) -> str | None:
+    """Why the clipped `channel` of a flat isn't the top of an exposure ladder, with the remedy; None where it is.
+
+    EMVA 1288 needs exposures up to and beyond saturation, so a clipped flat is right where at least `LADDER_LEVELS`
+    unclipped levels of the same gain and light lie below it, their slope foretells that it clips, and its repeats clip too.
+    """
+    unclipped = [
+        other
+        for other in levels
+        if (other.gain_db, other.scale) == (level.gain_db, level.scale) and other.clipped[channel] <= CLIPPED_LIMIT
+    ]
+    for other in unclipped:
+        if other.light >= level.light and other.clipped[channel] < CLIPPED_LIMIT / 5:
+            return f"but {other.id} with as much light isn't; recapture it"
+    below = sorted((other for other in unclipped if 0 < other.light < level.light), key=lambda other: other.light)
+    if len({other.light for other in below}) < LADDER_LEVELS:
+        return f"expose shorter, or add {LADDER_LEVELS} unsaturated levels below it"
+    slope = float(np.median([(other.mean_dn[channel] - black) / other.light for other in below[-LADDER_LEVELS:]]))
+    if slope * level.light < LADDER_REACH * (level.mean_dn[channel] - black):
+        return f"but the flats below it foretell {black + slope * level.light:.0f} DN; recapture it"
+    return None
+
+
+def _saturated_flats(levels: list[_FlatLevel], camera: Camera) -> Iterator[str]:
+    """One line for each flat that is clipped without being the top of an exposure ladder."""
+    for level in levels:
+        for channel, share in level.clipped.items():
+            if share <= CLIPPED_LIMIT:
+                continue
+            if why := _why_not_a_ladder(level, channel, levels, camera.black_level_dn or 0.0):
+                yield f"{level.where}: saturated flat, {100 * share:.0f} % of the {channel} pixels are clipped; {why}"
+                break
+
+
+def _check_frames(recordings: RecordingSet, found: _Findings) -> None:
+    """Every frame, loaded once."""
+    flats: dict[Side, list[_FlatLevel]] = defaultdict(list)
+    clipped_of: dict[tuple[Side, str], list[str]] = defaultdict(list)
+    for capture in recordings.manifest.captures:
+        camera = recordings.manifest.cameras[capture.side]
+        try:
+            frame = recordings.frame(capture)
+        except InputError as error:
+            found.problems.append(str(error))
+            continue
+        if isinstance(capture, Dark | Charuco):
+            continue
+        clipped = clipped_share(frame, camera)
+        if isinstance(capture, Flat):
+            try:
+                light, scale = _light(recordings, capture)
+            except InputError:  # named with the spectra
+                continue
+            planes = _channel_planes(frame, camera)
+            mean_dn = {name: float(np.mean([plane.mean() for plane in planes[name]])) for name in planes}
+            where = f"{recordings.where(capture.frame)} (capture {capture.id})"
+            flats[capture.side].append(_FlatLevel(capture.id, where, capture.gain_db, light, scale, mean_dn, clipped))
+        elif max(clipped.values()) > CLIPPED_LIMIT:
+            clipped_of[capture.side, capture.kind].append(capture.id)
+    for side, levels in flats.items():
+        found.problems += _saturated_flats(levels, recordings.manifest.cameras[side])
+    for (side, kind), ids in clipped_of.items():
+        named = ", ".join(ids[:3]) + (f" .. {ids[-1]}" if len(ids) > 3 else "")
+        found.warnings.append(
+            f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped ({named}); "
+            "what a clipped channel saw is not used; expose shorter"
+        )
+
+
+def _check_cameras(recordings: RecordingSet, found: _Findings) -> None:
+    for side, camera in recordings.manifest.cameras.items():
+        where = f"{recordings.source}: camera {side}"
+        found.warnings += _unknown_keys(where, camera)
+        found.problems += [f"{where}: {problem}" for problem in _camera_problems(camera)]
+        if camera.lens_file is not None:
+            try:
+                recordings.file(camera.lens_file)
+            except InputError as error:
+                found.problems.append(f"{recordings.where(camera.lens_file)} (lens_file of camera {side}): {error}")
+
+
+def _check_captures(recordings: RecordingSet, found: _Findings) -> None:
+    manifest, source = recordings.manifest, recordings.source
+    for id, count in Counter(capture.id for capture in manifest.captures).items():
+        if count > 1:
+            found.problems.append(f"{source}: capture id '{id}' is used {count} times; give every capture its own")
+    framed: dict[str, Capture] = {}
+    for capture in manifest.captures:
+        where = f"{source}: capture {capture.id}"
+        found.warnings += _unknown_keys(where, capture)
+        found.problems += [f"{where}: {text}" for text in _capture_problems(capture, manifest.cameras[capture.side])]
+        if isinstance(capture, Flat) and capture.radiance is None and capture.photons_per_pixel is None:
+            found.warnings.append(
+                f"{where}: neither radiance nor photons_per_pixel: it tells of noise, not of sensitivity; add what is known"
+            )
+        first = framed.setdefault(capture.frame, capture)
+        if first is not capture and not isinstance(capture, SlantedEdge):
+            found.warnings.append(f"{where}: its frame is that of {first.id} too, so it is no repeat; check the path")
+
+
+def _check_spectra_and_targets(recordings: RecordingSet, found: _Findings) -> None:
+    manifest = recordings.manifest
+    efficiencies = {
+        path: f"quantum_efficiency {channel} of camera {side}"
+        for side, camera in manifest.cameras.items()
+        for channel, path in (camera.quantum_efficiency or {}).items()
+    }
+    lights: dict[str, str] = {}
+    targets: dict[str, str] = {}
+    for capture in manifest.captures:
+        for key, path in _spectra_of(capture).items():
+            lights.setdefault(path, f"{key} of capture {capture.id}")
+        if isinstance(capture, Checkerboard | Bernoulli):
+            targets.setdefault(capture.target, f"target of capture {capture.id}")
+    for path, user in [*efficiencies.items(), *lights.items()]:
+        where = f"{recordings.where(path)} ({user})"
+        try:
+            lowest, highest = min(value := recordings.spectrum(path).value), max(value)
+        except InputError as error:
+            found.problems.append(f"{where}: {error.__cause__}")
+            continue
+        if user.startswith("quantum_efficiency") and not 0 <= lowest <= highest <= 1:
+            found.problems.append(
+                f"{where}: {lowest:g}..{highest:g} isn't a quantum efficiency of 0..1 electrons a photon; "
+                "divide percent by 100"
+            )
+        elif not user.startswith("quantum_efficiency") and highest <= 0:
+            found.warnings.append(f"{where}: no light at any wavelength; was the shutter open?")
+    for path, user in targets.items():
+        try:
+            recordings.target(path)
+        except InputError as error:
+            found.problems.append(f"{recordings.where(path)} ({user}): {error.__cause__}")
+
+
+def inspect(recordings: RecordingSet) -> tuple[list[str], list[str]]:
+    """(problems, warnings) of a recording set, one line each: everything that `read` refuses and everything it remarks.
+
+    Looks at every frame, spectrum and target once.
+    """
+    found = _Findings(warnings=list(_unknown_keys(f"{recordings.source}: manifest", recordings.manifest)))
+    _check_cameras(recordings, found)
+    _check_captures(recordings, found)
+    _check_spectra_and_targets(recordings, found)
+    _check_frames(recordings, found)
+    return found.problems, found.warnings
+
+
+# --- reading and writing -----------------------------------------------------------------------------------------------
+
+_CAPTURE: TypeAdapter[AnyCapture] = TypeAdapter(AnyCapture)
+
+
+def _schema_lines(where: str, error: ValidationError) -> Iterator[str]:
+    for item in error.errors():
+        kinds = get_args(Kind)
+        key = ".".join(str(part) for part in item["loc"] if part not in kinds)
+        if item["type"] == "missing":
+            yield f"{where}: the key '{key}' is missing; add it"
+        else:
+            given = "" if isinstance(item["input"], dict | list) else f" (it is {item['input']!r})"
+            yield f"{where}: {key or 'it'}: {item['msg'][:1].lower()}{item['msg'][1:]}{given}; correct it"
+
+
+def _usable_captures(listed: list[Any], where: str, sides: Container[str], found: _Findings) -> list[AnyCapture]:
+    captures: list[AnyCapture] = []
+    for number, item in enumerate(listed):
+        at = f"{where}: captures[{number}]"
+        if not isinstance(item, dict):
+            found.problems.append(f"{at}: isn't an object; write the capture's keys")
+            continue
+        at += f" ({item['id']})" if item.get("id") is not None else ""
+        kind = item.get("kind")
+        if isinstance(kind, str) and kind not in get_args(Kind):
+            found.warnings.append(f"{at}: unknown kind '{kind}' is skipped; the kinds are {', '.join(get_args(Kind))}")
+            continue
+        if kind == "chart" and item.get("chart") not in (None, "ColorChecker24"):
+            found.warnings.append(f"{at}: unknown chart {item['chart']!r} is skipped; only ColorChecker24 is known")
+            continue
+        try:
+            capture = _CAPTURE.validate_python(item)
+        except ValidationError as error:
+            found.problems += _schema_lines(at, error)
+            continue
+        if capture.side not in sides:
+            found.problems.append(f"{at}: no camera '{capture.side}' in cameras; describe it, or correct the side")
+            continue
+        captures.append(capture)
+    return captures
+
+
+def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
+    """The manifest in JSON `text`, and warnings on what was skipped. RecordingError with one line for each problem."""
+    try:
+        raw = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise RecordingError([f"{where}: isn't JSON ({_reason(error)}); write it again"]) from error
+    if not isinstance(raw, dict):
+        raise RecordingError([f"{where}: isn't a JSON object; write the keys of the recording-set format"])
+    if raw.get("format") != "calibench-recording" or raw.get("version") != 1:
+        given = f"format {raw.get('format')!r} version {raw.get('version')!r}"
+        raise RecordingError([f"{where}: {given}, not 'calibench-recording' 1; give a recording set of that version"])
+    found = _Findings()
+    listed, cameras = raw.get("captures"), raw.get("cameras")
+    captures: list[AnyCapture] = []
+    if isinstance(listed, list):
+        # Where the cameras themselves are wrong, that is said once, below.
+        sides = cameras if isinstance(cameras, dict) and cameras else get_args(Side)
+        captures = _usable_captures(listed, where, sides, found)
+        raw["captures"] = ()
+        if not captures and not found.problems:
+            found.problems += [*found.warnings, f"{where}: no capture that can be used; list what was captured"]
+    manifest: Manifest | None = None
+    try:
+        manifest = Manifest.model_validate(raw)
+    except ValidationError as error:
+        found.problems += _schema_lines(where, error)
+    if manifest is not None and not manifest.cameras:
+        found.problems.append(f"{where}: cameras is empty; describe the left camera at least")
+    if found.problems or manifest is None:
+        raise RecordingError(found.problems)
+    return manifest.model_copy(update={"captures": tuple(captures)}), found.warnings
+
+
+def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None = None) -> RecordingSet:
+    """The recording set in the folder `path`, looked through completely.
+
+    Raises RecordingError (an InputError) with one line for everything that can't be used; what is merely odd (unknown
+    keys, skipped kinds) stands in `.warnings`.
+    """
+    root = Path(path)
+    if root.name == "manifest.json" and root.is_file():
+        root = root.parent
+    if not root.is_dir():
+        raise RecordingError([f"{root}: no such folder; give the folder of a recording set"])
+    try:
+        text = _locate(root, "manifest.json").read_text(encoding="utf-8-sig")
+    except (InputError, OSError, UnicodeDecodeError) as error:
+        raise RecordingError([f"{root / 'manifest.json'}: {_reason(error)}"]) from error
+    manifest, skipped = parse_manifest(text, str(root / "manifest.json"))
+    recordings = RecordingSet(manifest, source=str(root), store=_Folder(root))
+    if progress:
+        progress(f"looking through {len(manifest.captures)} captures")
+    problems, warnings = inspect(recordings)
+    if problems:
+        raise RecordingError(problems)
+    recordings.warnings = (*skipped, *warnings)
+    return recordings
+
+
+def format_spectrum(spectrum: Spectrum) -> str:
+    """A spectrum as the format's CSV; reading it gives the same numbers bit for bit."""
+    rows = (f"{at!r},{height!r}\n" for at, height in zip(spectrum.wavelength_nm, spectrum.value, strict=True))
+    return "wavelength_nm,value\n" + "".join(rows)
+
+
+def manifest_json(manifest: Manifest) -> str:
+    """A manifest as JSON text: the keys that were given, unknown ones too."""
+    kept = manifest.model_dump(mode="json", exclude_unset=True)
+    head = {key: getattr(manifest, key) for key in ("format", "version", "name", "notes")}
+    return json.dumps(head | kept, indent=1, ensure_ascii=False) + "\n"
+
+
+def _write_into(recordings: RecordingSet, root: Path) -> None:
+    def place(path: str) -> Path:
+        pure = PurePosixPath(path)
+        if "\\" in path or pure.is_absolute() or ".." in pure.parts or path == "manifest.json":
+            raise InputError(
+                f"{recordings.source}: the path '{path}' leaves the folder; name it frames/..., spectra/..."
+            )
+        file = root / pure
+        file.parent.mkdir(parents=True, exist_ok=True)
+        return file
+
+    manifest = recordings.manifest
+    written: set[str] = set()
+    for capture in manifest.captures:
+        if capture.frame in written:
+            continue
+        written.add(capture.frame)
+        file, there = place(capture.frame), recordings.file(capture.frame)
+        if there is not None:
+            shutil.copyfile(there, file)  # the bytes themselves, whatever the container
+            continue
+        frame = recordings.frame(capture)
+        if file.suffix == ".npy":
+            np.save(file, frame, allow_pickle=False)
+        elif file.suffix in (".tif", ".tiff"):
+            tifffile.imwrite(file, frame, photometric="minisblack", metadata=None)
+        else:
+            raise InputError(f"{recordings.source}: can't write a frame to '{capture.frame}'; name it .npy or .tif")
+    spectra = {path for capture in manifest.captures for path in _spectra_of(capture).values()}
+    for camera in manifest.cameras.values():
+        spectra |= set((camera.quantum_efficiency or {}).values())
+        if camera.lens_file is not None and (there := recordings.file(camera.lens_file)) is not None:
+            shutil.copyfile(there, place(camera.lens_file))
+    for path in spectra:
+        there = recordings.file(path)
+        text = format_spectrum(recordings.spectrum(path)) if there is None else there.read_text(encoding="utf-8")
+        place(path).write_text(text, encoding="utf-8")
+    for path in {c.target for c in manifest.captures if isinstance(c, Checkerboard | Bernoulli)}:
+        np.save(place(path), recordings.target(path), allow_pickle=False)
+    (root / "manifest.json").write_text(manifest_json(manifest), encoding="utf-8")
+
+
+def write(recordings: RecordingSet, path: str | os.PathLike[str]) -> Path:
+    """Write a recording set as the folder `path`: completely, or not at all. Frames stay bit-exact.
+
+    Raises InputError where `path` exists and isn't an empty folder, and RecordingError where the set itself would be
+    refused by `read`.
+    """
+    folder = Path(path)
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder}: already exists; give a new folder, or take that one away")
+    problems, _ = inspect(recordings)
+    if problems:
+        raise RecordingError(problems)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".partial", dir=folder.parent))
+    try:
+        _write_into(recordings, partial)
+        partial.chmod(0o755)
+        if folder.exists():
+            folder.rmdir()
+        partial.rename(folder)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise InputError(
+            f"{folder}: can't be written ({_reason(error)}); make room or choose another folder"
+        ) from error
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return folder
