@@ -1,0 +1,89 @@
+"""Fits: from recordings to a camera's parameters with their uncertainties. `fit_recording_set` runs all that there are."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from lab.errors import NotDetermined
+from lab.recording import RecordingSet
+from lab.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
+from sim.camera import Side
+
+#: Called with what was just done and the share of the work that is done, 0..1; from any thread, one call at a time.
+Progress = Callable[[str, float], None]
+T = TypeVar("T")
+WORKERS = 2
+STEPS = ("noise", "spectral", "mtf", "psf", "geometry")
+
+
+class _Run:
+    """What the steps of one fit share: the skipped ones and the count of those done."""
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self.total, self.progress = total, progress
+        self.done = 0
+        self.skipped: list[Skipped] = []
+        self.lock = threading.Lock()
+
+    def step(self, name: str, side: Side | None, work: Callable[[], T]) -> T | None:
+        """The result of `work`, or None with a line in `skipped` where the recordings don't determine it."""
+        result: T | None = None
+        try:
+            result = work()
+        except NotDetermined as refused:
+            with self.lock:
+                self.skipped.append(Skipped(step=refused.step, reason=refused.reason, side=side))
+        with self.lock:
+            self.done += 1
+            if self.progress:
+                self.progress(f"{name} of the {side} camera" if side else name, self.done / self.total)
+        return result
+
+
+def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None) -> FitResult:
+    """Run every fit on every side, and the stereo pair; what the recordings don't determine stands in `skipped`.
+
+    Both sides, and each side's geometry beside its radiometry, run at the same time.
+    """
+    from lab.fit import geometry, mtf, noise, psf, spectral, stereo  # noqa: PLC0415  (all of it only where all is run)
+
+    sides = recordings.sides
+    run = _Run(len(STEPS) * len(sides) + 1, progress)
+
+    def radiometry(side: Side) -> CameraFit:
+        levels = run.step("noise", side, lambda: noise.fit_noise(recordings, side))
+        return CameraFit(
+            noise=levels,
+            spectral=run.step("spectral", side, lambda: spectral.fit_spectral(recordings, side, levels)),
+            mtf=run.step("mtf", side, lambda: mtf.fit_mtf(recordings, side, levels)) or (),
+            psf=run.step("psf", side, lambda: psf.fit_psf(recordings, side, levels)) or (),
+        )
+
+    def pinhole(side: Side) -> GeometryFit | None:
+        return run.step("geometry", side, lambda: geometry.fit_geometry(recordings, side))
+
+    with ThreadPoolExecutor(WORKERS, thread_name_prefix="fit") as pool:
+        radiometries: dict[Side, Future[CameraFit]] = {side: pool.submit(radiometry, side) for side in sides}
+        pinholes = {side: pool.submit(pinhole, side) for side in sides}
+        cameras = {
+            side: radiometries[side].result().model_copy(update={"geometry": pinholes[side].result()}) for side in sides
+        }
+
+    def pair() -> StereoFit:
+        both = {side: camera.geometry for side, camera in cameras.items() if camera.geometry is not None}
+        if "left" not in both or "right" not in both:
+            missing = " and ".join(side for side in ("left", "right") if side not in both)
+            raise NotDetermined("stereo", f"no geometry of the {missing} side; capture charuco poses with both cameras")
+        return stereo.fit_stereo(recordings, both["left"], both["right"])
+
+    found = run.step("stereo", None, pair)
+    order = {side: number for number, side in enumerate((*sides, None))}
+    return FitResult(
+        source=recordings.source,
+        cameras=cameras,
+        stereo=found,
+        skipped=tuple(sorted(run.skipped, key=lambda item: order[item.side])),  # the order of threads mustn't show
+    )
