@@ -1,0 +1,202 @@
+"""MTF of slanted edges against truths in closed form: an edge blurred by a Gaussian is an error function of the distance."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from lab.errors import NotDetermined
+from lab.fit.mtf import Plane, edge_mtf, fit_mtf, planes_mtf
+
+FULL_E = 9000.0
+
+
+def edge(size, angle_deg, sigma_px, bend_px=0.0, *, offset_px=0.3, dark=0.1, row0=0.0, col0=0.0, step=1):
+    """Unit edge, light on the right of a vertical one, exact at the samples; bent, it is a circle with that sagitta."""
+    r = row0 + step * np.arange(size)[:, None] - (size * step - 1) / 2
+    c = col0 + step * np.arange(size)[None, :] - (size * step - 1) / 2
+    a = np.radians(angle_deg)
+    d = c * np.cos(a) + r * np.sin(a) - offset_px
+    if bend_px:
+        radius = (size * step / 2) ** 2 / (2 * bend_px)
+        d = np.hypot(radius + d, -c * np.sin(a) + r * np.cos(a)) - radius
+    return dark + 0.5 * (1 + erf(d / sigma_px / np.sqrt(2)))
+
+
+def gaussian_mtf(sigma_px, frequency):
+    return np.exp(-2 * (np.pi * sigma_px * frequency) ** 2)
+
+
+def gaussian_mtf50(sigma_px):
+    return np.sqrt(2 * np.log(2)) / (2 * np.pi * sigma_px)
+
+
+def noisy(mean, rng):
+    electrons = mean * FULL_E
+    return np.round(0.4 * rng.normal(electrons, np.sqrt(electrons + 4.0)))
+
+
+@pytest.mark.parametrize("bend_px", [0.0, 2.0])
+@pytest.mark.parametrize("sigma_px", [0.55, 1.5])
+@pytest.mark.parametrize("angle_deg", [5.0, -12.0, 30.0, 95.0, 130.0, 185.0, 355.0])
+def test_noise_free_curve_is_the_gaussians(angle_deg, sigma_px, bend_px):
+    found = edge_mtf(edge(200, angle_deg, sigma_px, bend_px))
+    # the goal is 0.02 % of MTF50; the spline's own error is two orders below
+    assert found.mtf50_cy_per_px == pytest.approx(gaussian_mtf50(sigma_px), rel=2e-4)
+    # 2 px of bend turn the edge by +-2.3 deg: of an isotropic blur nothing is seen of that
+    np.testing.assert_allclose(found.mtf, gaussian_mtf(sigma_px, found.frequency_cy_per_px), atol=4e-4)
+    turned = (found.angle_deg - angle_deg + 90) % 180 - 90
+    assert abs(turned) < (0.03 if bend_px else 1e-3)  # a bent edge's angle is that at the region's centre
+    assert -90 < found.angle_deg <= 90
+
+
+def test_undersampled_blur_keeps_its_curve_beyond_nyquist():
+    found = edge_mtf(edge(400, 5.0, 0.3))
+    np.testing.assert_allclose(found.mtf, gaussian_mtf(0.3, found.frequency_cy_per_px), atol=3e-4)
+
+
+def test_scatter_is_as_predicted_and_near_the_bound():
+    rng = np.random.default_rng(11)
+    mean = edge(400, 5.0, 0.55)
+    found = [edge_mtf(noisy(mean, rng)) for _ in range(30)]
+    relative = np.array([f.mtf50_cy_per_px for f in found]) / gaussian_mtf50(0.55) - 1
+    predicted = np.mean([f.mtf50_cy_per_px_std for f in found]) / gaussian_mtf50(0.55)
+    # Cramer-Rao bound of this noise with a free line spread of +-4 px: 0.256 % (hats of 0.25 px, levels free)
+    assert predicted < 1.1 * 0.00256
+    assert abs(relative.mean()) < 3 * predicted / np.sqrt(30) + 2e-4
+    # a standard deviation from 30 values scatters by 1 / sqrt(58) = 13 %: three of these
+    assert 0.6 < relative.std(ddof=1) / predicted < 1.4
+
+
+def test_covariance_covers_the_whole_curve():
+    rng = np.random.default_rng(5)
+    frequency = np.arange(0.05, 0.5, 0.05)
+    truth = gaussian_mtf(0.7, frequency)
+    chi2 = []
+    for _ in range(40):
+        found = edge_mtf(noisy(edge(160, 7.0, 0.7), rng), frequency)
+        gap = found.mtf - truth
+        chi2.append(gap @ np.linalg.solve(found.covariance, gap))
+        np.testing.assert_allclose(found.mtf_std, np.sqrt(np.diag(found.covariance)))
+    n = len(frequency)
+    # mean of 40 chi2 of n degrees of freedom: n +- sqrt(2 n / 40); 4 of these
+    assert abs(np.mean(chi2) - n) < 4 * np.sqrt(2 * n / 40)
+
+
+def test_no_noise_floor_above_nyquist():
+    rng = np.random.default_rng(3)
+    found = [edge_mtf(noisy(edge(400, 5.0, 0.9), rng)) for _ in range(8)]
+    above = found[0].frequency_cy_per_px > 0.6  # the Gaussian itself is below 0.003 there
+    assert np.mean([f.mtf[above] for f in found]) < 0.004
+
+
+def test_a_prediction_through_the_operator_is_what_the_estimator_reports():
+    """An asymmetric line spread with long tails, which the truncated tails of any estimator bend: the operator bends it alike."""
+
+    def profile(d):
+        return 0.9 * 0.5 * (1 + erf(d / 0.6 / np.sqrt(2))) + 0.1 * (0.5 + np.arctan(d / 3.0 - 0.2) / np.pi)
+
+    r, c = np.indices((200, 200)) - 99.5
+    a = np.radians(6.0)
+    d = c * np.cos(a) + r * np.sin(a) - 0.2
+    found = edge_mtf(100 + 1000 * profile(d))
+    # what is left is the asymmetry, which shifts the edge against the profile's own zero
+    signal = found.frequency_cy_per_px < 0.8
+    np.testing.assert_allclose(found.predict(profile)[signal], found.mtf[signal], atol=2e-4)
+    assert np.abs(found.mtf - found.predict(lambda x: 0.5 * (1 + erf(x / 0.6 / np.sqrt(2))))).max() > 0.03
+
+
+def test_a_gradient_of_the_illumination_is_taken_out():
+    r, c = np.indices((200, 200)) - 99.5
+    shaded = edge(200, 5.0, 0.7) * (1 + 4e-4 * c - 6e-4 * r)
+    found = edge_mtf(shaded)
+    np.testing.assert_allclose(found.mtf, gaussian_mtf(0.7, found.frequency_cy_per_px), atol=5e-4)
+
+
+def test_two_planes_of_unequal_gain_on_their_own_grids():
+    planes = [
+        Plane(1.00 * edge(100, 5.0, 0.6, row0=0, col0=1, step=2), 0, 1, 2),
+        Plane(1.07 * edge(100, 5.0, 0.6, row0=1, col0=0, step=2), 1, 0, 2),
+    ]
+    found = planes_mtf(planes)
+    # frequencies are of the full sensor although each plane is sampled at every second pixel
+    np.testing.assert_allclose(found.mtf, gaussian_mtf(0.6, found.frequency_cy_per_px), atol=2e-4)
+
+
+def test_hot_pixels_are_left_out():
+    rng = np.random.default_rng(2)
+    image = noisy(edge(200, 5.0, 0.7), rng)
+    image.ravel()[rng.integers(0, image.size, 60)] += 3000
+    found = edge_mtf(image)
+    assert found.mtf50_cy_per_px == pytest.approx(gaussian_mtf50(0.7), abs=4 * found.mtf50_cy_per_px_std)
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        np.ones((200, 200)),
+        np.random.default_rng(0).normal(100, 3, (200, 200)),
+        np.where(np.abs(np.arange(200) - 100) < 30, 100.0, 10.0) * np.ones((200, 1)),
+        (np.arange(200)[:, None] // 25 + np.arange(200) // 25) % 2 * 100.0,
+        np.arange(200.0) * np.ones((200, 1)),
+        np.ones((10, 10)),
+        np.full((64, 64), np.nan),
+    ],
+    ids=["uniform", "noise", "two edges", "checkerboard", "ramp", "tiny", "not finite"],
+)
+def test_no_single_edge_is_not_determined(region):
+    with pytest.raises(NotDetermined):
+        edge_mtf(region)
+
+
+@pytest.mark.slow
+def test_takes_less_than_50_ms_a_region():
+    image = noisy(edge(300, 5.0, 0.55), np.random.default_rng(0))
+    edge_mtf(image)
+    taken = []
+    for _ in range(10):
+        start = time.perf_counter()
+        edge_mtf(image)
+        taken.append(time.perf_counter() - start)
+    assert min(taken) < 0.05
+
+
+def recordings(frames, captures, cfa="RGGB"):
+    camera = SimpleNamespace(cfa=cfa, black_level_dn=64.0, white_level_dn=4095.0, bit_depth=12)
+    return SimpleNamespace(
+        camera=lambda side: camera,
+        captures=lambda kind=None, side=None: captures,
+        frame=lambda capture: frames[capture.id],
+    )
+
+
+def capture(name, **more):
+    return SimpleNamespace(id=name, side="left", region=(31, 20, 191, 180), angle_deg=95.0, field_mm=(0.0, 0.0), **more)
+
+
+def test_fit_takes_every_channel_of_the_mosaic_on_its_own_grid():
+    rng = np.random.default_rng(4)
+    sigma = {"R": 0.8, "G": 0.6, "B": 0.5}
+    frame = np.zeros((200, 200))
+    for phase, channel in enumerate("RGGB"):
+        i, j = phase // 2, phase % 2
+        frame[i::2, j::2] = edge(200, 95.0, sigma[channel])[i::2, j::2]
+    raw = (64 + np.round(0.4 * rng.poisson(8000.0 * frame))).astype(np.uint16)
+    curves = fit_mtf(recordings({"edge-1": raw}, [capture("edge-1")]), "left")
+    assert [c.channel for c in curves] == ["R", "G", "B"]
+    for curve in curves:
+        assert curve.angle_deg == pytest.approx(95.0, abs=5 * curve.angle_deg_std)
+        assert curve.mtf50_cy_per_px == pytest.approx(
+            gaussian_mtf50(sigma[curve.channel]), abs=4 * curve.mtf50_cy_per_px_std
+        )
+
+
+def test_fit_refuses_a_saturated_edge():
+    raw = np.full((200, 200), 4095, np.uint16)
+    raw[:, :100] = 500
+    with pytest.raises(NotDetermined, match="saturated"):
+        fit_mtf(recordings({"edge-1": raw}, [capture("edge-1")]), "left")
