@@ -19,6 +19,10 @@ class Garbled(InstrumentError):
     """Something came that isn't an answer to what was asked."""
 
 
+class Interrupted(InstrumentError):
+    """A wait was ended by `stop` from another thread."""
+
+
 class Refused(InstrumentError):
     """The instrument answered with an error code of its own, kept in `code`."""
 

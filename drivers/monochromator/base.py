@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -57,7 +58,7 @@ def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingF
             raise InstrumentError(
                 f"monochromator: filter {row.place} serves {row.from_nm}..{row.to_nm} nm; give a band that isn't empty"
             )
-    for before, after in zip(rows, rows[1:], strict=False):
+    for before, after in itertools.pairwise(rows):
         if after.from_nm < before.to_nm:
             raise InstrumentError(
                 f"monochromator: filters {before.place} and {after.place} both serve {after.from_nm} nm; give bands that don't overlap"

@@ -1,0 +1,221 @@
+"""Oriel/Newport Cornerstone 260 on RS-232: 9600 8N1, every character echoed, replies end CR LF.
+
+The driver works in handshake mode, in which every statement is answered by the status byte once it is done: `00`, or
+`20` (hex) for an error whose number `ERROR?` tells. Source: the manual's appendix on low level commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.instrument import Identity, Recorder
+from drivers.monochromator.base import (
+    Monochromator,
+    checked_wavelength_nm,
+    filter_place,
+    order_sorting_filters,
+)
+from drivers.transport import Transport, WireInstrument, shown
+
+ERRORS = {
+    0: "system error",
+    1: "statement not understood",
+    2: "bad parameter",
+    3: "wavelength not allowed for this grating",
+    6: "accessory not present",
+    7: "accessory already in position",
+    8: "wavelength drive can't find home",
+    9: "label too long",
+}
+_ALREADY_THERE = 7
+_DONE = {"00", "0"}
+_FAILED = {"20", "32"}
+#: Reciprocal linear dispersion with 1200 l/mm: 1e6 nm / (1200 per mm x 260 mm) x cos(9.6 deg).
+_DISPERSION_NM_PER_MM = 3.16
+
+
+class Cornerstone260(WireInstrument, Monochromator):
+    """A Cornerstone 260.
+
+    `filters`: the order-sorting filters (rows of `place`, `from_nm`, `to_nm`; None: the default table; an empty list:
+    no wheel). `grating`: which one to use, None: the one that stands. `move_timeout_s`: longest motion.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        filters: Sequence[object] | None = None,
+        grating: int | None = None,
+        dispersion_nm_per_mm: float = _DISPERSION_NM_PER_MM,
+        upper_nm: float = 1400.0,
+        tolerance_nm: float = 0.5,
+        timeout_s: float = 2.0,
+        move_timeout_s: float = 60.0,
+        baudrate: int = 9600,
+        record: Recorder | None = None,
+    ) -> None:
+        super().__init__(Transport(address, "Cornerstone 260", baudrate=baudrate, timeout_s=timeout_s, record=record))
+        self.filters = order_sorting_filters(filters)
+        self.grating = grating
+        self.dispersion_nm_per_mm = dispersion_nm_per_mm
+        self.upper_nm = upper_nm
+        self.tolerance_nm = tolerance_nm
+        self.move_timeout_s = move_timeout_s
+        self._identity = Identity("Newport", "Cornerstone 260")
+
+    # --- the abstraction --------------------------------------------------------------------------------------------
+
+    def identity(self) -> Identity:
+        with self._conversation():
+            return self._identity
+
+    def move_nm(self, wavelength_nm: float) -> None:
+        wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
+        with self._conversation():
+            if self.filters:
+                self.select_filter(filter_place(self.filters, wanted))
+            self._do(f"GOWAVE {wanted:.3f}")
+            reached = self._number("WAVE?")
+            if abs(reached - wanted) > self.tolerance_nm:
+                raise Garbled(
+                    f"{self._transport.name}: stands at {reached:g} nm after a move to {wanted:g} nm; "
+                    "check its units and its wavelength calibration"
+                )
+
+    def wavelength_nm(self) -> float:
+        with self._conversation():
+            return self._number("WAVE?")
+
+    def open_shutter(self) -> None:
+        with self._conversation():
+            self._do("SHUTTER O")
+
+    def close_shutter(self) -> None:
+        with self._conversation():
+            self._do("SHUTTER C")
+
+    def shutter_is_open(self) -> bool:
+        with self._conversation():
+            answer = self._ask("SHUTTER?")
+            if answer not in {"O", "C"}:
+                raise self._strange("SHUTTER?", answer)
+            return answer == "O"
+
+    def select_filter(self, place: int) -> None:
+        with self._conversation():
+            if self.selected_filter() != place:
+                self._do(f"FILTER {place}")
+
+    def selected_filter(self) -> int:
+        with self._conversation():
+            return round(self._number("FILTER?"))
+
+    def slit_um(self) -> float:
+        with self._conversation():
+            return self._number("SLIT1MICRONS?")
+
+    def set_slit_um(self, width_um: float) -> None:
+        with self._conversation():
+            for slit in (1, 2):
+                self._do(f"SLIT{slit}MICRONS {round(width_um)}")
+
+    def bandwidth_nm(self) -> float:
+        return self.slit_um() * 1e-3 * self.dispersion_nm_per_mm
+
+    # --- the wire ---------------------------------------------------------------------------------------------------
+
+    def _establish(self) -> None:
+        line = self._transport
+        # An empty statement ends whatever half a statement an earlier host left behind.
+        line.write(b"\n")
+        line.drain(quiet_s=0.1)
+        line.write(b"HANDSHAKE 1\n")
+        self._echo("HANDSHAKE 1")
+        line.drain(quiet_s=0.1)  # its own status byte, and an error that stood from before
+        self._ask("ERROR?")
+        model, _, serial_number = self._ask("INFO?").partition(" SN ")
+        self._identity = Identity("Newport", model.strip() or "Cornerstone 260", serial_number.strip())
+        self._do("UNITS NM")
+        if self.grating is not None and self._ask("GRAT?").partition(",")[0].strip() != str(self.grating):
+            self._do(f"GRAT {self.grating}")
+
+    def _make_safe(self) -> None:
+        self._do("SHUTTER C")
+
+    def _do(self, statement: str) -> None:
+        """A command: its echo, and its status byte once it is done."""
+        self._say(statement)
+        try:
+            status = self._line(statement, self.move_timeout_s)
+        except Interrupted:
+            self._transport.resume()
+            self._transport.write(b"ABORT\n")
+            self._transport.drain(quiet_s=0.2)
+            raise
+        if status in _FAILED:
+            code = self._error_number()
+            if code != _ALREADY_THERE:
+                raise self._refused(statement, code)
+        elif status not in _DONE:
+            raise self._strange(statement, status)
+
+    def _ask(self, query: str) -> str:
+        """A query: its echo, its reply, its status byte. A refused query has the status byte alone."""
+        self._say(query)
+        reply = self._line(query)
+        if reply in _FAILED:
+            # A status byte of 20, or the number 20 with its status byte to follow.
+            try:
+                status = self._line(query, 0.3)
+            except NoAnswer:
+                raise self._refused(query, self._error_number()) from None
+        else:
+            status = self._line(query)
+        if status in _FAILED:
+            raise self._refused(query, self._error_number())
+        if status not in _DONE:
+            raise self._strange(query, status)
+        return reply
+
+    def _number(self, query: str) -> float:
+        reply = self._ask(query)
+        try:
+            return float(reply)
+        except ValueError:
+            raise self._strange(query, reply) from None
+
+    def _error_number(self) -> int:
+        self._say("ERROR?")
+        reply = self._line("ERROR?")
+        self._line("ERROR?")
+        return int(reply) if reply.isdigit() else 0
+
+    def _say(self, statement: str) -> None:
+        self._transport.write(statement.encode("ascii") + b"\n")
+        self._echo(statement)
+
+    def _echo(self, statement: str) -> None:
+        echo = self._transport.read_until(b"\n", asked=statement)
+        if echo.strip() != statement.encode("ascii"):
+            raise Garbled(
+                f"{self._transport.name}: {shown(echo)} instead of the echo of {statement!r}; "
+                "check that a Cornerstone 260 is at this address and nothing else talks to it"
+            )
+
+    def _line(self, asked: str, timeout_s: float | None = None) -> str:
+        return self._transport.read_until(b"\r\n", timeout_s, asked).decode("latin-1").strip()
+
+    def _refused(self, statement: str, code: int) -> InstrumentError:
+        meaning = ERRORS.get(code, "unknown error")
+        return Refused(
+            f"{self._transport.name}: refused {statement!r}: error {code}, {meaning}; check the value against the instrument",
+            code,
+        )
+
+    def _strange(self, asked: str, answer: str) -> Garbled:
+        return Garbled(
+            f"{self._transport.name}: answered {asked!r} with {shown(answer.encode('latin-1'))}; "
+            "check that a Cornerstone 260 is at this address and nothing else talks to it"
+        )

@@ -1,0 +1,59 @@
+"""Drivers by family and name. Other packages add theirs through the entry point group `calibench.drivers`.
+
+An entry point's name is `family.name` (`monochromator.cornerstone260`), and it refers to a callable that takes the
+`address` of the station file and that table's other keys by name, and returns the family's instrument:
+`make(address, *, record=None, **settings)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from drivers.errors import InstrumentError
+
+GROUP = "calibench.drivers"
+
+
+def _ours(**values: str) -> Iterable[EntryPoint]:
+    return (EntryPoint(name.replace("__", "."), value, GROUP) for name, value in values.items())
+
+
+#: Until an installation has entry points of its own; an installed entry point of the same name goes first.
+_BUILT_IN = {
+    point.name: point
+    for point in _ours(
+        monochromator__cornerstone260="drivers.monochromator.cornerstone260:Cornerstone260",
+        spectroradiometer__specbos1211="drivers.spectroradiometer.specbos1211:Specbos1211",
+        display__browser="drivers.display.browser:BrowserDisplay",
+        stage__operator="drivers.stage.operator:OperatorStage",
+        stage__prompt="drivers.stage.prompt:PromptStage",
+    )
+}
+
+
+def names(family: str) -> tuple[str, ...]:
+    """Names of the drivers of one family ("monochromator", "camera", ...), sorted."""
+    return tuple(sorted(name.partition(".")[2] for name in _all() if name.partition(".")[0] == family))
+
+
+def driver(family: str, name: str) -> Callable[..., Any]:
+    """What makes the instrument: call it with an address. Raises `InstrumentError` if there is no such driver."""
+    point = _all().get(f"{family}.{name}")
+    if point is None:
+        known = ", ".join(names(family)) or "none"
+        raise InstrumentError(
+            f"{family}: no driver {name!r}; installed are {known}: correct `driver` in the station file or install its package"
+        )
+    try:
+        made: Callable[..., Any] = point.load()
+    except (ImportError, AttributeError) as error:
+        raise InstrumentError(
+            f"{family}: the driver {name!r} ({point.value}) can't be loaded: {error}; install its package again"
+        ) from error
+    return made
+
+
+def _all() -> dict[str, EntryPoint]:
+    return _BUILT_IN | {point.name: point for point in entry_points(group=GROUP)}

@@ -1,0 +1,220 @@
+"""JETI specbos 1211 (and 1201) on its serial line: 8N1, no flow control, commands end CR.
+
+A setting is answered by ACK or NAK; after a NAK, `*stat:err?` tells why. `*init` is answered by ACK, and by BEL once
+the measurement is done. Without flow control a spectrum can lose characters on its way: it is asked for again.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from contextlib import suppress
+
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.instrument import Identity, Recorder
+from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
+from drivers.transport import Transport, WireInstrument, shown
+from sim.spectrum import Spectrum
+
+ACK, BEL, NAK = b"\x06", b"\x07", b"\x15"
+ERRORS = {
+    4: ("command not understood", "check that a specbos is at this address"),
+    120: ("over-exposed", "dim the light or measure at a greater distance"),
+    121: ("under-exposed", "give it more light or a longer `max_integration_s`"),
+    123: ("no integration time fits the light", "check that the light is steady"),
+    138: ("no measurement to fetch", "measure first"),
+    141: ("outside the calibrated range", "ask for wavelengths within the instrument's calibration"),
+}
+#: A fetch that broke off is asked for again, this often in all.
+FETCHES = 5
+_HEADER_LINES = 2
+
+
+class Specbos1211(WireInstrument, Spectroradiometer):
+    """A specbos 1211. Rates in `baudrates` are tried in turn; a TCP connection has none.
+
+    `from_nm`, `to_nm`: range asked for, in steps of 1 nm. `max_integration_s`: longest integration time that the
+    instrument may choose; one measurement ends within 5 times that and 10 s.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        from_nm: int = 350,
+        to_nm: int = 1000,
+        max_integration_s: float = 3.0,
+        timeout_s: float = 2.0,
+        fetch_timeout_s: float = 6.0,
+        measure_timeout_s: float | None = None,
+        baudrates: tuple[int, ...] = (921600, 115200, 38400),
+        record: Recorder | None = None,
+    ) -> None:
+        super().__init__(Transport(address, "specbos 1211", baudrate=baudrates[0], timeout_s=timeout_s, record=record))
+        self.from_nm, self.to_nm = int(from_nm), int(to_nm)
+        if not self.from_nm < self.to_nm:
+            raise InstrumentError(f"specbos 1211: {from_nm}..{to_nm} nm is no range; give from_nm below to_nm")
+        self.max_integration_s = max_integration_s
+        self.fetch_timeout_s = fetch_timeout_s
+        self.measure_timeout_s = 5 * max_integration_s + 10 if measure_timeout_s is None else measure_timeout_s
+        self.baudrates = tuple(baudrates)
+        self._identity = Identity("JETI", "specbos 1211")
+
+    def identity(self) -> Identity:
+        with self._conversation():
+            return self._identity
+
+    def measure(self) -> RadianceMeasurement:
+        with self._conversation() as line:
+            self._set("*init")
+            done = line.read(1, self.measure_timeout_s, "*init")
+            if done == NAK:
+                raise self._refusal("*init")
+            if done != BEL:
+                raise self._strange("*init", done)
+            spectrum = self._fetch_spectrum()
+            return RadianceMeasurement(spectrum, self._integration_time_s(), self._identity.serial_number)
+
+    def stop(self) -> None:
+        """End a measurement that another thread waits for; there is nothing to bring into a safe state."""
+        self._transport.interrupt()
+        with self._lock:
+            self._transport.resume()
+
+    # --- the wire ---------------------------------------------------------------------------------------------------
+
+    def _establish(self) -> None:
+        line = self._transport
+        model = self._find()
+        serial_number = re.sub(r"\D+", "", self._ask("*para:spnum?"))
+        firmware = ""
+        with suppress(Refused):
+            firmware = self._ask("*vers?")
+        self._identity = Identity("JETI", model, serial_number, firmware)
+        for setting in (
+            "*conf:default",
+            "*para:calibn 0",
+            "*para:expo 1",
+            f"*conf:maxtin {round(self.max_integration_s * 1000)}",
+            "*conf:func 6",
+            "*conf:form 4",
+            f"*conf:wran {self.from_nm} {self.to_nm} 1",
+            "*conf:aver 1",
+        ):
+            self._set(setting)
+        line.drain(quiet_s=0.02)
+
+    def _find(self) -> str:
+        """Model that answers `*idn?`, at the first rate at which one does."""
+        line = self._transport
+        failure: InstrumentError | None = None
+        for baudrate in self.baudrates if "://" not in line.address else self.baudrates[:1]:
+            if line.baudrate != baudrate:
+                line.baudrate = baudrate
+                line.open()
+            line.write(b"\r")  # ends whatever half a command an earlier host left behind
+            line.drain(quiet_s=0.05)
+            try:
+                answer = self._ask("*idn?")
+            except (Disconnected, Interrupted):
+                raise
+            except InstrumentError as error:
+                failure = failure or error
+                continue
+            if found := re.fullmatch(r"JETI_SB(\d+)", answer):
+                return f"specbos {found[1]}"
+            if answer.startswith("SB05"):
+                return "specbos 1201"
+            failure = self._strange("*idn?", answer.encode("latin-1"))
+        line.baudrate = self.baudrates[0]
+        assert failure is not None
+        raise failure
+
+    def _make_safe(self) -> None:
+        """It emits nothing and moves nothing."""
+
+    def _set(self, command: str) -> None:
+        """A setting: ACK, or NAK and the reason."""
+        self._transport.write(command.encode("ascii") + b"\r")
+        answer = self._transport.read(1, asked=command)
+        if answer == NAK:
+            raise self._refusal(command)
+        if answer != ACK:
+            raise self._strange(command, answer)
+
+    def _ask(self, query: str) -> str:
+        """A query: one line, or NAK and the reason."""
+        line = self._transport
+        line.write(query.encode("ascii") + b"\r")
+        first = line.read(1, asked=query)
+        if first == NAK:
+            raise self._refusal(query)
+        rest = b"" if first == b"\r" else line.read_until(b"\r", asked=query)
+        return (first + rest).decode("latin-1").strip()
+
+    def _refusal(self, command: str) -> InstrumentError:
+        self._transport.write(b"*stat:err?\r")
+        answer = self._transport.read_until(b"\r", asked="*stat:err?").decode("latin-1")
+        found = re.search(r"(\d+)\s*$", answer.strip())
+        if not found:
+            return self._strange("*stat:err?", answer.encode("latin-1"))
+        code = int(found[1])
+        meaning, remedy = ERRORS.get(code, ("an error of its own", "look it up in its manual"))
+        return Refused(f"{self._transport.name}: {command!r} failed: error {code}, {meaning}; {remedy}", code)
+
+    def _fetch_spectrum(self) -> Spectrum:
+        """The spectrum just measured; asked for again while it comes broken."""
+        failure: InstrumentError | None = None
+        for _ in range(FETCHES):
+            try:
+                return self._fetch_once()
+            except (NoAnswer, Garbled) as error:
+                failure = error
+                self._transport.drain(quiet_s=0.1)
+        assert failure is not None
+        raise Garbled(f"{failure} (asked {FETCHES} times)")
+
+    def _fetch_once(self) -> Spectrum:
+        line = self._transport
+        query = "*fetch:sprad"
+        wavelengths = range(self.from_nm, self.to_nm + 1)
+        line.write(query.encode("ascii") + b"\r")
+        first = line.read(1, self.fetch_timeout_s, query)
+        if first == NAK:
+            raise self._refusal(query)
+        header = (
+            [first.strip()] if first == b"\r" else [first + line.read_until(b"\r", self.fetch_timeout_s, query).strip()]
+        )
+        while len(header) < _HEADER_LINES:
+            header.append(line.read_until(b"\r", self.fetch_timeout_s, query).strip())
+        values: list[float] = []
+        # Within a reply characters follow each other: a pause of a second is where it broke off.
+        for _ in wavelengths:
+            text = line.read_until(b"\r", min(1.0, self.fetch_timeout_s), query).decode("latin-1").strip()
+            try:
+                value = float(text)
+            except ValueError:
+                raise self._strange(query, text.encode("latin-1")) from None
+            if not math.isfinite(value):
+                raise self._strange(query, text.encode("latin-1"))
+            values.append(value)
+        rest = line.drain(quiet_s=0.05)
+        if rest.strip():
+            raise Garbled(
+                f"{line.name}: sent {shown(rest.strip())} after {len(values)} values; check that nothing else talks to it"
+            )
+        return Spectrum.of(wavelengths, values)
+
+    def _integration_time_s(self) -> float | None:
+        """Integration time of the last measurement; None where the firmware doesn't tell."""
+        try:
+            found = re.search(r"(\d+(?:\.\d+)?)\s*(?:ms)?\s*$", self._ask("*fetch:tint"))
+        except Refused:
+            return None
+        return float(found[1]) / 1000.0 if found else None
+
+    def _strange(self, asked: str, answer: bytes) -> Garbled:
+        return Garbled(
+            f"{self._transport.name}: answered {asked!r} with {shown(answer)}; "
+            "check that a specbos is at this address and nothing else talks to it"
+        )

@@ -1,0 +1,236 @@
+"""Lines to instruments: a serial port or a TCP connection, with a time-out on every call and a transcript of every byte."""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import serial
+
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.instrument import Instrument, Recorder
+
+#: Longest time between two looks at whether `interrupt` was called.
+_SLICE_S = 0.05
+#: More than any instrument here says at once: what babbles on is not ours.
+_LONGEST_ANSWER = 1 << 20
+
+
+def shown(data: bytes) -> str:
+    """Bytes as one line for a message: printable ASCII as it is, the rest escaped, cut at 60 characters."""
+    text = data.decode("latin-1").encode("unicode_escape").decode("ascii")
+    return repr(data)[1:] if len(text) <= 60 else f"'{text[:57]}...'"
+
+
+class Transport:
+    """A byte line to one instrument.
+
+    `address` is a device path (`/dev/ttyUSB0`, `COM3`) or `socket://host:port`. `device` is the name that messages
+    call the instrument. `record` gets every piece sent and received. One thread talks at a time; only `interrupt` may
+    come from another.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        device: str,
+        *,
+        baudrate: int = 9600,
+        timeout_s: float = 2.0,
+        record: Recorder | None = None,
+    ) -> None:
+        self.address = address
+        self.device = device
+        self.baudrate = baudrate
+        self.timeout_s = timeout_s
+        self._record = record or (lambda direction, data: None)
+        self._port: serial.SerialBase | None = None
+        self._received = bytearray()
+        self._interrupted = threading.Event()
+
+    @property
+    def name(self) -> str:
+        """The instrument and where it is, for messages."""
+        return f"{self.device} at {self.address}"
+
+    def open(self) -> None:
+        """Open the line anew, 8N1 without flow control, with nothing left over in it. Raises `Disconnected`."""
+        self.close()
+        options = {} if "://" in self.address else {"exclusive": True}
+        try:
+            self._port = serial.serial_for_url(
+                self.address, baudrate=self.baudrate, timeout=0, write_timeout=self.timeout_s, **options
+            )
+        except (OSError, ValueError) as error:  # pyserial's SerialException is an OSError
+            reason = getattr(error, "strerror", None) or str(error).replace("\n", " ")
+            raise Disconnected(
+                f"{self.name}: can't be opened ({reason}); check the cable, the power and the address in the station file"
+            ) from error
+
+    def close(self) -> None:
+        """Let go of the line; never raises."""
+        port, self._port = self._port, None
+        self._received.clear()
+        if port is not None:
+            with suppress(OSError):
+                port.close()
+
+    def interrupt(self) -> None:
+        """End a wait that another thread is in: it raises `Interrupted`."""
+        self._interrupted.set()
+
+    def resume(self) -> None:
+        """Take back `interrupt`."""
+        self._interrupted.clear()
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises `Disconnected`."""
+        port = self._open_port()
+        try:
+            port.write(data)
+        except OSError as error:
+            raise self._gone(error) from error
+        self._record("sent", data)
+
+    def read(self, count: int, timeout_s: float | None = None, asked: str = "") -> bytes:
+        """Exactly `count` bytes. Raises `NoAnswer` with what came instead, `Disconnected`, `Interrupted`."""
+        deadline = self._deadline(timeout_s)
+        while len(self._received) < count:
+            self._fill(deadline, asked)
+        return self._take(count)
+
+    def read_until(self, end: bytes, timeout_s: float | None = None, asked: str = "") -> bytes:
+        """Everything up to and with the next `end`. Raises `NoAnswer`, `Disconnected`, `Garbled` or `Interrupted`."""
+        deadline = self._deadline(timeout_s)
+        while True:
+            at = self._received.find(end)
+            if at >= 0:
+                return self._take(at + len(end))
+            if len(self._received) > _LONGEST_ANSWER:
+                raise Garbled(f"{self.name}: sends without end; check that the right instrument is at this address")
+            self._fill(deadline, asked)
+
+    def drain(self, quiet_s: float = 0.05, limit_s: float = 1.0) -> bytes:
+        """Throw away what comes until the line has been quiet for `quiet_s`; returns it. Raises `Disconnected`."""
+        end = time.monotonic() + limit_s
+        last = time.monotonic()
+        while time.monotonic() < min(end, last + quiet_s):
+            if self._receive(quiet_s):
+                last = time.monotonic()
+        return self._take(len(self._received))
+
+    def _deadline(self, timeout_s: float | None) -> tuple[float, float]:
+        wait_s = self.timeout_s if timeout_s is None else timeout_s
+        return time.monotonic() + wait_s, wait_s
+
+    def _take(self, count: int) -> bytes:
+        data = bytes(self._received[:count])
+        del self._received[:count]
+        return data
+
+    def _fill(self, deadline: tuple[float, float], asked: str) -> None:
+        """Wait for at least one more byte until the deadline."""
+        end, wait_s = deadline
+        while True:
+            if self._interrupted.is_set():
+                raise Interrupted(
+                    f"{self.name}: stopped while waiting{f' for {asked!r}' if asked else ''}; start again"
+                )
+            left = end - time.monotonic()
+            if self._receive(max(0.0, min(_SLICE_S, left))):
+                return
+            if left <= 0:
+                question = f" to {asked!r}" if asked else ""
+                got = f"only {shown(bytes(self._received))}" if self._received else "no answer"
+                raise NoAnswer(
+                    f"{self.name}: {got} within {wait_s:g} s{question}; check the power, the cable and that nothing else talks to it"
+                )
+
+    def _receive(self, timeout_s: float) -> bool:
+        """Take in what is there, waiting for at most `timeout_s`; False if there was nothing."""
+        port = self._open_port()
+        try:
+            port.timeout = timeout_s
+            data = port.read(max(1, port.in_waiting))
+        except (OSError, TypeError) as error:  # TypeError: pyserial reads from a descriptor that was closed meanwhile
+            raise self._gone(error) from error
+        if data:
+            self._record("received", data)
+            self._received += data
+        return bool(data)
+
+    def _open_port(self) -> serial.SerialBase:
+        if self._port is None:
+            raise Disconnected(f"{self.name}: not connected; connect first")
+        return self._port
+
+    def _gone(self, error: Exception) -> Disconnected:
+        self.close()
+        reason = str(error).replace("\n", " ")
+        return Disconnected(f"{self.name}: the line broke ({reason}); plug it in again, the next call reconnects")
+
+
+class WireInstrument(Instrument):
+    """An instrument on a `Transport`: one conversation at a time, and a fresh start after one that failed."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+        self._lock = threading.RLock()
+        self._live = False
+        self._met = False
+
+    @abstractmethod
+    def _establish(self) -> None:
+        """Find the instrument on a line just opened, and bring it into a known state."""
+
+    @abstractmethod
+    def _make_safe(self) -> None:
+        """Bring the instrument into its safe state, in a conversation."""
+
+    def connect(self) -> None:
+        with self._conversation():
+            pass
+
+    def stop(self) -> None:
+        if not self._met:
+            return
+        self._transport.interrupt()
+        with self._lock:
+            self._transport.resume()
+            with self._conversation():
+                self._make_safe()
+
+    def close(self) -> None:
+        if self._met:
+            with suppress(InstrumentError):
+                self.stop()
+        with self._lock:
+            self._live = self._met = False
+            self._transport.close()
+
+    @contextmanager
+    def _conversation(self) -> Iterator[Transport]:
+        """Hold the line; after any failure but a refusal, the next conversation opens it anew.
+
+        Nothing that came late may be taken for the answer to a later question.
+        """
+        with self._lock:
+            if not self._live:
+                self._transport.open()
+                try:
+                    self._establish()
+                except InstrumentError:
+                    self._transport.close()
+                    raise
+                self._live = self._met = True
+            try:
+                yield self._transport
+            except Refused:
+                raise
+            except InstrumentError:
+                self._live = False
+                self._transport.close()
+                raise
