@@ -2,7 +2,7 @@
 
 An entry point's name is `family.name` (`monochromator.cornerstone260`), and it refers to a callable that takes the
 `address` of the station file and that table's other keys by name, and returns the family's instrument:
-`make(address, *, record=None, **settings)`.
+`make(address, *, recorder=None, **settings)`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _BUILT_IN = {
         monochromator__cornerstone260="drivers.monochromator.cornerstone260:Cornerstone260",
         spectroradiometer__specbos1211="drivers.spectroradiometer.specbos1211:Specbos1211",
         display__browser="drivers.display.browser:BrowserDisplay",
+        camera__u3v="drivers.camera.u3v:U3vCamera",
         stage__operator="drivers.stage.operator:OperatorStage",
         stage__prompt="drivers.stage.prompt:PromptStage",
     )

@@ -29,7 +29,7 @@ class Transport:
     """A byte line to one instrument.
 
     `address` is a device path (`/dev/ttyUSB0`, `COM3`) or `socket://host:port`. `device` is the name that messages
-    call the instrument. `record` gets every piece sent and received. One thread talks at a time; only `interrupt` may
+    call the instrument. `recorder` gets every piece sent and received. One thread talks at a time; only `interrupt` may
     come from another.
     """
 
@@ -40,13 +40,13 @@ class Transport:
         *,
         baudrate: int = 9600,
         timeout_s: float = 2.0,
-        record: Recorder | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self.address = address
         self.device = device
         self.baudrate = baudrate
         self.timeout_s = timeout_s
-        self._record = record or (lambda direction, data: None)
+        self._record = recorder or (lambda direction, data: None)
         self._port: serial.SerialBase | None = None
         self._received = bytearray()
         self._interrupted = threading.Event()

@@ -52,7 +52,7 @@ class BrowserDisplay(Display):
         timeout_s: float = 5.0,
         connect_timeout_s: float = 20.0,
         allow_remote: bool = False,
-        record: Recorder | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         host, _, port = address.rpartition(":")
         if not host or not port.isdigit() or int(port) > 65535:
@@ -67,7 +67,7 @@ class BrowserDisplay(Display):
         self.timeout_s = timeout_s
         self.connect_timeout_s = connect_timeout_s
         self._allow_remote = allow_remote
-        self._record = record or (lambda direction, data: None)
+        self._record = recorder or (lambda direction, data: None)
         self._lock = threading.RLock()
         self._change = threading.Condition()
         self._page: ServerConnection | None = None

@@ -54,9 +54,11 @@ class Cornerstone260(WireInstrument, Monochromator):
         timeout_s: float = 2.0,
         move_timeout_s: float = 60.0,
         baudrate: int = 9600,
-        record: Recorder | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
-        super().__init__(Transport(address, "Cornerstone 260", baudrate=baudrate, timeout_s=timeout_s, record=record))
+        super().__init__(
+            Transport(address, "Cornerstone 260", baudrate=baudrate, timeout_s=timeout_s, recorder=recorder)
+        )
         self.filters = order_sorting_filters(filters)
         self.grating = grating
         self.dispersion_nm_per_mm = dispersion_nm_per_mm

@@ -48,9 +48,11 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         fetch_timeout_s: float = 6.0,
         measure_timeout_s: float | None = None,
         baudrates: tuple[int, ...] = (921600, 115200, 38400),
-        record: Recorder | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
-        super().__init__(Transport(address, "specbos 1211", baudrate=baudrates[0], timeout_s=timeout_s, record=record))
+        super().__init__(
+            Transport(address, "specbos 1211", baudrate=baudrates[0], timeout_s=timeout_s, recorder=recorder)
+        )
         self.from_nm, self.to_nm = int(from_nm), int(to_nm)
         if not self.from_nm < self.to_nm:
             raise InstrumentError(f"specbos 1211: {from_nm}..{to_nm} nm is no range; give from_nm below to_nm")

@@ -20,9 +20,9 @@ class OperatorStage(WireInstrument, Stage):
     """The operator at `address` (`socket://host:port`); `place_timeout_s`: longest time to place a target."""
 
     def __init__(
-        self, address: str, *, timeout_s: float = 5.0, place_timeout_s: float = 600.0, record: Recorder | None = None
+        self, address: str, *, timeout_s: float = 5.0, place_timeout_s: float = 600.0, recorder: Recorder | None = None
     ) -> None:
-        super().__init__(Transport(address, "target stage", timeout_s=timeout_s, record=record))
+        super().__init__(Transport(address, "target stage", timeout_s=timeout_s, recorder=recorder))
         self.place_timeout_s = place_timeout_s
 
     def identity(self) -> Identity:

@@ -23,11 +23,11 @@ class PromptStage(Stage):
         *,
         instructions: Mapping[str, str] | None = None,
         ask: Callable[[str], str] | None = None,
-        record: Recorder | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self._instructions = dict(instructions or {})
         self._ask = ask
-        self._record = record or (lambda direction, data: None)
+        self._record = recorder or (lambda direction, data: None)
         self._placed = ""
 
     def connect(self) -> None:
