@@ -219,13 +219,7 @@ class WireInstrument(Instrument):
         """
         with self._lock:
             if not self._live:
-                self._transport.open()
-                try:
-                    self._establish()
-                except InstrumentError:
-                    self._transport.close()
-                    raise
-                self._live = self._met = True
+                self._meet()
             try:
                 yield self._transport
             except Refused:
@@ -234,3 +228,20 @@ class WireInstrument(Instrument):
                 self._live = False
                 self._transport.close()
                 raise
+
+    def _meet(self) -> None:
+        """Open the line and find the instrument; once more if it was known before, for a late answer may still come in."""
+        for last in (not self._met, True):
+            self._transport.open()
+            try:
+                self._establish()
+            except (NoAnswer, Garbled):
+                self._transport.close()
+                if last:
+                    raise
+            except InstrumentError:
+                self._transport.close()
+                raise
+            else:
+                self._live = self._met = True
+                return

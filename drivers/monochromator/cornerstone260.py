@@ -78,7 +78,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         with self._conversation():
             if self.filters:
                 self.select_filter(filter_place(self.filters, wanted))
-            self._do(f"GOWAVE {wanted:.3f}")
+            self._do(f"GOWAVE {round(wanted, 3):.12g}")
             reached = self._number("WAVE?")
             if abs(reached - wanted) > self.tolerance_nm:
                 raise Garbled(

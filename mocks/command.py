@@ -1,0 +1,322 @@
+"""The commands that start mock instruments: `calibench mock` for one alone, `calibench bench` for the whole bench.
+
+The bench's process holds the hidden truth; what leaves it is addresses, and what a lab would know of such a bench.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import select
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import typer
+
+from mocks.cornerstone260 import Cornerstone260
+from mocks.cr300 import ColorimetryResearch
+from mocks.display import Page, Screen, browse
+from mocks.lamp import Lamp, LampClock
+from mocks.pr655 import PhotoResearch
+from mocks.specbos1211 import Specbos1211
+from mocks.stage import Stage, Targets
+from mocks.wire import AddressError, Endpoint, Fault, FaultSpecError, Grammar, Light, Pty, Tcp, parse_faults, serve
+
+commands = typer.Typer()
+
+
+class Place(Light, Targets, Screen, Protocol):
+    """All that the mocks here act on: a bench, or a lamp alone."""
+
+
+INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
+    "cornerstone260": Cornerstone260,
+    "specbos1211": Specbos1211,
+    "pr655": lambda place: PhotoResearch(place, "PR-655"),
+    "pr670": lambda place: PhotoResearch(place, "PR-670", "67001234"),
+    "cr250": lambda place: ColorimetryResearch(place, "CR-250"),
+    "cr300": lambda place: ColorimetryResearch(place, "CR-300"),
+    "stage": Stage,
+}
+
+
+class _Unusable(Exception):
+    """An option that can't be used; the message is one line, the exit code 2."""
+
+
+@commands.command()
+def mock(
+    name: Annotated[str, typer.Argument(help=f"Instrument: {', '.join([*INSTRUMENTS, 'display'])}.")],
+    link: Annotated[Path | None, typer.Option(help="Make this path a link to the pseudo-terminal.")] = None,
+    tcp: Annotated[str, typer.Option(help="HOST:PORT to listen at instead (display: to connect to).")] = "",
+    fault: Annotated[
+        str,
+        typer.Option(help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug."),
+    ] = "",
+    real_time: Annotated[float, typer.Option(help="Real seconds for each of the instrument's (0: no waiting).")] = 0.0,
+) -> None:
+    """Serve one mock instrument on a pseudo-terminal or a TCP port; prints `ready ADDRESS` when it listens."""
+    with _one_line_errors():
+        if name not in INSTRUMENTS and name != "display":
+            raise _Unusable(f"mock {name}: no such instrument; choose from {', '.join([*INSTRUMENTS, 'display'])}")
+        if link is not None and tcp:
+            raise _Unusable("mock: --link and --tcp exclude one another; give one of them")
+        faults = parse_faults(fault)
+        lamp = Lamp(clock=LampClock(max(0.0, real_time)))
+        stop = threading.Event()
+        with _ended_by_signals(stop):
+            if name == "display":
+                host, port = _host_and_port(tcp or "127.0.0.1:8765")
+                _say(f"ready {host}:{port}")
+                browse(Page(lamp), f"{host}:{port}", stop, faults)
+            else:
+                endpoint = Tcp(*_host_and_port(tcp)) if tcp else Pty(link)
+                serve(INSTRUMENTS[name](lamp), endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
+
+
+@commands.command()
+def bench(
+    station: Annotated[Path | None, typer.Option(help="Write the station file of this bench here.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the hidden truth and of the noise.")] = 1,
+    real_time: Annotated[float, typer.Option(help="Real seconds for each of the bench's (0: no waiting).")] = 0.0,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="INSTRUMENT:SPEC, as in spectroradiometer:half@3; may be repeated.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Where the stage and the cameras listen.")] = "127.0.0.1",
+    advertise: Annotated[str, typer.Option(help="How other machines call this one; as --host if not given.")] = "",
+    serial_over_tcp: Annotated[
+        bool, typer.Option("--serial-over-tcp", help="The serial instruments listen at --host, too.")
+    ] = False,
+    display: Annotated[str, typer.Option(help="HOST:PORT at which the display driver will listen.")] = "",
+    with_parent: Annotated[bool, typer.Option("--with-parent", help="End when standard input is closed.")] = False,
+) -> None:
+    """Run the whole mock bench: prints one line an instrument, then `ready`."""
+    with _one_line_errors():
+        faults = _bench_faults(fault or [])
+        stop = threading.Event()
+        with _ended_by_signals(stop), contextlib.ExitStack() as running:
+            line = _BenchLine(host, advertise or host, serial_over_tcp, display)
+            addresses, known = _start_bench(running, stop, seed, real_time, faults, line)
+            for instrument, at in addresses.items():
+                _say(f"{instrument} {at['driver']} {at['address']}")
+            if station is not None:
+                _write(station, station_toml(addresses, known))
+                _say(f"station {station}")
+            _say("ready")
+            if with_parent:
+                _wait_for_parent(stop)
+            while not stop.wait(0.5):
+                pass
+
+
+@dataclass(frozen=True)
+class _BenchLine:
+    """Where the bench's instruments are to be reached."""
+
+    host: str
+    advertise: str
+    serial_over_tcp: bool
+    display: str
+
+    def advertised(self, address: str) -> str:
+        """The address as another machine writes it."""
+        return address.replace(f"//{self.host}:", f"//{self.advertise}:", 1)
+
+    def display_settings(self) -> tuple[str, dict[str, Any]]:
+        """Where the mock display connects to, and the driver's table of the station file."""
+        if not self.display:
+            address = f"127.0.0.1:{_free_port()}"
+            return address, {"driver": "browser", "address": address}
+        host, port = _host_and_port(self.display)
+        if host in {"127.0.0.1", "localhost"}:
+            return self.display, {"driver": "browser", "address": self.display}
+        return self.display, {"driver": "browser", "address": f"0.0.0.0:{port}", "allow_remote": True}
+
+
+def _start_bench(
+    running: contextlib.ExitStack,
+    stop: threading.Event,
+    seed: int,
+    real_time: float,
+    faults: Mapping[str, tuple[Fault, ...]],
+    line: _BenchLine,
+) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+    """Start everything; returns the addresses by instrument, and what a lab knows of this bench."""
+    # The bench brings the whole image former along: only this command pays for it.
+    from mocks.bench import SCREEN_COLS, SCREEN_ROWS, Bench
+    from mocks.usb import SERIAL_NUMBERS, serve_usbip, stereo_pair
+
+    place = Bench(seed=seed, real_time_factor=max(0.0, real_time))
+    running.callback(stop.set)
+    display_at, display_table = line.display_settings()
+    addresses: dict[str, dict[str, Any]] = {
+        "monochromator": {"driver": "cornerstone260"},
+        "spectroradiometer": {"driver": "specbos1211"},
+        "display": display_table,
+        "stage": {"driver": "operator"},
+    }
+    for instrument, grammar, endpoint in (
+        ("monochromator", Cornerstone260(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
+        ("spectroradiometer", Specbos1211(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
+        ("stage", Stage(place), Tcp(line.host, 0)),
+    ):
+        address = _serve_in_thread(running, stop, instrument, grammar, endpoint, faults.get(instrument, ()))
+        addresses[instrument]["address"] = line.advertised(address)
+    page = Page(place, SCREEN_ROWS, SCREEN_COLS)
+    _thread(running, "display", lambda: browse(page, display_at, stop, faults.get("display", ())))
+    usb = running.enter_context(serve_usbip(stereo_pair(place), line.host))
+    for side, serial_number in SERIAL_NUMBERS.items():
+        addresses[f"cameras.{side}"] = {"driver": "u3v", "address": line.advertised(usb.url(serial_number))}
+    known: dict[str, Any] = {"cameras": place.station_cameras(), "targets": place.station_targets()}
+    return addresses, known
+
+
+def _serve_in_thread(
+    running: contextlib.ExitStack,
+    stop: threading.Event,
+    name: str,
+    grammar: Grammar,
+    endpoint: Endpoint,
+    faults: tuple[Fault, ...],
+) -> str:
+    listening = threading.Event()
+    _thread(
+        running, name, lambda: serve(grammar, endpoint, stop, faults=faults, announce=lambda address: listening.set())
+    )
+    if not listening.wait(10.0):
+        raise AddressError(f"bench: the {name} didn't start within 10 s; see the error above")
+    return endpoint.address
+
+
+def _thread(running: contextlib.ExitStack, name: str, work: Callable[[], None]) -> None:
+    thread = threading.Thread(target=work, name=f"mock-{name}", daemon=True)
+    thread.start()
+    running.callback(thread.join, 5.0)
+
+
+# --- the station file -------------------------------------------------------------------------------------------------
+
+
+def station_toml(addresses: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]) -> str:
+    """The station file (TOML): an address a table, the cameras' data sheets, the targets' nominal layout."""
+    tables: dict[str, Any] = {"name": "mock bench", "cameras": {}}
+    for instrument, at in addresses.items():
+        family, _, side = instrument.partition(".")
+        if side:
+            tables[family][side] = {**at, "datasheet": known.get("cameras", {}).get(side, {})}
+        else:
+            tables[instrument] = dict(at)
+    tables["targets"] = known.get("targets", {})
+    return "\n".join(_toml_table((), tables)).lstrip("\n") + "\n"
+
+
+def _toml_table(path: tuple[str, ...], table: Mapping[str, Any]) -> Iterator[str]:
+    """Lines of one table: its values first, then its tables. What is None isn't known, and left out."""
+    deeper = {key: value for key, value in table.items() if isinstance(value, Mapping) and len(path) < 4}
+    plain = {key: value for key, value in table.items() if key not in deeper and value is not None}
+    if path and (plain or not deeper):
+        yield ""
+        yield f"[{'.'.join(_toml_key(part) for part in path)}]"
+    for key, value in plain.items():
+        yield f"{_toml_key(key)} = {_toml_value(value)}"
+    for key, value in deeper.items():
+        yield from _toml_table((*path, str(key)), value)
+
+
+def _toml_key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        entries = (f"{_toml_key(str(k))} = {_toml_value(v)}" for k, v in value.items() if v is not None)
+        return "{" + ", ".join(entries) + "}"
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if hasattr(value, "tolist"):
+        return _toml_value(value.tolist())
+    return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+
+
+def _write(path: Path, text: str) -> None:
+    """Whole or not at all: another process may be waiting for this file."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise _Unusable(
+            f"--station {path}: can't be written ({error.strerror}); give a path in a folder that is there"
+        ) from error
+
+
+# --- the process ------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _one_line_errors() -> Iterator[None]:
+    try:
+        yield
+    except (_Unusable, AddressError, FaultSpecError) as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(2) from None
+
+
+@contextlib.contextmanager
+def _ended_by_signals(stop: threading.Event) -> Iterator[None]:
+    """SIGTERM, SIGINT and SIGHUP end the loop that waits on `stop`; what was set before comes back afterwards."""
+    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _wait_for_parent(stop: threading.Event) -> None:
+    """Set `stop` once standard input ends: whoever started the bench is gone, or wants it gone."""
+    descriptor = sys.stdin.fileno()
+    while not stop.is_set():
+        if select.select([descriptor], [], [], 0.2)[0] and not os.read(descriptor, 4096):
+            stop.set()
+
+
+def _bench_faults(specs: list[str]) -> dict[str, tuple[Fault, ...]]:
+    instruments = ("monochromator", "spectroradiometer", "display", "stage")
+    faults: dict[str, tuple[Fault, ...]] = {}
+    for spec in specs:
+        instrument, separator, what = spec.partition(":")
+        if not separator or instrument not in instruments:
+            raise _Unusable(f"--fault {spec}: write INSTRUMENT:SPEC with one of {', '.join(instruments)}")
+        faults[instrument] = faults.get(instrument, ()) + parse_faults(what)
+    return faults
+
+
+def _host_and_port(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise _Unusable(f"--tcp {text}: not an address; write HOST:PORT, as in 127.0.0.1:5025")
+    return host, int(port)
+
+
+def _free_port() -> int:
+    """A port that nobody listens at now: the display's driver will."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
