@@ -8,7 +8,7 @@ from functools import cache
 from importlib.resources import files
 
 import numpy as np
-from scipy import constants
+from scipy.interpolate import CubicSpline
 
 from mocks.wire import MockClock
 from sim.spectrum import FloatArray, Spectrum
@@ -40,7 +40,7 @@ class Lamp:
 
     def __init__(self, luminance_cd_m2: float = 100.0, clock: MockClock | None = None) -> None:
         wavelength_nm = np.arange(340.0, 1100.5, 1.0)
-        x = constants.h * constants.c / (wavelength_nm * 1e-9 * constants.k * 2856.0)
+        x = 1.435e7 / (2848.0 * wavelength_nm)  # as CIE defines it: 2848 K on the c2 of 1931, 2856 K on today's
         shape = Spectrum.of(wavelength_nm, (560.0 / wavelength_nm) ** 5 / np.expm1(x))
         scale = luminance_cd_m2 / tristimulus(shape)[1]
         self._radiance = Spectrum.of(wavelength_nm, scale * np.asarray(shape.value))
@@ -75,19 +75,15 @@ class Lamp:
 
 
 @cache
-def _colour_matching() -> FloatArray:
+def _colour_matching(first_nm: float, last_nm: float) -> FloatArray:
+    """Rows x, y, z of the colour matching functions at every nm, by a cubic spline through the table."""
     text = (files("mocks") / "cie1931.csv").read_text(encoding="utf-8")
-    return np.array([[float(v) for v in line.split(",")] for line in text.splitlines()[2:]])
+    table = np.array([[float(v) for v in line.split(",")] for line in text.splitlines()[2:]])
+    return np.asarray(CubicSpline(table[:, 0], table[:, 1:])(np.arange(first_nm, last_nm + 0.5, 1.0)).T)
 
 
 def tristimulus(radiance: Spectrum) -> tuple[float, float, float]:
-    """X, Y, Z (CIE 1931, Y in cd/m2) of a spectral radiance in W sr^-1 m^-2 nm^-1: 683 x integral of L times each function."""
-    wavelength_nm = np.arange(360.0, 830.5, 1.0)
-    table = _colour_matching()
-    light = radiance.at(wavelength_nm)
-    x, y, z = (
-        LUMINOUS_EFFICACY_LM_PER_W
-        * float(np.trapezoid(light * np.interp(wavelength_nm, table[:, 0], table[:, k]), wavelength_nm))
-        for k in (1, 2, 3)
-    )
+    """X, Y, Z (CIE 1931, Y in cd/m2) of a spectral radiance in W sr^-1 m^-2 nm^-1: 683 x sum of L times each function."""
+    light = radiance.at(np.arange(360.0, 830.5, 1.0))
+    x, y, z = (LUMINOUS_EFFICACY_LM_PER_W * float(np.sum(light * row)) for row in _colour_matching(360.0, 830.0))
     return x, y, z

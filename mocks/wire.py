@@ -131,13 +131,13 @@ def parse_faults(spec: str) -> tuple[Fault, ...]:
     """
     faults: list[Fault] = []
     for item in filter(None, (part.strip() for part in spec.split(","))):
-        what, _, when = item.partition("@")
+        what, has_when, when = item.partition("@")
         kind, has_value, value = what.partition("=")
         kind = {"dropped": "drop", "half-reply": "half"}.get(kind, kind)
         if kind not in KINDS:
             raise FaultSpecError(f"--fault {item}: no fault {kind!r}; choose from {', '.join(KINDS)}")
         try:
-            number = int(when.rstrip("+")) if when else 1
+            number = int(when.removesuffix("+")) if has_when else 1
             amount = float(value) if has_value else None
         except ValueError:
             raise FaultSpecError(
