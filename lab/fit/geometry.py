@@ -72,9 +72,10 @@ def find_board(picture: Array, capture: Charuco) -> BoardView:
         raise NotDetermined(
             "geometry", f"only {len(index)} corners found, {MIN_CORNERS} needed: light or place the board better"
         )
+    if len(index) < (rows - 1) * (cols - 1):
+        index, points = _completed(index, points, rows - 1, cols - 1, picture.shape)
     board = np.zeros((len(index), 3), dtype=np.float32)
-    board[:, 0] = (index % (cols - 1) + 1) * capture.square_mm
-    board[:, 1] = (index // (cols - 1) + 1) * capture.square_mm
+    board[:, :2] = (_grid(index, cols - 1) + 1.0) * capture.square_mm
     fitted, trusted = _refine(picture, points, board[:, :2].astype(float), capture.square_mm, marker_mm, rows, cols)
     if trusted.sum() < MIN_CORNERS:
         raise NotDetermined(
@@ -103,6 +104,42 @@ def _charuco_corners(grey: NDArray[np.uint8], capture: Charuco) -> tuple[NDArray
         if len(best[0]) or rows % 2:
             break
     return best
+
+
+def _grid(index: NDArray[np.int64], cols: int) -> Array:
+    """(x, y) of corners in squares, from the first inner corner."""
+    return np.column_stack([index % cols, index // cols]).astype(float)
+
+
+def _completed(
+    index: NDArray[np.int64], points: Array, rows: int, cols: int, shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], Array]:
+    """The corners between markers that couldn't be read, where the board's plane and a smooth bend put them; the fit decides."""
+    homography, _ = cv2.findHomography(_grid(index, cols), points, cv2.RANSAC, 3.0)
+    if homography is None:
+        return index, points
+
+    def plane(of: NDArray[np.int64]) -> Array:
+        return np.asarray(cv2.perspectiveTransform(_grid(of, cols)[:, None, :], homography)[:, 0])
+
+    known = plane(index)
+    centre, scale = known.mean(axis=0), known.std() + 1.0
+
+    def bends(at: Array) -> Array:
+        x, y = ((at - centre) / scale).T
+        terms = [np.ones_like(x), x, y]
+        if len(index) >= 12:
+            terms += [x * x, x * y, y * y]
+        return np.column_stack(terms)
+
+    gap = np.linalg.lstsq(bends(known), points - known, rcond=None)[0]
+    missing = np.setdiff1d(np.arange(rows * cols), index)
+    guess = plane(missing)
+    guess = guess + bends(guess) @ gap
+    inside = np.all((guess > 4) & (guess < np.array([shape[1], shape[0]]) - 5), axis=1)
+    index = np.concatenate([index, missing[inside]])
+    order = np.argsort(index)
+    return index[order], np.concatenate([points, guess[inside]])[order]
 
 
 def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArray[np.int64], Array]:
