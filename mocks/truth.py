@@ -1,0 +1,247 @@
+"""The hidden truth of the mock bench: what its cameras really are. Known to the bench and to tests, never on a wire.
+
+Each camera does what its data sheet says to within a smooth few per cent. The left one conceals two pieces of physics that
+a first model leaves out: a birefringent anti-alias filter and an infrared-cut filter; the right one conceals none. Beyond
+that there is a little of what no model of ours has (the filter's dispersion, pattern noise of neighbours that is a
+little alike), at levels that don't matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
+
+from sim.camera import CameraModel, Geometry, Lens, Side
+from sim.effects.base import Effect
+from sim.effects.infrared_cut_filter import InfraredCutFilter
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from sim.sensor.electrons import FixedPattern
+from sim.spectrum import FloatArray, Spectrum
+
+ROWS, COLS, PITCH_UM = 480, 640, 3.0
+#: Distance of the cameras, and from them to where targets stand (mm). Both look at the same point there.
+BASELINE_MM, DISTANCE_MM = 60.0, 900.0
+#: Every so many degrees the dark current doubles.
+DOUBLING_C = 7.0
+SIDES: tuple[Side, ...] = ("left", "right")
+
+
+class DispersingLowPassFilter(OpticalLowPassFilter):
+    """The anti-alias filter with quartz's dispersion: its displacement is as stated at 550 nm and 3 % more at 440 nm."""
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray | None:
+        def birefringence(nm: float) -> float:  # quartz, fitted to 0.00964 at 400 nm and 0.00904 at 650 nm
+            return 0.00867 + 0.000155 / (nm * 1e-3) ** 2
+
+        factor = birefringence(wavelength_nm) / birefringence(550.0)
+        return super().transfer(fx_cy_per_um * factor, fy_cy_per_um * factor, wavelength_nm, camera)
+
+
+class RipplingInfraredCutFilter(InfraredCutFilter):
+    """The infrared-cut filter with the ripple that a coating's pass band has: 0.3 %."""
+
+    def transmittance(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
+        ripple = 1.0 - 0.0015 * (1.0 + np.cos(2 * np.pi * np.asarray(wavelength_nm, float) / 60.0))
+        return super().transmittance(wavelength_nm, sin_theta) * ripple
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenCamera:
+    """One camera: model and concealed effects, its pixels' pattern, where it stands, and what its maker says.
+
+    A point X of the rig's frame (mm; origin amid the cameras, z forward) is `rotation` (X - `centre_mm`) in the camera's.
+    `reference_temperature_c`: at which the model's dark current holds.
+    """
+
+    model: CameraModel
+    effects: tuple[Effect, ...]
+    pattern: FixedPattern
+    rotation: FloatArray
+    centre_mm: FloatArray
+    reference_temperature_c: float
+    datasheet: Mapping[str, Any]
+
+    @property
+    def geometry(self) -> Geometry:
+        """Pinhole and distortion; every hidden camera has one."""
+        assert self.model.geometry is not None
+        return self.model.geometry
+
+    def dark_current_e_per_s(self, temperature_c: float) -> float:
+        """Mean dark current at a sensor temperature."""
+        doublings = (temperature_c - self.reference_temperature_c) / DOUBLING_C
+        return float(self.model.dark_current_e_per_s * 2.0**doublings)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Both cameras of the bench."""
+
+    cameras: Mapping[Side, HiddenCamera]
+
+    def stereo(self) -> tuple[FloatArray, FloatArray]:
+        """(rotation, translation_mm) from the left camera's frame to the right one's, in OpenCV's convention."""
+        left, right = self.cameras["left"], self.cameras["right"]
+        rotation = right.rotation @ left.rotation.T
+        return rotation, right.rotation @ (left.centre_mm - right.centre_mm)
+
+
+def makers_efficiency() -> dict[str, Spectrum]:
+    """The maker's QE curves (electrons a photon, 380..780 nm by 5), without infrared filter."""
+    w = np.arange(380.0, 780.1, 5.0)
+    return {channel: Spectrum.of(w, np.round(curve, 4)) for channel, curve in _efficiency(w).items()}
+
+
+def _efficiency(w: FloatArray) -> dict[str, FloatArray]:
+    def bell(centre: float, below: float, above: float) -> FloatArray:
+        return np.asarray(np.exp(-0.5 * ((w - centre) / np.where(w < centre, below, above)) ** 2))
+
+    silicon = expit((w - 388.0) / 9.0) * np.clip((1010.0 - w) / 380.0, 0.0, 1.0) ** 0.5
+    return {
+        "R": silicon
+        * (0.56 * expit((w - 583.0) / 8.5) * bell(600.0, 400.0, 210.0) + 0.035 * bell(455.0, 40.0, 45.0) + 0.01),
+        "G": silicon * (0.61 * bell(531.0, 33.0, 41.0) + 0.07 * expit((w - 705.0) / 22.0) + 0.015),
+        "B": silicon * (0.59 * bell(459.0, 30.0, 34.0) + 0.05 * expit((w - 720.0) / 26.0) + 0.012),
+    }
+
+
+def _true_efficiency(rng: np.random.Generator) -> dict[str, Spectrum]:
+    """The maker's curves, off by a scale of 2 %, a tilt of 1.5 % and a bend of 0.5 % (one sd each), on 1 nm up to 1000 nm."""
+    w = np.arange(370.0, 1000.1, 1.0)
+    x = (w - 560.0) / 180.0
+    curves = {}
+    for channel, curve in _efficiency(w).items():
+        scale, tilt, bend = rng.normal(0.0, [0.02, 0.015, 0.005])
+        # the scale of a curve is limited, so that no seed gives an untypical camera
+        factor = 1.0 + np.clip(scale, -0.03, 0.03) + np.clip(tilt, -0.02, 0.02) * x + bend * (x**2 - 0.4)
+        curves[channel] = Spectrum.of(w, curve * factor)
+    return curves
+
+
+def _pattern(rng: np.random.Generator, prnu_percent: float, dsnu_e: float) -> FixedPattern:
+    """Pattern noise with the stated standard deviations; a tenth of the PRNU's variance is shared by neighbours, a
+    fiftieth of the DSNU's by columns."""
+    white = rng.standard_normal((ROWS, COLS))
+    shared = ndimage.gaussian_filter(rng.standard_normal((ROWS, COLS)), 1.0, mode="wrap")
+    prnu = np.sqrt(0.9) * white + np.sqrt(0.1) * shared / shared.std()
+    dsnu = np.sqrt(0.98) * rng.standard_normal((ROWS, COLS)) + np.sqrt(0.02) * rng.standard_normal((1, COLS))
+    prnu, dsnu = prnu - prnu.mean(), dsnu - dsnu.mean()
+    return FixedPattern(prnu=prnu / prnu.std() * prnu_percent / 100.0, dsnu_e=dsnu / dsnu.std() * dsnu_e)
+
+
+def _datasheet() -> dict[str, Any]:
+    return {
+        "rows": ROWS,
+        "cols": COLS,
+        "pixel_pitch_um": PITCH_UM,
+        "fill_factor": 0.8,
+        "cfa": "RGGB",
+        "bit_depth": 12,
+        "black_level_dn": 64.0,
+        "white_level_dn": 4095.0,
+        "conversion_gain_dn_per_e": 0.4,
+        "full_well_e": 9500.0,
+        "read_noise_e": 2.5,
+        "dark_current_e_per_s": 5.0,
+        "dsnu_e": 1.0,
+        "prnu_percent": 0.8,
+        "f_number": 4.0,
+        "focal_length_mm": 6.0,
+        "lens_transmittance": 0.92,
+        "quantum_efficiency": {
+            channel: {"wavelength_nm": list(curve.wavelength_nm), "value": list(curve.value)}
+            for channel, curve in makers_efficiency().items()
+        },
+    }
+
+
+#: What differs from camera to camera, before the seed's share.
+_UNITS: dict[Side, dict[str, float]] = {
+    "left": {
+        "conversion_gain_dn_per_e": 0.412,
+        "read_noise_e": 2.31,
+        "dark_current_e_per_s": 5.8,
+        "black_level_dn": 64.3,
+    },
+    "right": {
+        "conversion_gain_dn_per_e": 0.395,
+        "read_noise_e": 2.64,
+        "dark_current_e_per_s": 4.4,
+        "black_level_dn": 63.6,
+    },
+}
+
+
+def _camera(side: Side, rng: np.random.Generator, effects: tuple[Effect, ...]) -> HiddenCamera:
+    sheet = _datasheet()
+    unit = _UNITS[side]
+    vary = rng.uniform(0.99, 1.01, 6)
+    focal_px = 6.0 / (PITCH_UM * 1e-3) * rng.uniform(0.997, 1.003)
+    model = CameraModel(
+        rows=ROWS,
+        cols=COLS,
+        pixel_pitch_um=PITCH_UM,
+        fill_factor=sheet["fill_factor"],
+        cfa="RGGB",
+        bit_depth=12,
+        black_level_dn=unit["black_level_dn"],
+        white_level_dn=4095.0,
+        conversion_gain_dn_per_e=unit["conversion_gain_dn_per_e"] * vary[0],
+        full_well_e=9300.0 * vary[1],
+        read_noise_e=unit["read_noise_e"] * vary[2],
+        dark_current_e_per_s=unit["dark_current_e_per_s"] * vary[3],
+        dsnu_e=1.05 * vary[4],
+        prnu_percent=0.74 * vary[5],
+        quantum_efficiency=_true_efficiency(rng),
+        lens=Lens(f_number=4.0, focal_length_mm=6.0, transmittance=0.92),
+        geometry=Geometry(
+            camera_matrix=(
+                (focal_px, 0.0, (COLS - 1) / 2 + rng.uniform(-4, 4)),
+                (0.0, focal_px * rng.uniform(0.9998, 1.0002), (ROWS - 1) / 2 + rng.uniform(-4, 4)),
+                (0.0, 0.0, 1.0),
+            ),
+            distortion=(rng.uniform(-0.13, -0.10), rng.uniform(0.04, 0.10), *rng.uniform(-2e-4, 2e-4, 2), 0.0),
+        ),
+    )
+    outwards = -1.0 if side == "left" else 1.0
+    toe_in_deg = np.rad2deg(np.arctan2(BASELINE_MM / 2, DISTANCE_MM))
+    # turned about y so that its z axis meets the other camera's at the targets; crooked by up to 0.2 degrees
+    turn = Rotation.from_euler("yxz", [outwards * toe_in_deg, *rng.uniform(-0.2, 0.2, 2)], degrees=True)
+    return HiddenCamera(
+        model=model,
+        effects=effects,
+        pattern=_pattern(rng, model.prnu_percent, model.dsnu_e),
+        rotation=turn.as_matrix(),
+        centre_mm=np.array([outwards * BASELINE_MM / 2, 0.0, 0.0]) + rng.uniform(-0.3, 0.3, 3),
+        reference_temperature_c=31.0,
+        datasheet=sheet,
+    )
+
+
+#: What the default bench conceals.
+CONCEALED: dict[Side, tuple[Effect, ...]] = {
+    "left": (
+        DispersingLowPassFilter(displacement_x_um=2.06, displacement_y_um=1.94),
+        RipplingInfraredCutFilter(cut_wavelength_nm=651.5, width_nm=3.2),
+    ),
+    "right": (),
+}
+
+
+def hidden_truth(seed: int = 1, concealed: Mapping[Side, tuple[Effect, ...]] | None = None) -> Truth:
+    """The truth of a seed; `concealed` None: `CONCEALED`. The same seed with other effects has the same cameras otherwise."""
+    effects = CONCEALED if concealed is None else concealed
+    return Truth(
+        {
+            side: _camera(side, np.random.default_rng([seed, index]), effects.get(side, ()))
+            for index, side in enumerate(SIDES)
+        }
+    )
