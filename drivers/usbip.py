@@ -16,6 +16,7 @@ import itertools
 import socket
 import struct
 import threading
+import time
 from abc import abstractmethod
 from array import array
 from collections.abc import Iterator, Sequence
@@ -51,6 +52,7 @@ MOST_BYTES = 512 * 1024 * 1024
 _CONNECT_TIMEOUT_S = 5.0
 _UNLINK_GRACE_S = 2.0
 _CONTROL_TIMEOUT_MS = 5000
+_BUSY_ATTEMPTS, _BUSY_PAUSE_S = 5, 0.03
 
 _DEVICE_DESCRIPTOR, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4, 5
 
@@ -301,7 +303,7 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
     bulk_read = intr_read = _read
     bulk_write = intr_write = _write
 
-    def ctrl_transfer(  # noqa: PLR0917  (pyusb's signature)
+    def ctrl_transfer(
         self,
         dev_handle: Pipe,
         bmRequestType: int,
@@ -496,7 +498,14 @@ class UsbIpBackend(PipeBackend):
         return found
 
     def open_pipe(self, device: RemoteDevice) -> TcpPipe:
-        connection = self._ask(OP_REQ_IMPORT, device.place.ljust(32, b"\0"))
+        for attempt in range(_BUSY_ATTEMPTS):
+            try:
+                connection = self._ask(OP_REQ_IMPORT, device.place.ljust(32, b"\0"))
+                break
+            except usb.core.USBError as error:
+                if error.errno != errno.EBUSY or attempt == _BUSY_ATTEMPTS - 1:
+                    raise
+                time.sleep(_BUSY_PAUSE_S)  # another client may just be reading its serial number
         try:
             receive_exactly(connection, DEVICE.size)
         except OSError as error:

@@ -57,7 +57,7 @@ FEATURE_BYTES = 4 * 18
 TICKS_PER_US = 10
 MOST_EXPOSURE_US = 60e6
 MOST_GAIN_DB = 24.0
-BAYER_RG8, BAYER_RG12, BAYER_RG12P, BAYER_RG16 = 0x01080009, 0x01100011, 0x010C0059, 0x0110002F
+BAYER_RG8, BAYER_RG12, BAYER_RG12P = 0x01080009, 0x01100011, 0x010C0059
 TRIGGER_ON = 1 << 0
 SOURCE_SHIFT, SOURCE_SOFTWARE, SOURCE_LINE = 4, 0, 1
 _MOST_QUEUED = 4
@@ -101,8 +101,6 @@ def encode(raw: UInt16Array, pixel_format: int) -> bytes:
         return pack_12p(raw)
     if pixel_format == BAYER_RG8:
         return (raw >> 4).astype(np.uint8).tobytes()
-    if pixel_format == BAYER_RG16:
-        return (raw << 4).astype("<u2").tobytes()
     return raw.astype("<u2").tobytes()
 
 
@@ -369,7 +367,7 @@ class U3vDevice(UsbDevice):
 
     def _check_window(self, register: int, value: int) -> None:
         if register == PIXEL_FORMAT:
-            if value not in (BAYER_RG8, BAYER_RG12, BAYER_RG12P, BAYER_RG16):
+            if value not in (BAYER_RG8, BAYER_RG12, BAYER_RG12P):
                 raise _Refusal(0x8002)
             return
         window = {name: self._get(name) for name in (WIDTH, HEIGHT, OFFSET_X, OFFSET_Y)} | {register: value}

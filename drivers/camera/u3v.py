@@ -145,8 +145,9 @@ def _formats() -> dict[int, PixelFormat]:
 
 
 PIXEL_FORMATS = _formats()
-#: What is chosen if the camera offers it: the deepest first, plain before packed.
-_PREFERENCE = sorted(PIXEL_FORMATS.values(), key=lambda item: (-item.bits, item.packed, item.name))
+#: What is chosen if the camera offers it: the deepest first, plain before packed; 16 bits last, for most cameras only
+#: shift their 10 or 12 bits up in it, and codes should be the converter's.
+_PREFERENCE = sorted(PIXEL_FORMATS.values(), key=lambda item: (item.bits == 16, -item.bits, item.packed, item.name))
 
 
 # --- control ----------------------------------------------------------------------------------------------------------
@@ -158,9 +159,7 @@ class GenCp:
     Thread-safe. Raises `Refused` with GenCP's status, `NoAnswer`, `Disconnected`, `Garbled`.
     """
 
-    def __init__(
-        self, device: usb.core.Device, out: int, into: int, who: str, record: Recorder | None = None
-    ) -> None:
+    def __init__(self, device: usb.core.Device, out: int, into: int, who: str, record: Recorder | None = None) -> None:
         self._device, self._out, self._in = device, out, into
         self._who = who
         self._recorder = record
@@ -315,7 +314,8 @@ class _Interfaces:
 class U3vCamera(Camera):
     """One USB3 Vision camera at `usbip://HOST:PORT/SERIAL` or `usb://SERIAL` (or an already found pyusb `device`).
 
-    `pixel_format`: a format's name, or None for the deepest raw one the camera offers. `timeout_s`: how long beyond the
+    `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits that the camera offers (16 only if it has
+    no other). `timeout_s`: how long beyond the
     exposure a frame may take.
     """
 
