@@ -1,0 +1,287 @@
+"""The command line: `calibench COMMAND`. Parses, calls one verb of `lab`, prints, and turns errors into exit codes.
+
+0 done; 2 the input can't be used; 3 a device failed; 4 a check fell short; 1 a defect of calibench; 130 interrupted.
+An error is one line on stderr (one for each problem of a folder), never a traceback; CALIBENCH_DEBUG=1 shows that too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import typer
+from pydantic import BaseModel, ValidationError
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from lab import recording
+from lab.errors import DeviceError, InputError
+from lab.fit import Progress as Advance
+from lab.fit import fit_recording_set
+from lab.recording import RecordingSet
+from lab.report.figures import by_side, measured, stereo_figures
+from lab.results import DiagnosisResult, FitResult, Skipped, ValidationResult
+
+EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
+
+app = typer.Typer(
+    name="calibench",
+    help="Captures with, calibrates and explains cameras.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+out = Console(soft_wrap=True, highlight=False)
+err = Console(stderr=True, soft_wrap=True, highlight=False)
+
+Source = Annotated[str, typer.Argument(metavar="SOURCE", help="a recording set's folder, or a stored session's id")]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="write the result as JSON ('-': to stdout)")]
+FitFile = Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="a fit's JSON, in place of fitting again")]
+Result = TypeVar("Result", bound=BaseModel)
+
+
+# --- shared by the commands --------------------------------------------------------------------------------------------
+
+
+def _warn(lines: tuple[str, ...]) -> None:
+    for line in lines:
+        err.print(f"[yellow]calibench: warning:[/] {escape(line)}")
+
+
+def _recordings(source: str) -> RecordingSet:
+    """The recording set in a folder, or that of a stored session; its warnings go to stderr."""
+    if Path(source).exists() or os.sep in source:
+        recordings = recording.read(source)
+    else:
+        from lab.store import Store
+
+        recordings = Store.open().recordings(source)
+    _warn(recordings.warnings)
+    return recordings
+
+
+@contextlib.contextmanager
+def _bar(what: str) -> Iterator[Advance]:
+    """A progress bar on stderr where that is a terminal; yields `advance(text, share)`."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+        task = progress.add_task(what, total=1.0)
+        yield lambda text, share: progress.update(task, description=f"{what}: {escape(text)}", completed=share)
+
+
+def _check_writable(file: Path | None) -> None:
+    """Refuse a result's file that can't be written before the work, not after it."""
+    if file is None or str(file) == "-":
+        return
+    if file.is_dir() or not file.parent.is_dir() or not os.access(file.parent, os.W_OK):
+        raise InputError(f"{file}: can't be written; name a file in a folder that exists and is yours")
+
+
+def _write_json(result: BaseModel, file: Path | None) -> None:
+    """The result as JSON: completely or not at all."""
+    if file is None:
+        return
+    text = result.model_dump_json(indent=1) + "\n"
+    if str(file) == "-":
+        sys.stdout.write(text)
+        return
+    handle, partial = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        Path(partial).chmod(0o644)
+        Path(partial).replace(file)
+    except BaseException:
+        Path(partial).unlink(missing_ok=True)
+        raise
+
+
+def _load(model: type[Result], file: Path) -> Result:
+    """A result that an earlier command wrote with `--json`."""
+    try:
+        return model.model_validate_json(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: can't be read ({error}); give the file that --json wrote") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        at = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{file}: not what --json wrote: {at} {first['msg']}; write it again") from error
+
+
+def _fitted(recordings: RecordingSet, fit_file: Path | None) -> FitResult:
+    if fit_file is not None:
+        return _load(FitResult, fit_file)
+    with _bar("fit") as advance:
+        return fit_recording_set(recordings, advance)
+
+
+def _validated(recordings: RecordingSet, fit: FitResult) -> ValidationResult:
+    from lab.validate import validate
+
+    with _bar("validate"):
+        return validate(recordings, fit)
+
+
+def _diagnosed(recordings: RecordingSet, fit: FitResult) -> DiagnosisResult:
+    from lab.diagnose import diagnose
+
+    with _bar("diagnose") as advance:
+        return diagnose(recordings, fit, advance)
+
+
+# --- what is printed ---------------------------------------------------------------------------------------------------
+
+
+def _print_skipped(skipped: tuple[Skipped, ...]) -> None:
+    for item in skipped:
+        of = f" ({item.side})" if item.side else ""
+        out.print(f"skipped: {escape(item.step)}{of}: {escape(item.reason)}")
+
+
+def _print_fit(recordings: RecordingSet, fit: FitResult) -> None:
+    sides = list(fit.cameras)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("quantity")
+    for side in sides:
+        table.add_column(f"{side}, ± one standard uncertainty")
+    for name, figures in by_side(fit, recordings.manifest.cameras):
+        table.add_row(name, *(figures[side].text if side in figures else "-" for side in sides))
+    if table.row_count:
+        out.print(table)
+    if fit.stereo is not None:
+        for figure in stereo_figures(fit.stereo):
+            out.print(f"stereo {figure.name}: {figure.text}")
+    for side, camera in fit.cameras.items():
+        for remark in camera.noise.remarks if camera.noise else ():
+            out.print(f"{side}: {escape(remark)}")
+    _print_skipped(fit.skipped)
+
+
+def _print_validation(validation: ValidationResult) -> None:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("check", "side", "capture", "n", "chi2/n", "rms, %", "within noise"):
+        table.add_column(heading)
+    for check in validation.checks:
+        table.add_row(
+            check.name,
+            check.side,
+            check.capture,
+            str(check.n),
+            f"{check.chi2 / max(check.n, 1):.2f}",
+            f"{check.rms_relative_percent:.2f}",
+            "yes" if check.passed else "[red]no[/]",
+        )
+    if table.row_count:
+        out.print(table)
+    _print_skipped(validation.skipped)
+
+
+def _print_diagnosis(diagnosis: DiagnosisResult) -> None:
+    out.print(f"verdict: [bold]{diagnosis.verdict}[/]")
+    for sentence in diagnosis.summary:
+        out.print(escape(sentence))
+    for effect in diagnosis.effects:
+        values = ", ".join(
+            f"{name.removesuffix('_' + value.unit)} {measured(value.value, value.std, value.unit)}"
+            for name, value in effect.parameters.items()
+        )
+        out.print(f"  {effect.name} ({', '.join(effect.sides)}), probability {effect.probability:.3f}: {values}")
+    if diagnosis.held_out is not None:
+        held = diagnosis.held_out
+        out.print(
+            f"held out ({', '.join(held.captures)}): chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after, n = {held.n}"
+        )
+    if diagnosis.next_capture:
+        out.print(f"next: {escape(diagnosis.next_capture)}")
+    _print_skipped(diagnosis.skipped)
+
+
+# --- commands on recordings --------------------------------------------------------------------------------------------
+
+
+@app.command()
+def fit(source: Source, json: Json = None) -> None:
+    """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
+    _check_writable(json)
+    recordings = _recordings(source)
+    result = _fitted(recordings, None)
+    if str(json) != "-":
+        _print_fit(recordings, result)
+    _write_json(result, json)
+
+
+@app.command()
+def validate(source: Source, json: Json = None, fit_file: FitFile = None) -> None:
+    """Predicted against measured, for what the fit didn't use. Exit code 4 where a check falls short."""
+    _check_writable(json)
+    recordings = _recordings(source)
+    result = _validated(recordings, _fitted(recordings, fit_file))
+    if str(json) != "-":
+        _print_validation(result)
+    _write_json(result, json)
+    if not all(check.passed for check in result.checks):
+        raise typer.Exit(EXIT_CHECK)
+
+
+@app.command()
+def diagnose(source: Source, json: Json = None, fit_file: FitFile = None) -> None:
+    """Name the physics that the model left out, where the recordings show any."""
+    _check_writable(json)
+    recordings = _recordings(source)
+    result = _diagnosed(recordings, _fitted(recordings, fit_file))
+    if str(json) != "-":
+        _print_diagnosis(result)
+    _write_json(result, json)
+
+
+# --- entry -------------------------------------------------------------------------------------------------------------
+
+
+def _attach_mocks() -> None:
+    """`calibench mock` and `calibench bench`: the mocks belong to the distribution, but nothing else here knows them."""
+    from mocks.command import commands
+
+    app.add_typer(commands)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    try:
+        _attach_mocks()
+        code = app(arguments, standalone_mode=False)
+    except (InputError, DeviceError) as error:
+        if os.environ.get("CALIBENCH_DEBUG"):
+            traceback.print_exc()
+        for line in str(error).splitlines():
+            err.print(f"[red]calibench:[/] {escape(line)}")
+        return error.exit_code
+    except KeyboardInterrupt:
+        err.print("calibench: interrupted")
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        usage = getattr(error, "format_message", None)
+        if usage is not None:
+            err.print(f"[red]calibench:[/] {escape(usage())} See `calibench --help`.")
+            return EXIT_INPUT
+        if os.environ.get("CALIBENCH_DEBUG"):
+            traceback.print_exc()
+        text = " ".join(str(error).split())
+        err.print(
+            f"[red]calibench:[/] {type(error).__name__}: {escape(text)}: a defect of calibench; "
+            "report it with what CALIBENCH_DEBUG=1 shows"
+        )
+        return EXIT_INTERNAL
+    return int(code or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

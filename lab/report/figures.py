@@ -1,0 +1,143 @@
+"""The key figures of a calibration with their uncertainties, as rows for a table: on the page and on the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from lab.recording import Camera
+from lab.results import CameraFit, FitResult, MtfCurve, NoiseFit, StereoFit
+from sim.camera import Side
+
+#: Field of `NoiseFit` -> (name, unit), in the order of the table; the maker's value has the same field name.
+NOISE = {
+    "conversion_gain_dn_per_e": ("conversion gain", "DN/e"),
+    "read_noise_e": ("read noise", "e"),
+    "black_level_dn": ("black level", "DN"),
+    "dark_current_e_per_s": ("dark current", "e/s"),
+    "full_well_e": ("full well", "e"),
+    "dsnu_e": ("DSNU", "e"),
+    "prnu_percent": ("PRNU", "%"),
+    "linearity_error_percent": ("linearity error", "%"),
+    "quantum_efficiency": ("quantum efficiency", "1"),
+}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number with its standard uncertainty (None: not stated), and what the maker says (None: nothing)."""
+
+    name: str
+    unit: str
+    value: float
+    std: float | None = None
+    stated: float | None = None
+
+    @property
+    def text(self) -> str:
+        """Value and uncertainty with the unit: `0.2803 ± 0.0004 DN/e`."""
+        return measured(self.value, self.std, self.unit)
+
+
+def measured(value: float, std: float | None = None, unit: str = "") -> str:
+    """`value ± std unit`, the uncertainty to two digits and the value to the same place; four digits where there is none."""
+    if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
+        number = f"{value:.4g}"
+    else:
+        place = 1 - math.floor(math.log10(std))
+        if abs(value) < 1e6 and place <= 9:
+            digits = max(place, 0)
+            number = f"{value:.{digits}f} ± {std:.{digits}f}"
+        else:
+            power = math.floor(math.log10(max(abs(value), std)))
+            digits = max(place + power, 0)
+            number = f"({value / 10**power:.{digits}f} ± {std / 10**power:.{digits}f})e{power:+03d}"
+    return number if unit in ("", "1") else f"{number} {unit}"
+
+
+def noise_figures(noise: NoiseFit, camera: Camera | None = None) -> Iterator[Figure]:
+    """What the photon transfer gave, beside the maker's word."""
+    for field, (name, unit) in NOISE.items():
+        value = getattr(noise, field)
+        if value is None:
+            continue
+        stated = getattr(camera, field, None) if field != "quantum_efficiency" else None
+        if field == "quantum_efficiency" and noise.quantum_efficiency_wavelength_nm is not None:
+            label = f"{name} at {noise.quantum_efficiency_wavelength_nm:g} nm"
+        else:
+            label = name
+        yield Figure(label, unit, value, getattr(noise, f"{field}_std"), stated)
+
+
+def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, float, int] | None:
+    """(lowest, highest, number) of one channel's MTF50 over all edges, cy/px; None where no edge has one."""
+    found = [
+        curve.mtf50_cy_per_px for curve in curves if curve.channel == channel and curve.mtf50_cy_per_px is not None
+    ]
+    return (min(found), max(found), len(found)) if found else None
+
+
+def camera_figures(fit: CameraFit, camera: Camera | None = None) -> Iterator[Figure]:
+    """All key figures of one camera."""
+    if fit.noise is not None:
+        yield from noise_figures(fit.noise, camera)
+    if fit.spectral is not None:
+        for channel, curve in fit.spectral.quantum_efficiency.items():
+            peak = max(range(len(curve)), key=lambda k: curve[k])
+            std = fit.spectral.quantum_efficiency_std.get(channel)
+            at = fit.spectral.wavelength_nm[peak]
+            yield Figure(f"QE peak {channel}, at {at:g} nm", "1", curve[peak], std[peak] if std else None)
+    for channel in ("R", "G", "B", "Y"):
+        if (span := mtf50_range(fit.mtf, channel)) is not None:
+            lowest, highest, number = span
+            middle, half = (lowest + highest) / 2, (highest - lowest) / 2
+            over = f"middle and half range over {number} edges" if number > 1 else "one edge"
+            yield Figure(f"MTF50 {channel} ({over})", "cy/px", middle, half or None)
+    if fit.geometry is not None:
+        matrix, matrix_std = fit.geometry.camera_matrix, fit.geometry.camera_matrix_std
+        for name, row, col in (
+            ("focal length x", 0, 0),
+            ("focal length y", 1, 1),
+            ("centre x", 0, 2),
+            ("centre y", 1, 2),
+        ):
+            yield Figure(name, "px", matrix[row][col], matrix_std[row][col] if matrix_std else None)
+        for number, value in enumerate(fit.geometry.distortion):
+            deviations = fit.geometry.distortion_std
+            name = ("k1", "k2", "p1", "p2", "k3")[number] if number < 5 else f"distortion {number}"
+            yield Figure(name, "1", value, deviations[number] if deviations else None)
+        yield Figure("reprojection rms", "px", fit.geometry.rms_px)
+
+
+def stereo_figures(stereo: StereoFit) -> Iterator[Figure]:
+    """Baseline, translation and rotation of the pair."""
+    yield Figure("baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
+    for name, value, number in zip("xyz", stereo.translation_mm, range(3), strict=True):
+        std = stereo.translation_mm_std
+        yield Figure(f"translation {name}", "mm", value, std[number] if std else None)
+    for name, value, number in zip("xyz", rotation_vector_mrad(stereo.rotation), range(3), strict=True):
+        turns = stereo.rotation_std_rad
+        yield Figure(f"rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
+    yield Figure("stereo rms", "px", stereo.rms_px)
+
+
+def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tuple[float, float, float]:
+    """Axis times angle (mrad) of a rotation matrix, for the small turns of a stereo pair."""
+    cosine = min(1.0, max(-1.0, (rotation[0][0] + rotation[1][1] + rotation[2][2] - 1) / 2))
+    angle = math.acos(cosine)
+    scale = 500.0 if angle < 1e-8 else 500.0 * angle / math.sin(angle)
+    return (
+        scale * (rotation[2][1] - rotation[1][2]),
+        scale * (rotation[0][2] - rotation[2][0]),
+        scale * (rotation[1][0] - rotation[0][1]),
+    )
+
+
+def by_side(fit: FitResult, cameras: dict[Side, Camera]) -> list[tuple[str, dict[Side, Figure]]]:
+    """Rows of the table of key figures: name -> figure of each side, in the order of the first side that has it."""
+    rows: dict[str, dict[Side, Figure]] = {}
+    for side, camera_fit in fit.cameras.items():
+        for figure in camera_figures(camera_fit, cameras.get(side)):
+            rows.setdefault(figure.name, {})[side] = figure
+    return list(rows.items())
