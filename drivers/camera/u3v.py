@@ -79,6 +79,7 @@ TEXT_BYTES = 64
 _MOST_XML_BYTES = 16 * 1024 * 1024
 _TRANSFER_BYTES = 1 << 20
 _ATTEMPTS = 3
+_LEAST_PACKET = PREFIX.size + 64
 _RESPONSE_FLOOR_MS = 500
 
 
@@ -166,8 +167,9 @@ class GenCp:
         self._lock = threading.Lock()
         self._request_id = 0
         self.response_ms = _RESPONSE_FLOOR_MS
-        self.max_command = 64  # what every camera takes, until it says more
-        self.max_ack = 64
+        self.attempts = _ATTEMPTS
+        # what every camera takes until it says more: one of the standard's texts
+        self.max_command = self.max_ack = _LEAST_PACKET
 
     def read(self, address: int, length: int) -> bytes:
         """`length` bytes at `address`, in as many packets as the camera asks for."""
@@ -202,11 +204,11 @@ class GenCp:
         with self._lock:
             self._request_id = self._request_id % 0xFFFF + 1
             packet = PREFIX.pack(PREFIX_MAGIC, REQUEST_ACK, command, len(body), self._request_id) + body
-            for attempt in range(_ATTEMPTS):  # a lost packet is repeated under its own number, as GenCP says
+            for attempt in range(self.attempts):  # a lost packet is repeated under its own number, as GenCP says
                 try:
                     return self._once(packet, expected)
                 except NoAnswer:
-                    if attempt == _ATTEMPTS - 1:
+                    if attempt == self.attempts - 1:
                         raise
             raise AssertionError("unreachable")
 
@@ -218,7 +220,7 @@ class GenCp:
             deadline = time.monotonic() + self.response_ms / 1000
             while True:
                 left_ms = max(1, int((deadline - time.monotonic()) * 1000))
-                answer = bytes(self._device.read(self._in, max(self.max_ack, 64), left_ms))
+                answer = bytes(self._device.read(self._in, self.max_ack, left_ms))
                 self._record("received", answer)
                 if len(answer) < PREFIX.size:
                     raise Garbled(f"{self._who}: answered {answer.hex() or 'nothing'} while {doing}")
@@ -373,7 +375,8 @@ class U3vCamera(Camera):
         control.response_ms = max(control.integer(ABRM_RESPONSE_MS), _RESPONSE_FLOOR_MS)
         sbrm = control.integer(ABRM_SBRM, 8)
         largest_command, largest_ack = control.integer(sbrm + SBRM_MAX_COMMAND), control.integer(sbrm + SBRM_MAX_ACK)
-        control.max_command, control.max_ack = max(64, largest_command), max(64, min(largest_ack, 1 << 16))
+        control.max_command = max(_LEAST_PACKET, largest_command)
+        control.max_ack = max(_LEAST_PACKET, min(largest_ack, 1 << 16))
         self._sirm = control.integer(sbrm + SBRM_SIRM, 8)
         self._identity = Identity(
             maker=control.text(ABRM_MANUFACTURER),
@@ -494,7 +497,14 @@ class U3vCamera(Camera):
             if self._device is None or self._armed != "software":
                 raise InstrumentError(f"{self._who}: it isn't armed for a software trigger; call arm first")
             self._fired = datetime.now(UTC)
-            self.nodes.execute("TriggerSoftware")
+            self._control.attempts = 1  # a trigger that is sent twice may expose twice
+            try:
+                self.nodes.execute("TriggerSoftware")
+            except InstrumentError:
+                self._recover()  # whether it exposed isn't known: no frame of it may be taken for the next one
+                raise
+            finally:
+                self._control.attempts = _ATTEMPTS
 
     def collect(self) -> Frame:
         with self._lock, self._lost():
