@@ -1,0 +1,46 @@
+"""A person as stage."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.errors import InstrumentError, Interrupted
+from drivers.stage.prompt import PromptStage
+
+
+def test_the_person_is_asked_once_for_each_target() -> None:
+    asked: list[str] = []
+
+    def ask(question: str) -> str:
+        asked.append(question)
+        return ""
+
+    stage = PromptStage(instructions={"cap": "put the caps on both lenses"}, ask=ask)
+    for target in ("cap", "cap", "sphere"):
+        stage.place(target)
+        assert stage.placed() == target
+    assert asked == [
+        "cap: put the caps on both lenses, then press Enter (q to stop): ",
+        "sphere: put sphere in front of the cameras, then press Enter (q to stop): ",
+    ]
+
+
+def test_the_person_can_stop() -> None:
+    stage = PromptStage(ask=lambda question: "q")
+    with pytest.raises(Interrupted, match="stopped at sphere by the operator"):
+        stage.place("sphere")
+    assert stage.placed() == ""
+
+
+def test_a_closed_terminal_is_one_error() -> None:
+    def closed(question: str) -> str:
+        raise EOFError
+
+    with pytest.raises(InstrumentError, match="terminal was closed while waiting for sphere"):
+        PromptStage(ask=closed).place("sphere")
+
+
+def test_without_a_terminal_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(InstrumentError, match="the input is no terminal"):
+        PromptStage().connect()
