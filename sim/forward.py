@@ -23,28 +23,34 @@ from sim.effects.base import Effect
 from sim.optics.diffraction import aperture_otf, diffraction_cutoff_cy_per_um, diffraction_otf
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.optics.illumination import sin_theta as sin_theta_at
-from sim.scene.render import Grid, layers
+from sim.scene.render import Grid, Light, draw
 from sim.scene.scenes import Darkness, KnifeEdge, Scene, UniformField
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
-from sim.sensor.electrons import FixedPattern
-from sim.spectrum import FloatArray, Spectrum, photons_from_energy, quadrature
+from sim.sensor.electrons import FixedPattern, ReadOut
+from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, photons_from_energy, quadrature
 
 ComplexArray = NDArray[np.complex128]
 
-#: Wavelengths at which an optical transfer function is averaged over light and sensitivity (Gauss's rule for that weight).
+#: Wavelengths at which an optical transfer function is averaged over light and sensitivity (Gauss's rule for that weight):
+#: within 1e-4 of a 1 nm sum, and for whole frames within 1e-3 near the cutoff, where little contrast is left.
 OTF_WAVELENGTHS = 10
+FRAME_WAVELENGTHS = 5
+
+#: Frequencies beyond which an edge's profile isn't followed: 64 cy/px, where a pixel's aperture passes < 0.5 %.
+HIGHEST_CY_PER_PX = 64.0
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """One exposure of a scene. `gain_db` is the analogue gain; `temperature_c` is for the record (the camera's dark current
-    holds at the temperature it is stated for)."""
+    """One exposure of a scene. `gain_db` is the analogue gain; `elapsed_s` the time after the session's first capture. Effects
+    may depend on it and on `temperature_c`; the camera's dark current is taken to be stated for the temperature there is."""
 
     scene: Scene
     exposure_s: float
     gain_db: float = 0.0
     temperature_c: float | None = None
+    elapsed_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.exposure_s) and self.exposure_s >= 0):
@@ -88,9 +94,8 @@ def electron_rate(
     `sim.optics.illumination.relative_illumination` for the fall-off. `reflectance` stands for a chart's patch under a light
     whose radiance on a perfect diffuser is `radiance`. Raises ValueError for radiance below 0.
     """
-    _, weight = _spectral_weight(camera, channel, radiance, effects, kind, sin_theta, reflectance)
-    area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2 * camera.fill_factor
-    return float(np.sum(weight)) * irradiance_factor(camera.lens.f_number, magnification) * area_m2
+    _, weight = _detected(camera, channel, [(radiance, reflectance)], effects, kind, sin_theta)
+    return float(np.sum(weight)) * _collection_m2_sr(camera, magnification)
 
 
 def optical_transfer(
@@ -110,11 +115,12 @@ def optical_transfer(
     wavelength, times the pixel's aperture. `radiance` None: light of equal energy at every wavelength.
     """
     fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_px, float), np.asarray(fy_cy_per_px, float))
-    nodes, share = _otf_wavelengths(camera, channel, radiance, effects, kind, reflectance)
-    total = np.zeros(fx.shape, complex)
-    for wavelength_nm, part in zip(nodes, share, strict=True):
-        total += part * _transfer_at(camera, float(wavelength_nm), fx, fy, effects)
-    return total * aperture_otf(fx, fy, camera.fill_factor)
+    wavelength_nm, weight = _detected(camera, channel, [(radiance, reflectance)], effects, kind)
+    nodes, share = _otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
+    total: FloatArray | ComplexArray = np.zeros(fx.shape)
+    for node, part in zip(nodes, share, strict=True):
+        total = total + part * _transfer_at(camera, float(node), fx, fy, effects)
+    return np.asarray(total * aperture_otf(fx, fy, camera.fill_factor), complex)
 
 
 def edge_profile(
@@ -132,25 +138,27 @@ def edge_profile(
     the edge's normal (fx, fy) = f (cos angle, sin angle); angle from the vertical, positive turns the top to the right.
     """
     distance_px = np.asarray(distance_px, float)
+    _check_finite("distance from the edge", distance_px, "px")
     reach = max(64.0, 1.05 * float(np.max(np.abs(distance_px), initial=0.0)))
-    nodes, _ = _otf_wavelengths(camera, channel, radiance, effects, kind, None)
-    cutoff = camera.pixel_pitch_um * diffraction_cutoff_cy_per_um(float(np.min(nodes)), camera.lens.f_number)
-    highest = min(cutoff, 64.0)
+    # The integral becomes a sum over harmonics of a period that is long against the reach and against the tails.
     period = 16.0 * reach
+    highest = _highest_cy_per_px(camera, channel, radiance, effects, kind)
     count = int(np.ceil(highest * period)) + 1
-    f = np.arange(count) / period
+    f = np.arange(1, count) / period
     angle = np.deg2rad(angle_deg)
     transfer = optical_transfer(camera, channel, radiance, f * np.cos(angle), f * np.sin(angle), effects, kind)
     samples = fft.next_fast_len(int(period * max(32.0, 4.0 * highest)), real=True)
     series = np.zeros(samples // 2 + 1, complex)
-    # Integral of the line spread function, term by term; the constant term gives the ramp d / period.
-    series[1:count] = transfer[1:] / (2j * np.pi * np.arange(1, count))
+    series[1:count] = transfer / (2j * np.pi * np.arange(1, count))
     profile = fft.irfft(series, samples) * samples
+    # The constant term of the line spread function makes a ramp. It is the limit from above: a veil wider than the period,
+    # a spike at zero frequency, lies even on both sides.
+    ramp = float(np.real(2.0 * transfer[0] - transfer[1]))
     step = period / samples
     wing = int(np.ceil(reach / step)) + 4
     at = np.arange(-wing, wing + 1)
-    table = CubicSpline(at * step, profile[at] + at * step / period + 0.5)
-    return table(distance_px)
+    table = CubicSpline(at * step, profile[at] + ramp * (at * step / period) + 0.5)
+    return np.asarray(table(distance_px))
 
 
 def kernel(
@@ -158,23 +166,29 @@ def kernel(
     channel: str,
     radiance: Spectrum | None,
     support: int,
-    oversample: int = 1,
+    oversample: float = 1,
     effects: Sequence[Effect] = (),
     kind: str = "bernoulli",
 ) -> FloatArray:
     """Point spread function with the pixel's aperture, (support, support) samples of 1/oversample px, sum 1.
 
-    Each sample is the mean response to light spread evenly over the sample's square, so that the kernel convolves a picture
-    drawn by area. The centre is the middle sample; `support` is odd.
+    A sample is the response of the middle pixel to light spread evenly over the sample's square: what light of that square
+    does there. So the kernel convolves a picture drawn by area; element [half + i, half + j] is the answer i down and j to the
+    right of the light. `support` is odd; `oversample` below 1 gives the coarse grid of a mosaic's plane (1/2).
     """
     if support < 1 or support % 2 == 0:
         raise ValueError(f"support {support} of the kernel has to be odd and at least 1: take {support + 1}")
-    size = fft.next_fast_len(4 * support + 16 * oversample)
-    f = fft.fftfreq(size, 1.0 / oversample)
-    fx, fy = f[None, :], f[:, None]
-    transfer = optical_transfer(camera, channel, radiance, fx, fy, effects, kind)
-    transfer = transfer * np.sinc(fx / oversample) * np.sinc(fy / oversample)
-    spread = np.real(fft.ifft2(transfer))
+    if not oversample > 0:
+        raise ValueError(f"oversample {oversample} of the kernel has to be above 0: 1 gives samples of one pixel")
+    highest = _highest_cy_per_px(camera, channel, radiance, effects, kind)
+    # Sampled finely enough for the optics, then every `fine`-th sample is taken: coarse kernels alias as a mosaic does.
+    fine = max(1, int(np.ceil(2.0 * min(highest, 8.0) / oversample)))
+    size = fft.next_fast_len(max(4 * support, 64)) * fine
+    fy = fft.fftfreq(size, 1.0 / (oversample * fine))
+    fx = fft.rfftfreq(size, 1.0 / (oversample * fine))
+    transfer = optical_transfer(camera, channel, radiance, fx[None, :], fy[:, None], effects, kind)
+    square = np.sinc(fx / oversample)[None, :] * np.sinc(fy / oversample)[:, None]
+    spread = fft.irfft2(transfer * square, (size, size))[::fine, ::fine]
     half = support // 2
     psf = np.roll(spread, (half, half), axis=(0, 1))[:support, :support]
     return psf / np.sum(psf)
@@ -188,7 +202,11 @@ def expected_electrons(
     Scenes that aren't uniform or straight edges are drawn by area on `oversample` x `oversample` samples a pixel, with
     `margin_px` around the frame, and blurred channel by channel with the channel's transfer function.
     """
-    light = _light_electron_rate(camera, exposure.scene, effects, oversample, margin_px) * exposure.exposure_s
+    collected_s, source = exposure.exposure_s, 1.0
+    for effect in effects:
+        collected_s = effect.exposure(collected_s)
+        source *= effect.drift(exposure.elapsed_s)
+    light = _light_electron_rate(camera, exposure.scene, effects, source, oversample, margin_px) * collected_s
     electrons = light + dark_electrons(camera, exposure)
     for effect in effects:
         electrons = effect.charge(electrons, exposure.exposure_s, camera)
@@ -200,20 +218,26 @@ def dark_electrons(camera: CameraModel, exposure: Exposure) -> float:
     return camera.dark_current_e_per_s * exposure.exposure_s
 
 
+def moments(
+    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 2, margin_px: int = 32
+) -> tuple[FloatArray, FloatArray]:
+    """`expected` (DN) and `variance` (DN^2) at the price of one."""
+    electrons = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
+    return sensor.dn_moments(electrons, camera, exposure.gain_db, read_out(camera, exposure, effects))
+
+
 def expected(
     camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 2, margin_px: int = 32
 ) -> FloatArray:
     """Mean frame (rows, cols) in DN, not rounded, of a camera whose pixels are all alike; clipping is averaged over noise."""
-    electrons = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
-    return sensor.dn_moments(electrons, camera, exposure.gain_db, read_out(camera, effects))[0]
+    return moments(camera, exposure, effects, oversample=oversample, margin_px=margin_px)[0]
 
 
 def variance(
     camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 2, margin_px: int = 32
 ) -> FloatArray:
     """Temporal variance (rows, cols) in DN^2: shot and read noise, clipping, and 1/12 for rounding."""
-    electrons = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
-    return sensor.dn_moments(electrons, camera, exposure.gain_db, read_out(camera, effects))[1]
+    return moments(camera, exposure, effects, oversample=oversample, margin_px=margin_px)[1]
 
 
 def sample(
@@ -237,21 +261,33 @@ def sample(
         fixed_pattern,
         dark_electrons=dark_electrons(camera, exposure),
         gain_db=exposure.gain_db,
-        response=read_out(camera, effects),
+        read_out=read_out(camera, exposure, effects),
     )
 
 
-def read_out(camera: CameraModel, effects: Sequence[Effect]) -> sensor.Response | None:
-    """The effects' responses one after the other, or None without effects."""
+def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect]) -> ReadOut:
+    """What the effects make of the read-out: their responses, noise and offsets, one after the other."""
     if not effects:
-        return None
+        return sensor.LINEAR
 
     def response(electrons: FloatArray) -> FloatArray:
         for effect in effects:
             electrons = effect.response(electrons, camera)
         return electrons
 
-    return response
+    def noise_e2(electrons: FloatArray, noise: FloatArray) -> FloatArray:
+        for effect in effects:
+            noise = effect.noise_e2(electrons, noise, camera)
+        return noise
+
+    # Only what is overridden acts, so that effects elsewhere leave the read-out the baseline's to the last bit.
+    bends = any(type(effect).response is not Effect.response for effect in effects)
+    stirs = any(type(effect).noise_e2 is not Effect.noise_e2 for effect in effects)
+    return ReadOut(
+        response if bends else None,
+        noise_e2 if stirs else None,
+        sum(effect.offset_dn(exposure.elapsed_s, exposure.temperature_c, camera) for effect in effects),
+    )
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------
@@ -265,89 +301,87 @@ def _efficiency(camera: CameraModel, channel: str) -> Spectrum:
     return camera.quantum_efficiency[channel]
 
 
-def _spectral_weight(
+def _collection_m2_sr(camera: CameraModel, magnification: float = 0.0) -> float:
+    """Radiance to a pixel's flux: irradiance factor x light-sensitive area."""
+    area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2 * camera.fill_factor
+    return irradiance_factor(camera.lens.f_number, magnification) * area_m2
+
+
+def _detected(
     camera: CameraModel,
     channel: str,
-    radiance: Spectrum | None,
+    lights: Sequence[Light],
     effects: Sequence[Effect],
     kind: str,
-    sin_theta: float,
-    reflectance: Spectrum | None,
+    sin_theta: FloatArray | float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths (nm) and detected electrons at each: photons s^-1 m^-2 sr^-1 x responsivity x quadrature weight."""
+    """Wavelengths (nm) and electrons detected at each: photons s^-1 m^-2 sr^-1 x responsivity x quadrature weight.
+
+    The second is (lights, wavelengths), or (angles, lights, wavelengths) where `sin_theta` is (angles,).
+    """
     curves = [_efficiency(camera, channel)]
-    curves += [curve for curve in (radiance, reflectance) if curve is not None]
+    curves += [curve for light in lights for curve in light if curve is not None]
     wavelength_nm, width = quadrature(curves)
-    light = np.ones_like(wavelength_nm) if radiance is None else radiance.at(wavelength_nm)
-    for effect in effects:
-        light = effect.radiance(wavelength_nm, light, kind)
-    _check_radiance(wavelength_nm, light)
-    if reflectance is not None:
-        light = light * reflectance.at(wavelength_nm)
-    photons = photons_from_energy(wavelength_nm, light)
-    return wavelength_nm, photons * responsivity(camera, channel, wavelength_nm, effects, sin_theta) * width
+    seen: dict[int, FloatArray] = {}
+    rows = []
+    for radiance, reflectance in lights:
+        if id(radiance) not in seen:
+            light = np.ones_like(wavelength_nm) if radiance is None else radiance.at(wavelength_nm)
+            for effect in effects:
+                light = effect.radiance(wavelength_nm, light, kind)
+            _check_radiance(wavelength_nm, light)
+            seen[id(radiance)] = light
+        light = seen[id(radiance)]
+        rows.append(light if reflectance is None else light * reflectance.at(wavelength_nm))
+    angles = np.asarray(sin_theta, float)[..., None, None]
+    factor = responsivity(camera, channel, wavelength_nm, effects, angles) * width
+    return wavelength_nm, photons_from_energy(wavelength_nm, np.stack(rows)) * factor
 
 
 def _check_radiance(wavelength_nm: FloatArray, radiance: FloatArray) -> None:
     lowest = int(np.argmin(np.where(np.isfinite(radiance), radiance, -np.inf)))
-    if not radiance[lowest] >= 0:
+    if not (radiance[lowest] >= 0 and np.isfinite(radiance[lowest])):
         raise ValueError(
             f"radiance is {radiance[lowest]:g} W sr^-1 m^-2 nm^-1 at {wavelength_nm[lowest]:g} nm, below the limit of 0 or not finite: subtract the radiometer's dark reading, and set what stays below 0 to 0"
         )
 
 
+def _check_finite(what: str, value: FloatArray, unit: str) -> None:
+    if not np.all(np.isfinite(value)):
+        bad = value[~np.isfinite(value)].flat[0]
+        raise ValueError(f"{what} is {bad} {unit}, and has to be a finite number: leave such points out")
+
+
 def _otf_wavelengths(
-    camera: CameraModel,
-    channel: str,
-    radiance: Spectrum | None,
-    effects: Sequence[Effect],
-    kind: str,
-    reflectance: Spectrum | None,
+    camera: CameraModel, channel: str, wavelength_nm: FloatArray, weight: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """A few wavelengths (nm) and shares (sum 1) over which to average the transfer function."""
-    wavelength_nm, weight = _spectral_weight(camera, channel, radiance, effects, kind, 0.0, reflectance)
+    """A few wavelengths (nm) and shares (sum 1) over which to average the transfer function for detected light `weight`."""
     total = float(np.sum(weight))
     if not total > 0:
-        # No light: nothing is weighted, any OTF will do; the middle of the sensitivity is the natural one.
-        wavelength_nm, weight = _spectral_weight(camera, channel, None, (), kind, 0.0, None)
-        total = float(np.sum(weight))
+        # No light: any transfer function will do, and that of equal energy is the natural one.
+        wavelength_nm, equal = _detected(camera, channel, [(None, None)], (), "flat")
+        weight, total = equal[0], float(np.sum(equal))
     if not total > 0:
-        raise ValueError(f"channel {channel!r} has a quantum efficiency of 0 everywhere: give its curve")
-    return gauss_rule(wavelength_nm, weight / total, OTF_WAVELENGTHS)
+        raise ValueError(
+            f"quantum efficiency x lens transmittance of channel {channel!r} is 0 everywhere: give a curve above 0"
+        )
+    return gauss_rule(wavelength_nm, weight / total, count)
 
 
-def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Gauss's quadrature for a discrete weight: at most `count` nodes and shares with the same moments up to 2 count - 1.
-
-    Lanczos's tridiagonal matrix of the positions in the weight's inner product; nodes are its eigenvalues, shares the squares
-    of the eigenvectors' first entries (Golub and Welsch 1969). Weights are >= 0 and add up to 1.
-    """
-    used = weight > 0
-    x, w = position[used], weight[used]
-    centre, half = 0.5 * (x[0] + x[-1]), max(0.5 * (x[-1] - x[0]), 1e-9)
-    t = (x - centre) / half
-    basis = np.sqrt(w)[None, :]
-    diagonal, off = [], []
-    for _ in range(min(count, x.size)):
-        v = basis[-1]
-        diagonal.append(float(v @ (t * v)))
-        residual = t * v
-        residual -= (basis @ residual) @ basis
-        residual -= (basis @ residual) @ basis  # twice is enough to stay orthogonal
-        norm = float(np.linalg.norm(residual))
-        if norm < 1e-9:
-            break
-        off.append(norm)
-        basis = np.vstack([basis, residual / norm])
-    matrix = np.diag(diagonal) + np.diag(off[: len(diagonal) - 1], 1) + np.diag(off[: len(diagonal) - 1], -1)
-    values, vectors = np.linalg.eigh(matrix)
-    return centre + half * values, vectors[0] ** 2
+def _highest_cy_per_px(
+    camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Effect], kind: str
+) -> float:
+    """The diffraction's cutoff at the shortest wavelength that counts."""
+    wavelength_nm, weight = _detected(camera, channel, [(radiance, None)], effects, kind)
+    nodes, _ = _otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
+    cutoff = camera.pixel_pitch_um * diffraction_cutoff_cy_per_um(float(np.min(nodes)), camera.lens.f_number)
+    return min(cutoff, HIGHEST_CY_PER_PX)
 
 
 def _transfer_at(
     camera: CameraModel, wavelength_nm: float, fx: FloatArray, fy: FloatArray, effects: Sequence[Effect]
 ) -> FloatArray | ComplexArray:
-    """Diffraction x the effects' transfer at one wavelength; fx, fy in cy/px."""
+    """Diffraction x the effects' transfer at one wavelength; fx, fy in cy/px, which broadcast."""
     fx_um, fy_um = fx / camera.pixel_pitch_um, fy / camera.pixel_pitch_um
     value: FloatArray | ComplexArray = diffraction_otf(np.hypot(fx_um, fy_um), wavelength_nm, camera.lens.f_number)
     for effect in effects:
@@ -358,30 +392,62 @@ def _transfer_at(
 
 
 def _light_electron_rate(
-    camera: CameraModel, scene: Scene, effects: Sequence[Effect], oversample: int, margin_px: int
+    camera: CameraModel, scene: Scene, effects: Sequence[Effect], source: float, oversample: int, margin_px: int
 ) -> FloatArray:
-    """Electrons a second of every pixel that light makes, (rows, cols)."""
+    """Electrons a second of every pixel that light makes, (rows, cols). `source`: factor on the scene's radiance."""
     shape = camera.rows, camera.cols
     if isinstance(scene, Darkness):
         return np.zeros(shape)
-    row, col = np.arange(camera.rows)[:, None], np.arange(camera.cols)[None, :]
-    images: dict[str, FloatArray] = {}
+    if isinstance(scene, UniformField):
+        images = {c: _uniform_image(camera, c, scene, effects) for c in camera.channels}
+    elif isinstance(scene, KnifeEdge):
+        images = {c: _edge_image(camera, c, scene, effects) for c in camera.channels}
+    else:
+        images = _blurred_images(camera, scene, effects, Grid(*shape, oversample, margin_px))
+    row, col = np.arange(camera.rows, dtype=np.float64)[:, None], np.arange(camera.cols, dtype=np.float64)[None, :]
+    shade: FloatArray = relative_illumination(camera, row, col) * source
+    x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
+    y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
+    for effect in effects:
+        shade = shade * effect.illumination(x_um, y_um, camera)
     for channel in camera.channels:
-        if isinstance(scene, UniformField):
-            images[channel] = np.full(shape, electron_rate(camera, channel, scene.radiance, effects, scene.kind))
-        elif isinstance(scene, KnifeEdge):
-            images[channel] = _edge_image(camera, channel, scene, effects)
-        else:
-            images[channel] = _blurred_image(camera, channel, scene, effects, Grid(*shape, oversample, margin_px))
-        images[channel] = images[channel] * _field(camera, channel, scene, effects)
-    return mosaic.assemble(images, camera.cfa) * relative_illumination(camera, row, col)
+        ambient = sum(effect.ambient_e_per_s(channel, camera) for effect in effects)
+        images[channel] = images[channel] * shade + ambient
+    return mosaic.assemble(images, camera.cfa)
 
 
-def _field(camera: CameraModel, channel: str, scene: Scene, effects: Sequence[Effect]) -> FloatArray:
-    return np.ones((camera.rows, camera.cols))
+def _field_of_rates(
+    camera: CameraModel, channel: str, lights: Sequence[Light], effects: Sequence[Effect], kind: str
+) -> list[CubicSpline] | None:
+    """Electron rates relative to the axis as functions of sin^2 of the chief ray's angle, one a light, where an effect's
+    transmittance depends on the angle; None where none does."""
+    if all(type(effect).transmittance is Effect.transmittance for effect in effects):
+        return None
+    corners = sin_theta_at(
+        camera, np.array([0, 0, camera.rows - 1, camera.rows - 1]), np.array([0, camera.cols - 1] * 2)
+    )
+    square = np.linspace(0.0, float(np.max(corners)) ** 2, 17)
+    _, weight = _detected(camera, channel, lights, effects, kind, np.sqrt(square))
+    rate = np.sum(weight, axis=-1)
+    if np.all(rate == rate[0]):
+        return None
+    relative = rate / np.where(rate[0] > 0, rate[0], 1.0)
+    return [CubicSpline(square, column) for column in relative.T]
+
+
+def _uniform_image(camera: CameraModel, channel: str, scene: UniformField, effects: Sequence[Effect]) -> FloatArray:
+    image = np.full((camera.rows, camera.cols), electron_rate(camera, channel, scene.radiance, effects, scene.kind))
+    field = _field_of_rates(camera, channel, [(scene.radiance, None)], effects, scene.kind)
+    if field is not None:
+        row, col = np.arange(camera.rows)[:, None], np.arange(camera.cols)[None, :]
+        image *= field[0](sin_theta_at(camera, row, col) ** 2)
+    return image
 
 
 def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Sequence[Effect]) -> FloatArray:
+    """Straight edges need no drawing: every pixel takes the profile of the nearest region's edge at its own distance."""
+    if not scene.regions:
+        raise ValueError("a knife edge with no region shows nothing: give at least one edge region")
     row, col = np.meshgrid(np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float), indexing="ij")
     away = []
     for edge in scene.regions:
@@ -390,34 +456,96 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
         across = np.maximum(np.maximum(col0 - col, col - (col1 - 1)), 0.0)
         away.append(np.hypot(down, across))
     owner = np.argmin(np.stack(away), axis=0)
-    dark = electron_rate(camera, channel, scene.dark_radiance, effects, scene.kind)
-    light = electron_rate(camera, channel, scene.light_radiance, effects, scene.kind)
+    spectra = scene.dark_radiance, scene.light_radiance
+    rates = [electron_rate(camera, channel, radiance, effects, scene.kind) for radiance in spectra]
+    field = _field_of_rates(camera, channel, [(radiance, None) for radiance in spectra], effects, scene.kind)
     image = np.empty(row.shape)
     for index, edge in enumerate(scene.regions):
         mine = owner == index
+        if not np.any(mine):
+            continue
+        dark, light = rates
+        if field is not None:
+            square = sin_theta_at(camera, row[mine], col[mine]) ** 2
+            dark, light = dark * field[0](square), light * field[1](square)
         distance = edge.distance_px(row[mine], col[mine])
-        bright = edge_profile(camera, channel, scene.light_radiance, edge.angle_deg, distance, effects, scene.kind)
-        dim = edge_profile(camera, channel, scene.dark_radiance, edge.angle_deg, distance, effects, scene.kind)
+        dim, bright = (
+            edge_profile(camera, channel, radiance, edge.angle_deg, distance, effects, scene.kind)
+            for radiance in spectra
+        )
         image[mine] = light * bright + dark * (1.0 - dim)
     return image
 
 
-def _blurred_image(
-    camera: CameraModel, channel: str, scene: Scene, effects: Sequence[Effect], grid: Grid
-) -> FloatArray:
+def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect], grid: Grid) -> dict[str, FloatArray]:
+    """Electrons a second (rows, cols) of every channel, of a scene drawn by area and convolved, before cos^4.
+
+    With OTF_k at a few wavelengths, w_lk the share of light l's electrons that goes with each, and F the Fourier transform,
+    the image is sum_k OTF_k F[sum_l w_lk picture_l]. The ground's picture is 1 minus all others', so that only the
+    differences to the ground are transformed.
+    """
+    drawing = draw(scene, grid)
+    lights: list[Light] = [drawing.ground, *(layer.light for layer in drawing.layers)]
     s, m = grid.oversample, grid.margin_px
-    fy = fft.fftfreq(grid.shape[0], 1.0 / s)[:, None]
-    fx = fft.rfftfreq(grid.shape[1], 1.0 / s)[None, :]
-    # A sample is a mean over its square, which the transfer function undoes; and pixel centres lie between even samples.
-    to_pixel = np.exp(2j * np.pi * 0.5 * (1.0 - 1.0 / s) * (fx + fy)) / (np.sinc(fx / s) * np.sinc(fy / s))
-    spectrum = np.zeros((grid.shape[0], grid.shape[1] // 2 + 1), complex)
-    for layer in layers(scene, grid):
-        picture = np.zeros(grid.shape)
-        picture[layer.window] = layer.coverage
-        rate = electron_rate(camera, channel, layer.radiance, effects, scene.kind, reflectance=layer.reflectance)
-        transfer = optical_transfer(
-            camera, channel, layer.radiance, fx, fy, effects, scene.kind, reflectance=layer.reflectance
-        )
-        spectrum += fft.rfft2(picture) * transfer * rate
-    image = fft.irfft2(spectrum * to_pixel, grid.shape)[::s, ::s]
-    return np.maximum(image[m : m + grid.rows, m : m + grid.cols], 0.0)
+    ny, nx = grid.shape
+    fy, fx = fft.fftfreq(ny, 1.0 / s)[:, None], fft.rfftfreq(nx, 1.0 / s)[None, :]
+    # The pixel's aperture; a sample is a mean over its square, which is undone; a pixel's centre lies between even samples.
+    shift = 1j * np.pi * (1.0 - 1.0 / s)
+    pixel_x, pixel_y = (aperture_otf(f, 0.0, camera.fill_factor) * np.exp(shift * f) / np.sinc(f / s) for f in (fx, fy))
+    images: dict[str, FloatArray] = {}
+    transformed: list[ComplexArray] = []
+    for channel in camera.channels:
+        wavelength_nm, weight = _detected(camera, channel, lights, effects, scene.kind)
+        weight = weight * _collection_m2_sr(camera)
+        nodes, _ = _otf_wavelengths(camera, channel, wavelength_nm, np.sum(weight, axis=0), FRAME_WAVELENGTHS)
+        shares = lagrange_shares(wavelength_nm, weight, nodes)
+        field = _field_of_rates(camera, channel, lights, effects, scene.kind)
+        pictures = [layer.coverage for layer in drawing.layers]
+        if field is not None:
+            pictures = [
+                picture * _relative_to_ground(camera, grid, layer.window, field[index], field[0])
+                for index, (layer, picture) in enumerate(zip(drawing.layers, pictures, strict=True), 1)
+            ]
+        windows = [layer.window for layer in drawing.layers]
+        # Few pictures are transformed one by one, once for all channels; of many, one sum a wavelength.
+        few = len(pictures) <= nodes.size
+        if few and (field is not None or not transformed):
+            transformed = [_transform(grid, [w], [p], [1.0]) for w, p in zip(windows, pictures, strict=True)]
+        spectrum = np.zeros((ny, nx // 2 + 1), complex)
+        for k, node in enumerate(nodes):
+            over = (shares[1:, k] - shares[0, k]).tolist()
+            transfer = _transfer_at(camera, float(node), fx, fy, effects)
+            for factor, picture in (
+                zip(over, transformed, strict=True) if few else [(1.0, _transform(grid, windows, pictures, over))]
+            ):
+                spectrum += (factor * transfer) * picture
+        spectrum *= pixel_x
+        spectrum *= pixel_y
+        # Only every s-th row and column is wanted: fold the rows before going back.
+        folded = spectrum.reshape(s, ny // s, -1).sum(axis=0) / s
+        image = fft.irfft(fft.ifft(folded, axis=0), nx, axis=1)[:, ::s]
+        image = np.maximum(image[m : m + grid.rows, m : m + grid.cols] + np.sum(weight[0]), 0.0)
+        if field is not None:
+            row, col = np.arange(camera.rows)[:, None], np.arange(camera.cols)[None, :]
+            image *= field[0](sin_theta_at(camera, row, col) ** 2)
+        images[channel] = image
+    return images
+
+
+def _relative_to_ground(
+    camera: CameraModel, grid: Grid, window: tuple[slice, slice], field: CubicSpline, ground: CubicSpline
+) -> FloatArray:
+    """How a light's rate changes over the field, over how the ground's does, on a window of the grid."""
+    row, col = grid.axes_px()
+    square = np.minimum(sin_theta_at(camera, row[window[0], None], col[None, window[1]]) ** 2, field.x[-1])
+    return np.asarray(field(square) / np.maximum(ground(square), 1e-12))
+
+
+def _transform(
+    grid: Grid, windows: Sequence[tuple[slice, slice]], pictures: Sequence[FloatArray], factors: Sequence[float]
+) -> ComplexArray:
+    """Fourier transform of the sum of factor x picture, each on its window of the grid."""
+    total = np.zeros(grid.shape)
+    for window, picture, factor in zip(windows, pictures, factors, strict=True):
+        total[window] += factor * picture
+    return np.asarray(fft.rfft2(total), complex)

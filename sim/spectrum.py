@@ -141,3 +141,46 @@ def quadrature(spectra: Iterable[Spectrum], step_nm: float = 5.0) -> tuple[Float
     weights[2::2] += width / 6.0
     weights[1::2] = width * (2.0 / 3.0)
     return nodes, weights
+
+
+def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss's quadrature for a discrete weight: at most `count` nodes and shares with the same moments up to 2 count - 1.
+
+    Lanczos's tridiagonal matrix of the positions in the weight's inner product; nodes are its eigenvalues, shares the squares
+    of the eigenvectors' first entries (Golub and Welsch 1969). `position` ascends; weights are >= 0 and add up to 1.
+    """
+    used = weight > 0
+    x, w = position[used], weight[used]
+    centre, half = 0.5 * (x[0] + x[-1]), max(0.5 * (x[-1] - x[0]), 1e-9)
+    t = (x - centre) / half
+    basis = np.empty((min(count, x.size), x.size))
+    basis[0] = np.sqrt(w)
+    size = len(basis)
+    matrix = np.zeros((size, size))
+    for k in range(size):
+        residual = t * basis[k]
+        matrix[k, k] = basis[k] @ residual
+        for _ in range(2):  # twice is enough to stay orthogonal
+            residual -= (basis[: k + 1] @ residual) @ basis[: k + 1]
+        norm = float(np.linalg.norm(residual))
+        if k + 1 == size:
+            break
+        if norm < 1e-9:
+            matrix = matrix[: k + 1, : k + 1]
+            break
+        matrix[k, k + 1] = matrix[k + 1, k] = norm
+        basis[k + 1] = residual / norm
+    values, vectors = np.linalg.eigh(matrix)
+    return centre + half * values, vectors[0] ** 2
+
+
+def lagrange_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
+    """(curves, nodes): how much each node counts in sum weight x g, for g given at the nodes only and taken as the polynomial
+    through them. `weight` is (curves, positions); the shares of a curve add up to its sum, exactly."""
+    basis = np.ones((nodes.size, position.size))
+    for k, node in enumerate(nodes):
+        for other in np.delete(nodes, k):
+            basis[k] *= (position - other) / (node - other)
+    shares = weight @ basis.T
+    shares[:, -1] += np.sum(weight, axis=1) - np.sum(shares, axis=1)
+    return shares

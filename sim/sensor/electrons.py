@@ -1,4 +1,4 @@
-"""From electrons to codes: fixed patterns, shot noise, full well, read noise, conversion, quantisation.
+"""From electrons to codes: fixed patterns, shot noise, full well, read-out, conversion, quantisation.
 
 The order, for one exposure: mean electrons (light + dark current) -> x (1 + PRNU) on the light -> shot noise (Poisson) -> full
 well -> the read-out's response -> + DSNU and read noise -> x conversion gain, + black level -> round, clip to
@@ -18,7 +18,22 @@ from scipy.special import ndtr
 from sim.camera import CameraModel
 from sim.spectrum import FloatArray
 
-Response = Callable[[FloatArray], FloatArray]
+#: From this mean on, a Poisson variable is drawn as m + sqrt(m) z + (z^2 - 1) / 6 with a normal z: its mean, variance and
+#: skewness are right, and its distribution function is within 1e-3 (half the Poisson's own steps are 0.05).
+MANY_ELECTRONS = 64.0
+
+
+@dataclass(frozen=True)
+class ReadOut:
+    """What effects make of the read-out. `response`: mean or noisy electrons -> electrons, point by point; `noise_e2`: (mean
+    electrons, their shot noise's variance) -> variance; `offset_dn` is added to the black level. Defaults: a linear one."""
+
+    response: Callable[[FloatArray], FloatArray] | None = None
+    noise_e2: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+    offset_dn: float = 0.0
+
+
+LINEAR = ReadOut()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,58 +64,49 @@ def clipped_moments(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of a normal variable after clipping to [lower, upper] (either may be infinite).
 
-    With standardised limits a, b, density phi and distribution Phi of the normal law:
-    E = lower Phi(a) + upper (1 - Phi(b)) + mean (Phi(b) - Phi(a)) - s (phi(b) - phi(a)), and E of the square in the same way.
+    With standardised limits a and b, density phi and distribution Phi of the normal law: E z = a Phi(a) + b (1 - Phi(b)) -
+    phi(b) + phi(a), E z^2 = a^2 Phi(a) + b^2 (1 - Phi(b)) + Phi(b) - Phi(a) - b phi(b) + a phi(a). Values more than eight
+    standard deviations from the limits are returned as they came.
     """
     mean, variance = np.broadcast_arrays(np.asarray(mean, float), np.asarray(variance, float))
+    out_mean, out_variance = mean.copy(), variance.copy()
     s = np.sqrt(variance)
-    # Eight standard deviations from the limits nothing is clipped (1e-15), and bits shouldn't change.
     near = (mean - 8.0 * s < lower) | (mean + 8.0 * s > upper)
     if not np.any(near):
-        return mean.copy(), variance.copy()
-    out_mean, out_variance = mean.copy(), variance.copy()
+        return out_mean, out_variance
     m, s = mean[near], np.maximum(s[near], 1e-12)
-    below = above = np.zeros_like(m)
-    phi_a = phi_b = a_phi_a = b_phi_b = np.zeros_like(m)
-    low = high = np.zeros_like(m)
-    if np.isfinite(lower):
-        a = (lower - m) / s
-        below, phi_a, low = ndtr(a), _normal_density(a), a
-        a_phi_a = a * phi_a
-    if np.isfinite(upper):
-        b = (upper - m) / s
-        above, phi_b, high = ndtr(-b), _normal_density(b), b
-        b_phi_b = b * phi_b
-    inside = 1.0 - below - above
-    # Moments of the standardised clipped variable, which avoids the cancellation of large means.
-    first = low * below + high * above - (phi_b - phi_a)
-    second = low**2 * below + high**2 * above + inside - (b_phi_b - a_phi_a)
+    first, second, inside = np.zeros_like(m), np.zeros_like(m), np.ones_like(m)
+    for limit, side in ((lower, 1.0), (upper, -1.0)):
+        if np.isfinite(limit):
+            z = (limit - m) / s
+            share, density = ndtr(side * z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+            first += z * share + side * density
+            second += z * z * share + side * z * density
+            inside -= share
     out_mean[near] = np.clip(m + s * first, lower, upper)
-    out_variance[near] = np.maximum(second - first**2, 0.0) * s * s
+    out_variance[near] = np.maximum(second + inside - first * first, 0.0) * s * s
     return out_mean, out_variance
 
 
-def _normal_density(x: FloatArray) -> FloatArray:
-    return np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
-
-
 def dn_moments(
-    electrons: FloatArray, camera: CameraModel, gain_db: float = 0.0, response: Response | None = None
+    electrons: FloatArray, camera: CameraModel, gain_db: float = 0.0, read_out: ReadOut = LINEAR
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (DN, not rounded) and temporal variance (DN^2, with 1/12 for rounding) of pixels with mean `electrons`.
 
-    Shot noise is Poisson; the clipping at full well and by the converter is taken into account with normal laws. The variance
-    goes through `response` by its slope.
+    Shot noise is Poisson; clipping at full well and by the converter is averaged over the noise with normal laws. The
+    variance goes through the response by its slope.
     """
     check_electrons(electrons)
-    mean, variance = clipped_moments(electrons, electrons, -np.inf, camera.full_well_e)
-    if response is not None:
-        step = np.maximum(1e-3 * mean, 1e-3)
-        slope = (response(mean + step) - response(mean)) / step
-        mean, variance = response(mean), variance * slope**2
+    noise = electrons if read_out.noise_e2 is None else np.maximum(read_out.noise_e2(electrons, electrons), 0.0)
+    mean, variance = clipped_moments(electrons, noise, -np.inf, camera.full_well_e)
+    if read_out.response is not None:
+        step = 1e-3 * mean + 1e-3
+        bent = read_out.response(mean)
+        variance = variance * ((read_out.response(mean + step) - bent) / step) ** 2
+        mean = bent
     gain = gain_dn_per_e(camera, gain_db)
     return clipped_moments(
-        camera.black_level_dn + gain * mean,
+        camera.black_level_dn + read_out.offset_dn + gain * mean,
         gain**2 * (variance + camera.read_noise_e**2) + 1.0 / 12.0,
         0.0,
         camera.white_level_dn,
@@ -115,32 +121,60 @@ def sample_from(
     *,
     dark_electrons: float = 0.0,
     gain_db: float = 0.0,
-    response: Response | None = None,
+    read_out: ReadOut = LINEAR,
 ) -> NDArray[np.uint16]:
-    """One frame: codes (rows, cols) drawn around `expected_electrons` (mean, with the dark current's `dark_electrons`).
+    """One frame: codes (rows, cols) drawn around `expected_electrons` (the mean, of which `dark_electrons` are dark current).
 
-    `fixed_pattern` None stands for pixels that are all alike. `response` is the read-out's (None: linear).
+    `fixed_pattern` None stands for pixels that are all alike. Raises ValueError for electrons below 0 or not finite.
     """
     check_electrons(expected_electrons)
     mean = expected_electrons
     if fixed_pattern is not None:
-        mean = np.maximum(mean + (mean - dark_electrons) * fixed_pattern.prnu, 0.0)
-    charge = np.minimum(rng.poisson(mean).astype(float), camera.full_well_e)
-    if response is not None:
-        charge = response(charge)
+        mean = mean + (mean - dark_electrons) * fixed_pattern.prnu
+        np.maximum(mean, 0.0, out=mean)
+    charge = draw_electrons(mean, rng)
+    if read_out.noise_e2 is not None:
+        wanted = np.maximum(read_out.noise_e2(mean, mean), 0.0)
+        charge = mean + (charge - mean) * np.sqrt(wanted / np.maximum(mean, 1e-12))
+    np.minimum(charge, camera.full_well_e, out=charge)
+    if read_out.response is not None:
+        charge = read_out.response(charge)
     if fixed_pattern is not None:
-        charge = charge + fixed_pattern.dsnu_e
+        charge += fixed_pattern.dsnu_e
     if camera.read_noise_e > 0:
-        charge = charge + rng.standard_normal(mean.shape) * camera.read_noise_e
-    codes = np.rint(camera.black_level_dn + gain_dn_per_e(camera, gain_db) * charge)
-    return np.clip(codes, 0.0, camera.white_level_dn).astype(np.uint16)
+        charge += rng.standard_normal(mean.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
+    charge *= gain_dn_per_e(camera, gain_db)
+    charge += camera.black_level_dn + read_out.offset_dn
+    np.rint(charge, out=charge)
+    np.clip(charge, 0.0, camera.white_level_dn, out=charge)
+    return charge.astype(np.uint16)
+
+
+def draw_electrons(mean: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Poisson electrons around `mean` (>= 0), as floats; see `MANY_ELECTRONS` for how large means are drawn."""
+    few = mean < MANY_ELECTRONS
+    if np.all(few):
+        return _draw_few(mean, rng)
+    z = rng.standard_normal(mean.shape, dtype=np.float32)
+    charge = mean + np.sqrt(mean) * z
+    z *= z
+    z -= np.float32(1.0)
+    z *= np.float32(1.0 / 6.0)
+    charge += z
+    if np.any(few):
+        charge[few] = _draw_few(mean[few], rng)
+    return charge
+
+
+def _draw_few(mean: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return rng.poisson(mean).astype(float)
 
 
 def check_electrons(electrons: FloatArray) -> None:
     """Raises ValueError where mean electrons aren't finite or are below 0."""
-    lowest = float(np.min(electrons, initial=np.inf))
-    if lowest < 0 or not np.all(np.isfinite(electrons)):
-        bad = lowest if lowest < 0 else float(np.asarray(electrons)[~np.isfinite(electrons)][0])
+    lowest, highest = float(np.min(electrons, initial=np.inf)), float(np.max(electrons, initial=0.0))
+    if not (lowest >= 0 and np.isfinite(highest)):  # a NaN fails either comparison
+        bad = lowest if not lowest >= 0 else highest
         raise ValueError(
             f"mean electrons of a pixel are {bad:g} e, below the limit of 0 e or not finite: check the radiance and the effects' parameters"
         )
