@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -241,6 +242,33 @@ def diagnose(source: Source, json: Json = None, fit_file: FitFile = None) -> Non
     if str(json) != "-":
         _print_diagnosis(result)
     _write_json(result, json)
+
+
+@app.command("import")
+def import_(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="the folder of the recordings")],
+    kind: Annotated[str, typer.Option("--from", metavar="KIND", help="emva1288 or raw-folder")],
+    out_folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="the recording set to write")],
+    checkerboard: Annotated[
+        str, typer.Option(metavar="ROWSxCOLS", help="raw-folder: inner corners; the images are pairs leftNN, rightNN")
+    ] = "",
+    square_mm: Annotated[float, typer.Option(help="side of that checkerboard's squares")] = 0.0,
+) -> None:
+    """Turn another format into a recording set."""
+    from lab.importers import read_checkerboard_pairs, read_foreign
+
+    if checkerboard:
+        corners = re.fullmatch(r"(\d+)x(\d+)", checkerboard)
+        if kind != "raw-folder" or corners is None or square_mm <= 0:
+            raise InputError(
+                "--checkerboard: give --from raw-folder --checkerboard ROWSxCOLS --square-mm S, as in 6x9 and 25"
+            )
+        recordings = read_checkerboard_pairs(path, (int(corners[1]), int(corners[2])), square_mm)
+    else:
+        recordings = read_foreign(kind, path)
+    _warn(recordings.warnings)
+    folder = recording.write(recordings, out_folder)
+    out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
 # --- entry -------------------------------------------------------------------------------------------------------------

@@ -206,6 +206,10 @@ class RecordingError(InputError):
         self.problems = tuple(problems)
 
 
+#: Endings of camera raws that LibRaw reads.
+RAWS = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+
+
 def _reason(error: Exception) -> str:
     """An exception's text on one line."""
     return " ".join(str(error).split()) or type(error).__name__
@@ -291,7 +295,7 @@ def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
         return _load_npy(file, np.uint16)
     if suffix in (".tif", ".tiff"):
         return _load_tif(file)
-    if suffix == ".dng":
+    if suffix in RAWS:
         return _load_raw(file, shape)
     raise InputError(f"a frame can't be {suffix or 'without an ending'}; give .npy, .tif or .dng")
 
@@ -342,7 +346,7 @@ def _checked_target(target: Target) -> Target:
 # --- where frames, spectra and targets lie -----------------------------------------------------------------------------
 
 
-class _Store(Protocol):
+class Store(Protocol):
     """Frames, spectra and targets by the manifest's path; an InputError says why not, without the path."""
 
     def frame(self, path: str, camera: Camera) -> Frame: ...
@@ -352,7 +356,9 @@ class _Store(Protocol):
     def where(self, path: str) -> str: ...
 
 
-class _Folder:
+class FolderStore:
+    """Frames, spectra and targets as files below `root`; importers override what they decode themselves."""
+
     def __init__(self, root: Path) -> None:
         self.root = root
 
@@ -434,14 +440,14 @@ class RecordingSet:
         *,
         source: str = "memory",
         warnings: tuple[str, ...] = (),
-        store: _Store | None = None,
+        store: Store | None = None,
         cache_bytes: int = 256 << 20,
     ) -> None:
         self.manifest = manifest
         self.source = source
         self.warnings = warnings
         self.cache_bytes = cache_bytes
-        self._store: _Store = store or _Memory(frames or {}, spectra or {}, targets or {})
+        self._store: Store = store or _Memory(frames or {}, spectra or {}, targets or {})
         self._cache: OrderedDict[str, Frame] = OrderedDict()
         self._held = 0
         self._lock = threading.Lock()
@@ -924,7 +930,7 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
     except (InputError, OSError, UnicodeDecodeError) as error:
         raise RecordingError([f"{root / 'manifest.json'}: {_reason(error)}"]) from error
     manifest, skipped = parse_manifest(text, str(root / "manifest.json"))
-    recordings = RecordingSet(manifest, source=str(root), store=_Folder(root))
+    recordings = RecordingSet(manifest, source=str(root), store=FolderStore(root))
     if progress:
         progress(f"looking through {len(manifest.captures)} captures")
     problems, warnings = inspect(recordings)
