@@ -174,7 +174,8 @@ class Imager:
             )
             rows = slice(*np.searchsorted(row, [corner_row.min() - 1, corner_row.max() + 1]))
             cols = slice(*np.searchsorted(col, [corner_col.min() - 1, corner_col.max() + 1]))
-            windows.append((rows, cols, quadrilateral(row[rows], col[cols], corner_row, corner_col)))
+            coverage = quadrilateral(row[rows], col[cols], 1.0 / OVERSAMPLE, corner_row, corner_col)
+            windows.append((rows, cols, coverage))
         images = {}
         for channel in self.camera.model.channels:
             frame = self.rate(channel, radiance, colorchecker.FRAME_REFLECTANCE)
