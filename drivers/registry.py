@@ -7,31 +7,13 @@ An entry point's name is `family.name` (`monochromator.cornerstone260`), and it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from drivers.errors import InstrumentError
 
 GROUP = "calibench.drivers"
-
-
-def _ours(**values: str) -> Iterable[EntryPoint]:
-    return (EntryPoint(name.replace("__", "."), value, GROUP) for name, value in values.items())
-
-
-#: Until an installation has entry points of its own; an installed entry point of the same name goes first.
-_BUILT_IN = {
-    point.name: point
-    for point in _ours(
-        monochromator__cornerstone260="drivers.monochromator.cornerstone260:Cornerstone260",
-        spectroradiometer__specbos1211="drivers.spectroradiometer.specbos1211:Specbos1211",
-        display__browser="drivers.display.browser:BrowserDisplay",
-        camera__u3v="drivers.camera.u3v:U3vCamera",
-        stage__operator="drivers.stage.operator:OperatorStage",
-        stage__prompt="drivers.stage.prompt:PromptStage",
-    )
-}
 
 
 def names(family: str) -> tuple[str, ...]:
@@ -57,4 +39,4 @@ def driver(family: str, name: str) -> Callable[..., Any]:
 
 
 def _all() -> dict[str, EntryPoint]:
-    return _BUILT_IN | {point.name: point for point in entry_points(group=GROUP)}
+    return {point.name: point for point in entry_points(group=GROUP)}
