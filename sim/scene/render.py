@@ -115,17 +115,18 @@ def cells(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> Float
             f"the pattern's cells are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of {1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
         )
     row, col = grid.axes_px()
-    if divide == 1:
-        return _cells_on(pattern, warp, row, col, surround)
-    # Strip by strip, as the divided grid can be large.
     step = 1.0 / grid.oversample
     offset = ((np.arange(divide) + 0.5) / divide - 0.5) * step
     fine_col = (col[:, None] + offset).ravel()
+    mapper = warp.mapper((row[0] - step, row[-1] + step), (col[0] - step, col[-1] + step))
+    # A frame around the pattern, wide enough that no neighbour of a border falls off it.
+    framed = np.pad(pattern, 2, constant_values=surround)
     out = np.empty(grid.shape)
-    for start in range(0, row.size, 64):
-        fine_row = (row[start : start + 64, None] + offset).ravel()
-        fine = _cells_on(pattern, warp, fine_row, fine_col, surround)
-        out[start : start + 64] = fine.reshape(-1, divide, col.size, divide).mean(axis=(1, 3))
+    strips = max(1, (row.size * divide * fine_col.size) // 100_000)  # strips that stay in the processor's cache
+    for part in np.array_split(np.arange(row.size), min(strips, row.size // 2)):
+        fine_row = (row[part, None] + offset).ravel()
+        fine = _cells_on(framed, *mapper(fine_row, fine_col))
+        out[part] = fine if divide == 1 else fine.reshape(part.size, divide, col.size, divide).mean(axis=(1, 3))
     return out
 
 
@@ -151,24 +152,24 @@ def _footprint(shape: tuple[int, ...], warp: Warp, grid: Grid) -> float:
     return float(np.max(extent))
 
 
-def _cells_on(pattern: FloatArray, warp: Warp, row: FloatArray, col: FloatArray, surround: float) -> FloatArray:
-    u, v = warp.grid_to_pattern(row, col)
+def _cells_on(framed: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """`cells` for samples no larger than a cell, at pattern points (u, v); `framed` has two cells more on each side."""
+    rows, cols = framed.shape[0] - 4, framed.shape[1] - 4
     u_down, u_across = np.gradient(u)
     v_down, v_across = np.gradient(v)
-    rows, cols = pattern.shape
-    framed = np.pad(pattern, 1, constant_values=surround)
     near_u, near_v = np.rint(u), np.rint(v)
     right = half_plane(u - near_u, u_across, u_down)
     below = half_plane(v - near_v, v_across, v_down)
-    # Left of the border u = j is cell j - 1, which is column j of the framed pattern.
-    left = np.clip(near_u, -1, cols + 1).astype(np.intp)
-    top = np.clip(near_v, -1, rows + 1).astype(np.intp)
-    j0, j1 = np.maximum(left, 0), np.minimum(left + 1, cols + 1)
-    i0, i1 = np.maximum(top, 0), np.minimum(top + 1, rows + 1)
-    above = framed[i0, j0]
-    above += (framed[i0, j1] - above) * right
-    under = framed[i1, j0]
-    under += (framed[i1, j1] - under) * right
+    # Left of the border u = j is cell j - 1, which is column j + 1 of the framed pattern.
+    left = np.clip(near_u, -1, cols + 1, out=near_u)
+    top = np.clip(near_v, -1, rows + 1, out=near_v)
+    width = framed.shape[1]
+    at = ((top + 1) * width + (left + 1)).astype(np.intp)
+    flat = framed.ravel()
+    above = flat[at]
+    above += (flat[1:][at] - above) * right
+    under = flat[width:][at]
+    under += (flat[width + 1 :][at] - under) * right
     above += (under - above) * below
     return above
 

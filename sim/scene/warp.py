@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -65,18 +66,23 @@ class Warp:
         return _project(np.linalg.inv(np.asarray(self.homography)), x, y)
 
     def grid_to_pattern(self, row: FloatArray, col: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pattern (u, v), each (len(row), len(col)), of the grid of ascending `row` and `col`.
+        """Pattern (u, v), each (len(row), len(col)), of the grid of ascending `row` and `col`; see `mapper`."""
+        return self.mapper((row[0], row[-1]), (col[0], col[-1]))(row, col)
 
-        The lens's distortion is smooth: it's undone on a grid of about 8 px and interpolated by quintic splines (1e-6 px).
+    def mapper(
+        self, rows: tuple[float, float], cols: tuple[float, float]
+    ) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+        """A function from ascending camera `row` and `col` (px, within `rows` and `cols`) to pattern (u, v) on their grid.
+
+        The lens's distortion is smooth: it's undone on nodes some 8 px apart and interpolated by cubic splines (1e-5 px).
         """
+        back = np.linalg.inv(np.asarray(self.homography))
         if self.geometry is None or not any(self.geometry.distortion):
-            return self.to_pattern(row[:, None], col[None, :])
-        y0 = np.linspace(row[0], row[-1], max(8, int((row[-1] - row[0]) / 8) + 1))
-        x0 = np.linspace(col[0], col[-1], max(8, int((col[-1] - col[0]) / 8) + 1))
-        xs, ys = undistort(*np.meshgrid(x0, y0), self.geometry)
-        x = RectBivariateSpline(y0, x0, xs, kx=5, ky=5)(row, col)
-        y = RectBivariateSpline(y0, x0, ys, kx=5, ky=5)(row, col)
-        return _project(np.linalg.inv(np.asarray(self.homography)), x, y)
+            return lambda row, col: _project(back, col[None, :], row[:, None])
+        y0, x0 = (np.linspace(low, high, max(8, int((high - low) / 8) + 2)) for low, high in (rows, cols))
+        straight_x, straight_y = undistort(*np.meshgrid(x0, y0), self.geometry)
+        x, y = RectBivariateSpline(y0, x0, straight_x), RectBivariateSpline(y0, x0, straight_y)
+        return lambda row, col: _project(back, x(row, col), y(row, col))
 
 
 def _project(homography: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
