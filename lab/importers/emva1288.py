@@ -63,7 +63,7 @@ def parse_descriptor(text: str) -> Descriptor:
             found.release = " ".join(rest) or None
         elif key == "n":
             bits, found.width, found.height = (
-                int(value) for value in _numbers(rest, 3, number, "bits, width and height")
+                int(value) for value in _numbers(rest, 3, number, "bits, width and height")[:3]
             )
             found.bits = bits
             if not 1 <= bits <= 16:
@@ -87,12 +87,14 @@ def parse_descriptor(text: str) -> Descriptor:
 
 
 def _numbers(words: list[str], least: int, line: int, what: str) -> list[float]:
-    try:
-        values = [float(word.rstrip(",;")) for word in words if word.strip(",;")]
-    except ValueError:
-        raise InputError(f"line {line}: '{' '.join(words)}' isn't {what}; write numbers") from None
+    values: list[float] = []
+    for word in words:
+        try:
+            values.append(float(word.strip(",;") or "nan"))
+        except ValueError:
+            break  # a word after the numbers (a pixel format) does no harm
     if len(values) < least or not all(np.isfinite(values)) or any(value < 0 for value in values):
-        raise InputError(f"line {line}: '{' '.join(words)}' isn't {what}; write them")
+        raise InputError(f"line {line}: '{' '.join(words)}' isn't {what}; write these numbers")
     return values
 
 
