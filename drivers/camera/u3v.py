@@ -160,10 +160,10 @@ class GenCp:
     Thread-safe. Raises `Refused` with GenCP's status, `NoAnswer`, `Disconnected`, `Garbled`.
     """
 
-    def __init__(self, device: usb.core.Device, out: int, into: int, who: str, record: Recorder | None = None) -> None:
+    def __init__(self, device: usb.core.Device, out: int, into: int, who: str, recorder: Recorder | None = None) -> None:
         self._device, self._out, self._in = device, out, into
         self._who = who
-        self._recorder = record
+        self._recorder = recorder
         self._lock = threading.Lock()
         self._request_id = 0
         self.response_ms = _RESPONSE_FLOOR_MS
@@ -328,13 +328,13 @@ class U3vCamera(Camera):
         pixel_format: str | None = None,
         timeout_s: float = 3.0,
         device: usb.core.Device | None = None,
-        record: Recorder | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self.address = address
         self._given = device
         self._wanted_format = pixel_format
         self._timeout_s = timeout_s
-        self._recorder = record
+        self._recorder = recorder
         self._who = f"camera {address}"
         self._lock = threading.RLock()
         self._device: usb.core.Device | None = None

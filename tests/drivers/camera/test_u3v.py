@@ -292,7 +292,7 @@ def test_a_camera_that_answers_nothing(camera: U3vCamera, device: U3vDevice) -> 
 
 def test_transcript(device: U3vDevice) -> None:
     pieces: list[tuple[str, bytes]] = []
-    with camera_of(device, record=lambda way, data: pieces.append((way, data))):
+    with camera_of(device, recorder=lambda way, data: pieces.append((way, data))):
         pass
     assert pieces[0] == ("sent", bytes.fromhex("55335643 0040 0008 0c00 0100 cc01000000000000 0000 0400"))
     assert pieces[1][0] == "received"
