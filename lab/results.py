@@ -67,7 +67,10 @@ class SpectralFit(Frozen):
     wavelength_nm: tuple[float, ...]
     quantum_efficiency: dict[str, tuple[float, ...]]
     quantum_efficiency_std: dict[str, tuple[float, ...]]
-    coverage_factor: float = 1.0
+    #: Times the standard uncertainty: a band of about 95 %.
+    coverage_factor: float = 2.0
+    #: What the curve rests on where light is missing, and what was taken as known, in sentences.
+    remarks: tuple[str, ...] = ()
 
 
 class MtfCurve(Frozen):

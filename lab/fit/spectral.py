@@ -1,0 +1,593 @@
+"""Spectral sensitivity from narrowband light: C = S L solved for S, with its uncertainty.
+
+The light's measured spectrum is in L, so the bandwidth of the source is taken out instead of smeared in (which is what division
+of C by the light's power does). The problem is ill-posed below the bandwidth: the second difference of S has a normal prior
+(Tikhonov), whose strength is what makes the signals most probable (evidence, with the null space integrated out), and which may
+be rougher where the curve bends more: its local scale is the curvature found in a first pass, smoothed, plus a floor that the
+evidence chooses. S >= 0.
+
+Signals have the noise of the pixels and 0.3 % of the radiometer's repeatability (independent from spectrum to spectrum). What all
+signals share (conversion gain, PRNU of the region) is a scale, added to the bands at the end. The radiometer's absolute
+calibration is taken as right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg, optimize
+
+from lab.errors import NotDetermined
+from lab.fit.noise import DarkLine, dark_line
+from lab.recording import Capture, Flat, RecordingSet
+from lab.results import NoiseFit, SpectralFit
+from sim.camera import Side
+from sim.optics.illumination import irradiance_factor
+from sim.sensor.mosaic import phases, step
+from sim.spectrum import FloatArray, photons_from_energy
+
+COVERAGE_FACTOR = 2.0  # times the standard uncertainty: a band of about 95 %
+RADIOMETER_RELATIVE_STD = 0.003  # repeatability of one measured spectrum
+LOCAL_WIDTH_NM = 10.0  # over which the local roughness is averaged
+ROUGHNESS_FLOORS = (0.02, 0.05, 0.15, 0.4, 1.0, 3.0)  # of the local scale's maximum; 3: the same everywhere
+CENTRAL_SHARE = 0.25  # of rows and columns: the region on axis that signals are averaged over
+CLIPPED_LIMIT = 1e-4  # share of clipped pixels from which a mean is too low
+SATURATED_SHARE = 0.98  # of the fitted full well
+FLAT_RANGE = (0.2, 0.9)  # of saturation: flats that may help out
+MIN_LIGHTS = 5
+OUTPUT_STEP_NM = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """A sensitivity on the wavelengths of the lights, `std` one standard uncertainty, `coverage_factor` what to multiply it by
+    for a band of about 95 %, and the covariance (before the positivity, which only takes away)."""
+
+    sensitivity: FloatArray
+    std: FloatArray
+    coverage_factor: float
+    covariance: FloatArray
+
+
+def estimate_sensitivity(
+    wavelength_nm: ArrayLike, lights: ArrayLike, signal: ArrayLike, signal_std: ArrayLike
+) -> Sensitivity:
+    """Sensitivity S(w) from signals C_i = integral L_i(w) S(w) dw + noise.
+
+    `wavelength_nm` (m,), ascending; `lights` (n, m), photons (or power) per nm; `signal`, `signal_std` (n,). S is in signal per
+    photon (or energy), on `wavelength_nm`; integrals are trapezoids. Raises ValueError where shapes don't fit, values aren't
+    finite, a standard deviation isn't above 0, or there are fewer than 3 lights.
+    """
+    wave, light, value, std = (np.asarray(a, float) for a in (wavelength_nm, lights, signal, signal_std))
+    _check(wave, light, value, std)
+    return _solve(wave, light * _trapezoid(wave), value, std)
+
+
+def _check(wave: FloatArray, light: FloatArray, value: FloatArray, std: FloatArray) -> None:
+    if wave.ndim != 1 or light.shape != (value.size, wave.size) or std.shape != value.shape:
+        raise ValueError(
+            f"{wave.size} wavelengths, lights {light.shape}, {value.size} signals, {std.size} standard deviations: "
+            "lights are (signals, wavelengths)"
+        )
+    if np.any(np.diff(wave) <= 0):
+        raise ValueError("wavelengths must ascend: sort them")
+    if value.size < 3:
+        raise ValueError(f"{value.size} lights, 3 needed: a sensitivity with a second difference has 3 points")
+    if not all(np.all(np.isfinite(a)) for a in (light, value, std)) or np.any(std <= 0):
+        raise ValueError("lights and signals must be finite, standard deviations above 0 and finite")
+    if not np.all(np.any(light > 0, axis=1)):
+        raise ValueError(f"light {int(np.argmin(np.any(light > 0, axis=1)))} is dark at all wavelengths: leave it out")
+
+
+def _trapezoid(wave: FloatArray) -> FloatArray:
+    """Weights of the trapezoidal rule."""
+    half = np.diff(wave) / 2.0
+    return np.append(half, 0.0) + np.append(0.0, half)
+
+
+@dataclass(frozen=True, eq=False)
+class _Bounds:
+    """operator S >= limit: what saturated signals say."""
+
+    operator: FloatArray
+    limit: FloatArray
+
+
+def _solve(
+    wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, bounds: _Bounds | None = None
+) -> Sensitivity:
+    """Solution of value = operator S + noise in two passes: alike roughness everywhere, then local."""
+    mean, covariance, _ = _tikhonov(wave, operator, value, std, np.ones_like(wave))
+    distance = (wave[:, None] - wave) / LOCAL_WIDTH_NM
+    average = np.exp(-0.5 * distance**2)
+    average /= average.sum(axis=1, keepdims=True)
+    for _ in range(2):
+        if wave.size < 5:
+            break
+        bend = np.gradient(np.gradient(mean, wave), wave)
+        local = np.sqrt(average @ bend**2)
+        if local.max() <= 0:
+            break
+        passes = [_tikhonov(wave, operator, value, std, local / local.max() + floor) for floor in ROUGHNESS_FLOORS]
+        mean, covariance, _ = min(passes, key=lambda found: found[2])
+    everywhere = _Bounds(np.eye(wave.size), np.zeros(wave.size))
+    if bounds is not None:
+        everywhere = _Bounds(
+            np.concatenate([everywhere.operator, bounds.operator]), np.append(everywhere.limit, bounds.limit)
+        )
+    return Sensitivity(
+        _within(mean, covariance, everywhere),
+        np.sqrt(np.clip(np.diag(covariance), 0.0, None)),
+        COVERAGE_FACTOR,
+        covariance,
+    )
+
+
+def _smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
+    """(m, m): columns span curves whose second difference is white with standard deviation `roughness`, but for the line."""
+    return np.clip(wave[:, None] - wave, 0.0, None) * (np.sqrt(np.gradient(wave)) * roughness)
+
+
+def _line(wave: FloatArray) -> FloatArray:
+    """(m, 2): the constant and the slope, the curves without a second difference."""
+    return np.stack([np.ones_like(wave), 2.0 * (wave - wave.mean()) / np.ptp(wave)], axis=1)
+
+
+def _tikhonov(
+    wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, roughness: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Posterior mean and covariance of S under a second-difference prior of shape `roughness` and free line, and the negative
+    log evidence at the strength that maximises it (the line integrated out)."""
+    line = _line(wave)
+    root = _smooth_root(wave, roughness)
+    root -= line @ np.linalg.lstsq(line, root, rcond=None)[0]  # the line is free: what is left is well scaled
+    z, h, f = value / std, operator @ line / std[:, None], operator @ root / std[:, None]
+    rest = linalg.qr(h)[0][:, line.shape[1] :]
+    eigenvalue, vector = np.linalg.eigh((rest.T @ f) @ (rest.T @ f).T)
+    eigenvalue = np.clip(eigenvalue, 0.0, None)
+    power = (vector.T @ (rest.T @ z)) ** 2
+
+    def loss(log_strength: float) -> float:
+        variance = np.exp(log_strength) * eigenvalue + 1.0
+        return 0.5 * float(np.sum(power / variance + np.log(variance)))
+
+    start = -np.log(max(float(eigenvalue.max()), 1e-300))
+    grid = start + np.linspace(-2.0, 40.0, 85)
+    best = int(np.argmin([loss(g) for g in grid]))
+    found = optimize.minimize_scalar(
+        loss, bounds=(grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]), method="bounded"
+    )
+    strength = float(np.exp(found.x))
+    inverse = np.linalg.inv(strength * f @ f.T + np.eye(value.size))
+    line_covariance = np.linalg.inv(h.T @ inverse @ h)
+    coefficient = line_covariance @ (h.T @ (inverse @ z))
+    gain = strength * root @ (f.T @ inverse)
+    mean = line @ coefficient + gain @ (z - h @ coefficient)
+    left = line - gain @ h
+    covariance = strength * root @ root.T - gain @ (strength * f @ root.T) + left @ line_covariance @ left.T
+    return mean, 0.5 * (covariance + covariance.T), float(found.fun)
+
+
+def _within(mean: FloatArray, covariance: FloatArray, bounds: _Bounds) -> FloatArray:
+    """The most probable curve within bounds, of a normal law: an active set on its dual, S = mean + V G' multiplier."""
+    spread = covariance @ bounds.operator.T
+    inner = bounds.operator @ spread
+    slack = bounds.operator @ mean - bounds.limit
+    ridge = 1e-9 * float(np.mean(np.diag(inner))) + 1e-300
+    active = np.zeros(slack.size, bool)
+    multiplier = np.zeros(slack.size)
+    for _ in range(50):
+        now = slack + inner @ multiplier
+        worst = np.where(active, np.inf, now)
+        # New bounds in batches, for neighbours fall together; tolerance on the curve's own scale.
+        entering = worst < -1e-6 * float(np.max(np.abs(mean)))
+        if not entering.any():
+            break
+        active |= entering
+        while active.any():
+            index = np.flatnonzero(active)
+            solved = np.linalg.solve(inner[np.ix_(index, index)] + ridge * np.eye(index.size), -slack[index])
+            if np.all(solved >= 0):
+                break
+            active[index[solved < 0]] = False
+        multiplier = np.zeros(slack.size)
+        if active.any():
+            multiplier[active] = solved
+    return np.clip(mean + spread @ multiplier, 0.0, None)
+
+
+# --- where light is missing because it saturated -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Signals:
+    """Signals of one channel: operator (n, m) on its quantum efficiency, e/s, and lower limits from saturated ones."""
+
+    operator: FloatArray
+    value: FloatArray
+    std: FloatArray
+    saturated: FloatArray  # (k, m)
+    limit: FloatArray
+
+    @property
+    def has_gaps(self) -> bool:
+        return self.limit.size > 0
+
+
+def _with_maker(wave: FloatArray, signals: Sequence[_Signals], maker: Sequence[FloatArray]) -> list[Sensitivity]:
+    """All channels at once, with the maker's curves as prior: S_c = M_c (1 + a + b_c) + d_c.
+
+    `a` is common to the channels (filters in the lens, scale of the radiometer), `b_c` the channel's own (a line of 2 %), both
+    smooth by their second difference; `d_c` is small and local. The three strengths are found by evidence.
+    """
+    count, size = len(signals), wave.size
+    offsets = np.cumsum([0, *(s.value.size for s in signals)])
+    total = int(offsets[-1])
+    smooth, line = _smooth_root(wave, np.ones(size)), _line(wave)
+    smooth = smooth - line @ np.linalg.lstsq(line, smooth, rcond=None)[0]
+    smooth = smooth / np.sqrt(np.mean(smooth**2) * size)  # strengths are then relative deviations
+    local = np.exp(-0.5 * ((wave[:, None] - wave) / 15.0) ** 2)
+    value = np.concatenate([(s.value - s.operator @ m) / s.std for s, m in zip(signals, maker, strict=True)])
+    scaled = [s.operator / s.std[:, None] for s in signals]
+    through = np.concatenate([o * m for o, m in zip(scaled, maker, strict=True)])
+    kernel_line, kernel_smooth = line @ line.T, smooth @ smooth.T
+
+    def blocks(operators: Sequence[FloatArray], kernel: FloatArray) -> FloatArray:
+        return linalg.block_diag(*(o @ kernel @ o.T for o in operators))
+
+    own = [o * m for o, m in zip(scaled, maker, strict=True)]
+    pieces = [through @ kernel_smooth @ through.T, blocks(own, kernel_smooth), blocks(scaled, local)]
+    fixed = 0.3**2 * through @ kernel_line @ through.T + 0.02**2 * blocks(own, kernel_line) + np.eye(total)
+    peak = max(float(m.max()) for m in maker)
+
+    def loss(log_std: FloatArray) -> float:
+        weights = np.exp(2.0 * np.asarray(log_std))
+        try:
+            factor = linalg.cho_factor(fixed + sum(w * p for w, p in zip(weights, pieces, strict=True)))
+        except linalg.LinAlgError:
+            return 1e12
+        # A weak prior keeps strengths that don't matter from running away.
+        weak = 0.5 * float(np.sum(((np.asarray(log_std) - centre) / 4.0) ** 2))
+        return 0.5 * float(value @ linalg.cho_solve(factor, value)) + float(np.log(np.diag(factor[0])).sum()) + weak
+
+    centre = np.log([0.03, 0.003, 1e-3 * peak])
+    starts = [centre, centre + np.array([3.0, 0.0, 0.0])]
+    found = min(
+        (
+            optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02})
+            for start in starts
+        ),
+        key=lambda result: float(result.fun),
+    )
+    weight = np.exp(2.0 * found.x)
+    factor = linalg.cho_factor(fixed + sum(w * p for w, p in zip(weight, pieces, strict=True)))
+    common = 0.3**2 * kernel_line + weight[0] * kernel_smooth
+    single = 0.02**2 * kernel_line + weight[1] * kernel_smooth
+    result = []
+    for c in range(count):
+        m = maker[c]
+        # Covariance of the channel's curve with all signals, and its own.
+        cross = (m[:, None] * common) @ through.T
+        at = slice(offsets[c], offsets[c + 1])
+        cross[:, at] += (m[:, None] * single) @ own[c].T + weight[2] * local @ scaled[c].T
+        prior = np.outer(m, m) * (common + single) + weight[2] * local
+        mean = m + cross @ linalg.cho_solve(factor, value)
+        covariance = prior - cross @ linalg.cho_solve(factor, cross.T)
+        bounds = _Bounds(
+            np.concatenate([np.eye(size), signals[c].saturated]), np.append(np.zeros(size), signals[c].limit)
+        )
+        result.append(
+            Sensitivity(
+                _within(mean, covariance, bounds),
+                np.sqrt(np.clip(np.diag(covariance), 0.0, None)),
+                COVERAGE_FACTOR,
+                covariance,
+            )
+        )
+    return result
+
+
+# --- a recording set ---------------------------------------------------------------------------------------------------
+
+
+def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> SpectralFit:
+    """Absolute quantum efficiency of every channel from the narrowband captures, electrons a photon at the pixel.
+
+    Irradiance on axis: pi T L / (1 + 4 N^2); the stated lens transmittance and fill factor are divided out, and the region's mean
+    cos^4. Signals are means over the central quarter of rows and columns. Saturated captures are left out; where a channel has
+    no other light, the maker's curves (times a smooth factor that the channels share, and a smooth few per cent of its own) and
+    the flats with a stated radiance fill in, or without these smoothness alone. Raises NotDetermined where the scale or the
+    light is missing.
+    """
+    return _Recording(recordings, side, noise).fit()
+
+
+class _Recording:
+    """Signals and lights of one camera's captures."""
+
+    def __init__(self, recordings: RecordingSet, side: Side, noise: NoiseFit | None) -> None:
+        self.recordings, self.side, self.noise = recordings, side, noise
+        self.camera = recordings.camera(side)
+        self.remarks: list[str] = []
+        self.narrowband = recordings.captures("narrowband", side)
+        if not self.narrowband:
+            raise NotDetermined("spectral", "no narrowband captures: capture them over the visible by 10 nm or finer")
+        self.gain, self.gain_std = self._conversion_gain()
+        self.region = self._central_region()
+        self.pixels = {channel: self._count(channel) for channel in phases(self.camera.cfa)}
+        self.photons = self._photons_per_radiance()
+        self.darks: dict[tuple[float, str], DarkLine] = {}
+
+    def _conversion_gain(self) -> tuple[float, float]:
+        if self.noise is not None and self.noise.conversion_gain_dn_per_e is not None:
+            return self.noise.conversion_gain_dn_per_e, self.noise.conversion_gain_dn_per_e_std or 0.0
+        if self.camera.conversion_gain_dn_per_e is not None:
+            self.remarks.append(
+                "the conversion gain is the maker's: the scale of the quantum efficiency stands with it"
+            )
+            return self.camera.conversion_gain_dn_per_e, 0.0
+        raise NotDetermined(
+            "spectral", "the conversion gain isn't known: capture flats with repeats, or state conversion_gain_dn_per_e"
+        )
+
+    def _photons_per_radiance(self) -> float:
+        """Photons s^-1 at one pixel on axis per radiance in photons s^-1 m^-2 sr^-1, with the region's cos^4."""
+        camera = self.camera
+        missing = [key for key in ("f_number", "pixel_pitch_um") if getattr(camera, key) is None]
+        if missing:
+            raise NotDetermined(
+                "spectral", f"{' and '.join(missing)} unknown: state it, the photons at a pixel follow from it"
+            )
+        for key, what in (
+            ("lens_transmittance", "the lens's losses are part of the quantum efficiency"),
+            ("fill_factor", "the quantum efficiency is that of the whole pixel"),
+        ):
+            if getattr(camera, key) is None:
+                self.remarks.append(f"{key} is unknown and taken as 1: {what}")
+        pitch_m = cast(float, camera.pixel_pitch_um) * 1e-6
+        return (
+            irradiance_factor(cast(float, camera.f_number))
+            * (camera.lens_transmittance or 1.0)
+            * (camera.fill_factor or 1.0)
+            * pitch_m**2
+            * self._fall_off()
+        )
+
+    def _central_region(self) -> tuple[slice, slice]:
+        """Rows and columns of the region, whole periods of the mosaic."""
+        period = step(self.camera.cfa)
+        spans = []
+        for size in (self.camera.rows, self.camera.cols):
+            half = max(round(size * CENTRAL_SHARE / 2 / period), 1) * period
+            middle = size // 2 // period * period
+            spans.append(slice(max(middle - half, 0), min(middle + half, size)))
+        return spans[0], spans[1]
+
+    def _fall_off(self) -> float:
+        """Mean cos^4 over the region, about the frame's centre."""
+        if self.camera.focal_length_mm is None or self.camera.pixel_pitch_um is None:
+            return 1.0
+        scale = self.camera.pixel_pitch_um * 1e-3 / self.camera.focal_length_mm
+        rows, cols = (np.arange(s.start, s.stop) for s in self.region)
+        y = (rows - 0.5 * (self.camera.rows - 1)) * scale
+        x = (cols - 0.5 * (self.camera.cols - 1)) * scale
+        return float(np.mean(1.0 / (1.0 + y[:, None] ** 2 + x**2) ** 2))
+
+    def _values(self, capture: Capture) -> dict[str, FloatArray]:
+        """DN of each channel's pixels in the region."""
+        frame = self.recordings.frame(capture)[self.region]
+        period = step(self.camera.cfa)  # the region starts on whole periods
+        return {
+            channel: np.concatenate([frame[r::period, c::period].ravel() for r, c in at]).astype(float)
+            for channel, at in phases(self.camera.cfa).items()
+        }
+
+    def _count(self, channel: str) -> int:
+        rows, cols = (s.stop - s.start for s in self.region)
+        return rows * cols // step(self.camera.cfa) ** 2 * len(phases(self.camera.cfa)[channel])
+
+    def _dark(self, gain_db: float, channel: str, exposure_s: float) -> tuple[float, float]:
+        """Dark mean in the region and its uncertainty."""
+        if not self.darks:
+            self._read_darks()
+        line = self.darks.get((gain_db, channel))
+        if line is not None:
+            basis = np.array([1.0, exposure_s])
+            return line.at(exposure_s), float(np.sqrt(basis @ line.covariance @ basis))
+        black = self.noise.black_level_dn if self.noise is not None else None
+        black = self.camera.black_level_dn if black is None else black
+        if black is None:
+            raise NotDetermined(
+                "spectral", "neither darks nor a black level: capture darks at the narrowband exposures"
+            )
+        rate = (self.noise.dark_current_e_per_s or 0.0) if self.noise is not None else 0.0
+        return black + rate * exposure_s * self._dn_per_e(gain_db), 0.0
+
+    def _read_darks(self) -> None:
+        found: dict[tuple[float, str], list[tuple[float, float, float]]] = {}
+        for dark in self.recordings.captures("dark", self.side):
+            for channel, values in self._values(dark).items():
+                own = found.setdefault((dark.gain_db or 0.0, channel), [])
+                own.append(
+                    (dark.exposure_s, float(values.mean()), float(np.hypot(values.std(), 0.3) / np.sqrt(values.size)))
+                )
+        for key, rows in found.items():
+            self.darks[key] = dark_line(*np.array(rows).T)
+
+    def _dn_per_e(self, gain_db: float | None) -> float:
+        return self.gain * 10.0 ** ((gain_db or 0.0) / 20.0)
+
+    def _rate(self, capture: Capture, channel: str, values: FloatArray) -> tuple[float, float, bool, float]:
+        """Electrons per second, their standard uncertainty, whether the capture saturates, and its share of saturation."""
+        gain = self._dn_per_e(capture.gain_db)
+        dark, dark_std = self._dark(capture.gain_db or 0.0, channel, capture.exposure_s)
+        signal = float(values.mean()) - dark
+        limit = self.camera.saturation_dn - dark
+        if self.noise is not None and self.noise.full_well_e is not None:
+            limit = min(limit, self.noise.full_well_e * gain)
+        clipped = (
+            float(np.mean(values >= self.camera.saturation_dn)) > CLIPPED_LIMIT or signal > SATURATED_SHARE * limit
+        )
+        scale = 1.0 / (gain * capture.exposure_s)
+        # The spread of the pixels holds shot noise, read noise and PRNU.
+        std = float(np.hypot(np.hypot(values.std(), 0.3) / np.sqrt(values.size), dark_std))
+        return signal * scale, std * scale, clipped, signal / limit
+
+    def _lights(self) -> dict[str, FloatArray]:
+        """Spectral photon rates of a pixel (photons s^-1 nm^-1) by the path of the radiance, on `self.wave`."""
+        paths = dict.fromkeys(capture.radiance for capture in self.narrowband)
+        spectra = {path: self.recordings.spectrum(path) for path in paths}
+        low, high = np.inf, -np.inf
+        for spectrum in spectra.values():
+            wave, value = np.array(spectrum.wavelength_nm), np.array(spectrum.value)
+            lit = wave[value > 1e-3 * value.max()] if value.max() > 0 else wave[:0]
+            if lit.size:
+                low, high = min(low, lit[0]), max(high, lit[-1])
+        if not low < high:
+            raise NotDetermined("spectral", "all narrowband spectra are dark: measure them with the light on")
+        self.wave = np.arange(np.floor(low), np.ceil(high) + 0.5)
+        return {path: self._photon_rate(path) for path in paths}
+
+    def _photon_rate(self, path: str) -> FloatArray:
+        spectrum = self.recordings.spectrum(path)
+        return self.photons * photons_from_energy(self.wave, np.clip(spectrum.at(self.wave), 0.0, None))
+
+    def _signals(self) -> dict[str, _Signals]:
+        lights = self._lights()
+        weights = _trapezoid(self.wave)
+        rates: dict[tuple[str, str], list[tuple[float, float, bool, float]]] = {}
+        for capture in self.narrowband:
+            for channel, values in self._values(capture).items():
+                rates.setdefault((channel, capture.radiance), []).append(self._rate(capture, channel, values))
+        result = {}
+        for channel in phases(self.camera.cfa):
+            good: list[tuple[FloatArray, float, float]] = []
+            high: list[tuple[FloatArray, float]] = []
+            for path, light in lights.items():
+                if not np.any(light > 0):
+                    continue
+                found = rates[channel, path]
+                usable = [(rate, std) for rate, std, clipped, _ in found if not clipped]
+                if usable:
+                    weight = 1.0 / np.array([std for _, std in usable]) ** 2
+                    mean = float(np.sum(weight * [rate for rate, _ in usable]) / weight.sum())
+                    spread = float(np.sqrt(1.0 / weight.sum()))
+                    good.append((light * weights, mean, float(np.hypot(spread, RADIOMETER_RELATIVE_STD * mean))))
+                else:
+                    # A saturated mean is a lower limit; 1 % below leaves room for its noise.
+                    high.append((light * weights, 0.99 * max(rate for rate, *_ in found)))
+            if len(good) < MIN_LIGHTS:
+                raise NotDetermined(
+                    "spectral",
+                    f"only {len(good)} of {len(lights)} narrowband lights leave channel {channel} unsaturated, {MIN_LIGHTS} needed: "
+                    "expose shorter",
+                )
+            size = self.wave.size
+            result[channel] = _Signals(
+                np.array([g[0] for g in good]),
+                np.array([g[1] for g in good]),
+                np.array([g[2] for g in good]),
+                np.array([h[0] for h in high]).reshape(-1, size),
+                np.array([h[1] for h in high]),
+            )
+        return result
+
+    def _with_flats(self, signals: dict[str, _Signals]) -> dict[str, _Signals]:
+        """The signals and those of the flats whose radiance is known: one for each spectrum."""
+        rates: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        used: dict[str, list[Flat]] = {}
+        for flat in self.recordings.captures("flat", self.side):
+            if flat.radiance is not None:
+                used.setdefault(flat.radiance, []).append(flat)
+        for path, flats in used.items():
+            for flat in flats:
+                for channel, values in self._values(flat).items():
+                    rate, std, clipped, share = self._rate(flat, channel, values)
+                    if not clipped and FLAT_RANGE[0] < share < FLAT_RANGE[1]:
+                        rates.setdefault((channel, path), []).append((rate, std))
+        weights = _trapezoid(self.wave)
+        result = {}
+        for channel, own in signals.items():
+            rows, values_, stds = [own.operator], [own.value], [own.std]
+            for path in used:
+                found = rates.get((channel, path))
+                spectrum = self.recordings.spectrum(path)
+                total = np.trapezoid(spectrum.value, spectrum.wavelength_nm)
+                inside = float(np.trapezoid(spectrum.at(self.wave), self.wave))
+                # Light beyond the narrowband range would be counted as light inside.
+                if not found or inside < 0.95 * total:
+                    continue
+                weight = 1.0 / np.array([std for _, std in found]) ** 2
+                mean = float(np.sum(weight * [rate for rate, _ in found]) / weight.sum())
+                outside = 1.0 - inside / total
+                rows.append((self._photon_rate(path) * weights)[None])
+                values_.append(np.array([mean]))
+                stds.append(np.array([mean * np.hypot(RADIOMETER_RELATIVE_STD, outside)]))
+            result[channel] = _Signals(
+                np.concatenate(rows), np.concatenate(values_), np.concatenate(stds), own.saturated, own.limit
+            )
+        return result
+
+    def _maker(self) -> dict[str, FloatArray] | None:
+        stated = self.camera.quantum_efficiency or {}
+        if not all(channel in stated for channel in phases(self.camera.cfa)):
+            return None
+        curves = {
+            c: np.clip(self.recordings.spectrum(stated[c]).at(self.wave), 0.0, None) for c in phases(self.camera.cfa)
+        }
+        return curves if all(curve.max() > 0 for curve in curves.values()) else None
+
+    def fit(self) -> SpectralFit:
+        signals = self._signals()
+        gaps = {c: s.limit.size for c, s in signals.items() if s.has_gaps}
+        maker = self._maker() if gaps else None
+        if gaps:
+            listed = ", ".join(f"{channel} under {count}" for channel, count in gaps.items())
+            filled = (
+                "there the curve rests on the maker's, times a smooth factor that the channels share, and on the flats"
+                if maker
+                else "there the curve is known from below and by its smoothness alone"
+            )
+            self.remarks.append(
+                f"saturated narrowband captures are left out ({listed} lights): {filled}; expose shorter to measure it"
+            )
+        if maker:
+            helped = self._with_flats(signals)
+            solved = dict(
+                zip(helped, _with_maker(self.wave, list(helped.values()), [maker[c] for c in helped]), strict=True)
+            )
+        else:
+            solved = {
+                c: _solve(self.wave, s.operator, s.value, s.std, _Bounds(s.saturated, s.limit) if s.has_gaps else None)
+                for c, s in signals.items()
+            }
+        return self._result(solved)
+
+    def _result(self, solved: dict[str, Sensitivity]) -> SpectralFit:
+        nominal = [capture.wavelength_nm for capture in self.narrowband]
+        low, high = max(min(nominal), self.wave[0]), min(max(nominal), self.wave[-1])
+        first, last = np.ceil(low / OUTPUT_STEP_NM), np.floor(high / OUTPUT_STEP_NM)
+        out = np.arange(first, last + 1) * OUTPUT_STEP_NM
+        if out.size < 2:
+            raise NotDetermined(
+                "spectral", f"the narrowband lights span {low:g}..{high:g} nm only: capture them over the visible"
+            )
+        prnu = self.noise.prnu_percent if self.noise is not None else None
+        efficiency, std = {}, {}
+        for channel, found in solved.items():
+            scale = np.hypot(self.gain_std / self.gain, (prnu or 0.0) / 100.0 / np.sqrt(self.pixels[channel]))
+            value = np.interp(out, self.wave, found.sensitivity)
+            own = np.interp(out, self.wave, found.std)
+            efficiency[channel] = tuple(value.tolist())
+            std[channel] = tuple(np.hypot(own, scale * value).tolist())
+        return SpectralFit(
+            wavelength_nm=tuple(out.tolist()),
+            quantum_efficiency=efficiency,
+            quantum_efficiency_std=std,
+            coverage_factor=COVERAGE_FACTOR,
+            remarks=tuple(self.remarks),
+        )
