@@ -1,0 +1,232 @@
+"""Where a pattern on a screen lies in the camera's frame, to a few thousandths of a pixel.
+
+The checkerboard's corners are found and fitted in the levelled mosaic (see `lab.fit.geometry`), numbered by growing a grid
+from one of them, and matched to the target by the Bernoulli pattern, which unlike a checkerboard fits in one place only. The
+map from camera px to target cells is a homography after a smooth displacement, cubic in the position:
+
+    cell(p) = H(p + D(p))
+
+Points are (x, y), x along columns; a cell (i, j) of the target covers j..j+1 by i..i+1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, spatial
+
+from lab.errors import NotDetermined
+from lab.fit.geometry import fit_corners
+
+Array = NDArray[np.floating[Any]]
+
+ORDER = 3
+MIN_CORNERS = 12
+MATCH = 0.5  # correlation of the levelled picture with the pattern, below which it isn't that pattern
+
+
+@dataclass(frozen=True)
+class ScreenWarp:
+    """Camera px -> target cells. `displacement` (2, terms) in px, of a polynomial in (p - centre) / scale."""
+
+    homography: Array
+    displacement: Array
+    centre: Array
+    scale: float
+    corner_rms_px: float
+
+    def basis(self, points: Array) -> Array:
+        """Polynomial terms at `points` (n, 2): (terms, n); the first is constant."""
+        x, y = ((points - self.centre) / self.scale).T
+        return np.array([x**i * y**j for n in range(ORDER + 1) for i, j in ((n - k, k) for k in range(n + 1))])
+
+    def cells(self, points: Array) -> Array:
+        """(x, y) in cells of the points (n, 2) in px."""
+        moved = points + (self.displacement @ self.basis(points)).T
+        return np.asarray(cv2.perspectiveTransform(moved[:, None, :].astype(np.float64), self.homography)[:, 0])
+
+    def displaced(self, change: Array) -> ScreenWarp:
+        """With `change` (2, terms) added to the displacement."""
+        return ScreenWarp(self.homography, self.displacement + change, self.centre, self.scale, self.corner_rms_px)
+
+
+def register(
+    checkerboard: Array,
+    bernoulli: Array,
+    checkerboard_target: NDArray[np.uint8],
+    bernoulli_target: NDArray[np.uint8],
+    cell_px: float | None,
+) -> ScreenWarp:
+    """The warp from pictures (rows, cols), levelled to 0 dark .. 1 lit (NaN where the screen isn't), and their targets.
+
+    `cell_px`: a cell's size in camera px, nominal. Raises `NotDetermined` where corners or pattern aren't found.
+    """
+    rows, cols = target_corners(checkerboard_target)
+    seen = np.isfinite(checkerboard)
+    if seen.sum() < 100:
+        raise NotDetermined("psf", "white and black captures show no lit screen: light it, or expose longer")
+    if cell_px is None:  # the whole target is taken to be in view
+        cell_px = float(np.sqrt(seen.sum() / checkerboard_target.size))
+    square_px = cell_px * float(rows[1] - rows[0])
+    picture = np.where(seen, checkerboard, 0.0)
+    points, grid, across, down = _grown_grid(picture, seen, square_px)
+    half = np.full(len(points), float(np.clip(0.4 * square_px, 2.5, 9.0)))
+    fitted, trusted = fit_corners(picture, points, across, down, half)
+    points, grid = fitted[trusted], grid[trusted]
+    if len(points) < MIN_CORNERS:
+        raise NotDetermined(
+            "psf", f"{len(points)} corners of the checkerboard found, {MIN_CORNERS} needed: focus the screen better"
+        )
+    cells = _matched(points, grid, rows, cols, bernoulli, bernoulli_target)
+    return _fitted_warp(points, cells)
+
+
+def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns, in cells, of a checkerboard target's inner corners."""
+    t = target.astype(bool)
+    corner = (t[:-1, :-1] == t[1:, 1:]) & (t[:-1, 1:] == t[1:, :-1]) & (t[:-1, :-1] != t[:-1, 1:])
+    rows = np.flatnonzero(corner.any(axis=1)) + 1
+    cols = np.flatnonzero(corner.any(axis=0)) + 1
+    if len(rows) < 2 or len(cols) < 2 or not corner[np.ix_(rows - 1, cols - 1)].all():
+        raise NotDetermined("psf", "the checkerboard's target is no checkerboard of 3 x 3 squares or more")
+    return rows, cols
+
+
+def _grown_grid(
+    picture: Array, seen: NDArray[np.bool_], square_px: float
+) -> tuple[Array, NDArray[np.int64], Array, Array]:
+    """Saddle points numbered by steps along two directions: points (n, 2), steps (n, 2), and the step vectors there."""
+    sigma = float(np.clip(0.08 * square_px, 1.2, 4.0))
+    xx, yy, xy = (ndimage.gaussian_filter(picture, sigma, order) for order in ((0, 2), (2, 0), (1, 1)))
+    saddle = xy**2 - xx * yy
+    saddle[ndimage.binary_dilation(~seen, iterations=int(2 * sigma) + 1)] = 0.0
+    peak = (saddle == ndimage.maximum_filter(saddle, size=int(0.6 * square_px) | 1)) & (saddle > 0)
+    if not peak.any():
+        raise NotDetermined("psf", "no checkerboard corners found: is it in focus and in view?")
+    peak &= saddle > 0.25 * np.quantile(saddle[peak], 0.9)
+    points = np.argwhere(peak)[:, ::-1].astype(float)
+    if len(points) < MIN_CORNERS:
+        raise NotDetermined(
+            "psf", f"{len(points)} corners of the checkerboard found, {MIN_CORNERS} needed: focus the screen better"
+        )
+    tree = spatial.cKDTree(points)
+    best: dict[tuple[int, int], int] = {}
+    vectors: dict[tuple[int, int], tuple[Array, Array]] = {}
+    for seed in tree.query(points.mean(axis=0), k=min(6, len(points)))[1]:
+        numbered, steps = _grow(points, tree, int(seed))
+        if len(numbered) > len(best):
+            best, vectors = numbered, steps
+        if len(best) > 0.7 * len(points):
+            break
+    at = list(best)
+    return (
+        points[[best[a] for a in at]],
+        np.array(at),
+        np.array([vectors[a][0] for a in at]),
+        np.array([vectors[a][1] for a in at]),
+    )
+
+
+def _grow(
+    points: Array, tree: spatial.cKDTree, seed: int
+) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], tuple[Array, Array]]]:
+    near = points[tree.query(points[seed], k=min(9, len(points)))[1][1:]] - points[seed]
+    first = near[0]
+    turned = near @ np.array([-first[1], first[0]]) / (np.linalg.norm(near, axis=1) * np.linalg.norm(first))
+    square = near[(turned > 0.8) & (np.linalg.norm(near, axis=1) < 1.6 * np.linalg.norm(first))]
+    if not len(square):
+        return {}, {}
+    numbered, taken = {(0, 0): seed}, {seed}
+    vectors = {(0, 0): (first, square[0])}
+    queue = [(0, 0)]
+    for at in queue:  # grows while it runs
+        across, down = vectors[at]
+        for step, vector in (((1, 0), across), ((-1, 0), -across), ((0, 1), down), ((0, -1), -down)):
+            to = (at[0] + step[0], at[1] + step[1])
+            if to in numbered:
+                continue
+            distance, found = tree.query(points[numbered[at]] + vector)
+            if distance > 0.25 * np.linalg.norm(vector) or found in taken:
+                continue
+            moved = points[found] - points[numbered[at]]
+            numbered[to] = int(found)
+            taken.add(int(found))
+            vectors[to] = (moved * step[0], down) if step[0] else (across, moved * step[1])
+            queue.append(to)
+    return numbered, vectors
+
+
+def _matched(
+    points: Array,
+    grid: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    cols: NDArray[np.int64],
+    bernoulli: Array,
+    target: NDArray[np.uint8],
+) -> Array:
+    """Cells (x, y) of the corners: of all turns and shifts of the grid, the one that the Bernoulli picture agrees with."""
+    some = np.argwhere(np.isfinite(bernoulli))
+    some = some[np.random.default_rng(0).integers(0, len(some), 4000)]
+    value = bernoulli[some[:, 0], some[:, 1]]
+    best, score = None, -1.0
+    for turn in ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0)):
+        turned = grid @ np.array(turn).reshape(2, 2).T
+        turned = turned - turned.min(axis=0)
+        extent = turned.max(axis=0)
+        for sx in range(max(1, len(cols) - int(extent[0]))):
+            for sy in range(max(1, len(rows) - int(extent[1]))):
+                x, y = turned[:, 0] + sx, turned[:, 1] + sy
+                known = (x < len(cols)) & (y < len(rows))
+                if known.sum() < MIN_CORNERS:
+                    continue
+                cells = np.column_stack([cols[np.minimum(x, len(cols) - 1)], rows[np.minimum(y, len(rows) - 1)]])
+                homography, _ = cv2.findHomography(points[known], cells[known].astype(float), 0)
+                if homography is None:
+                    continue
+                at = np.floor(
+                    cv2.perspectiveTransform(some[:, None, ::-1].astype(np.float64), homography)[:, 0]
+                ).astype(int)
+                inside = np.all((at >= 0) & (at < np.array(target.shape)[::-1]), axis=1)
+                if inside.sum() < 500:
+                    continue
+                lit = target[at[inside, 1], at[inside, 0]].astype(float)
+                agreement = float(np.corrcoef(lit, value[inside])[0, 1]) if lit.std() > 0 else 0.0
+                if agreement > score:
+                    score, best = agreement, (known, cells)
+    if best is None or score < MATCH:
+        raise NotDetermined(
+            "psf",
+            f"the Bernoulli capture doesn't show its target (correlation {max(score, 0.0):.2f}): was the screen moved?",
+        )
+    known, cells = best
+    matched = np.full((len(points), 2), np.nan)
+    matched[known] = cells[known]
+    return matched
+
+
+def _fitted_warp(points: Array, cells: Array) -> ScreenWarp:
+    """Homography and cubic displacement from the corners, outliers beyond 5 sigma left out."""
+    used = np.isfinite(cells[:, 0])
+    points, cells = points[used], cells[used]
+    homography, _ = cv2.findHomography(points, cells, 0)
+    warp = ScreenWarp(
+        homography, np.zeros((2, 10)), points.mean(axis=0), float(np.ptp(points, axis=0).max() / 2.0), 0.0
+    )
+    back = np.linalg.inv(homography)
+    expected = cv2.perspectiveTransform(cells[:, None, :].astype(np.float64), back)[:, 0]
+    gap = expected - points  # where D has to take the points
+    basis = warp.basis(points)
+    # The homography stays as it is, so that the terms only take up what it leaves: few corners, few terms
+    terms = 10 if len(points) >= 40 else 6 if len(points) >= 20 else 1
+    kept = np.ones(len(points), dtype=bool)
+    for _ in range(4):
+        displacement = np.zeros((2, 10))
+        displacement[:, :terms] = np.linalg.lstsq(basis[:terms, kept].T, gap[kept], rcond=None)[0].T
+        left = np.linalg.norm(gap - (displacement @ basis).T, axis=1)
+        rms = float(np.sqrt(np.mean(left[kept] ** 2)))
+        kept = left < 5.0 * rms / np.sqrt(2.0) + 1e-6
+    return ScreenWarp(homography, displacement, warp.centre, warp.scale, rms)
