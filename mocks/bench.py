@@ -30,7 +30,7 @@ from scipy import constants
 from scipy.special import expit
 
 from mocks.imaging import SCREEN_OVERSAMPLE, Edge, Imager, Pose, corners_px
-from mocks.truth import COLS, DISTANCE_MM, PITCH_UM, ROWS, SIDES, Truth, hidden_truth
+from mocks.truth import AIR_C, COLS, DISTANCE_MM, PITCH_UM, ROWS, SELF_HEATING_C, SIDES, Truth, hidden_truth
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.sensor.electrons import sample_from
@@ -390,11 +390,11 @@ class Bench:
     @property
     def temperature_c(self) -> float:
         """Air temperature at the bench: 23 degrees, within 0.1."""
-        return 23.0 + 0.1 * float(np.sin(2 * np.pi * (self.clock.now() - self._started_s) / 5400.0))
+        return AIR_C + 0.1 * float(np.sin(2 * np.pi * (self.clock.now() - self._started_s) / 5400.0))
 
     def sensor_temperature_c(self, side: Side) -> float:
-        """Temperature of one camera's sensor, as the camera itself reports it: 8 degrees above the air's."""
-        return self.temperature_c + (8.0 if side == "left" else 7.8)
+        """Temperature of one camera's sensor, as the camera itself reports it."""
+        return self.temperature_c + SELF_HEATING_C[side]
 
     def sensor(self, side: Side) -> tuple[int, int, float]:
         """What a camera's own registers say of its sensor: rows, columns, distance of neighbouring pixels (um)."""

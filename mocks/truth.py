@@ -30,6 +30,9 @@ BASELINE_MM, DISTANCE_MM = 60.0, 900.0
 #: Every so many degrees the dark current doubles.
 DOUBLING_C = 7.0
 SIDES: tuple[Side, ...] = ("left", "right")
+#: Air at the bench, and by how much a camera's sensor is warmer. The models' dark currents hold there.
+AIR_C = 23.0
+SELF_HEATING_C: dict[Side, float] = {"left": 8.0, "right": 7.8}
 
 
 class DispersingLowPassFilter(OpticalLowPassFilter):
@@ -221,7 +224,7 @@ def _camera(side: Side, rng: np.random.Generator, effects: tuple[Effect, ...]) -
         pattern=_pattern(rng, model.prnu_percent, model.dsnu_e),
         rotation=turn.as_matrix(),
         centre_mm=np.array([outwards * BASELINE_MM / 2, 0.0, 0.0]) + rng.uniform(-0.3, 0.3, 3),
-        reference_temperature_c=31.0,
+        reference_temperature_c=AIR_C + SELF_HEATING_C[side],
         datasheet=sheet,
     )
 

@@ -1,0 +1,245 @@
+"""A Cornerstone 260B monochromator on USB: a USBTMC (USB488) device that takes SCPI-like commands.
+
+A motion is done by a thread, so that `idle?` and `*opc?` behave as on the instrument; commands wait for the motion
+before them, except `idle?`, `abort` and the error queue. Wordings beyond those in the manual's examples follow SCPI-99.
+
+Source: USB-IF, USBTMC 1.0 and USB488; Newport, CS130B/CS260B command examples.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections import deque
+
+from mocks.usb_device import Cancelled, Stalled, UsbDevice, UsbEndpoint, UsbIdentity, UsbInterface
+from mocks.wire import Light
+
+BULK_OUT, BULK_IN = 0x02, 0x82
+DEV_DEP_MSG_OUT, REQUEST_DEV_DEP_MSG_IN = 1, 2
+_HEADER = struct.Struct("<BBBxIB3x")  # message, tag, its complement, size, attributes
+_END_OF_MESSAGE = 1
+_UPPER_NM, _NM_PER_S = 1400.0, 175.0
+_LONGEST_MESSAGE = 4096
+#: nm in one unit; wavenumbers are the exception.
+_UNITS = {"NM": 1.0, "UM": 1000.0}
+
+
+class _Refusal(Exception):
+    """An entry of the error queue."""
+
+
+_UNKNOWN, _BAD_DATA, _OUT_OF_RANGE = '-113, "Undefined header"', '-104, "Data type error"', '-222, "Data out of range"'
+
+
+class Cornerstone260B(UsbDevice):
+    """The instrument; `light` feels its grating, slits, filter wheel and shutter."""
+
+    def __init__(self, light: Light, serial_number: str = "CB-260B-01") -> None:
+        super().__init__(
+            UsbIdentity(0x1FDE, 0x0014, (0, 0, 0), "Newport Corporation", "CS260B", serial_number),
+            (UsbInterface(0, (0xFE, 0x03, 0x01), (UsbEndpoint(BULK_OUT), UsbEndpoint(BULK_IN))),),
+        )
+        self._light = light
+        self._message = bytearray()
+        self._requests: deque[tuple[int, int]] = deque()  # tag and largest size of answers that the host waits for
+        self._answers = bytearray()
+        self._waiting: deque[tuple[int, str]] = deque()  # with the number of aborts when it came
+        self._worker: threading.Thread | None = None
+        self._moving = False
+        self._aborts = self._current = 0
+        self._errors: deque[str] = deque()
+        self._settings: dict[str, float] = {"GRATING": 1, "FILTER": 1, "OUTPORT": 1, "SHUTTER": 0}
+        self._nm = 0.0
+        self._units = "NM"
+
+    # --- USBTMC -------------------------------------------------------------------------------------------------------
+
+    def control(self, setup: bytes, data: bytes, cancelled: Cancelled) -> bytes:
+        kind, request, value, _, length = struct.unpack("<BBHHH", setup)
+        if kind == 0xA1 and request == 7:  # GET_CAPABILITIES: USBTMC 1.0, USB488 1.0, SCPI
+            answer = bytes([1, 0, 0, 1, 0, 0]) + bytes(6) + bytes([0, 1, 0x04, 0x00]) + bytes(8)
+        elif kind == 0xA1 and request == 5:  # INITIATE_CLEAR
+            self._forget()
+            answer = b"\x01"
+        elif kind == 0xA1 and request == 6:  # CHECK_CLEAR_STATUS
+            answer = b"\x01\x00"
+        elif kind == 0xA1 and request == 128:  # READ_STATUS_BYTE: message available, error queue
+            with self.changed:
+                status = (0x10 if self._answers else 0) | (0x04 if self._errors else 0)
+            answer = bytes([1, value & 0x7F, status])
+        elif kind == 0xA2 and request in (1, 3):  # INITIATE_ABORT_BULK_OUT, _IN
+            with self.changed:
+                self._requests.clear()
+            answer = bytes([1, value & 0xFF])
+        elif kind == 0xA2 and request in (2, 4):  # CHECK_ABORT_..._STATUS
+            answer = b"\x01" + bytes(7)
+        else:
+            raise Stalled(f"request {setup.hex()} isn't known")
+        return answer[:length]
+
+    def bulk_out(self, endpoint: int, data: bytes, cancelled: Cancelled) -> None:
+        if endpoint != BULK_OUT:
+            super().bulk_out(endpoint, data, cancelled)
+        if len(data) < _HEADER.size:
+            raise Stalled(f"a USBTMC header of {len(data)} bytes")
+        message, tag, complement, size, attributes = _HEADER.unpack_from(data)
+        if tag == 0 or tag ^ complement != 0xFF:
+            raise Stalled(f"a USBTMC tag {tag:#04x} with complement {complement:#04x}")
+        if message == REQUEST_DEV_DEP_MSG_IN:
+            with self.changed:
+                self._requests.append((tag, size))
+                self.changed.notify_all()
+        elif message == DEV_DEP_MSG_OUT and size <= len(data) - _HEADER.size:
+            self._message += data[_HEADER.size : _HEADER.size + size]
+            if attributes & _END_OF_MESSAGE or len(self._message) > _LONGEST_MESSAGE:
+                text, self._message = bytes(self._message), bytearray()
+                self._take(text.decode("latin-1"))
+        else:
+            raise Stalled(f"a USBTMC message {message} of {size} bytes")
+
+    def bulk_in(self, endpoint: int, length: int, cancelled: Cancelled) -> bytes:
+        if endpoint != BULK_IN:
+            return super().bulk_in(endpoint, length, cancelled)
+        with self.changed:
+            self.wait_for(lambda: bool(self._requests and self._answers), cancelled)
+            tag, most = self._requests.popleft()
+            end = self._answers.index(b"\n") + 1
+            count = min(end, most, max(0, length - _HEADER.size))
+            piece = bytes(self._answers[:count])
+            del self._answers[:count]
+        head = _HEADER.pack(REQUEST_DEV_DEP_MSG_IN, tag, tag ^ 0xFF, count, int(count == end))
+        return head + piece + bytes(-count % 4)
+
+    def on_reset(self) -> None:
+        self._forget()
+
+    def _forget(self) -> None:
+        with self.changed:
+            self._message.clear()
+            self._requests.clear()
+            self._answers.clear()
+            self._waiting.clear()
+
+    # --- commands -----------------------------------------------------------------------------------------------------
+
+    def _take(self, text: str) -> None:
+        for line in text.replace("\r", "\n").split("\n"):
+            for part in line.split(";"):
+                command = " ".join(part.upper().split())
+                if command in ("IDLE?", "ABORT", "SYSTEM:ERROR?", "SYST:ERR?"):
+                    self._obey(command)
+                elif command:
+                    self._enqueue(command)
+
+    def _enqueue(self, command: str) -> None:
+        with self.changed:
+            self._waiting.append((self._aborts, command))
+            if self._worker is None:
+                self._worker = threading.Thread(target=self._work, name="cs260b", daemon=True)
+                self._worker.start()
+
+    def _work(self) -> None:
+        while True:
+            with self.changed:
+                if not self._waiting:
+                    self._worker = None
+                    return
+                self._current, command = self._waiting.popleft()
+                self._moving = command.startswith(("GOWAVE", "GRATING ", "FILTER ", "OUTPORT "))
+            self._obey(command)
+            with self.changed:
+                self._moving = False
+
+    def _obey(self, command: str) -> None:
+        try:
+            answer = self._execute(command)
+        except _Refusal as refusal:
+            with self.changed:
+                self._errors.append(str(refusal))
+            return
+        if answer is not None:
+            with self.changed:
+                self._answers += answer.encode() + b"\r\n"
+                self.changed.notify_all()
+
+    def _execute(self, command: str) -> str | None:
+        word, _, argument = command.partition(" ")
+        if word.endswith("?"):
+            return self._answer(word[:-1])
+        if word == "ABORT":
+            self._aborts += 1
+        elif word == "GOWAVE":
+            self._move_to(self._nanometres(_number(argument)))
+        elif word == "UNITS":
+            if argument not in (*_UNITS, "WN"):
+                raise _Refusal(_OUT_OF_RANGE)
+            self._units = argument
+        elif word in self._settings:
+            self._set(word, _number(argument))
+        elif word.startswith("SLIT") and word.endswith("MICRONS"):
+            width_um = _number(argument)
+            if not 4.0 <= width_um <= 3000.0:
+                raise _Refusal(_OUT_OF_RANGE)
+            self._light.set_slit_um(width_um)
+        elif word not in ("*CLS", "*RST", "*OPC"):
+            raise _Refusal(_UNKNOWN)
+        if word == "*CLS":
+            self._errors.clear()
+        return None
+
+    def _answer(self, what: str) -> str:  # noqa: PLR0911  (a question a line)
+        if what == "*IDN":
+            return f"Newport,CS260B,{self.identity.serial_number},1.0"
+        if what == "WAVE":
+            return f"{self._in_units(self._nm):.3f}"
+        if what == "UNITS":
+            return self._units
+        if what == "*OPC":
+            return "1"  # it waited for its turn: everything before is done
+        if what == "IDLE":
+            with self.changed:
+                return "0" if self._moving or self._waiting else "1"
+        if what in ("SYSTEM:ERROR", "SYST:ERR"):
+            with self.changed:
+                return self._errors.popleft() if self._errors else "0, No Error"
+        if what in self._settings:
+            return f"{self._settings[what]:.0f}"
+        raise _Refusal(_UNKNOWN)
+
+    def _nanometres(self, value: float) -> float:
+        if self._units == "WN":
+            return 1e7 / value if value > 0 else 0.0
+        return value * _UNITS[self._units]
+
+    def _in_units(self, nm: float) -> float:
+        if self._units == "WN":
+            return 1e7 / nm if nm > 0 else 0.0
+        return nm / _UNITS[self._units]
+
+    def _move_to(self, nm: float) -> None:
+        if not 0 <= nm <= _UPPER_NM:
+            raise _Refusal(_OUT_OF_RANGE)
+        self._light.clock.sleep(abs(nm - self._nm) / _NM_PER_S)
+        if self._current == self._aborts:
+            self._nm = nm
+            self._light.set_wavelength(nm)
+
+    def _set(self, what: str, value: float) -> None:
+        most = {"GRATING": 2, "FILTER": 6, "OUTPORT": 2, "SHUTTER": 1}[what]
+        if value != int(value) or not (0 if what == "SHUTTER" else 1) <= value <= most:
+            raise _Refusal(_OUT_OF_RANGE)
+        if what == "SHUTTER":
+            self._light.set_shutter(bool(value))
+        elif value != self._settings[what]:
+            self._light.clock.sleep(10.0 if what == "GRATING" else 1.5)
+            if what == "FILTER":
+                self._light.set_filter(int(value))
+        self._settings[what] = value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise _Refusal(_BAD_DATA) from error
