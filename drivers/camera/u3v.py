@@ -160,7 +160,9 @@ class GenCp:
     Thread-safe. Raises `Refused` with GenCP's status, `NoAnswer`, `Disconnected`, `Garbled`.
     """
 
-    def __init__(self, device: usb.core.Device, out: int, into: int, who: str, recorder: Recorder | None = None) -> None:
+    def __init__(
+        self, device: usb.core.Device, out: int, into: int, who: str, recorder: Recorder | None = None
+    ) -> None:
         self._device, self._out, self._in = device, out, into
         self._who = who
         self._recorder = recorder
