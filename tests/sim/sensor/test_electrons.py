@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sim.camera import CameraModel
+from sim.sensor.electrons import (
+    MANY_ELECTRONS,
+    FixedPattern,
+    ReadOut,
+    clipped_moments,
+    dn_moments,
+    draw_electrons,
+    gain_dn_per_e,
+    sample_from,
+)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(-np.inf, 1.0), (0.0, np.inf), (-0.5, 0.7), (3.0, 4.0)])
+def test_moments_of_a_clipped_normal_variable(lower: float, upper: float) -> None:
+    z = stats.norm(0.3, 1.7)
+    x = np.linspace(0.3 - 12 * 1.7, 0.3 + 12 * 1.7, 400_001)
+    weight, clipped = z.pdf(x) * (x[1] - x[0]), np.clip(x, lower, upper)
+    mean, variance = clipped_moments(np.array([0.3]), np.array([1.7**2]), lower, upper)
+    # A sum at steps of 1e-4 with kinks at the limits errs by about the step squared.
+    assert mean[0] == pytest.approx(weight @ clipped, abs=1e-7)
+    assert variance[0] == pytest.approx(weight @ clipped**2 - (weight @ clipped) ** 2, abs=1e-6)
+
+
+def test_far_from_the_limits_nothing_changes_to_the_last_bit() -> None:
+    mean, variance = clipped_moments(np.array([500.1]), np.array([33.3]), 0.0, 4095.0)
+    assert (mean[0], variance[0]) == (500.1, 33.3)
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.4, 7.0, MANY_ELECTRONS - 0.1, MANY_ELECTRONS, 900.0])
+def test_electrons_are_poisson(mean: float) -> None:
+    drawn = draw_electrons(np.full(400_000, mean), np.random.default_rng(5))
+    n = drawn.size
+    # Standard errors: mean sqrt(m / n); variance sqrt((2 m^2 + m) / n) for Poisson; 4.5 of them.
+    assert drawn.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(mean / n) + 1e-9)
+    assert drawn.var() == pytest.approx(mean, abs=4.5 * np.sqrt((2 * mean**2 + mean) / n) + 1e-9)
+    if mean > 1:
+        # Skewness 1/sqrt(m), its standard error sqrt(6 / n) = 0.004.
+        assert stats.skew(drawn) == pytest.approx(mean**-0.5, abs=0.02)
+
+
+def test_the_normal_stand_in_has_poissons_distribution() -> None:
+    """Rounded to whole electrons it has to agree to 1e-3: with 1e6 draws the empirical distribution errs by 1e-3 itself."""
+    mean = MANY_ELECTRONS
+    drawn = np.rint(draw_electrons(np.full(1_000_000, mean), np.random.default_rng(6)))
+    counts = np.arange(30, 110)
+    empirical = np.searchsorted(np.sort(drawn), counts, side="right") / drawn.size
+    assert np.max(np.abs(empirical - stats.poisson(mean).cdf(counts))) < 3e-3
+
+
+@pytest.mark.parametrize("level_e", [0.0, 2.0, 50.0, 3000.0, 10_480.0, 11_500.0])
+def test_frames_have_the_moments(colour_camera: CameraModel, level_e: float) -> None:
+    camera = colour_camera.model_copy(update={"rows": 300, "cols": 400, "black_level_dn": 2.0, "read_noise_e": 4.0})
+    electrons = np.full((300, 400), level_e)
+    mean, variance = (float(m[0, 0]) for m in dn_moments(electrons, camera, 3.0))
+    frame = sample_from(electrons, camera, np.random.default_rng(7), gain_db=3.0).astype(float)
+    n = frame.size
+    # Rounding is uniform noise only where the noise is wide against a code (here 1.9 DN at least, clipped at black): 1 %.
+    assert frame.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(variance / n) + 0.01)
+    kurtosis = 3.0 if level_e < 10_000 else 12.0
+    assert frame.var() == pytest.approx(variance, rel=4.5 * np.sqrt((kurtosis - 1) / n) + 0.02, abs=1e-3)
+
+
+def test_gain_in_db_is_of_amplitude(colour_camera: CameraModel) -> None:
+    assert gain_dn_per_e(colour_camera, 20.0) == pytest.approx(3.5)
+    mean, variance = dn_moments(np.array([[100.0]]), colour_camera, 6.0)
+    gain = 0.35 * 10 ** (6 / 20)
+    assert mean[0, 0] == pytest.approx(240 + 100 * gain)
+    assert variance[0, 0] == pytest.approx((100 + 2.5**2) * gain**2 + 1 / 12)
+
+
+def test_fixed_patterns_stay_and_have_their_size(colour_camera: CameraModel) -> None:
+    camera = colour_camera.model_copy(update={"rows": 200, "cols": 300})
+    rng = np.random.default_rng(8)
+    pattern = FixedPattern.draw(camera, rng)
+    n = pattern.prnu.size
+    assert pattern.prnu.std() == pytest.approx(0.008, rel=4 / np.sqrt(2 * n))
+    assert pattern.dsnu_e.std() == pytest.approx(1.0, rel=4 / np.sqrt(2 * n))
+    electrons = np.full(pattern.prnu.shape, 5000.0)
+    mean = np.mean([sample_from(electrons, camera, rng, pattern, dark_electrons=5.0) for _ in range(30)], axis=0)
+    wanted = 240 + 0.35 * (5000 + 4995 * pattern.prnu + pattern.dsnu_e)
+    # What 30 frames of shot and read noise and rounding leave.
+    error = np.sqrt((0.35**2 * (5000 + 2.5**2) + 1 / 12) / 30)
+    assert np.std(mean - wanted) == pytest.approx(error, rel=4 / np.sqrt(2 * n))
+
+
+def test_dark_frames_keep_their_mean_under_dsnu(colour_camera: CameraModel) -> None:
+    """DSNU is an offset behind the shot noise: it doesn't bend at 0 electrons."""
+    camera = colour_camera.model_copy(update={"rows": 200, "cols": 300, "dsnu_e": 20.0})
+    pattern = FixedPattern(prnu=np.zeros((200, 300)), dsnu_e=np.tile([-20.0, 20.0], (200, 150)))
+    frame = sample_from(np.full((200, 300), 0.1), camera, np.random.default_rng(9), pattern, dark_electrons=0.1)
+    assert frame[:, ::2].mean() == pytest.approx(240 + 0.35 * (0.1 - 20), abs=0.05)
+    assert frame[:, 1::2].mean() == pytest.approx(240 + 0.35 * (0.1 + 20), abs=0.05)
+
+
+def test_the_read_out_bends_and_stirs(colour_camera: CameraModel) -> None:
+    camera = colour_camera.model_copy(update={"rows": 200, "cols": 300})
+    read_out = ReadOut(lambda e: e * (1 - 1e-5 * e), lambda e, noise: noise * 0.9, 3.0)
+    electrons = np.full((200, 300), 6000.0)
+    mean, variance = (float(m[0, 0]) for m in dn_moments(electrons, camera, 0.0, read_out))
+    assert mean == pytest.approx(243 + 0.35 * 6000 * 0.94)
+    # The slope is taken over 0.1 % of the signal, 6 e: 1 - 2e-5 x 6003.
+    assert variance == pytest.approx(0.35**2 * (5400 * (1 - 0.12) ** 2 + 2.5**2) + 1 / 12, rel=3e-4)
+    frame = sample_from(electrons, camera, np.random.default_rng(10), read_out=read_out).astype(float)
+    n = frame.size
+    # The bend takes 1e-5 x var = 0.05 e off the mean of noisy electrons: 0.02 DN.
+    assert frame.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(variance / n) + 0.02)
+    assert frame.var() == pytest.approx(variance, rel=4.5 * np.sqrt(2 / n))
+
+
+@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
+def test_impossible_electrons_are_named(colour_camera: CameraModel, bad: float) -> None:
+    electrons = np.full((72, 96), 10.0)
+    electrons[3, 4] = bad
+    for call in (
+        lambda: dn_moments(electrons, colour_camera),
+        lambda: sample_from(electrons, colour_camera, np.random.default_rng(1)),
+    ):
+        with pytest.raises(
+            ValueError, match="mean electrons of a pixel are .* e, below the limit of 0 e or not finite: check"
+        ):
+            call()
