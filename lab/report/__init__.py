@@ -1,0 +1,255 @@
+"""Reports: one self-contained HTML page per calibration. No network: the charts' library is inlined once."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from lab.errors import InputError
+from lab.recording import RecordingSet
+from lab.report import charts, words
+from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
+from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
+from lab.report.provenance import Provenance, installed_versions, provenance_of
+from lab.results import (
+    Check,
+    DiagnosisResult,
+    FitResult,
+    KernelPair,
+    ParameterValue,
+    ResidualCurve,
+    Skipped,
+    ValidationResult,
+)
+from sim.camera import Side
+
+__all__ = ["Provenance", "installed_versions", "provenance_of", "render_report", "write_report"]
+KERNELS_A_SIDE = 12
+CURVES_A_SIDE = 4
+
+
+@dataclass(frozen=True)
+class _Kernel:
+    """One measured kernel beside its prediction, as pictures."""
+
+    label: str
+    channel: str
+    measured: str
+    predicted: str
+    difference: str
+    limit: str
+    psnr_peak: str
+    psnr_unit: str
+
+    @classmethod
+    def of(cls, pair: KernelPair) -> _Kernel:
+        seen, foretold = np.asarray(pair.measured, float), np.asarray(pair.predicted, float)
+        margin = trimmed_margin([seen, foretold])
+        limit = max(float(np.abs(seen - foretold).max()), 1e-12)
+        peak = float(foretold.max())
+        return cls(
+            label=pair.label,
+            channel=pair.channel,
+            measured=kernel_picture(seen, peak, margin),
+            predicted=kernel_picture(foretold, peak, margin),
+            difference=difference_picture(seen - foretold, limit, margin),
+            limit=f"{limit:.2g}",
+            psnr_peak=f"{pair.psnr_peak_db:.1f}",
+            psnr_unit=f"{pair.psnr_unit_db:.1f}",
+        )
+
+
+def _chart_item(recordings: RecordingSet, check: Check) -> dict[str, Any]:
+    captures = [capture for capture in recordings.captures("chart", check.side) if capture.id == check.capture]
+    photo = frame_picture(recordings.frame(captures[0]), recordings.camera(check.side)) if captures else None
+    return {
+        "capture": check.capture,
+        "sentence": words.check_sentence(check),
+        "photo": photo,
+        "patches": [(name, *pair) for name, pair in patch_colours(check.patches).items()],
+        "figure": charts.patch_comparison(check.patches),
+    }
+
+
+def _residuals(
+    diagnosis: DiagnosisResult | None, sides: tuple[Side, ...]
+) -> dict[Side, list[tuple[ResidualCurve, Any]]]:
+    curves = diagnosis.curves if diagnosis is not None else ()
+    return {
+        side: [
+            (curve, charts.residual_curve(curve))
+            for curve in charts.worst_curves([curve for curve in curves if curve.side == side], CURVES_A_SIDE)
+        ]
+        for side in sides
+    }
+
+
+def _threshold_text(diagnosis: DiagnosisResult | None) -> str:
+    if diagnosis is None or diagnosis.threshold is None:
+        return ""
+    rate = (
+        f", at a false-alarm rate of {diagnosis.false_alarm_rate:.2g}" if diagnosis.false_alarm_rate is not None else ""
+    )
+    return f" (threshold {diagnosis.threshold:.1f} sigma{rate})"
+
+
+def _chart_json(figure: dict[str, Any]) -> Markup:
+    """A figure as JSON that can't end its script element; numbers to 7 digits, which no chart shows."""
+
+    def rounded(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: rounded(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [rounded(item) for item in value]
+        if isinstance(value, float):
+            return float(f"{value:.7g}") if np.isfinite(value) else None
+        return value
+
+    text = json.dumps(rounded(figure), separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("<", "\\u003c"))  # within JSON's strings the same, and no way out of the element
+
+
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+
+    def parameter_name(name: str, value: ParameterValue) -> str:
+        return name.removesuffix(f"_{value.unit}").replace("_", " ")
+
+    def parameter_value(value: ParameterValue) -> str:
+        return measured(value.value, value.std, value.unit)
+
+    def stated(value: float | None, unit: str) -> str:
+        return "" if value is None else measured(value, None, unit)
+
+    environment.filters |= {
+        "words": lambda text: str(text).replace("_", " "),
+        "chart_json": _chart_json,
+        "parameter_name": parameter_name,
+        "parameter_value": parameter_value,
+        "stated": stated,
+    }
+    return environment
+
+
+def render_report(
+    recordings: RecordingSet,
+    fit: FitResult,
+    validation: ValidationResult | None,
+    diagnosis: DiagnosisResult | None,
+    provenance: Provenance,
+) -> str:
+    """The report as HTML text; see `write_report`."""
+    sides = tuple(fit.cameras)
+    checks = validation.checks if validation is not None else ()
+    badge, mood, headline = words.headline(diagnosis)
+    curves = diagnosis.curves if diagnosis is not None else ()
+    rows = by_side(fit, recordings.manifest.cameras)
+    skipped: dict[tuple[str, str, str], Skipped] = {}
+    for result in (fit, validation, diagnosis):
+        for item in result.skipped if result is not None else ():
+            skipped.setdefault((item.step, item.side or "", item.reason), item)
+
+    def of(side: Side, name: str) -> list[Check]:
+        return [check for check in checks if check.side == side and check.name == name]
+
+    noises = {side: camera.noise for side, camera in fit.cameras.items()}
+    context: dict[str, Any] = {
+        "title": recordings.manifest.name or Path(recordings.source).name,
+        "version": metadata.version("calibench"),
+        "source": recordings.source,
+        "made": provenance.made.strftime("%Y-%m-%d %H:%M UTC"),
+        "captures": len(recordings.captures()),
+        "sides": sides,
+        "badge": badge,
+        "mood": mood,
+        "headline": headline,
+        "summary": list(words.summary(fit, validation, diagnosis)),
+        "diagnosis": diagnosis,
+        "threshold_text": _threshold_text(diagnosis),
+        "mismatch_map": charts.mismatch_map(diagnosis) if diagnosis is not None else None,
+        "held_out": charts.held_out_bars(diagnosis) if diagnosis is not None else None,
+        "residuals": _residuals(diagnosis, sides),
+        "rows": rows,
+        "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
+        "remarks": [(side, remark) for side, noise in noises.items() if noise for remark in noise.remarks],
+        "transfer": {side: charts.photon_transfer(noise) if noise else None for side, noise in noises.items()},
+        "linearity": {side: charts.linearity(noise) if noise else None for side, noise in noises.items()},
+        "qe": {
+            side: charts.quantum_efficiency(camera.spectral, recordings, side) if camera.spectral else None
+            for side, camera in fit.cameras.items()
+        },
+        "mtf": {
+            side: charts.transfer_overlays(of(side, "mtf"), [curve for curve in curves if curve.side == side])
+            for side in sides
+        },
+        "kernels": {
+            side: [_Kernel.of(pair) for check in of(side, "psf") for pair in check.kernels][:KERNELS_A_SIDE]
+            for side in sides
+        },
+        "charts": {
+            side: [_chart_item(recordings, check) for check in of(side, "colorchecker") if check.patches][:1]
+            for side in sides
+        },
+        "stereo": list(stereo_figures(fit.stereo)) if fit.stereo else [],
+        "pairs": fit.stereo.pairs if fit.stereo else 0,
+        "geometry": {
+            side: {"figures": list(geometry_figures(camera.geometry)), "views": camera.geometry.views}
+            if camera.geometry
+            else None
+            for side, camera in fit.cameras.items()
+        },
+        "checks": checks,
+        "skipped": list(skipped.values()),
+        "warnings": recordings.warnings,
+        "provenance": provenance,
+        "notes": recordings.manifest.notes,
+        "listed": recordings.captures(),
+        "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+    }
+    return _environment().get_template("page.html").render(context)
+
+
+def write_report(
+    out: str | os.PathLike[str],
+    recordings: RecordingSet,
+    fit: FitResult,
+    validation: ValidationResult | None,
+    diagnosis: DiagnosisResult | None,
+    provenance: Provenance | None = None,
+) -> Path:
+    """Write the report as the file `out`, one self-contained page: completely, or not at all.
+
+    `validation` and `diagnosis` may be None: the page says that they were not done. `provenance`: by default, what the
+    recordings themselves tell. Raises InputError where the file can't be written.
+    """
+    file = Path(out)
+    page = render_report(recordings, fit, validation, diagnosis, provenance or provenance_of(recordings))
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        handle, partial = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as stream:
+                stream.write(page)
+            Path(partial).chmod(0o644)
+            Path(partial).replace(file)
+        except BaseException:
+            Path(partial).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise InputError(f"{file}: can't be written ({error.strerror}); choose another place with --out") from error
+    return file

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from lab.recording import Camera
-from lab.results import CameraFit, FitResult, MtfCurve, NoiseFit, StereoFit
+from lab.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
 from sim.camera import Side
 
 #: Field of `NoiseFit` -> (name, unit), in the order of the table; the maker's value has the same field name.
@@ -95,19 +95,18 @@ def camera_figures(fit: CameraFit, camera: Camera | None = None) -> Iterator[Fig
             over = f"middle and half range over {number} edges" if number > 1 else "one edge"
             yield Figure(f"MTF50 {channel} ({over})", "cy/px", middle, half or None)
     if fit.geometry is not None:
-        matrix, matrix_std = fit.geometry.camera_matrix, fit.geometry.camera_matrix_std
-        for name, row, col in (
-            ("focal length x", 0, 0),
-            ("focal length y", 1, 1),
-            ("centre x", 0, 2),
-            ("centre y", 1, 2),
-        ):
-            yield Figure(name, "px", matrix[row][col], matrix_std[row][col] if matrix_std else None)
-        for number, value in enumerate(fit.geometry.distortion):
-            deviations = fit.geometry.distortion_std
-            name = ("k1", "k2", "p1", "p2", "k3")[number] if number < 5 else f"distortion {number}"
-            yield Figure(name, "1", value, deviations[number] if deviations else None)
-        yield Figure("reprojection rms", "px", fit.geometry.rms_px)
+        yield from geometry_figures(fit.geometry)
+
+
+def geometry_figures(geometry: GeometryFit) -> Iterator[Figure]:
+    """Pinhole and distortion."""
+    matrix, matrix_std = geometry.camera_matrix, geometry.camera_matrix_std
+    for name, row, col in (("focal length x", 0, 0), ("focal length y", 1, 1), ("centre x", 0, 2), ("centre y", 1, 2)):
+        yield Figure(name, "px", matrix[row][col], matrix_std[row][col] if matrix_std else None)
+    for number, value in enumerate(geometry.distortion):
+        name = ("k1", "k2", "p1", "p2", "k3")[number] if number < 5 else f"distortion {number}"
+        yield Figure(name, "1", value, geometry.distortion_std[number] if geometry.distortion_std else None)
+    yield Figure("reprojection rms", "px", geometry.rms_px)
 
 
 def stereo_figures(stereo: StereoFit) -> Iterator[Figure]:

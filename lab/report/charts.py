@@ -1,0 +1,542 @@
+"""The report's charts as Plotly figures. Colours that depend on light or dark are named "@fg", "@muted" and "@grid"; the page's
+script puts them in. Uncertainty is drawn wherever the results state one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lab.recording import RecordingSet
+from lab.report.figures import measured
+from lab.results import (
+    Check,
+    Curve,
+    DiagnosisResult,
+    NoiseFit,
+    Patch,
+    ResidualCurve,
+    SpectralFit,
+)
+from sim.camera import Side
+
+Figure = dict[str, Any]
+Trace = dict[str, Any]
+#: Apart for all common kinds of colour vision, and legible on white and on near-black.
+CHANNEL = {"R": "#d1495b", "G": "#2a9d57", "B": "#3d7be0", "Y": "#8a63d2", "G1": "#2a9d57", "G2": "#7fb800"}
+BEFORE, AFTER = "#e08a1e", "#1f9aa5"
+FADED = 0.22  # opacity of an uncertainty band
+
+
+def _faded(colour: str, opacity: float = FADED) -> str:
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return f"rgba({red},{green},{blue},{opacity})"
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """A labelled axis in the report's style."""
+    return {
+        "title": {"text": title, "standoff": 6},
+        "gridcolor": "@grid",
+        "zerolinecolor": "@grid",
+        "linecolor": "@muted",
+        "ticks": "outside",
+        "ticklen": 4,
+        "tickcolor": "@muted",
+        "automargin": True,
+    } | more
+
+
+def _layout(height: int, **more: Any) -> dict[str, Any]:
+    return {
+        "height": height,
+        "margin": {"l": 56, "r": 14, "t": 26, "b": 44},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "@fg"},
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0, "font": {"size": 11}},
+        "hovermode": "closest",
+    } | more
+
+
+def _bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
+    return {"type": "data", "array": list(std), "color": colour, "thickness": 1, "width": 2}
+
+
+def _band(
+    x: Sequence[float], centre: np.ndarray[Any, Any], half: np.ndarray[Any, Any], colour: str, **more: Any
+) -> Trace:
+    """A filled band centre +- half."""
+    return {
+        "type": "scatter",
+        "x": [*x, *reversed(list(x))],
+        "y": [*(centre + half).tolist(), *reversed((centre - half).tolist())],
+        "fill": "toself",
+        "fillcolor": _faded(colour),
+        "line": {"width": 0},
+        "hoverinfo": "skip",
+        "showlegend": False,
+    } | more
+
+
+def photon_transfer(noise: NoiseFit) -> Figure | None:
+    """Temporal variance against signal, with the line of the fitted conversion gain."""
+    points = noise.photon_transfer
+    if points is None:
+        return None
+    data: list[Trace] = []
+    for channel in dict.fromkeys(points.channel):
+        for used in (True, False):
+            at = [k for k, name in enumerate(points.channel) if name == channel and points.used[k] is used]
+            if not at:
+                continue
+            colour = CHANNEL.get(channel, "#888888")
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": channel if used else f"{channel}, not used",
+                    "x": [points.signal_dn[k] for k in at],
+                    "y": [points.variance_dn2[k] for k in at],
+                    "error_x": _bars([points.signal_dn_std[k] for k in at], colour),
+                    "error_y": _bars([points.variance_dn2_std[k] for k in at], colour),
+                    "marker": {"color": colour, "size": 6, "symbol": "circle" if used else "circle-open"},
+                }
+            )
+    top = max(points.signal_dn)
+    if noise.conversion_gain_dn_per_e is not None:
+        gain = noise.conversion_gain_dn_per_e
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": f"slope {measured(gain, noise.conversion_gain_dn_per_e_std, 'DN/e')}",
+                "x": [0.0, top],
+                "y": [0.0, gain * top],
+                "line": {"color": "@fg", "width": 1.5, "dash": "dash"},
+            }
+        )
+    highest = 1.15 * max(points.variance_dn2)
+    return {
+        "data": data,
+        "layout": _layout(
+            330,
+            xaxis=axis("signal above dark, DN", rangemode="tozero"),
+            yaxis=axis("temporal variance above dark, DN²", range=[-0.02 * highest, highest]),
+        ),
+    }
+
+
+def linearity(noise: NoiseFit) -> Figure | None:
+    """Deviation from the straight line of the response, per cent of the line."""
+    points = noise.photon_transfer
+    if points is None:
+        return None
+    data: list[Trace] = []
+    for channel in dict.fromkeys(points.channel):
+        at = [
+            k
+            for k, name in enumerate(points.channel)
+            if name == channel and points.linearity_residual_percent[k] is not None
+        ]
+        if at:
+            colour = CHANNEL.get(channel, "#888888")
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers+lines",
+                    "name": channel,
+                    "x": [points.signal_dn[k] for k in at],
+                    "y": [points.linearity_residual_percent[k] for k in at],
+                    "error_y": _bars(
+                        [100 * points.signal_dn_std[k] / max(abs(points.signal_dn[k]), 1e-9) for k in at], colour
+                    ),
+                    "marker": {"color": colour, "size": 5},
+                    "line": {"color": colour, "width": 1},
+                }
+            )
+    if not data:
+        return None
+    return {
+        "data": data,
+        "layout": _layout(
+            220, xaxis=axis("signal above dark, DN", rangemode="tozero"), yaxis=axis("off the line, %", zeroline=True)
+        ),
+    }
+
+
+def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Side) -> Figure:
+    """Quantum efficiency with its band (one standard uncertainty, expanded by the fit's coverage factor) and the maker's."""
+    data: list[Trace] = []
+    for channel, values in spectral.quantum_efficiency.items():
+        colour = CHANNEL.get(channel, "#888888")
+        std = spectral.quantum_efficiency_std.get(channel)
+        if std:
+            half = spectral.coverage_factor * np.asarray(std)
+            data.append(_band(spectral.wavelength_nm, np.asarray(values), half, colour))
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines+markers",
+                "name": channel,
+                "x": list(spectral.wavelength_nm),
+                "y": list(values),
+                "line": {"color": colour, "width": 2},
+                "marker": {"size": 4},
+            }
+        )
+    for channel, path in (recordings.camera(side).quantum_efficiency or {}).items():
+        curve = recordings.spectrum(path)
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": f"{channel}, maker",
+                "x": list(curve.wavelength_nm),
+                "y": list(curve.value),
+                "line": {"color": CHANNEL.get(channel, "#888888"), "width": 1.2, "dash": "dot"},
+            }
+        )
+    span = [min(spectral.wavelength_nm) - 10, max(spectral.wavelength_nm) + 10]
+    return {
+        "data": data,
+        "layout": _layout(
+            340,
+            xaxis=axis("wavelength, nm", range=span),
+            yaxis=axis("quantum efficiency, e/photon", rangemode="tozero"),
+        ),
+    }
+
+
+def _grid(panels: int, columns: int, height: int) -> tuple[dict[str, Any], int]:
+    """Layout of `panels` subplots in a grid, and its height."""
+    rows = -(-panels // columns)
+    return (
+        {
+            "grid": {
+                "rows": rows,
+                "columns": columns,
+                "pattern": "independent",
+                "xgap": 0.16,
+                "ygap": 0.3 if rows < 4 else 0.34,
+            }
+        },
+        60 + rows * height,
+    )
+
+
+def _panel_title(number: int, text: str) -> dict[str, Any]:
+    suffix = "" if number == 0 else str(number + 1)
+    return {
+        "text": text,
+        "xref": f"x{suffix} domain",
+        "yref": f"y{suffix} domain",
+        "x": 0,
+        "y": 1.02,
+        "xanchor": "left",
+        "yanchor": "bottom",
+        "showarrow": False,
+        "font": {"size": 11, "color": "@fg"},
+    }
+
+
+def curves_by_label(checks: Sequence[Check]) -> dict[str, list[Curve]]:
+    """Label -> the channels' curves of it, in the order of the checks."""
+    found: dict[str, list[Curve]] = {}
+    for check in checks:
+        for curve in check.curves:
+            found.setdefault(curve.label, []).append(curve)
+    return found
+
+
+def transfer_overlays(
+    checks: Sequence[Check], explained: Sequence[ResidualCurve] = (), columns: int = 3
+) -> Figure | None:
+    """Measured MTF (points) over the baseline's prediction (dashed) and, where effects were named, theirs (solid)."""
+    labels = curves_by_label(checks)
+    after = {(curve.label, curve.channel): curve for curve in explained}
+    if not labels:
+        return None
+    layout, height = _grid(len(labels), columns, 190)
+    data: list[Trace] = []
+    titles = []
+    for number, (label, curves) in enumerate(labels.items()):
+        on = {"xaxis": f"x{number + 1}" if number else "x", "yaxis": f"y{number + 1}" if number else "y"}
+        titles.append(_panel_title(number, label))
+        for curve in curves:
+            colour = CHANNEL.get(curve.channel, "#888888")
+            named = {"legendgroup": curve.channel, "showlegend": False} | on
+            data.append(_band(curve.x, np.asarray(curve.measured), np.asarray(curve.measured_std), colour, **on))
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "markers",
+                    "name": f"{curve.channel} measured",
+                    "x": list(curve.x),
+                    "y": list(curve.measured),
+                    "marker": {"color": colour, "size": 4},
+                }
+                | named
+                | {"showlegend": number == 0}
+            )
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": "predicted, baseline",
+                    "x": list(curve.x),
+                    "y": list(curve.predicted),
+                    "line": {"color": colour, "width": 1.3, "dash": "dash"},
+                }
+                | named
+                | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "baseline"}
+            )
+            if (explained_curve := after.get((curve.label, curve.channel))) is not None:
+                data.append(
+                    {
+                        "type": "scatter",
+                        "mode": "lines",
+                        "name": "predicted, with the named effects",
+                        "x": list(explained_curve.x),
+                        "y": list(explained_curve.after),
+                        "line": {"color": colour, "width": 1.8},
+                    }
+                    | named
+                    | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "after"}
+                )
+        layout |= {
+            f"xaxis{number + 1 if number else ''}": axis("cy/px" if number >= len(labels) - columns else ""),
+            f"yaxis{number + 1 if number else ''}": axis("MTF" if number % columns == 0 else "", range=[-0.02, 1.08]),
+        }
+    legend = {"orientation": "h", "y": 1 + 26 / height, "yanchor": "bottom", "x": 0, "font": {"size": 11}}
+    return {
+        "data": data,
+        "layout": _layout(height, annotations=titles, **layout)
+        | {"legend": legend, "margin": {"l": 56, "r": 14, "t": 56, "b": 44}},
+    }
+
+
+def patch_comparison(patches: Sequence[Patch]) -> Figure:
+    """Measured against predicted, and below it how far off each patch is in per cent, with its uncertainty."""
+    data: list[Trace] = []
+    top = max(max(patch.measured_dn, patch.predicted_dn) for patch in patches)
+    for channel in dict.fromkeys(patch.channel for patch in patches):
+        mine = [patch for patch in patches if patch.channel == channel]
+        colour = CHANNEL.get(channel, "#888888")
+        common = {"type": "scatter", "mode": "markers", "name": channel, "marker": {"color": colour, "size": 6}}
+        data.append(
+            common
+            | {
+                "x": [patch.predicted_dn for patch in mine],
+                "y": [patch.measured_dn for patch in mine],
+                "error_x": _bars([patch.predicted_dn_std for patch in mine], colour),
+                "error_y": _bars([patch.measured_dn_std for patch in mine], colour),
+                "text": [patch.patch for patch in mine],
+            }
+        )
+        data.append(
+            common
+            | {
+                "x": [patch.patch for patch in mine],
+                "y": [100 * (patch.measured_dn / patch.predicted_dn - 1) for patch in mine],
+                "error_y": _bars(
+                    [100 * float(np.hypot(p.measured_dn_std, p.predicted_dn_std)) / p.predicted_dn for p in mine],
+                    colour,
+                ),
+                "xaxis": "x2",
+                "yaxis": "y2",
+                "showlegend": False,
+            }
+        )
+    data.append(
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": "equal",
+            "x": [0, top],
+            "y": [0, top],
+            "line": {"color": "@muted", "width": 1, "dash": "dot"},
+        }
+    )
+    return {
+        "data": data,
+        "layout": _layout(
+            560,
+            xaxis=axis("predicted, DN above black", rangemode="tozero", anchor="y"),
+            yaxis=axis("measured, DN above black", rangemode="tozero", domain=[0.56, 1.0]),
+            xaxis2=axis("", anchor="y2", tickangle=-45, tickfont={"size": 10}),
+            yaxis2=axis("measured − predicted, %", domain=[0.0, 0.4], zeroline=True),
+        ),
+    }
+
+
+def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
+    """Where the baseline fails: significance by measurement and axis, one row for each side and measurement."""
+    if not diagnosis.mismatches:
+        return None
+    rows = list(dict.fromkeys((item.side, item.measurement) for item in diagnosis.mismatches))
+    axes = list(dict.fromkeys(item.axis for item in diagnosis.mismatches))
+    strongest: dict[tuple[tuple[str, str], str], Any] = {}
+    for item in diagnosis.mismatches:
+        key = ((item.side, item.measurement), item.axis)
+        if key not in strongest or item.significance_sigma > strongest[key].significance_sigma:
+            strongest[key] = item
+    cells = [[strongest.get((row, name)) for name in axes] for row in rows]
+    names = [f"{side}: {measurement.replace('_', ' ')}" for side, measurement in rows]
+    labels = [name.replace("_", " ") for name in axes]
+    return {
+        "data": [
+            {
+                "type": "heatmap",
+                "x": labels,
+                "y": names,
+                "z": [[None if cell is None else cell.significance_sigma for cell in row] for row in cells],
+                "customdata": [["" if cell is None else cell.where for cell in row] for row in cells],
+                "hovertemplate": "%{y}<br>%{x}: %{z:.1f} sigma<br>%{customdata}<extra></extra>",
+                "colorscale": [[0, "#fde0c5"], [0.5, "#f0874f"], [1, "#a1232f"]],
+                "zmin": diagnosis.threshold or 0.0,
+                "xgap": 3,
+                "ygap": 3,
+                "colorbar": {"title": {"text": "sigma", "side": "right"}, "thickness": 10, "outlinewidth": 0},
+            }
+        ],
+        "layout": _layout(
+            110 + 44 * len(rows),
+            xaxis=axis("", side="bottom", showgrid=False),
+            yaxis=axis("", autorange="reversed", showgrid=False),
+            annotations=[
+                {
+                    "x": labels[column],
+                    "y": names[row],
+                    "text": f"{cell.significance_sigma:.1f} σ",
+                    "showarrow": False,
+                    "font": {"size": 12, "color": "#1b1b1b"},
+                    "bgcolor": "rgba(255,255,255,0.55)",
+                }
+                for row, line in enumerate(cells)
+                for column, cell in enumerate(line)
+                if cell is not None
+            ],
+        ),
+    }
+
+
+def worst_curves(curves: Sequence[ResidualCurve], most: int = 4) -> list[ResidualCurve]:
+    """The curves that tell most, of each measurement in turn: by how much chi2 the named effects take away, or is there."""
+
+    def weight(curve: ResidualCurve) -> float:
+        std = np.maximum(np.asarray(curve.measured_std), 1e-12)
+        before = np.sum(((np.asarray(curve.measured) - np.asarray(curve.before)) / std) ** 2)
+        return float(before)
+
+    by_measurement: dict[str, list[ResidualCurve]] = {}
+    for curve in sorted(curves, key=weight, reverse=True):
+        by_measurement.setdefault(curve.measurement, []).append(curve)
+    ranked: list[ResidualCurve] = []
+    for turn in range(most):
+        ranked += [group[turn] for group in by_measurement.values() if turn < len(group)]
+    return ranked[:most]
+
+
+def residual_curve(curve: ResidualCurve) -> Figure:
+    """One measurement with the baseline and the named effects, and below it what is left, in standard deviations."""
+    std = np.maximum(np.asarray(curve.measured_std), 1e-12)
+    seen = np.asarray(curve.measured)
+    data: list[Trace] = [
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": "measured",
+            "x": list(curve.x),
+            "y": list(curve.measured),
+            "error_y": _bars(curve.measured_std, "@fg"),
+            "marker": {"color": "@fg", "size": 4},
+        }
+    ]
+    for name, values, colour, dash in (
+        ("baseline", curve.before, BEFORE, "dash"),
+        ("with the named effects", curve.after, AFTER, "solid"),
+    ):
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": name,
+                "x": list(curve.x),
+                "y": list(values),
+                "line": {"color": colour, "width": 2, "dash": dash},
+            }
+        )
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "showlegend": False,
+                "name": name,
+                "x": list(curve.x),
+                "y": ((seen - np.asarray(values)) / std).tolist(),
+                "marker": {"color": colour, "size": 4},
+                "yaxis": "y2",
+            }
+        )
+    return {
+        "data": data,
+        "layout": _layout(
+            330,
+            xaxis=axis(curve.axis, anchor="y2"),
+            yaxis=axis("measured", domain=[0.42, 1.0]),
+            yaxis2=axis("residual, σ", domain=[0.0, 0.32], zeroline=True),
+            shapes=[
+                {
+                    "type": "rect",
+                    "xref": "paper",
+                    "yref": "y2",
+                    "x0": 0,
+                    "x1": 1,
+                    "y0": -2,
+                    "y1": 2,
+                    "fillcolor": "rgba(128,128,128,0.15)",
+                    "line": {"width": 0},
+                    "layer": "below",
+                }
+            ],
+        ),
+    }
+
+
+def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
+    """chi2 per number on captures that the diagnosis has not seen, before and after; 1 is what noise leaves."""
+    held = diagnosis.held_out
+    if held is None or held.n == 0:
+        return None
+    return {
+        "data": [
+            {
+                "type": "bar",
+                "orientation": "h",
+                "y": ["baseline", "with the named effects"],
+                "x": [held.chi2_before / held.n, held.chi2_after / held.n],
+                "marker": {"color": [BEFORE, AFTER]},
+                "text": [f"{held.chi2_before / held.n:.2f}", f"{held.chi2_after / held.n:.2f}"],
+                "textposition": "auto",
+                "showlegend": False,
+            }
+        ],
+        "layout": _layout(
+            150,
+            xaxis=axis("χ² / n on held-out captures (1: noise alone)", rangemode="tozero"),
+            yaxis=axis("", autorange="reversed", showgrid=False),
+            shapes=[
+                {
+                    "type": "line",
+                    "x0": 1,
+                    "x1": 1,
+                    "yref": "paper",
+                    "y0": 0,
+                    "y1": 1,
+                    "line": {"color": "@fg", "width": 1, "dash": "dot"},
+                }
+            ],
+        ),
+    }

@@ -1,0 +1,94 @@
+"""Small pictures as PNG data for the page: kernels, colour patches, the chart as the camera saw it."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lab.recording import Camera
+from lab.results import Patch
+from sim.sensor.mosaic import planes
+
+DISPLAY_GAMMA = 2.2
+
+
+def png_data_uri(image: NDArray[np.uint8]) -> str:
+    """An image (rows, cols) or (rows, cols, 3: R, G, B) as the text of a PNG data URI."""
+    pixels = image if image.ndim == 2 else image[..., ::-1]
+    _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
+    """A kernel in colours from 0 to `peak` (root scale, so that the tails show), `margin` cells cut off at each border."""
+    values = np.asarray(kernel, float)
+    if margin:
+        values = values[margin:-margin, margin:-margin]
+    scaled = np.sqrt(np.clip(values / peak, 0.0, 1.0))
+    coloured = cv2.applyColorMap((255 * scaled).round().astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    return png_data_uri(np.ascontiguousarray(coloured[..., ::-1], dtype=np.uint8))
+
+
+def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> str:
+    """A signed difference in blue (-limit) through white (0) to red (+limit)."""
+    values = np.asarray(difference, float)
+    if margin:
+        values = values[margin:-margin, margin:-margin]
+    share = np.clip(values / limit, -1.0, 1.0)
+    red, blue = np.array([178, 24, 43]), np.array([33, 102, 172])
+    towards = np.where(share[..., None] > 0, red, blue)
+    mixed = 255 + np.abs(share)[..., None] * (towards - 255.0)
+    return png_data_uri(mixed.round().astype(np.uint8))
+
+
+def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
+    """How many border cells all `kernels` have in common that stay below `share` of the highest value."""
+    highest = max(float(kernel.max()) for kernel in kernels)
+    size = min(min(kernel.shape) for kernel in kernels)
+    margin = 0
+    while size - 2 * (margin + 1) >= 7 and all(
+        np.abs(np.concatenate([k[margin], k[-1 - margin], k[:, margin], k[:, -1 - margin]])).max() < share * highest
+        for k in kernels
+    ):
+        margin += 1
+    return margin
+
+
+def patch_colours(patches: tuple[Patch, ...]) -> dict[str, tuple[str, str]]:
+    """Patch -> (measured, predicted) as CSS colours: camera R, G, B balanced on the measured white patch, gamma 2.2.
+
+    Camera colours, not colorimetry: both go through the same balance, so what differs on the page differs in the recording.
+    """
+    measured: dict[str, dict[str, float]] = {}
+    predicted: dict[str, dict[str, float]] = {}
+    for patch in patches:
+        measured.setdefault(patch.patch, {})[patch.channel] = patch.measured_dn
+        predicted.setdefault(patch.patch, {})[patch.channel] = patch.predicted_dn
+    channels = ("R", "G", "B") if any("R" in values for values in measured.values()) else ("Y", "Y", "Y")
+    whitest = max(measured.values(), key=lambda values: min(values.get(channel, 0.0) for channel in channels))
+
+    def css(values: dict[str, float]) -> str:
+        share = [values.get(channel, 0.0) / max(whitest.get(channel, 1.0), 1e-9) * 0.9 for channel in channels]
+        return "#" + "".join(f"{round(255 * min(max(value, 0.0), 1.0) ** (1 / DISPLAY_GAMMA)):02x}" for value in share)
+
+    return {name: (css(measured[name]), css(predicted[name])) for name in measured}
+
+
+def frame_picture(frame: NDArray[np.uint16], camera: Camera, width_px: int = 480) -> str:
+    """A frame as a viewer wants it: one pixel per Bayer cell, black subtracted, channels scaled alike to their 99.5 %."""
+    split: dict[str, Any] = planes(frame.astype(np.float32) - float(camera.black_level_dn or 0.0), camera.cfa)
+    if camera.cfa == "MONO":
+        colours = np.stack([split["Y"]] * 3, axis=-1)
+    else:
+        colours = np.stack([split["R"], (split["G1"] + split["G2"]) / 2, split["B"]], axis=-1)
+    tops = np.percentile(colours, 99.5, axis=(0, 1))
+    display = np.clip(colours / np.maximum(tops, 1e-6), 0.0, 1.0) ** (1 / DISPLAY_GAMMA)
+    factor = width_px / display.shape[1]
+    if factor < 1:
+        size = (width_px, max(1, round(display.shape[0] * factor)))
+        display = cv2.resize(display, size, interpolation=cv2.INTER_AREA)
+    return png_data_uri((255 * display).round().astype(np.uint8))

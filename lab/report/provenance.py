@@ -1,0 +1,55 @@
+"""Where a report's numbers come from: instruments, versions, and digests of what was evaluated."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib import metadata
+
+from lab.recording import RecordingSet, manifest_json
+from sim.parameters import Frozen
+
+#: The distributions whose version can change a number.
+DISTRIBUTIONS = ("calibench", "numpy", "scipy", "opencv-contrib-python-headless", "colour-science", "rawpy")
+
+
+class Provenance(Frozen):
+    """What a calibration was made of and with."""
+
+    made: datetime
+    instruments: dict[
+        str, dict[str, str]
+    ] = {}  # role -> what the instrument says of itself (maker, model, serial, ...)
+    versions: dict[str, str] = {}
+    manifest_sha256: str
+    frame_sha256: dict[str, str]  # capture id -> SHA-256 of the frame's values (little-endian uint16, row by row)
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of calibench, of the libraries that compute, and of Python."""
+    found = {"python": platform.python_version(), "system": platform.platform(terse=True)}
+    for name in DISTRIBUTIONS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def provenance_of(
+    recordings: RecordingSet, instruments: Mapping[str, Mapping[str, str]] | None = None, made: datetime | None = None
+) -> Provenance:
+    """Provenance of an evaluation of `recordings`: reads every frame once. `made`: now, where not given."""
+    digests = {
+        capture.id: hashlib.sha256(recordings.frame(capture).astype("<u2").tobytes()).hexdigest()
+        for capture in recordings.captures()
+    }
+    return Provenance(
+        made=made or datetime.now(UTC),
+        instruments={role: dict(said) for role, said in (instruments or {}).items()},
+        versions=installed_versions(),
+        manifest_sha256=hashlib.sha256(manifest_json(recordings.manifest).encode()).hexdigest(),
+        frame_sha256=digests,
+    )

@@ -1,0 +1,100 @@
+"""The report's sentences: the verdict in plain words, and what the checks say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lab.report.figures import measured
+from lab.results import Check, DiagnosisResult, FitResult, NamedEffect, ParameterValue, ValidationResult
+
+#: Verdict -> (what stands on the badge, its mood, the headline).
+VERDICTS = {
+    "no_mismatch": ("no mismatch", "good", "The baseline model explains these recordings."),
+    "explained": ("explained", "told", "The baseline model leaves physics out, and it has a name."),
+    "partly_explained": (
+        "partly explained",
+        "open",
+        "The baseline model leaves physics out; the named effects account for a part of it.",
+    ),
+    "unexplained": (
+        "unexplained",
+        "bad",
+        "The baseline model leaves something out that no effect in the library accounts for.",
+    ),
+}
+
+
+def headline(diagnosis: DiagnosisResult | None) -> tuple[str, str, str]:
+    """(badge, mood, sentence) of a diagnosis, or of there being none."""
+    if diagnosis is None:
+        return "not diagnosed", "open", "The recordings were calibrated; they were not diagnosed."
+    return VERDICTS[diagnosis.verdict]
+
+
+def effect_name(name: str) -> str:
+    """An effect's name as words."""
+    return name.replace("_", " ")
+
+
+def parameter_text(name: str, value: ParameterValue) -> str:
+    """`displacement x: 2.10 ± 0.05 um`: the unit at the end of the name goes to the value."""
+    words = name.removesuffix(f"_{value.unit}").replace("_", " ")
+    return f"{words} {measured(value.value, value.std, value.unit)}"
+
+
+def effect_sentence(effect: NamedEffect) -> str:
+    """What was left out on which side, how sure that is, and its size."""
+    where = " and ".join(effect.sides)
+    sizes = "; ".join(parameter_text(name, value) for name, value in effect.parameters.items())
+    return f"{effect_name(effect.name).capitalize()} ({where}, probability {effect.probability:.3g}): {sizes}."
+
+
+def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult | None) -> Iterator[str]:
+    """The report in a few sentences, the verdict's own first."""
+    if diagnosis is not None:
+        yield from diagnosis.summary or [effect_sentence(effect) for effect in diagnosis.effects]
+        named = {side for effect in diagnosis.effects for side in effect.sides}
+        clean = [
+            side for side in fit.cameras if side not in named and not any(m.side == side for m in diagnosis.mismatches)
+        ]
+        if named and clean:
+            yield f"The {' and '.join(clean)} camera conceals nothing that these recordings would show."
+    for side, camera in fit.cameras.items():
+        noise = camera.noise
+        if noise is not None and noise.conversion_gain_dn_per_e is not None:
+            parts = [
+                f"conversion gain {measured(noise.conversion_gain_dn_per_e, noise.conversion_gain_dn_per_e_std, 'DN/e')}"
+            ]
+            if noise.read_noise_e is not None:
+                parts.append(f"read noise {measured(noise.read_noise_e, noise.read_noise_e_std, 'e')}")
+            if noise.full_well_e is not None:
+                parts.append(f"full well {measured(noise.full_well_e, noise.full_well_e_std, 'e')}")
+            yield f"{side.capitalize()} camera: {', '.join(parts)}."
+    if fit.stereo is not None:
+        yield (
+            f"Stereo: baseline {measured(fit.stereo.baseline_mm, fit.stereo.baseline_mm_std, 'mm')}, "
+            f"rms {fit.stereo.rms_px:.3f} px over {fit.stereo.pairs} pairs."
+        )
+    if validation is not None and validation.checks:
+        yield " ".join(check_sentence(check) for check in _one_a_kind(validation.checks))
+
+
+def _one_a_kind(checks: tuple[Check, ...]) -> list[Check]:
+    worst: dict[tuple[str, str], Check] = {}
+    for check in checks:
+        key = (check.name, check.side)
+        if key not in worst or check.chi2 / max(check.n, 1) > worst[key].chi2 / max(worst[key].n, 1):
+            worst[key] = check
+    return list(worst.values())
+
+
+CHECK_NAMES = {"colorchecker": "ColorChecker", "mtf": "MTF", "psf": "PSF"}
+
+
+def check_sentence(check: Check) -> str:
+    """What one comparison of the baseline's prediction with the measurement says."""
+    verdict = "within its uncertainty" if check.passed else "beyond its uncertainty"
+    return (
+        f"{CHECK_NAMES[check.name]} ({check.side}, {check.capture}): {check.rms_relative_percent:.2g} % rms off the "
+        f"baseline's prediction, {verdict}."
+    )
