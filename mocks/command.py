@@ -174,7 +174,9 @@ def _start_bench(
     _thread(running, "display", lambda: browse(page, display_at, stop, faults.get("display", ())))
     usb = running.enter_context(serve_usbip(stereo_pair(place), line.host))
     for side, serial_number in SERIAL_NUMBERS.items():
-        addresses[f"cameras.{side}"] = {"driver": "u3v", "address": line.advertised(usb.url(serial_number))}
+        # The first frame of a new scene is rendered while the camera exposes: real seconds for virtual milliseconds.
+        address = line.advertised(usb.url(serial_number))
+        addresses[f"cameras.{side}"] = {"driver": "u3v", "address": address, "timeout_s": 60.0}
     known: dict[str, Any] = {"cameras": place.station_cameras(), "targets": place.station_targets()}
     return addresses, known
 
