@@ -44,8 +44,9 @@ WriteSpectrum = Callable[[str, Spectrum], StoredFile]
 
 #: Longest times (s) for an instrument to come back: the drivers' own time-outs are shorter and say more.
 MOVE_S, PLACE_S, MEASURE_S, READOUT_S, STOP_S = 90.0, 660.0, 180.0, 30.0, 15.0
-#: A test frame above this share of the range is saturated, and tells only that the exposure is too long.
-SATURATED, UNLIT = 0.97, 0.01
+#: A test frame above or below these shares of the range tells only in which direction to go: 10 % below the data sheet's
+#: full well, for a sensor may saturate below its data sheet.
+SATURATED, UNLIT = 0.9, 0.01
 TRIES = 14
 
 
@@ -361,7 +362,12 @@ class CamerasDevice(Device):
         shot = self.shot
 
         def take() -> None:
-            frames = dict(zip(self.cameras, capture_together(list(self.cameras.values())), strict=True))
+            try:
+                together = capture_together(list(self.cameras.values()))
+            except NoAnswer:
+                # A frame lost on a busy bus isn't a broken camera: nothing of it was kept, so once more is safe.
+                together = capture_together(list(self.cameras.values()))
+            frames = dict(zip(self.cameras, together, strict=True))
             for side, frame in frames.items():
                 sheet = self.sheets[side]
                 if frame.raw.shape != (sheet.rows, sheet.cols):
@@ -373,7 +379,7 @@ class CamerasDevice(Device):
             self.stored = {side: self.write(path, side, frames[side].raw) for side, path in shot.paths.items()}
             self.frames = frames
 
-        return Status("cameras", take, max(shot.exposure_s.values()) + READOUT_S)
+        return Status("cameras", take, 2 * max(shot.exposure_s.values()) + READOUT_S)
 
     async def stop(self, success: bool = True) -> None:
         for side, camera in self.cameras.items():
@@ -535,14 +541,15 @@ def find_exposure(
 
     exposure_s = {side: bounded(start_s[side]) for side in instruments.cameras.cameras}
     levels: dict[Side, float] = {}
+    before: tuple[dict[Side, float], dict[Side, float]] | None = None
     for _ in range(TRIES):
         yield from _shoot(instruments, Shot(exposure_s, limits.gain_db, {}))
         levels = dict(instruments.cameras.levels)
         following = dict(exposure_s)
         for side, level in levels.items():
-            if abs(level - wanted.level) <= wanted.tolerance:
+            if abs(level - wanted.level) <= wanted.tolerance and not _stuck(side, before, exposure_s, levels):
                 continue
-            if level >= SATURATED:
+            if level >= SATURATED or _stuck(side, before, exposure_s, levels):
                 factor = 0.2
             elif level < UNLIT:
                 factor = 10.0
@@ -551,8 +558,21 @@ def find_exposure(
             following[side] = bounded(exposure_s[side] * factor)
         if following == exposure_s:
             break
-        exposure_s = following
+        before, exposure_s = (exposure_s, levels), following
     return exposure_s, levels
+
+
+def _stuck(
+    side: Side,
+    before: tuple[dict[Side, float], dict[Side, float]] | None,
+    exposure_s: Mapping[Side, float],
+    levels: Mapping[Side, float],
+) -> bool:
+    """Whether a shorter exposure left a bright frame as bright: it is saturated, wherever the data sheet ends the range."""
+    if before is None or levels[side] < 0.3:
+        return False
+    shortened = exposure_s[side] / before[0][side]
+    return shortened < 0.9 and levels[side] / before[1][side] > np.sqrt(shortened)
 
 
 def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> Plan[Taken]:

@@ -141,7 +141,7 @@ class ScreenSequence(Sequence):
 
     A cell covers about `cell_camera_px` camera pixels, a whole number of screen pixels; the pattern is centred on the screen
     and lies inside what all cameras surely see. White and black light and darken the whole screen. The Bernoulli pattern is
-    fair coin tosses from `seed`. Every pattern comes once a turn, so that a drift hits all of them alike.
+    fair coin tosses from `seed`. White and black, which level the others, come first.
     """
 
     frames: int = Field(default=4, ge=1)
@@ -220,8 +220,8 @@ class ScreenSequence(Sequence):
             "checkerboard": Checkerboard,
             "bernoulli": Bernoulli,
         }
-        for frame in range(1, self.frames + 1):
-            for pattern in self.patterns_shown:
+        for pattern in self.patterns_shown:
+            for frame in range(1, self.frames + 1):
                 id = f"screen/{pattern}/{frame}"
                 captures: list[AnyCapture] = []
                 for side in station.sides:
