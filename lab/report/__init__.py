@@ -55,15 +55,16 @@ class _Kernel:
     def of(cls, pair: KernelPair) -> _Kernel:
         seen, foretold = np.asarray(pair.measured, float), np.asarray(pair.predicted, float)
         margin = trimmed_margin([seen, foretold])
-        limit = max(float(np.abs(seen - foretold).max()), 1e-12)
         peak = float(foretold.max())
+        # Not below 5 % of the peak: else mere noise would look like a difference.
+        limit = max(float(np.abs(seen - foretold).max()), 0.05 * peak)
         return cls(
             label=pair.label,
             channel=pair.channel,
             measured=kernel_picture(seen, peak, margin),
             predicted=kernel_picture(foretold, peak, margin),
             difference=difference_picture(seen - foretold, limit, margin),
-            limit=f"{limit:.2g}",
+            limit=f"{100 * limit / peak:.2g} %",
             psnr_peak=f"{pair.psnr_peak_db:.1f}",
             psnr_unit=f"{pair.psnr_unit_db:.1f}",
         )

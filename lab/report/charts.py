@@ -278,7 +278,7 @@ def transfer_overlays(
                     "marker": {"color": colour, "size": 4},
                 }
                 | named
-                | {"showlegend": number == 0}
+                | {"showlegend": number == 0, "legendrank": 1}
             )
             data.append(
                 {
@@ -290,7 +290,7 @@ def transfer_overlays(
                     "line": {"color": colour, "width": 1.3, "dash": "dash"},
                 }
                 | named
-                | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "baseline"}
+                | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "baseline", "legendrank": 2}
             )
             if (explained_curve := after.get((curve.label, curve.channel))) is not None:
                 data.append(
@@ -303,7 +303,7 @@ def transfer_overlays(
                         "line": {"color": colour, "width": 1.8},
                     }
                     | named
-                    | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "after"}
+                    | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "after", "legendrank": 3}
                 )
         layout |= {
             f"xaxis{number + 1 if number else ''}": axis("cy/px" if number >= len(labels) - columns else ""),

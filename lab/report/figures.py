@@ -33,11 +33,12 @@ class Figure:
     value: float
     std: float | None = None
     stated: float | None = None
+    note: str = ""
 
     @property
     def text(self) -> str:
-        """Value and uncertainty with the unit: `0.2803 ± 0.0004 DN/e`."""
-        return measured(self.value, self.std, self.unit)
+        """Value and uncertainty with the unit, and what belongs to it: `0.383 ± 0.008 at 610 nm`."""
+        return f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
 
 
 def measured(value: float, std: float | None = None, unit: str = "") -> str:
@@ -53,7 +54,7 @@ def measured(value: float, std: float | None = None, unit: str = "") -> str:
             power = math.floor(math.log10(max(abs(value), std)))
             digits = max(place + power, 0)
             number = f"({value / 10**power:.{digits}f} ± {std / 10**power:.{digits}f})e{power:+03d}"
-    return number if unit in ("", "1") else f"{number} {unit}"
+    return number if unit in ("", "1") else f"{number} {unit.replace('um', 'µm')}"
 
 
 def noise_figures(noise: NoiseFit, camera: Camera | None = None) -> Iterator[Figure]:
@@ -63,11 +64,9 @@ def noise_figures(noise: NoiseFit, camera: Camera | None = None) -> Iterator[Fig
         if value is None:
             continue
         stated = getattr(camera, field, None) if field != "quantum_efficiency" else None
-        if field == "quantum_efficiency" and noise.quantum_efficiency_wavelength_nm is not None:
-            label = f"{name} at {noise.quantum_efficiency_wavelength_nm:g} nm"
-        else:
-            label = name
-        yield Figure(label, unit, value, getattr(noise, f"{field}_std"), stated)
+        at_nm = noise.quantum_efficiency_wavelength_nm if field == "quantum_efficiency" else None
+        note = f"at {at_nm:g} nm" if at_nm is not None else ""
+        yield Figure(name, unit, value, getattr(noise, f"{field}_std"), stated, note)
 
 
 def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, float, int] | None:
@@ -87,13 +86,13 @@ def camera_figures(fit: CameraFit, camera: Camera | None = None) -> Iterator[Fig
             peak = max(range(len(curve)), key=lambda k: curve[k])
             std = fit.spectral.quantum_efficiency_std.get(channel)
             at = fit.spectral.wavelength_nm[peak]
-            yield Figure(f"QE peak {channel}, at {at:g} nm", "1", curve[peak], std[peak] if std else None)
+            yield Figure(f"QE peak {channel}", "1", curve[peak], std[peak] if std else None, note=f"at {at:g} nm")
     for channel in ("R", "G", "B", "Y"):
         if (span := mtf50_range(fit.mtf, channel)) is not None:
             lowest, highest, number = span
             middle, half = (lowest + highest) / 2, (highest - lowest) / 2
-            over = f"middle and half range over {number} edges" if number > 1 else "one edge"
-            yield Figure(f"MTF50 {channel} ({over})", "cy/px", middle, half or None)
+            note = f"(middle and half range of {number} edges)" if number > 1 else ""
+            yield Figure(f"MTF50 {channel}", "cy/px", middle, half or None, note=note)
     if fit.geometry is not None:
         yield from geometry_figures(fit.geometry)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from lab.report.figures import measured
 from lab.results import Check, DiagnosisResult, FitResult, NamedEffect, ParameterValue, ValidationResult
@@ -75,17 +75,28 @@ def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: Diag
             f"Stereo: baseline {measured(fit.stereo.baseline_mm, fit.stereo.baseline_mm_std, 'mm')}, "
             f"rms {fit.stereo.rms_px:.3f} px over {fit.stereo.pairs} pairs."
         )
-    if validation is not None and validation.checks:
-        yield " ".join(check_sentence(check) for check in _one_a_kind(validation.checks))
+    for side in fit.cameras:
+        worst = _one_a_kind(check for check in (validation.checks if validation else ()) if check.side == side)
+        if worst:
+            parts = [
+                f"{CHECK_NAMES[check.name]} {check.rms_relative_percent:.2g} % rms ({_within(check)})"
+                for check in worst
+            ]
+            yield f"{side.capitalize()} camera, measured against the baseline's prediction: {', '.join(parts)}."
 
 
-def _one_a_kind(checks: tuple[Check, ...]) -> list[Check]:
-    worst: dict[tuple[str, str], Check] = {}
+def _one_a_kind(checks: Iterable[Check]) -> list[Check]:
+    worst: dict[str, Check] = {}
     for check in checks:
-        key = (check.name, check.side)
-        if key not in worst or check.chi2 / max(check.n, 1) > worst[key].chi2 / max(worst[key].n, 1):
-            worst[key] = check
+        if check.name not in worst or check.chi2 / max(check.n, 1) > worst[check.name].chi2 / max(
+            worst[check.name].n, 1
+        ):
+            worst[check.name] = check
     return list(worst.values())
+
+
+def _within(check: Check) -> str:
+    return "within its uncertainty" if check.passed else "beyond its uncertainty"
 
 
 CHECK_NAMES = {"colorchecker": "ColorChecker", "mtf": "MTF", "psf": "PSF"}
@@ -93,8 +104,7 @@ CHECK_NAMES = {"colorchecker": "ColorChecker", "mtf": "MTF", "psf": "PSF"}
 
 def check_sentence(check: Check) -> str:
     """What one comparison of the baseline's prediction with the measurement says."""
-    verdict = "within its uncertainty" if check.passed else "beyond its uncertainty"
     return (
         f"{CHECK_NAMES[check.name]} ({check.side}, {check.capture}): {check.rms_relative_percent:.2g} % rms off the "
-        f"baseline's prediction, {verdict}."
+        f"baseline's prediction, {_within(check)}."
     )
