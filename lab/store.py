@@ -153,7 +153,6 @@ class JobRow(Base):
     id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
     kind: Mapped[str] = mapped_column(sa.String(20))
     source: Mapped[str] = mapped_column(sa.Text)
-    options: Mapped[dict[str, Any]]
     state: Mapped[str] = mapped_column(sa.String(20), index=True)
     progress: Mapped[float] = mapped_column(default=0.0)
     message: Mapped[str] = mapped_column(sa.Text, default="")
@@ -855,7 +854,7 @@ def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
 def _chunk(frame: NDArray[np.uint16]) -> bytes:
     """A frame as HDF5's shuffle and gzip filters would leave it; zlib lets other threads run, HDF5's own filters don't."""
     shuffled = np.ascontiguousarray(frame.astype("<u2").view(np.uint8).reshape(-1, 2).T)
-    return zlib.compress(shuffled, _GZIP_LEVEL)
+    return zlib.compress(shuffled.tobytes(), _GZIP_LEVEL)
 
 
 def _pack(
