@@ -151,13 +151,14 @@ def edge_profile(
     series = np.zeros(samples // 2 + 1, complex)
     series[1:count] = transfer / (2j * np.pi * np.arange(1, count))
     profile = fft.irfft(series, samples) * samples
-    # The constant term of the line spread function makes a ramp. It is the limit from above: a veil wider than the period,
-    # a spike at zero frequency, lies even on both sides.
+    # The term at zero frequency is half of (2 d Re H + Im H' / pi) / period. Both are limits from above: a veil wider than
+    # the period, a spike at zero frequency, lies even on both sides.
     ramp = float(np.real(2.0 * transfer[0] - transfer[1]))
+    level = 0.5 + float(np.imag(transfer[0])) / (2.0 * np.pi)
     step = period / samples
     wing = int(np.ceil(reach / step)) + 4
     at = np.arange(-wing, wing + 1)
-    table = CubicSpline(at * step, profile[at] + ramp * (at * step / period) + 0.5)
+    table = CubicSpline(at * step, profile[at] + ramp * (at * step / period) + level)
     return np.asarray(table(distance_px))
 
 
@@ -195,12 +196,14 @@ def kernel(
 
 
 def expected_electrons(
-    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 2, margin_px: int = 32
+    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> FloatArray:
     """Mean electrons (rows, cols) of every pixel, light and dark current, after the effects on charge; not yet clipped.
 
     Scenes that aren't uniform or straight edges are drawn by area on `oversample` x `oversample` samples a pixel, with
-    `margin_px` around the frame, and blurred channel by channel with the channel's transfer function.
+    `margin_px` around the frame, and blurred channel by channel with the channel's transfer function. The light beyond the
+    margin is taken as the scene's other end. On random cells of 2 px at f/4 and 3 um pixels, 2, 3, 4, 6 samples a pixel leave
+    0.6, 0.2, 0.1, 0.05 % of white rms.
     """
     collected_s, source = exposure.exposure_s, 1.0
     for effect in effects:
@@ -219,7 +222,7 @@ def dark_electrons(camera: CameraModel, exposure: Exposure) -> float:
 
 
 def moments(
-    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 2, margin_px: int = 32
+    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> tuple[FloatArray, FloatArray]:
     """`expected` (DN) and `variance` (DN^2) at the price of one."""
     electrons = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
@@ -227,14 +230,14 @@ def moments(
 
 
 def expected(
-    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 2, margin_px: int = 32
+    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> FloatArray:
     """Mean frame (rows, cols) in DN, not rounded, of a camera whose pixels are all alike; clipping is averaged over noise."""
     return moments(camera, exposure, effects, oversample=oversample, margin_px=margin_px)[0]
 
 
 def variance(
-    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 2, margin_px: int = 32
+    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> FloatArray:
     """Temporal variance (rows, cols) in DN^2: shot and read noise, clipping, and 1/12 for rounding."""
     return moments(camera, exposure, effects, oversample=oversample, margin_px=margin_px)[1]
@@ -247,7 +250,7 @@ def sample(
     effects: Sequence[Effect] = (),
     fixed_pattern: FixedPattern | None = None,
     *,
-    oversample: int = 2,
+    oversample: int = 3,
     margin_px: int = 32,
 ) -> NDArray[np.uint16]:
     """One raw frame (rows, cols) drawn from the model. `fixed_pattern` None: pixels that are all alike.

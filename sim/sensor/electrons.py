@@ -125,8 +125,13 @@ def sample_from(
 ) -> NDArray[np.uint16]:
     """One frame: codes (rows, cols) drawn around `expected_electrons` (the mean, of which `dark_electrons` are dark current).
 
-    `fixed_pattern` None stands for pixels that are all alike. Raises ValueError for electrons below 0 or not finite.
+    `fixed_pattern` None stands for pixels that are all alike. Raises ValueError for electrons below 0 or not finite, and for
+    a white level beyond 16 bit.
     """
+    if camera.white_level_dn > 65535:
+        raise ValueError(
+            f"the white level {camera.white_level_dn:g} DN is above the limit of 65535 DN of a 16-bit frame: give the converter's highest code"
+        )
     check_electrons(expected_electrons)
     mean = expected_electrons
     if fixed_pattern is not None:

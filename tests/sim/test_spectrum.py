@@ -103,7 +103,7 @@ def test_lagrange_shares_integrate_polynomials_exactly() -> None:
 
 
 def test_spectra_refuse_disorder_in_words() -> None:
-    with pytest.raises(ValueError, match="500.0 nm follows 600.0 nm; sort"):
+    with pytest.raises(ValueError, match=r"500\.0 nm follows 600\.0 nm; sort"):
         Spectrum.of([600.0, 500.0], [1.0, 1.0])
     with pytest.raises(ValueError, match="ascending"):
         Spectrum.of([400.0, 500.0], [1.0, 1.0]).resampled([500.0, 450.0])

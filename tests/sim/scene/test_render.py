@@ -81,7 +81,7 @@ def test_cells_beyond_what_can_be_drawn_are_refused() -> None:
     warp = Warp.from_corners(4000, 4000, [(0, 0), (0, 10), (10, 10), (10, 0)])
     with pytest.raises(ValueError, match="use larger cells"):
         cells(np.zeros((4000, 4000)), warp, Grid(10, 10, 1, 0), 0.0)
-    with pytest.raises(ValueError, match="outside the limits 0..1"):
+    with pytest.raises(ValueError, match=r"outside the limits 0\.\.1"):
         cells(np.full((2, 2), 255.0), Warp.from_corners(2, 2, [(0, 0), (0, 9), (9, 9), (9, 0)]), Grid(10, 10), 0.0)
 
 

@@ -123,6 +123,6 @@ def test_impossible_electrons_are_named(colour_camera: CameraModel, bad: float) 
         lambda: sample_from(electrons, colour_camera, np.random.default_rng(1)),
     ):
         with pytest.raises(
-            ValueError, match="mean electrons of a pixel are .* e, below the limit of 0 e or not finite: check"
+            ValueError, match=r"mean electrons of a pixel are .* e, below the limit of 0 e or not finite: check"
         ):
             call()

@@ -1,0 +1,151 @@
+"""The numbers an ISETCam user gets, where ISETCam is right (its README says where it isn't)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect
+from sim.forward import electron_rate, optical_transfer
+from sim.sensor.electrons import FixedPattern, dn_moments, sample_from
+from sim.spectrum import FloatArray, Spectrum
+
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference" / "isetcam"
+pytestmark = pytest.mark.skipif(
+    not REFERENCE.is_dir(), reason="the ISETCam reference numbers are not beside the repository"
+)
+
+
+def table(name: str) -> np.ndarray:
+    return np.genfromtxt(REFERENCE / name, delimiter=",", names=True, dtype=None, encoding="utf-8")
+
+
+def lines(wavelength_nm: FloatArray, photons: FloatArray) -> Spectrum:
+    """ISETCam sums bins of 10 nm: photons (per nm) become lines of 2 pm that hold a bin's energy."""
+    w = np.asarray(wavelength_nm, float)
+    energy = np.asarray(photons, float) * 10.0 * 1.986445857148928e-16 / w
+    knots = (w[:, None] + np.array([-0.001, 0.0, 0.001])).ravel()
+    return Spectrum.of(knots, (energy[:, None] / 0.001 * np.array([0.0, 1.0, 0.0])).ravel())
+
+
+def curve(wavelength_nm: FloatArray, value: FloatArray) -> Spectrum:
+    """A sensitivity that holds 1 nm beyond its ends, so that the outermost lines are whole."""
+    w = [wavelength_nm[0] - 1.0, *wavelength_nm, wavelength_nm[-1] + 1.0]
+    return Spectrum.of(w, [value[0], *value, value[-1]])
+
+
+def camera(f_number: float, fill_factor: float, efficiency: dict[str, Spectrum], **changes: object) -> CameraModel:
+    """DN are thousandths of an electron, so that rounding is nothing, and clip at 10000 e as 1 V does."""
+    values = {
+        "rows": 128, "cols": 128, "pixel_pitch_um": 2.0, "fill_factor": fill_factor,
+        "cfa": "MONO" if "Y" in efficiency else "RGGB", "bit_depth": 16, "black_level_dn": 0.0, "white_level_dn": 1e7,
+        "conversion_gain_dn_per_e": 1000.0, "full_well_e": 1e9, "read_noise_e": 0.0, "dark_current_e_per_s": 0.0,
+        "dsnu_e": 0.0, "prnu_percent": 0.0, "quantum_efficiency": efficiency,
+        "lens": Lens(f_number=f_number, focal_length_mm=4.0),
+    }  # fmt: skip
+    return CameraModel.model_validate(values | changes)
+
+
+def test_radiometry_of_24_patches() -> None:
+    m = loadmat(REFERENCE / "radiometry.mat")
+    w = m["wave"].ravel().astype(float)
+    chain = m["sqe"] * m["trans"].ravel()[:, None]
+    model = camera(
+        float(m["fN"].item()),
+        float(m["fillfactor"].item()),
+        {channel: curve(w, chain[:, k]) for k, channel in enumerate("RGB")},
+    )
+    assert m["pix_w"].item() == pytest.approx(2e-6)
+    for patch, wanted in zip(m["patch_photons"], m["pm_volts"], strict=True):
+        light = lines(w, patch)
+        for channel, volts in zip("RGB", wanted, strict=True):
+            rate = electron_rate(model, channel, light, magnification=float(m["m"].item()))
+            # The closed form itself agrees with ISETCam's volts to 6e-7.
+            assert rate * m["texp"].item() * m["cg"].item() == pytest.approx(volts, rel=1e-5)
+
+
+def test_electrons_of_24_patches_behind_a_diffracting_lens() -> None:
+    spectra, patches = table("macbeth_spectra.csv"), table("macbeth_diffraction_patches.csv")
+    w = spectra["wave_nm"].astype(float)
+    curves = {c: curve(w, spectra[f"{c}_filter"] * spectra["pd_qe"] * spectra["ir_filter"]) for c in "RGB"}
+    model = camera(4.0, 0.75, curves, lens=Lens(f_number=4.0, focal_length_mm=4.0))
+    for index, patch in enumerate(patches):
+        light = lines(w, spectra["illum_photons"] * spectra[f"refl_{index + 1:02d}"])
+        for channel, name in [("R", "R_e"), ("G", "Gr_e"), ("B", "B_e")]:
+            electrons = electron_rate(model, channel, light, magnification=0.00334448) * 0.1
+            # Their lens blurs the 58 px patches into each other: an edge has tails of N lambda / (pi^2 d), 0.4 % of the step at
+            # 29 px of 2 um, and a patch has four edges to neighbours of its own level or another: half of their sum is allowed for.
+            assert patch[name] == pytest.approx(electrons, abs=0.008 * np.max(patches[name]))
+
+
+@pytest.mark.parametrize("row", table("noise.csv") if REFERENCE.is_dir() else [], ids=lambda r: f"{r[0]}-{r[1]}-{r[3]}")
+def test_noise(row: np.void) -> None:
+    inputs = loadmat(REFERENCE / "noise_inputs.mat")
+    field, config, exposure_s = str(row["field"]), str(row["config"]), float(row["exp_s"])
+    on = {name for name in ("read", "dark", "dsnu", "prnu") if config in (f"{name}_only", "all")}
+    qe = Spectrum.of([300.0, 900.0], [1.0, 1.0])
+    volt = float(inputs["cg"].item())
+    model = camera(
+        4.0,
+        0.75,
+        {"Y": qe},
+        read_noise_e=float(inputs["rd"].item()) / volt if "read" in on else 0.0,
+        dark_current_e_per_s=float(inputs["dk"].item()) / volt if "dark" in on else 0.0,
+        dsnu_e=float(inputs["ds"].item()) / volt if "dsnu" in on else 0.0,
+        prnu_percent=float(inputs["pr"].item()) if "prnu" in on else 0.0,
+    )
+    light = float(inputs["rate"].item()) * exposure_s if field == "flat" else 0.0
+    dark = model.dark_current_e_per_s * exposure_s
+    electrons = np.full((128, 128), light + dark)
+    # What can't be negative is read above a black level, so that the normal law's lower half isn't clipped.
+    black = 0.0 if "read" in on else 100.0
+    model = model.model_copy(update={"black_level_dn": 1000.0 * black, "white_level_dn": 1e7 + 1000.0 * black})
+    mean, variance = dn_moments(electrons, model)
+    mean, variance = mean / 1000.0 - black, variance / 1e6
+    spatial = (light * model.prnu_percent / 100) ** 2 + model.dsnu_e**2
+    unclipped = light > 100 and exposure_s < 0.1
+    if unclipped:
+        assert mean[0, 0] == pytest.approx(row["pred_mean_e"], rel=1e-6)
+        # ISETCam's prediction carries the PRNU on the variance of the noise too: (1 + 0.02^2) var.
+        assert variance[0, 0] * (1 + (model.prnu_percent / 100) ** 2) + spatial == pytest.approx(
+            row["pred_var_e2"], rel=3e-3
+        )
+        if not on & {"prnu", "all"}:
+            assert variance[0, 0] + spatial == pytest.approx(row["pred_var_e2"], rel=1e-6)
+    # ISETCam measured 128 x 128 x 8 values: clipped at 0 V and 1 V, as `dn_moments` says. Four standard errors; patterns
+    # (128 x 128 values of them) have their own.
+    n, pixels = 128 * 128 * 8, 128 * 128
+    digital = model.model_copy(update={"conversion_gain_dn_per_e": 6.0, "black_level_dn": 0.0, "white_level_dn": 6e4})
+    if not on & {"dsnu", "prnu"}:
+        assert row["mean_e"] == pytest.approx(mean[0, 0], abs=4 * np.sqrt(variance[0, 0] / n) + 1e-6)
+        assert row["var_e2"] == pytest.approx(variance[0, 0], rel=4 * np.sqrt(4 / n), abs=1e-6)
+    elif unclipped:
+        pattern = FixedPattern.draw(digital, np.random.default_rng(1))
+        frame = sample_from(electrons, digital, np.random.default_rng(2), pattern, dark_electrons=dark) / 6.0
+        assert frame.mean() == pytest.approx(row["mean_e"], abs=6 * np.sqrt(row["pred_var_e2"] / pixels))
+        assert frame.var() == pytest.approx(row["var_e2"], rel=6 * np.sqrt(2 / pixels))
+
+
+class Birefringent(Effect):
+    """Two copies on each axis, 1 um to either side, as ISETCam's filter of d = 1 um makes them."""
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray:
+        return np.cos(2 * np.pi * fx_cy_per_um) * np.cos(2 * np.pi * fy_cy_per_um)
+
+
+def test_analytic_contrast_with_and_without_a_birefringent_filter() -> None:
+    m = table("mtf.csv")
+    model = camera(4.0, 1.0, {"Y": Spectrum.of([300.0, 900.0], [1.0, 1.0])})
+    line = Spectrum.of([549.999, 550.0, 550.001], [0.0, 1.0, 0.0])
+    f = m["freq_cy_mm"] * 1e-3 * 2.0
+    np.testing.assert_allclose(optical_transfer(model, "Y", line, f, 0 * f), m["analytic_noaa"], atol=1e-4)
+    filtered = np.abs(optical_transfer(model, "Y", line, f, 0 * f, (Birefringent(),)))
+    column = next(name for name in m.dtype.names if re.match("ana_gauss1_aa", name))
+    np.testing.assert_allclose(filtered, m[column], atol=1e-4)
