@@ -9,27 +9,32 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import subprocess
 import sys
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 from pydantic import BaseModel, ValidationError
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from lab import recording
 from lab.errors import DeviceError, InputError
 from lab.fit import Progress as Advance
 from lab.fit import fit_recording_set
-from lab.recording import RecordingSet
+from lab.recording import RecordingError, RecordingSet
 from lab.report.figures import by_side, measured, stereo_figures
 from lab.results import DiagnosisResult, FitResult, Skipped, ValidationResult
+
+if TYPE_CHECKING:
+    from lab.store import Store
 
 EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
 
@@ -46,6 +51,15 @@ err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 Source = Annotated[str, typer.Argument(metavar="SOURCE", help="a recording set's folder, or a stored session's id")]
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="write the result as JSON ('-': to stdout)")]
+StationFile = Annotated[
+    Path | None, typer.Option("--station", metavar="FILE", help="the station file; without one, the mock bench")
+]
+Quick = Annotated[bool, typer.Option("--quick", help="fewer exposures and repeats")]
+DataFolder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
+]
+Resume = Annotated[str, typer.Option(metavar="SESSION", help="go on with this session")]
+BENCH_START_S, BENCH_END_S = 60.0, 10.0
 FitFile = Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="a fit's JSON, in place of fitting again")]
 Result = TypeVar("Result", bound=BaseModel)
 
@@ -58,16 +72,49 @@ def _warn(lines: tuple[str, ...]) -> None:
         err.print(f"[yellow]calibench: warning:[/] {escape(line)}")
 
 
+def _store(folder: Path | None = None) -> Store:
+    """The data folder: `folder`, else what CALIBENCH_DATA says; made if it isn't there."""
+    from lab.store import Settings, Store
+
+    settings = Settings() if folder is None else Settings(data=folder)
+    return Store.open(settings)
+
+
+def _stored_recordings(store: Store, session_id: str) -> RecordingSet:
+    """A session as a recording set, looked through like a folder."""
+    recordings = store.recording_set(session_id)
+    if not recordings.captures():
+        raise InputError(f"session {session_id}: nothing was captured yet; resume it with `calibench capture --resume`")
+    problems, warnings = recording.inspect(recordings)
+    if problems:
+        raise RecordingError(problems)
+    recordings.warnings = tuple(warnings)
+    return recordings
+
+
 def _recordings(source: str) -> RecordingSet:
     """The recording set in a folder, or that of a stored session; its warnings go to stderr."""
+    from lab.store import Settings
+
     if Path(source).exists() or os.sep in source:
         recordings = recording.read(source)
+    elif not Settings().data.is_dir():
+        raise InputError(f"{source}: no such folder, and there are no sessions in {Settings().data}; correct it")
     else:
-        from lab.store import Store
-
-        recordings = Store.open().recordings(source)
+        store = _store()
+        if not store.has_session(source):
+            raise InputError(f"{source}: neither a recording set's folder nor a session in {store.root}; correct it")
+        recordings = _stored_recordings(store, source)
     _warn(recordings.warnings)
     return recordings
+
+
+def _instruments(source: str) -> dict[str, dict[str, str]]:
+    """What the instruments of a stored session said of themselves; nothing for a folder."""
+    if Path(source).exists():
+        return {}
+    runs = _store().runs(source)
+    return runs[-1].instruments if runs else {}
 
 
 @contextlib.contextmanager
@@ -269,6 +316,171 @@ def import_(
     _warn(recordings.warnings)
     folder = recording.write(recordings, out_folder)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
+
+
+@app.command()
+def report(
+    source: Source,
+    out_file: Annotated[Path, typer.Option("--out", metavar="FILE", help="the page to write")] = Path("report.html"),
+    fit_file: FitFile = None,
+) -> None:
+    """Fit, validate, diagnose, and write one page with pictures."""
+    from lab.report import provenance_of, write_report
+
+    _check_writable(out_file)
+    recordings = _recordings(source)
+    fitted = _fitted(recordings, fit_file)
+    validation, diagnosis = _validated(recordings, fitted), _diagnosed(recordings, fitted)
+    provenance = provenance_of(recordings, _instruments(source))
+    out.print(f"report: {write_report(out_file, recordings, fitted, validation, diagnosis, provenance)}")
+
+
+# --- commands on stations and sessions ---------------------------------------------------------------------------------
+
+
+@app.command()
+def capture(
+    station: StationFile = None,
+    quick: Quick = False,
+    out_folder: DataFolder = None,
+    name: Annotated[str, typer.Option(help="what the session is called")] = "",
+    resume: Resume = "",
+) -> None:
+    """Run the sequences of a station and keep what was captured. Without a station file: on the mock bench."""
+    store = _store(out_folder)
+    session_id = _captured(store, station, quick, name, resume)
+    out.print(f"session: {session_id}")
+
+
+@app.command()
+def run(
+    station: StationFile = None,
+    quick: Quick = False,
+    out_folder: DataFolder = None,
+    name: Annotated[str, typer.Option(help="what the session is called")] = "",
+    resume: Resume = "",
+) -> None:
+    """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench."""
+    from lab.report import provenance_of, write_report
+
+    store = _store(out_folder)
+    session_id = _captured(store, station, quick, name, resume)
+    recordings = _stored_recordings(store, session_id)
+    _warn(recordings.warnings)
+    fitted = _fitted(recordings, None)
+    validation = _validated(recordings, fitted)
+    diagnosis = _diagnosed(recordings, fitted)
+    folder = store.folder(session_id)
+    for kind, result in (("fit", fitted), ("validate", validation), ("diagnose", diagnosis)):
+        store.add_result(kind, session_id, result.model_dump(mode="json"))
+        _write_json(result, folder / f"{kind}.json")
+    runs = store.runs(session_id)
+    provenance = provenance_of(recordings, runs[-1].instruments if runs else {})
+    page = write_report(folder / "report.html", recordings, fitted, validation, diagnosis, provenance)
+    _print_fit(recordings, fitted)
+    _print_validation(validation)
+    _print_diagnosis(diagnosis)
+    out.print(f"session: {session_id}")
+    out.print(f"report: {page}")
+
+
+@app.command()
+def sessions(out_folder: DataFolder = None) -> None:
+    """List the stored sessions."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("session", "name", "created", "state", "steps done"):
+        table.add_column(heading)
+    for info in _store(out_folder).sessions():
+        created = f"{info.created:%Y-%m-%d %H:%M}"
+        table.add_row(info.id, escape(info.name), created, info.state, f"{info.steps_done} of {info.steps}")
+    out.print(table)
+
+
+@app.command()
+def export(
+    session: Annotated[str, typer.Argument(metavar="SESSION", help="a stored session's id")],
+    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="the recording set to write")],
+) -> None:
+    """Write a stored session as a recording set."""
+    recordings = _stored_recordings(_store(), session)
+    _warn(recordings.warnings)
+    folder = recording.write(recordings, to)
+    out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
+
+
+def _captured(store: Store, station_file: Path | None, quick: bool, name: str, resume: str) -> str:
+    """Run a new session, or what is left of the session `resume`; its id. On the mock bench where there is no station."""
+    from lab.session import CaptureSession
+    from lab.session import Progress as Standing
+    from lab.station import read_station
+
+    if resume and store.session(resume).state == "finished":
+        return resume
+    with contextlib.ExitStack() as stack:
+        file = station_file or stack.enter_context(_mock_bench())
+        station = read_station(file)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        left = TextColumn("{task.fields[left]}")
+        bar = stack.enter_context(Progress(*columns, left, console=err, transient=True, disable=not err.is_terminal))
+        task = bar.add_task("capture", total=None, left="")
+
+        def tell(standing: Standing) -> None:
+            left_s = "" if standing.left_s is None else f"about {standing.left_s:.0f} s left"
+            what = escape(f"{standing.sequence} {standing.what}".strip())
+            bar.update(task, description=what, total=standing.total, completed=standing.done, left=left_s)
+            if standing.remark:
+                err.print(f"calibench: {escape(standing.remark)}")
+
+        if resume:
+            session = CaptureSession(store, resume, on_progress=tell)
+            session.station = station  # the instruments may have moved to other addresses
+        else:
+            session = CaptureSession.start(store, station, quick=quick, name=name, on_progress=tell)
+        try:
+            session.run()
+        except KeyboardInterrupt:
+            err.print(f"calibench: go on with `calibench capture --resume {session.id}`")
+            raise
+    return session.id
+
+
+@contextlib.contextmanager
+def _mock_bench() -> Iterator[Path]:
+    """Start the mock bench as a process of its own, and give its station file; it ends with the block, or with us."""
+    with tempfile.TemporaryDirectory(prefix="calibench-bench-") as folder:
+        file = Path(folder) / "station.toml"
+        command = [sys.executable, "-m", "lab.cli", "bench", "--station", str(file), "--with-parent"]
+        # Of its own session: Ctrl-C is for us, and the bench has to be there while the shutter closes.
+        bench = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
+        try:
+            _await_ready(bench)
+            yield file
+        finally:
+            assert bench.stdin is not None
+            bench.stdin.close()
+            try:
+                bench.wait(BENCH_END_S)
+            except subprocess.TimeoutExpired:
+                bench.kill()
+                bench.wait()
+
+
+def _await_ready(bench: subprocess.Popen[str]) -> None:
+    """Wait until the bench says that it is ready; what it says afterwards is read and dropped."""
+    ready = threading.Event()
+
+    def listen() -> None:
+        assert bench.stdout is not None
+        for line in bench.stdout:
+            if line.strip() == "ready":
+                ready.set()
+        ready.set()
+
+    threading.Thread(target=listen, daemon=True).start()
+    if not ready.wait(BENCH_START_S) or bench.poll() is not None:
+        raise DeviceError("mock bench: it doesn't start; see what `calibench bench` says")
 
 
 # --- entry -------------------------------------------------------------------------------------------------------------
