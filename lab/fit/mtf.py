@@ -28,7 +28,11 @@ from scipy import ndimage, sparse
 from scipy.interpolate import BSpline
 
 from lab.errors import NotDetermined
+from lab.recording import RecordingSet, SlantedEdge
 from lab.results import MtfCurve, NoiseFit
+from sim.camera import Cfa, Side
+from sim.sensor.mosaic import phases
+from sim.sensor.mosaic import step as period
 
 Array = NDArray[np.floating[Any]]
 
@@ -688,24 +692,21 @@ def _angle_deg_std(steepness: Array, foot: Array, weight: Array, slope: float, h
 
 
 def region_planes(
-    frame: NDArray[np.generic], region: tuple[int, int, int, int], cfa: str, channel: str, black_level_dn: float
+    frame: NDArray[np.generic], region: tuple[int, int, int, int], cfa: Cfa, channel: str, black_level_dn: float
 ) -> list[Plane]:
     """The channel's planes (two green ones) within `region` of a raw frame, DN above black, at their sensor coordinates."""
     row0, col0, row1, col1 = region
-    if cfa == "MONO":
-        return [Plane(frame[row0:row1, col0:col1].astype(float) - black_level_dn, row0, col0, 1)]
+    step = period(cfa)
     found = []
-    for phase, name in enumerate(cfa):
-        if name == channel:
-            r = row0 + (phase // 2 - row0) % 2
-            c = col0 + (phase % 2 - col0) % 2
-            found.append(Plane(frame[r:row1:2, c:col1:2].astype(float) - black_level_dn, r, c, 2))
+    for first_row, first_col in phases(cfa)[channel]:
+        r, c = row0 + (first_row - row0) % step, col0 + (first_col - col0) % step
+        found.append(Plane(frame[r:row1:step, c:col1:step].astype(float) - black_level_dn, r, c, step))
     return found
 
 
 def measure_edge(
-    recordings: Any,
-    captures: Sequence[Any],
+    recordings: RecordingSet,
+    captures: Sequence[SlantedEdge],
     channel: str,
     noise: NoiseFit | None = None,
     frequency_cy_per_px: ArrayLike | None = None,
@@ -721,9 +722,8 @@ def measure_edge(
     if black is None:
         raise NotDetermined("mtf", "the black level is neither fitted nor stated: add dark frames")
     frames = [recordings.frame(c) for c in captures]
-    white = camera.white_level_dn if camera.white_level_dn is not None else 2.0**camera.bit_depth - 1.0
     row0, col0, row1, col1 = first.region
-    saturated = float(np.mean(frames[0][row0:row1, col0:col1] >= white))
+    saturated = float(np.mean(frames[0][row0:row1, col0:col1] >= camera.saturation_dn))
     if saturated > 0.002:
         raise NotDetermined("mtf", f"{first.id}: {100 * saturated:.1f} % of the region is saturated; expose it shorter")
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
@@ -732,7 +732,7 @@ def measure_edge(
     return planes_mtf(planes, frequency)
 
 
-def fit_mtf(recordings: Any, side: str, noise: NoiseFit | None = None) -> tuple[MtfCurve, ...]:
+def fit_mtf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> tuple[MtfCurve, ...]:
     """One MTF curve for every slanted-edge capture of `side` and every channel (R, G, B; or Y), captures in their order.
 
     The black level is `noise`'s where it was fitted, else the stated one. The angle is given in the turn (of 180 deg) next to

@@ -16,7 +16,7 @@ answer i px down and j px right of light spread over one pixel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +40,8 @@ LENGTHS_PX = (0.0, 0.6, 1.0, 1.6, 2.5)  # of the prior's correlation; 0: none
 STRENGTHS = (0.5, 1.0, 2.0, 4.0)  # of the prior, relative to the kernel's maximum
 FAR_STD = 0.1  # of the prior of the light from beyond the support
 REGISTRATION_STEPS = 3
+GRID_STD = 5e-4  # of the kernel's maximum: what five taps on half pixels leave of a diffraction-limited kernel
+SHIFT_STD_PX = 0.005  # of the corners' common place, beside their scatter: neighbouring squares of unequal shading
 RIM_SHARE = 0.04  # of a kernel in the outermost pixels, above which the support is doubled
 ROUNDS = 3  # envelope -> kernel -> envelope; more change less than 0.1 dB
 
@@ -162,7 +164,7 @@ def solve_kernel(
     residual = max(
         normal.power - 2.0 * float(np.vdot(normal.right, found)) + float(np.vdot(found, normal.gram @ found)), 0.0
     )
-    freedom = max(normal.count - np.count_nonzero(found > 0.0), 1)
+    freedom = max(normal.count - int(np.count_nonzero(found > 0.0)), 1)
     noise = float(np.sqrt(residual / freedom)) if noise_std is None else float(noise_std)
     noise = max(noise, 1e-9 * float(np.sqrt(normal.power / normal.count)))
     information, weighted = normal.gram / noise**2, normal.right / noise**2
@@ -371,29 +373,30 @@ def _rim_share(kernel: Array) -> float:
 
 
 def _on_pixels(fine: Array) -> Array:
-    """From half pixels to pixels: light over a whole pixel is light over half ones, smoothed by (1/8, 3/4, 1/8); that has the
-    pixel's variance, 1/12 = 1/48 + 1/16 px^2."""
+    """From half pixels to pixels, sum 1."""
     matrix = _pixel_matrix(len(fine))
     kernel = matrix @ fine @ matrix.T
     return np.asarray(kernel / kernel.sum())
 
 
 def _pixel_matrix(size: int) -> Array:
+    """One axis: light over a whole pixel is light over two half ones, a quarter pixel to either side: cos(pi f / 2)."""
     half = (size // 2 - 1) // 2
-    matrix = np.zeros((2 * half + 1, size))
+    taps = _taps(lambda f: np.cos(0.5 * np.pi * f), 0.8)
+    matrix = np.zeros((2 * half + 1, size + 4))
     for row in range(2 * half + 1):
-        middle = size // 2 + 2 * (row - half)
-        matrix[row, middle - 1 : middle + 2] = 0.125, 0.75, 0.125
-    return matrix
+        middle = size // 2 + 2 + 2 * (row - half)
+        matrix[row, middle - 2 : middle + 3] = taps
+    return matrix[:, 2:-2]
 
 
-def _sharpening() -> Array:
-    """Five taps on half pixels that take out the two half-pixel squares of drawing and of the kernel's grid, up to 0.6 cy/px."""
-    frequency = np.linspace(0.0, 0.6, 61)
+def _taps(response: Callable[[Array], Array], highest_cy_per_px: float) -> Array:
+    """Five symmetric taps on half pixels with a given response, 1 at 0, by least squares up to `highest_cy_per_px`."""
+    frequency = np.linspace(0.0, highest_cy_per_px, 61)
     terms = np.column_stack([np.ones_like(frequency), 2 * np.cos(np.pi * frequency), 2 * np.cos(2 * np.pi * frequency)])
     weight = np.where(frequency == 0.0, 1e3, 1.0)
-    taps = np.linalg.lstsq(terms * weight[:, None], weight / np.sinc(0.5 * frequency) ** 2, rcond=None)[0]
-    return taps[[2, 1, 0, 1, 2]] / (taps[0] + 2 * taps[1] + 2 * taps[2])
+    taps = np.linalg.lstsq(terms * weight[:, None], weight * response(frequency), rcond=None)[0]
+    return np.asarray(taps[[2, 1, 0, 1, 2]] / (taps[0] + 2 * taps[1] + 2 * taps[2]))
 
 
 @dataclass(frozen=True)
@@ -420,7 +423,8 @@ class _Drawn:
         fine_y, fine_x = np.arange(2 * rows) / 2.0, np.arange(2 * cols) / 2.0
         cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(fine_y, fine_x) for k in (0, 1))
         picture = _area_drawn(target, cell_x, cell_y)
-        taps = _sharpening()
+        # The squares of drawing and of the kernel's grid, half a pixel each, are taken out again
+        taps = _taps(lambda f: np.sinc(0.5 * f) ** -2, 0.6)
         for axis in (0, 1):
             picture = ndimage.correlate1d(picture, taps, axis=axis, mode="nearest")
         around = ndimage.gaussian_filter(picture, 2.0 * support_px, mode="nearest", truncate=3.0)
@@ -489,8 +493,14 @@ class _Drawn:
         raw = pixels @ estimate.kernel.ravel()
         total = raw.sum()
         slopes = pixels / total - np.outer(raw, pixels.sum(axis=0)) / total**2
-        covariance = slopes @ estimate.covariance @ slopes.T
         shape = (len(matrix), len(matrix))
+        # Where the pattern lies, as a whole, is the corners' word: an error there shifts the kernel
+        shifts = [
+            np.gradient(np.pad((raw / total).reshape(shape), 1), axis=axis)[1:-1, 1:-1].ravel() for axis in (0, 1)
+        ]
+        shift_std = float(np.hypot(self.warp.corner_std_px, SHIFT_STD_PX))
+        covariance = slopes @ estimate.covariance @ slopes.T + shift_std**2 * sum(np.outer(v, v) for v in shifts)
+        covariance = covariance + (GRID_STD * raw.max() / total) ** 2 * np.eye(len(raw))
         return ScreenKernel(
             channel=channel,
             kernel=(raw / total).reshape(shape),

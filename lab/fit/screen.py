@@ -11,7 +11,7 @@ Points are (x, y), x along columns; a cell (i, j) of the target covers j..j+1 by
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -38,6 +38,7 @@ class ScreenWarp:
     centre: Array
     scale: float
     corner_rms_px: float
+    corner_std_px: float  # of their mean
 
     def basis(self, points: Array) -> Array:
         """Polynomial terms at `points` (n, 2): (terms, n); the first is constant."""
@@ -51,7 +52,7 @@ class ScreenWarp:
 
     def displaced(self, change: Array) -> ScreenWarp:
         """With `change` (2, terms) added to the displacement."""
-        return ScreenWarp(self.homography, self.displacement + change, self.centre, self.scale, self.corner_rms_px)
+        return replace(self, displacement=self.displacement + change)
 
 
 def register(
@@ -214,7 +215,7 @@ def _fitted_warp(points: Array, cells: Array) -> ScreenWarp:
     points, cells = points[used], cells[used]
     homography, _ = cv2.findHomography(points, cells, 0)
     warp = ScreenWarp(
-        homography, np.zeros((2, 10)), points.mean(axis=0), float(np.ptp(points, axis=0).max() / 2.0), 0.0
+        homography, np.zeros((2, 10)), points.mean(axis=0), float(np.ptp(points, axis=0).max() / 2.0), 0.0, 0.0
     )
     back = np.linalg.inv(homography)
     expected = cv2.perspectiveTransform(cells[:, None, :].astype(np.float64), back)[:, 0]
@@ -229,4 +230,5 @@ def _fitted_warp(points: Array, cells: Array) -> ScreenWarp:
         left = np.linalg.norm(gap - (displacement @ basis).T, axis=1)
         rms = float(np.sqrt(np.mean(left[kept] ** 2)))
         kept = left < 5.0 * rms / np.sqrt(2.0) + 1e-6
-    return ScreenWarp(homography, displacement, warp.centre, warp.scale, rms)
+    std = rms / float(np.sqrt(2.0 * max(int(kept.sum()) - terms, 1)))
+    return ScreenWarp(homography, displacement, warp.centre, warp.scale, rms, std)

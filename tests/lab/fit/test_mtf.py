@@ -166,7 +166,7 @@ def test_takes_less_than_50_ms_a_region():
 
 
 def recordings(frames, captures, cfa="RGGB"):
-    camera = SimpleNamespace(cfa=cfa, black_level_dn=64.0, white_level_dn=4095.0, bit_depth=12)
+    camera = SimpleNamespace(cfa=cfa, black_level_dn=64.0, saturation_dn=4095.0)
     return SimpleNamespace(
         camera=lambda side: camera,
         captures=lambda kind=None, side=None: captures,
