@@ -132,47 +132,75 @@ def sample_from(
         raise ValueError(
             f"the white level {camera.white_level_dn:g} DN is above the limit of 65535 DN of a 16-bit frame: give the converter's highest code"
         )
-    check_electrons(expected_electrons)
-    mean = expected_electrons
-    if fixed_pattern is not None:
-        mean = mean + (mean - dark_electrons) * fixed_pattern.prnu
-        np.maximum(mean, 0.0, out=mean)
+    electrons = np.asarray(expected_electrons, float)
+    check_electrons(electrons)
+    frame = np.empty(electrons.shape, np.uint16)
+    rows = max(1, 32_768 // max(1, electrons.shape[-1]))  # strips that stay in the processor's cache
+    for start in range(0, len(electrons), rows):
+        strip = slice(start, start + rows)
+        mean = electrons[strip].astype(np.float32)
+        if fixed_pattern is not None:
+            mean += (mean - np.float32(dark_electrons)) * fixed_pattern.prnu[strip].astype(np.float32)
+            np.maximum(mean, np.float32(0.0), out=mean)
+        charge = _read_charge(mean, camera, rng, read_out)
+        if fixed_pattern is not None:
+            charge += fixed_pattern.dsnu_e[strip].astype(np.float32)
+        charge *= np.float32(gain_dn_per_e(camera, gain_db))
+        charge += np.float32(camera.black_level_dn + read_out.offset_dn)
+        np.rint(charge, out=charge)
+        np.clip(charge, np.float32(0.0), np.float32(camera.white_level_dn), out=charge)
+        frame[strip] = charge
+    return frame
+
+
+Float32Array = NDArray[np.float32]
+
+
+def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generator, read_out: ReadOut) -> Float32Array:
+    """Electrons as they are read: shot noise, full well, response and read noise."""
+    highest = float(np.max(mean, initial=0.0))
+    plain = read_out.response is None and read_out.noise_e2 is None
+    if plain and np.min(mean) >= MANY_ELECTRONS and highest + 8.0 * np.sqrt(highest) < camera.full_well_e:
+        # Nothing comes between shot and read noise: one normal variable for both, with the skewness of the sum.
+        return _normal_stand_in(mean, np.float32(camera.read_noise_e) ** 2, rng)
     charge = draw_electrons(mean, rng)
     if read_out.noise_e2 is not None:
-        wanted = np.maximum(read_out.noise_e2(mean, mean), 0.0)
-        charge = mean + (charge - mean) * np.sqrt(wanted / np.maximum(mean, 1e-12))
-    np.minimum(charge, camera.full_well_e, out=charge)
+        wanted = np.maximum(read_out.noise_e2(mean.astype(float), mean.astype(float)), 0.0)
+        charge = (mean + (charge - mean) * np.sqrt(wanted / np.maximum(mean, 1e-12))).astype(np.float32)
+    np.minimum(charge, np.float32(camera.full_well_e), out=charge)
     if read_out.response is not None:
-        charge = read_out.response(charge)
-    if fixed_pattern is not None:
-        charge += fixed_pattern.dsnu_e
+        charge = read_out.response(charge.astype(float)).astype(np.float32)
     if camera.read_noise_e > 0:
         charge += rng.standard_normal(mean.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
-    charge *= gain_dn_per_e(camera, gain_db)
-    charge += camera.black_level_dn + read_out.offset_dn
-    np.rint(charge, out=charge)
-    np.clip(charge, 0.0, camera.white_level_dn, out=charge)
-    return charge.astype(np.uint16)
-
-
-def draw_electrons(mean: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Poisson electrons around `mean` (>= 0), as floats; see `MANY_ELECTRONS` for how large means are drawn."""
-    few = mean < MANY_ELECTRONS
-    if np.all(few):
-        return _draw_few(mean, rng)
-    z = rng.standard_normal(mean.shape, dtype=np.float32)
-    charge = mean + np.sqrt(mean) * z
-    z *= z
-    z -= np.float32(1.0)
-    z *= np.float32(1.0 / 6.0)
-    charge += z
-    if np.any(few):
-        charge[few] = _draw_few(mean[few], rng)
     return charge
 
 
-def _draw_few(mean: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return rng.poisson(mean).astype(float)
+def draw_electrons(mean: Float32Array, rng: np.random.Generator) -> Float32Array:
+    """Poisson electrons around `mean` (>= 0); see `MANY_ELECTRONS` for how large means are drawn."""
+    mean = np.asarray(mean, np.float32)
+    few = mean < MANY_ELECTRONS
+    if np.all(few):
+        return rng.poisson(mean).astype(np.float32)
+    charge = _normal_stand_in(mean, np.float32(0.0), rng)
+    if np.any(few):
+        charge[few] = rng.poisson(mean[few])
+    return charge
+
+
+def _normal_stand_in(mean: Float32Array, read_e2: np.float32, rng: np.random.Generator) -> Float32Array:
+    """mean + s z + (mean / s^2) (z^2 - 1) / 6 with s^2 = mean + read noise squared: the third cumulant is the Poisson's."""
+    z = rng.standard_normal(mean.shape, dtype=np.float32)
+    variance = mean + read_e2
+    charge = np.sqrt(variance)
+    charge *= z
+    charge += mean
+    z *= z
+    z -= np.float32(1.0)
+    if read_e2 > 0:
+        z *= mean / variance
+    z *= np.float32(1.0 / 6.0)
+    charge += z
+    return charge
 
 
 def check_electrons(electrons: FloatArray) -> None:
