@@ -1,67 +1,33 @@
-"""Who may do what: keys with scopes, a cookie for the page, checks of Host and Origin.
+"""Who asks, and from where: keys in headers, a cookie for the page, checks of Host and Origin, headers, caps on bodies.
 
-A key is 256 random bits. Only its SHA-256 is stored (a slow hash would protect nothing more at that entropy), compared in
-constant time, sent in the header `Authorization: Bearer KEY`, never in a URL. The page swaps it once for a cookie that
-scripts can't read and other sites can't send.
+A key comes in the header `Authorization: Bearer KEY`, never in a URL. The page swaps it once for a cookie that scripts
+can't read and other sites can't send.
 """
 
 from __future__ import annotations
 
-import hashlib
-import hmac
-import ipaddress
+import asyncio
 import secrets
+import threading
 import time
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from enum import StrEnum
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
-from fastapi import HTTPException, Request, Response
-from starlette.types import ASGIApp, Receive, Scope, Send
+from fastapi import HTTPException, Request, Response, Security
+from fastapi.responses import JSONResponse
+from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from api.keys import Permission, StoredKey, digest, holder
 
 COOKIE = "calibench"
 COOKIE_LIFETIME_S = 12 * 3600.0
 
 
-class Permission(StrEnum):
-    """What a key allows. `operate` and `calibrate` include `read`; `admin` includes all."""
-
-    READ = "read"
-    OPERATE = "operate"
-    CALIBRATE = "calibrate"
-    ADMIN = "admin"
-
-    def allows(self, wanted: Permission) -> bool:
-        """Whether a key of this scope may do what needs `wanted`."""
-        return self is wanted or self is Permission.ADMIN or wanted is Permission.READ
-
-
-def new_key() -> str:
-    """A fresh key: 256 random bits behind a prefix that secret scanners can find."""
-    return "calibench_" + secrets.token_urlsafe(32)
-
-
-def digest(key: str) -> str:
-    """What is stored of a key."""
-    return hashlib.sha256(key.encode()).hexdigest()
-
-
-@dataclass(frozen=True)
-class StoredKey:
-    name: str
-    scope: Permission
-    sha256: str
-
-
-def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
-    """The stored key that `key` is, or None; every stored key is compared, each in constant time."""
-    mine = digest(key)
-    found = None
-    for candidate in stored:
-        if hmac.compare_digest(mine, candidate.sha256):
-            found = candidate
-    return found
+# --- logins of the page ------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -70,55 +36,102 @@ class Logins:
 
     clock: Callable[[], float] = time.monotonic
     _tokens: dict[str, tuple[StoredKey, float]] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def open(self, key: StoredKey) -> str:
         """A token for `key`, good for twelve hours."""
-        token = secrets.token_urlsafe(32)
-        self._tokens[digest(token)] = (key, self.clock() + COOKIE_LIFETIME_S)
+        token, at = secrets.token_urlsafe(32), self.clock()
+        with self._lock:
+            self._tokens = {known: entry for known, entry in self._tokens.items() if at < entry[1]}
+            self._tokens[digest(token)] = (key, at + COOKIE_LIFETIME_S)
         return token
 
     def holder(self, token: str) -> StoredKey | None:
         """The key that opened `token`, or None where it is unknown or has run out."""
-        key, until = self._tokens.get(digest(token), (None, 0.0))
+        with self._lock:
+            key, until = self._tokens.get(digest(token), (None, 0.0))
         return key if key is not None and self.clock() < until else None
 
     def close(self, token: str) -> None:
         """Forget `token`."""
-        self._tokens.pop(digest(token), None)
+        with self._lock:
+            self._tokens.pop(digest(token), None)
+
+
+@dataclass
+class Patience:
+    """Slows guessing down: failed logins are answered one after the other, each after a pause, and only so many wait."""
+
+    pause_s: float = 0.5
+    queue: int = 20
+    _waiting: int = 0
+    _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    async def after_failure(self) -> None:
+        """Wait one's turn and the pause; 429 at once where too many wait already."""
+        if self._waiting >= self.queue:
+            raise HTTPException(429, "too many failed logins; try again in a minute", headers={"Retry-After": "60"})
+        self._waiting += 1
+        try:
+            async with self._turn:
+                await asyncio.sleep(self.pause_s)
+        finally:
+            self._waiting -= 1
 
 
 @dataclass(frozen=True)
 class Gate:
-    """Decides on each request; one per application."""
+    """Finds out who asks; one per application."""
 
     keys: Callable[[], Iterable[StoredKey]]
-    logins: Logins
+    logins: Logins = field(default_factory=Logins)
 
     def identify(self, request: Request) -> StoredKey | None:
         """The key behind a request: from the Authorization header, else from the page's cookie."""
         header = request.headers.get("authorization", "")
         scheme, _, key = header.partition(" ")
-        if scheme.lower() == "bearer" and key:
-            return holder(key.strip(), self.keys())
+        if header:
+            return holder(key.strip(), self.keys()) if scheme.lower() == "bearer" and key.strip() else None
         token = request.cookies.get(COOKIE)
-        return self.logins.holder(token) if token else None
+        login = self.logins.holder(token) if token else None
+        # A key that was taken away takes its logins with it.
+        return login if login is not None and login in self.keys() else None
 
-    def demand(self, wanted: Permission) -> Callable[[Request], Awaitable[StoredKey]]:
-        """A FastAPI dependency: 401 without a valid key, 403 where its scope doesn't reach."""
 
-        async def check(request: Request) -> StoredKey:
-            key = self.identify(request)
-            if key is None:
-                raise HTTPException(
-                    401,
-                    "no valid key: send 'Authorization: Bearer KEY'; `calibench serve` prints one at its first start",
-                    headers={"WWW-Authenticate": "Bearer"},
-                )
-            if not key.scope.allows(wanted):
-                raise HTTPException(403, f"key '{key.name}' has the scope '{key.scope}', this needs '{wanted}'")
-            return key
+_BEARER = HTTPBearer(
+    scheme_name="key",
+    auto_error=False,
+    description="A key: `calibench key create NAME --scope SCOPE` makes one, the first start of the service makes the first.",
+)
+_COOKIE = APIKeyCookie(
+    name=COOKIE, scheme_name="login", auto_error=False, description="What `POST /login` gives the operator's page."
+)
 
-        return check
+
+class Demand:
+    """A dependency of a route: 401 without a valid key, 403 where its scope doesn't reach."""
+
+    def __init__(self, wanted: Permission) -> None:
+        self.wanted = wanted
+
+    def __call__(
+        self,
+        request: Request,
+        bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_BEARER)],
+        cookie: Annotated[str | None, Security(_COOKIE)],
+    ) -> StoredKey:
+        """The key behind the request; the two schemes are parameters only so that OpenAPI tells of them."""
+        gate: Gate = request.app.state.gate
+        key = gate.identify(request)
+        if key is None:
+            raise HTTPException(
+                401,
+                "no valid key: send 'Authorization: Bearer KEY'; `calibench key create NAME` makes one",
+                headers={"WWW-Authenticate": "Bearer"},
+            )
+        if not key.scope.allows(self.wanted):
+            raise HTTPException(403, f"key '{key.name}' has the scope '{key.scope}', this needs '{self.wanted}'")
+        return key
 
 
 def set_cookie(response: Response, token: str, *, secure: bool) -> None:
@@ -128,14 +141,7 @@ def set_cookie(response: Response, token: str, *, secure: bool) -> None:
     )
 
 
-def is_loopback(host: str) -> bool:
-    """Whether an address is this computer's own."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+# --- hosts -------------------------------------------------------------------------------------------------------------
 
 
 class SameHost:
@@ -147,18 +153,119 @@ class SameHost:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let the request pass, or answer 400 (Host) or 403 (Origin)."""
-        if scope["type"] == "http":
-            request = Request(scope)
-            host = urlsplit("//" + request.headers.get("host", "")).hostname or ""
-            if host not in self.hosts:
-                response = Response(f"Host '{host}' is not one of this service's: {', '.join(sorted(self.hosts))}", 400)
-                return await response(scope, receive, send)
-            origin = request.headers.get("origin")
-            if (
-                origin is not None
-                and request.method not in ("GET", "HEAD", "OPTIONS")
-                and urlsplit(origin).netloc != request.headers.get("host")
-            ):
-                return await Response(f"Origin '{origin}' is not this service", 403)(scope, receive, send)
+        if scope["type"] == "http" and (refusal := self._refusal(scope)) is not None:
+            await refusal(scope, receive, send)
+            return
+        if scope["type"] == "websocket":  # there are none
+            return
         await self.app(scope, receive, send)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers = Headers(scope=scope)
+        named = headers.getlist("host")
+        try:
+            host = (urlsplit("//" + named[0]).hostname or "") if len(named) == 1 else ""
+        except ValueError:
+            host = ""
+        if host not in self.hosts:
+            return JSONResponse(
+                {"detail": f"Host {host[:80]!r} is not one of this service's; `calibench serve --allow-host` adds one"},
+                400,
+            )
+        origin = headers.get("origin")
+        if origin is not None and scope["method"] not in ("GET", "HEAD", "OPTIONS"):
+            try:
+                origin_host = urlsplit(origin).netloc.lower()
+            except ValueError:
+                origin_host = ""
+            if origin_host != named[0].lower():
+                return JSONResponse({"detail": f"Origin {origin[:80]!r} is not this service"}, 403)
         return None
+
+
+# --- headers and bodies ------------------------------------------------------------------------------------------------
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+#: A report carries its own scripts and pictures, and needs nothing else: no network, no cookie, an origin of its own.
+REPORT_POLICY = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+class SafeHeaders:
+    """Puts the security headers on every answer; a route that needs another policy sets its own."""
+
+    DEFAULTS: dict[str, str] = {
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+        "Referrer-Policy": "no-referrer",
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Content-Security-Policy": PAGE_POLICY,
+        "Cache-Control": "no-store",
+    }
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer with the headers added."""
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in self.DEFAULTS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self.app(scope, receive, with_headers if scope["type"] == "http" else send)
+
+
+class TooLarge(Exception):
+    """A body beyond the cap, seen while it was read."""
+
+
+class SmallBodies:
+    """Refuses bodies beyond a cap, stated or streamed, before they fill the memory; `except_path` has a cap of its own."""
+
+    def __init__(self, app: ASGIApp, limit_bytes: int, except_path: str) -> None:
+        self.app, self.limit_bytes, self.except_path = app, limit_bytes, except_path
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let the request pass while its body stays small, else answer 413."""
+        if scope["type"] != "http" or (scope["method"] == "POST" and scope["path"] == self.except_path):
+            await self.app(scope, receive, send)
+            return
+        stated = Headers(scope=scope).get("content-length", "0")
+        if not stated.isdigit() or int(stated) > self.limit_bytes:
+            await self._refuse(scope, receive, send)
+            return
+        taken, begun = 0, False
+
+        async def counted() -> Message:
+            nonlocal taken
+            message: Message = await receive()
+            taken += len(message.get("body", b""))
+            if taken > self.limit_bytes:
+                raise TooLarge
+            return message
+
+        async def watched(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self.app(scope, counted, watched)
+        except TooLarge:
+            if begun:
+                raise
+            await self._refuse(scope, receive, send)
+
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send) -> None:
+        answer: dict[str, Any] = {"detail": f"the body is larger than {self.limit_bytes} bytes; send less"}
+        await JSONResponse(answer, 413, headers={"Connection": "close"})(scope, receive, send)

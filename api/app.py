@@ -1,0 +1,196 @@
+"""The REST service and the operator's page. Routes are thin; what they share is a `Service`."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator, Callable, Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, FastAPI, HTTPException, Request, Response
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import HTMLResponse
+from starlette.middleware import Middleware
+
+from api import errors, schemas
+from api.errors import answers
+from api.keys import LOOPBACK, holder, stored_keys
+from api.live import LiveSessions
+from api.routes import jobs, knowledge, recordings, sessions
+from api.schemas import Health, Login, Me
+from api.security import (
+    COOKIE,
+    Gate,
+    Patience,
+    SafeHeaders,
+    SameHost,
+    SmallBodies,
+    set_cookie,
+)
+from api.service import Here, Limits, Service
+from api.upload import Inbox
+from lab.jobs import JobRunner
+from lab.session import Progress
+from lab.station import Drivers, Station, drivers_of
+from lab.store import Store
+
+PREFIX = "/api/v1"
+PAGES = Path(__file__).parent / "pages"
+ASSETS = {
+    "operator.css": "text/css",
+    "operator.js": "text/javascript",
+    "docs.js": "text/javascript",
+}
+TAGS = [
+    {"name": "access", "description": "Keys, logins, health."},
+    {"name": "stations", "description": "Which instruments stand where."},
+    {"name": "sessions", "description": "Capturing: start, follow, pause, resume, abort."},
+    {"name": "captures", "description": "What was captured: pictures and raw frames."},
+    {"name": "recordings", "description": "Recording sets that are sent in."},
+    {"name": "jobs", "description": "Fits, validations, diagnoses, reports."},
+    {"name": "knowledge", "description": "What the models know."},
+]
+open_to_all = APIRouter()
+
+
+# --- what needs no key -------------------------------------------------------------------------------------------------
+
+
+@open_to_all.get("/health", tags=["access"])
+def health() -> Health:
+    """Whether the service is up."""
+    return Health(version=version("calibench"))
+
+
+@open_to_all.post("/login", tags=["access"], responses=answers(401, 403, 413, 422, 429))
+async def login(service: Here, request: Request, asked: Login, response: Response) -> Me:
+    """Swap a key for the page's cookie. Wrong keys are answered slowly."""
+    key = holder(asked.key.strip(), stored_keys(service.store))
+    if key is None:
+        await request.app.state.patience.after_failure()
+        raise HTTPException(401, "this key isn't valid; `calibench key create NAME` makes one")
+    set_cookie(response, service.gate.logins.open(key), secure=request.url.scheme == "https")
+    return Me(name=key.name, scope=key.scope)
+
+
+@open_to_all.post("/logout", status_code=204, tags=["access"])
+def logout(service: Here, request: Request, response: Response) -> None:
+    """Forget the page's login."""
+    service.gate.logins.close(request.cookies.get(COOKIE, ""))
+    response.delete_cookie(COOKIE, path="/")
+
+
+@open_to_all.get("/", include_in_schema=False)
+def operator_page() -> HTMLResponse:
+    """The operator's page."""
+    return HTMLResponse((PAGES / "operator.html").read_text(encoding="utf-8"))
+
+
+@open_to_all.get("/docs", include_in_schema=False)
+def docs_page() -> HTMLResponse:
+    """The routes, read from `/openapi.json`; nothing comes from elsewhere."""
+    return HTMLResponse((PAGES / "docs.html").read_text(encoding="utf-8"))
+
+
+@open_to_all.get("/static/{name}", include_in_schema=False)
+def static_file(name: str) -> Response:
+    """One of the pages' own files; looked up, never joined to a path."""
+    if name not in ASSETS:
+        raise HTTPException(404, "no such file")
+    return Response((PAGES / name).read_bytes(), media_type=ASSETS[name], headers={"Cache-Control": "no-cache"})
+
+
+@open_to_all.get("/favicon.ico", include_in_schema=False)
+def favicon() -> Response:
+    """None; said once, so that browsers don't ask again and again."""
+    return Response(status_code=204, headers={"Cache-Control": "max-age=86400"})
+
+
+# --- the application ---------------------------------------------------------------------------------------------------
+
+
+def create_app(
+    store: Store,
+    *,
+    stations: Path | None = None,
+    hosts: Iterable[str] = (),
+    limits: Limits | None = None,
+    connect: Callable[[Station], Drivers] = drivers_of,
+    jobs_runner: JobRunner | None = None,
+) -> FastAPI:
+    """The application on a store.
+
+    `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
+    the service is reached, beside this computer's own. `connect` makes a station's drivers. At its end, the application
+    stops what runs: sessions are left resumable with shutters closed, jobs are cancelled.
+    """
+    folder = stations or store.root / "stations"
+    folder.mkdir(parents=True, exist_ok=True)
+    caps = limits or Limits()
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        app.state.service.live.close()
+        app.state.service.jobs.close()
+
+    app = FastAPI(
+        title="calibench",
+        summary="Captures with, calibrates and explains cameras.",
+        version=version("calibench"),
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        swagger_ui_oauth2_redirect_url=None,
+        openapi_tags=TAGS,
+        license_info={"name": "BSD-3-Clause", "identifier": "BSD-3-Clause"},
+        middleware=[
+            Middleware(SafeHeaders),
+            Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
+            Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_path=f"{PREFIX}/recordings"),
+        ],
+    )
+    gate = Gate(lambda: stored_keys(store))
+    app.state.gate = gate
+    app.state.patience = Patience()
+    app.state.service = Service(
+        store=store,
+        stations=folder,
+        live=LiveSessions(store, connect),
+        jobs=jobs_runner or JobRunner(store),
+        inbox=Inbox(store.root / "recordings"),
+        gate=gate,
+        limits=caps,
+    )
+    errors.install(app)
+    app.include_router(open_to_all)
+    for part in (knowledge, sessions, recordings, jobs):
+        app.include_router(part.router, prefix=PREFIX)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    return app
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The schema, with the events' data, which no answer's model names."""
+    if app.openapi_schema is None:
+        made = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=app.summary,
+            description=(
+                "Errors have one line in `detail`: what, where, remedy. Keys go into the header "
+                "`Authorization: Bearer KEY`, never into a URL. Times are UTC; a unit ends every number's name."
+            ),
+            routes=app.routes,
+            tags=app.openapi_tags,
+            license_info=app.license_info,
+        )
+        known = made["components"]["schemas"]
+        for model in (Progress, schemas.Session, schemas.Job):
+            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            for name, definition in schema.pop("$defs", {}).items():
+                known.setdefault(name, definition)
+            known.setdefault(model.__name__, schema)
+        app.openapi_schema = made
+    return app.openapi_schema

@@ -1,0 +1,126 @@
+"""`calibench serve`, and `calibench key` for the keys that open it."""
+
+from __future__ import annotations
+
+import copy
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from api.keys import Permission, check_bind, create_key, is_loopback, stored_keys
+from lab.errors import InputError
+
+if TYPE_CHECKING:
+    from lab.store import Store
+
+commands = typer.Typer()
+key = typer.Typer(no_args_is_help=True, help="Keys for the REST service.")
+commands.add_typer(key, name="key")
+
+Folder = Annotated[
+    Path | None, typer.Option("--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
+]
+FIRST_KEY = "first"
+
+
+def _store(folder: Path | None) -> Store:
+    from lab.store import Settings, Store
+
+    return Store.open(Settings() if folder is None else Settings(data=folder))
+
+
+def _first_key(store: Store) -> None:
+    secret = create_key(store, FIRST_KEY, Permission.ADMIN)
+    typer.echo(f"first start: the key '{FIRST_KEY}' (scope admin), shown only this once:\n\n    {secret}\n")
+
+
+def logging_config() -> dict[str, Any]:
+    """uvicorn's, with keys hidden that a client wrote into a URL."""
+    from uvicorn.config import LOGGING_CONFIG
+
+    config = copy.deepcopy(LOGGING_CONFIG)
+    config["filters"] = {"hide_keys": {"()": "api.keys.HideKeys"}}
+    for handler in config["handlers"].values():
+        handler["filters"] = ["hide_keys"]
+    for name in ("api", "lab"):
+        config["loggers"][name] = {"handlers": ["default"], "level": "INFO", "propagate": False}
+    return config
+
+
+@commands.command()
+def serve(
+    host: Annotated[
+        str, typer.Option(help="where to listen; others than this computer need a key first")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8000,
+    allow_host: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="a name under which others reach it; may be repeated")
+    ] = None,
+    create_first_key: Annotated[
+        bool, typer.Option("--create-first-key", help="make and print an admin key if there is none, on any --host")
+    ] = False,
+    tls_certificate: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM; serves https")] = None,
+    tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM, the certificate's private key")] = None,
+    data: Folder = None,
+) -> None:
+    """Run the REST service and the operator's page. At its first start on loopback it makes a key and prints it."""
+    import uvicorn
+
+    from api.app import create_app
+
+    if (tls_certificate is None) != (tls_key is None):
+        raise InputError("--tls-certificate and --tls-key belong together; give both")
+    for file in (tls_certificate, tls_key):
+        if file is not None and not os.access(file, os.R_OK):
+            raise InputError(f"{file}: can't be read; give a PEM file")
+    store = _store(data)
+    if (is_loopback(host) or create_first_key) and not stored_keys(store):
+        _first_key(store)
+    check_bind(host, stored_keys(store))
+    names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in ("0.0.0.0", "::", "")}
+    scheme = "https" if tls_certificate is not None else "http"
+    shown = "127.0.0.1" if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
+    app = create_app(store, hosts=names)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            host=host,
+            port=port,
+            log_config=logging_config(),
+            server_header=False,
+            proxy_headers=False,
+            timeout_graceful_shutdown=5,
+            ssl_certfile=tls_certificate,
+            ssl_keyfile=tls_key,
+        )
+    )
+    typer.echo(f"operator's page: {scheme}://{shown}:{port}/    REST: {scheme}://{shown}:{port}/docs")
+    server.run()
+    if not server.started:
+        raise InputError(f"{host}:{port}: can't be listened at; choose another --port or end what uses it")
+
+
+@key.command("create")
+def create(
+    name: Annotated[str, typer.Argument(help="whose key it is")],
+    scope: Annotated[Permission, typer.Option(help="what it allows; each includes read")] = Permission.READ,
+    data: Folder = None,
+) -> None:
+    """Make a key and print it: this is the only time that it can be seen."""
+    typer.echo(create_key(_store(data), name, scope))
+
+
+@key.command("list")
+def list_keys(data: Folder = None) -> None:
+    """Names and scopes of all keys."""
+    for stored in stored_keys(_store(data)):
+        typer.echo(f"{stored.name}  {stored.scope}")
+
+
+@key.command("remove")
+def remove(name: str, data: Folder = None) -> None:
+    """Take a key away, with the page's logins that it opened."""
+    _store(data).remove_key(name)
+    typer.echo(f"removed: {name}")

@@ -1,0 +1,93 @@
+"""Errors as answers: one line in `detail`, and the status that fits."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from fastapi import FastAPI, HTTPException, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict
+
+from lab.errors import DeviceError, InputError
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class Conflict(Exception):
+    """What is asked for doesn't go with what goes on: 409."""
+
+
+class Problem(BaseModel):
+    """Every error's body."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {"detail": "no session '20300101-120000-abcdef'; GET /api/v1/sessions lists them"}
+        }
+    )
+
+    detail: str
+
+
+_MEANINGS = {
+    400: "a Host that isn't this service's",
+    401: "no valid key",
+    403: "the key's scope doesn't reach, or a foreign Origin",
+    404: "there is no such thing",
+    409: "doesn't go with what goes on",
+    413: "larger than allowed",
+    422: "can't be used: what, where, remedy",
+    429: "too often",
+    503: "an instrument failed",
+}
+
+
+def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The error answers of a route, for OpenAPI."""
+    return {status: {"model": Problem, "description": _MEANINGS[status]} for status in statuses}
+
+
+def known(what: str, look: Callable[[], T]) -> T:
+    """What `look` finds; where it raises InputError, 404 with `what` in one line."""
+    try:
+        return look()
+    except InputError:
+        raise HTTPException(404, what) from None
+
+
+def _one_line(error: Exception) -> str:
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip()) or type(error).__name__
+
+
+def _answer(status: int) -> Callable[[Request, Exception], JSONResponse]:
+    def handler(request: Request, error: Exception) -> JSONResponse:
+        return JSONResponse({"detail": _one_line(error)}, status)
+
+    return handler
+
+
+def _invalid(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    lines = []
+    for one in error.errors():
+        where = ".".join(str(part) for part in one["loc"] if part != "body") or "body"
+        lines.append(f"{where}: {one['msg']}")
+    return JSONResponse({"detail": "; ".join(lines)}, 422)
+
+
+def _defect(request: Request, error: Exception) -> JSONResponse:
+    log.error("%s %s: a defect", request.method, request.url.path, exc_info=error)
+    return JSONResponse({"detail": f"{type(error).__name__}: a defect of calibench; its log says more"}, 500)
+
+
+def install(app: FastAPI) -> None:
+    """Turn exceptions of `lab` into answers."""
+    app.add_exception_handler(InputError, _answer(422))
+    app.add_exception_handler(DeviceError, _answer(503))
+    app.add_exception_handler(Conflict, _answer(409))
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(Exception, _defect)

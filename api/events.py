@@ -1,0 +1,57 @@
+"""Server-sent events: what a follower gets first is how things stand, so that nobody has to have been there from the start."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+from pydantic import BaseModel
+from sse_starlette.event import ServerSentEvent
+from sse_starlette.sse import EventSourceResponse
+
+KEEP_ALIVE_S = 15.0
+
+
+def event(name: str, content: BaseModel) -> ServerSentEvent:
+    """One event with a schema as its data."""
+    return ServerSentEvent(event=name, data=content.model_dump_json())
+
+
+def stream(events: AsyncIterator[ServerSentEvent]) -> EventSourceResponse:
+    """The answer; a comment goes out every 15 s, so that proxies don't cut the line."""
+    return EventSourceResponse(events, ping=KEEP_ALIVE_S, send_timeout=30.0)
+
+
+async def watched(
+    look: Callable[[], BaseModel], over: Callable[[Any], bool], name: str, every_s: float = 0.5
+) -> AsyncIterator[ServerSentEvent]:
+    """How something stands now and after each change, by looking at the registry, which other processes write too; the last
+    one is called `end`."""
+    seen = None
+    while True:
+        found = await asyncio.to_thread(look)
+        ended = over(found)
+        if found != seen:
+            yield event(name, found)
+            seen = found
+        if ended:
+            yield event("end", found)
+            return
+        await asyncio.sleep(every_s)
+
+
+def described(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
+    """The 200 answer of a stream for OpenAPI: which events, with which data."""
+    lines = [f"- `{name}`: {when}; its data is a `{model.__name__}`." for name, model, when in events]
+    schema = {
+        "type": "string",
+        "description": "Server-sent events.",
+        "x-events": {name: {"$ref": f"#/components/schemas/{model.__name__}"} for name, model, _ in events},
+    }
+    return {
+        200: {
+            "description": "Server-sent events, with a comment every 15 s.\n\n" + "\n".join(lines),
+            "content": {"text/event-stream": {"schema": schema}},
+        }
+    }

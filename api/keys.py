@@ -1,0 +1,115 @@
+"""Keys: what they are, what they allow, how they are kept.
+
+A key is 256 random bits. Only its SHA-256 is stored (a slow hash would protect nothing more at that entropy), compared in
+constant time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import logging
+import re
+import secrets
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from lab.errors import InputError
+
+if TYPE_CHECKING:
+    from lab.store import Store
+
+KEY_PREFIX = "calibench_"
+LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
+_KEYS = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{20,}")
+
+
+class Permission(StrEnum):
+    """What a key allows. `operate` and `calibrate` include `read`; `admin` includes all."""
+
+    READ = "read"
+    OPERATE = "operate"
+    CALIBRATE = "calibrate"
+    ADMIN = "admin"
+
+    def allows(self, wanted: Permission) -> bool:
+        """Whether a key of this scope may do what needs `wanted`."""
+        return self is wanted or self is Permission.ADMIN or wanted is Permission.READ
+
+
+def new_key() -> str:
+    """A fresh key: 256 random bits behind a prefix that secret scanners can find."""
+    return KEY_PREFIX + secrets.token_urlsafe(32)
+
+
+def digest(key: str) -> str:
+    """What is stored of a key."""
+    return hashlib.sha256(key.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class StoredKey:
+    name: str
+    scope: Permission
+    sha256: str
+
+
+def stored_keys(store: Store) -> list[StoredKey]:
+    """The keys that a store holds."""
+    return [StoredKey(name, Permission(scope), sha256) for name, scope, sha256 in store.keys()]  # noqa: SIM118
+
+
+def create_key(store: Store, name: str, scope: Permission) -> str:
+    """Register a new key and return it; this is the only time that it can be seen. Raises InputError if the name is taken."""
+    if not re.fullmatch(r"[\w.@-]{1,100}", name):
+        raise InputError(f"key name {name!r}: use up to 100 letters, digits and any of _ . @ -")
+    key = new_key()
+    store.add_key(name, scope.value, digest(key))
+    return key
+
+
+def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
+    """The stored key that `key` is, or None; every stored key is compared, each in constant time."""
+    mine = digest(key)
+    found = None
+    for candidate in stored:
+        if hmac.compare_digest(mine, candidate.sha256):
+            found = candidate
+    return found
+
+
+class HideKeys(logging.Filter):
+    """Takes keys out of log lines, where a client wrote one into a URL against all advice."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Let every record pass, without the keys in it."""
+        text = record.getMessage()
+        hidden = _KEYS.sub(KEY_PREFIX + "***", text)
+        if hidden != text and isinstance(record.args, tuple):
+            # uvicorn's formatter unpacks the arguments, so they are kept, one by one.
+            record.args = tuple(_KEYS.sub(KEY_PREFIX + "***", a) if isinstance(a, str) else a for a in record.args)
+        if _KEYS.search(record.getMessage()):
+            record.msg, record.args = hidden, ()
+        return True
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is this computer's own."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def check_bind(host: str, keys: Iterable[StoredKey]) -> None:
+    """Raises InputError if others could reach a service that nobody has a key for."""
+    if not is_loopback(host) and not any(True for _ in keys):
+        raise InputError(
+            f"--host {host}: others could reach this service, and it has no key; "
+            "make one with `calibench key create NAME --scope admin`, then start again"
+        )

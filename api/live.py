@@ -1,0 +1,230 @@
+"""The sessions that this process runs: one thread each, and whoever wants to follow them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+
+from api.errors import Conflict
+from lab.errors import DeviceError, InputError
+from lab.sequences.calibration import Calibration
+from lab.session import CaptureSession, Progress
+from lab.station import Drivers, Station, drivers_of
+from lab.store import Store
+
+log = logging.getLogger(__name__)
+RUNS = frozenset({"running", "paused"})
+
+
+class LiveSession:
+    """One session in its thread, with its latest progress; followers get that first and then every change they keep up with."""
+
+    def __init__(self, station: Station) -> None:
+        self.station = station
+        self.pausing = False
+        self.capture: CaptureSession | None = None
+        self._latest: Progress | None = None
+        self._number = 0
+        self._ended = False
+        self._lock = threading.Lock()
+        self._followers: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def latest(self) -> Progress | None:
+        """The last word of the run."""
+        return self._latest
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run is over, whatever came of it."""
+        return self._ended
+
+    def begin(self, capture: CaptureSession) -> None:
+        """Run in a thread of its own; what comes of it is in the registry."""
+        self.capture = capture
+        self._thread = threading.Thread(target=self._work, args=(capture,), name=f"session {capture.id}", daemon=True)
+        self._thread.start()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the end of the run; whether it came."""
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+        return self._ended
+
+    def _work(self, capture: CaptureSession) -> None:
+        try:
+            capture.run()
+        except (InputError, DeviceError) as error:
+            log.warning("session %s: %s", capture.id, error)
+        except Exception:
+            log.exception("session %s: a defect", capture.id)
+        finally:
+            self._changed(ended=True)
+
+    def tell(self, progress: Progress) -> None:
+        """What the run calls from its thread."""
+        if progress.state != "running":
+            self.pausing = False
+        self._changed(progress)
+
+    def _changed(self, progress: Progress | None = None, ended: bool = False) -> None:
+        with self._lock:
+            self._latest = progress or self._latest
+            self._number += 1
+            self._ended = self._ended or ended
+            followers = list(self._followers)
+        for loop, wake in followers:
+            with contextlib.suppress(RuntimeError):  # that loop is closed
+                loop.call_soon_threadsafe(wake.set)
+
+    def nudge(self) -> None:
+        """Let the followers look again."""
+        self._changed()
+
+    async def follow(self) -> AsyncIterator[Progress]:
+        """The latest progress, then each later one, until the run ends. A slow follower misses some, never the last."""
+        wake = asyncio.Event()
+        me = (asyncio.get_running_loop(), wake)
+        with self._lock:
+            self._followers.add(me)
+        seen = -1
+        try:
+            while True:
+                wake.clear()
+                with self._lock:
+                    number, latest, ended = self._number, self._latest, self._ended
+                if number != seen and latest is not None:
+                    seen = number
+                    yield latest
+                if ended:
+                    return
+                await wake.wait()
+        finally:
+            with self._lock:
+                self._followers.discard(me)
+
+
+class LiveSessions:
+    """Starts, controls and ends sessions. At most one runs on an instrument at a time, this process's or another's."""
+
+    def __init__(self, store: Store, connect: Callable[[Station], Drivers] = drivers_of) -> None:
+        self._store, self._connect = store, connect
+        self._live: dict[str, LiveSession] = {}
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def find(self, session_id: str) -> LiveSession | None:
+        """The session, if this process runs it now."""
+        live = self._live.get(session_id)
+        return live if live is not None and not live.ended else None
+
+    def start(self, station: Station, calibration: Calibration, name: str, notes: str) -> str:
+        """Register a session and run it; its id. Raises Conflict if one runs on an instrument of the station, InputError if
+        the station lacks what the calibration needs."""
+        with self._lock:
+            self._check_free(station)
+            live = LiveSession(station)
+            capture = CaptureSession.start(
+                self._store,
+                station,
+                calibration,
+                name=name,
+                notes=notes,
+                on_progress=live.tell,
+                connect=self._connect,
+            )
+            self._live[capture.id] = live
+            live.begin(capture)
+        return capture.id
+
+    def resume(self, session_id: str) -> None:
+        """Go on after a pause, or run a session again that ended early. Raises Conflict where it is neither."""
+        with self._lock:
+            live = self.find(session_id)
+            if live is not None and live.capture is not None:
+                if live.pausing or (live.latest is not None and live.latest.state == "paused"):
+                    live.pausing = False
+                    live.capture.resume()
+                    return
+                raise Conflict(f"session {session_id} runs already; pause it first")
+            info = self._store.session(session_id)
+            if info.state == "finished":
+                raise Conflict(f"session {session_id} is finished; start a new one")
+            if info.state in RUNS:
+                raise Conflict(f"session {session_id} is run by another process; resume it there")
+            station = self._store.station(session_id)
+            self._check_free(station)
+            live = LiveSession(station)
+            self._live[session_id] = live
+            live.begin(CaptureSession(self._store, session_id, on_progress=live.tell, connect=self._connect))
+
+    def pause(self, session_id: str) -> None:
+        """Pause when the step under way is done. Raises Conflict where nothing can be paused now."""
+        capture, live = self._running(session_id)
+        state = live.latest.state if live.latest is not None else "connecting"
+        if state != "running":
+            raise Conflict(f"session {session_id} is {state}; only a running one can be paused")
+        live.pausing = True
+        capture.pause()
+        live.nudge()
+
+    def abort(self, session_id: str, reason: str) -> None:
+        """End the run now; what is finished stays, and the session can be resumed."""
+        capture, _ = self._running(session_id)
+        capture.abort(reason)
+
+    def close(self, patience_s: float = 60.0) -> None:
+        """End every run in good order: shutters closed, sessions resumable."""
+        with self._lock:
+            self._closed = True
+            live = {id: session for id, session in self._live.items() if not session.ended}
+        for session in live.values():
+            if session.capture is not None:
+                session.capture.abort("the service was stopped")
+        until = time.monotonic() + patience_s
+        for id, session in live.items():
+            if not session.join(max(0.0, until - time.monotonic())):
+                log.error("session %s didn't end within %g s; look after its instruments", id, patience_s)
+
+    def _running(self, session_id: str) -> tuple[CaptureSession, LiveSession]:
+        live = self.find(session_id)
+        if live is None or live.capture is None:
+            state = self._store.session(session_id).state
+            elsewhere = "run by another process" if state in RUNS else state
+            raise Conflict(f"session {session_id} isn't under way here, it is {elsewhere}")
+        return live.capture, live
+
+    def _check_free(self, station: Station) -> None:
+        self._live = {id: session for id, session in self._live.items() if not session.ended}
+        if self._closed:
+            raise Conflict("the service is being stopped; start the session when it is up again")
+        if (busy := self.busy(station)) is not None:
+            raise Conflict(f"session {busy} runs on these instruments; wait for it or abort it")
+
+    def busy(self, station: Station) -> str | None:
+        """Id of a session that uses an instrument of this station now, in this process or another."""
+        wanted = _addresses(station)
+        for id, session in self._live.items():
+            if not session.ended and wanted & _addresses(session.station):
+                return id
+        for info in self._store.sessions():
+            if info.state in RUNS and self.find(info.id) is None and wanted & _addresses(self._store.station(info.id)):
+                return info.id
+        return None
+
+
+def _addresses(station: Station) -> set[str]:
+    """Where the instruments of a station are reached."""
+    entries = [
+        station.monochromator,
+        station.spectroradiometer,
+        station.display,
+        station.stage,
+        *station.cameras.values(),
+    ]
+    return {entry.address for entry in entries if entry is not None}

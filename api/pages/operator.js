@@ -1,0 +1,299 @@
+// The operator's page: what runs now, the sessions, the jobs and their reports. No framework: a few functions over fetch.
+
+const $ = (id) => document.getElementById(id);
+const api = "/api/v1";
+const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
+const PICTURES_AT_ONCE = 48;
+let selected = null; // the session whose captures are shown
+let following = null; // the open event stream, with the session it follows
+
+class Problem extends Error {}
+
+async function ask(path, options = {}) {
+  const response = await fetch(api + path, {
+    headers: options.body ? { "Content-Type": "application/json" } : {},
+    ...options,
+  });
+  if (response.status === 401) {
+    showLogin();
+    throw new Problem("log in first");
+  }
+  const body = response.status === 204 ? null : await response.json();
+  if (!response.ok) throw new Problem(body.detail);
+  return body;
+}
+
+const post = (path, body) => ask(path, { method: "POST", body: body === undefined ? undefined : JSON.stringify(body) });
+
+function element(tag, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
+// Replaces the rows only where something changed, so that a button doesn't vanish under the pointer.
+function show(place, items, row) {
+  const text = JSON.stringify(items);
+  if ($(place).dataset.shown === text) return;
+  $(place).dataset.shown = text;
+  $(place).replaceChildren(...items.map(row));
+}
+
+const time = (text) => (text ? text.replace("T", " ").slice(0, 19) : "");
+
+function duration(seconds) {
+  if (seconds == null) return "";
+  const s = Math.round(seconds);
+  return s < 90 ? ` · ${s} s left` : ` · ${Math.round(s / 60)} min left`;
+}
+
+function exposure(seconds) {
+  if (seconds == null) return "";
+  return seconds < 1 ? ` · ${Number((seconds * 1e3).toPrecision(3))} ms` : ` · ${Number(seconds.toPrecision(3))} s`;
+}
+
+function guarded(place, action) {
+  return async (event) => {
+    event?.preventDefault();
+    $(place).textContent = "";
+    try {
+      await action(event);
+    } catch (error) {
+      $(place).textContent = error.message;
+    }
+    await refresh();
+  };
+}
+
+// --- log in ---------------------------------------------------------------------------------------------------------
+
+function showLogin() {
+  following?.stream.close();
+  following = null;
+  $("login").hidden = false;
+  $("desk").hidden = $("logout").hidden = true;
+  $("who").textContent = "";
+}
+
+async function enter() {
+  const me = await ask("/me");
+  $("who").textContent = `${me.name} (${me.scope})`;
+  $("login").hidden = true;
+  $("desk").hidden = $("logout").hidden = false;
+  await showStations();
+  await refresh();
+}
+
+async function showStations() {
+  const stations = await ask("/stations");
+  const usable = stations.filter((s) => !s.problem);
+  const select = $("start-form").elements.station;
+  select.replaceChildren(...usable.map((s) => element("option", { value: s.name, textContent: s.title === s.name ? s.name : `${s.name}: ${s.title}` })));
+  const problems = stations.filter((s) => s.problem).map((s) => `${s.name}: ${s.problem}`);
+  if (!stations.length) problems.push("No station file yet: put one into the folder 'stations' of the data folder.");
+  $("no-station").hidden = problems.length === 0;
+  $("no-station").textContent = problems.join(" ");
+  $("start-form").hidden = usable.length === 0;
+}
+
+$("login-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const form = event.target;
+  const problem = form.querySelector(".problem");
+  problem.textContent = "";
+  const response = await fetch("/login", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ key: form.elements.key.value }),
+  });
+  form.reset();
+  if (response.ok) await enter();
+  else problem.textContent = (await response.json()).detail;
+});
+
+$("logout").addEventListener("click", async () => {
+  await fetch("/logout", { method: "POST" });
+  showLogin();
+});
+
+// --- what runs now --------------------------------------------------------------------------------------------------
+
+function showLive(session) {
+  $("live").hidden = !session;
+  $("live-idle").hidden = Boolean(session);
+  if (!session) return;
+  $("live-name").textContent = session.name || session.id;
+  $("live-state").textContent = session.state;
+  $("pause").disabled = session.state !== "running";
+  $("resume").disabled = !["paused", "pausing"].includes(session.state);
+  $("live-bar").max = session.steps || 1;
+  if (following?.id !== session.id) follow(session.id);
+}
+
+function showProgress(p) {
+  $("live-bar").max = p.total || 1;
+  $("live-bar").value = p.done;
+  const step = p.total ? ` · step ${Math.min(p.done + 1, p.total)} of ${p.total}` : "";
+  $("live-step").textContent = `${p.what}${p.state === "running" ? step : ""}${duration(p.left_s)}`;
+  if (p.remark) $("live-remarks").prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
+}
+
+function follow(id) {
+  following?.stream.close();
+  $("live-step").textContent = "";
+  $("live-remarks").replaceChildren();
+  $("live-bar").value = 0;
+  const stream = new EventSource(`${api}/sessions/${id}/events`);
+  following = { id, stream };
+  stream.addEventListener("progress", (event) => showProgress(JSON.parse(event.data)));
+  stream.addEventListener("state", () => refresh().catch(() => {}));
+  stream.addEventListener("end", () => {
+    stream.close();
+    following = null;
+    refresh()
+      .then(() => selected === id && showCaptures())
+      .catch(() => {});
+  });
+}
+
+$("start-form").addEventListener(
+  "submit",
+  guarded("live-problem", async (event) => {
+    const fields = event.target.elements;
+    const session = await post("/sessions", { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked });
+    await select(session);
+  }),
+);
+for (const verb of ["pause", "resume", "abort"]) {
+  $(verb).addEventListener(
+    "click",
+    guarded("live-problem", async () => {
+      if (verb === "abort" && !confirm("Abort the run? What was captured stays, and the session can be resumed.")) return;
+      await post(`/sessions/${following.id}/${verb}`);
+    }),
+  );
+}
+
+// --- tables ---------------------------------------------------------------------------------------------------------
+
+function stateCell(item) {
+  const cell = element("td", {}, element("span", { className: `state ${item.state}`, textContent: item.state }));
+  if (item.error) cell.append(element("div", { className: "reason", textContent: item.error }));
+  return cell;
+}
+
+function sessionRow(session) {
+  const actions = element("td");
+  if (["created", "interrupted", "failed"].includes(session.state)) {
+    const resume = element("button", { textContent: "Resume" });
+    resume.addEventListener("click", guarded("live-problem", () => post(`/sessions/${session.id}/resume`)));
+    actions.append(resume, " ");
+  }
+  const open = element("button", { textContent: "Open" });
+  open.addEventListener("click", guarded("session-problem", () => select(session)));
+  actions.append(open);
+  return element(
+    "tr",
+    {},
+    element("td", { textContent: session.name || session.id, title: session.id }),
+    element("td", { textContent: time(session.created) }),
+    stateCell(session),
+    element("td", { className: "number", textContent: `${session.steps_done}/${session.steps}` }),
+    actions,
+  );
+}
+
+function jobRow(job) {
+  const actions = element("td");
+  if (job.state === "running" || job.state === "queued") {
+    const cancel = element("button", { textContent: "Cancel" });
+    cancel.addEventListener("click", guarded("job-problem", () => post(`/jobs/${job.id}/cancel`)));
+    actions.append(cancel);
+  } else if (job.state === "done") {
+    const where = job.kind === "report" ? `${api}/jobs/${job.id}/report` : `${api}/jobs/${job.id}/result`;
+    const label = job.kind === "report" ? "Report" : "JSON";
+    actions.append(element("a", { href: where, textContent: label, target: "_blank", rel: "noopener" }));
+  }
+  const state = stateCell(job);
+  if (job.state === "running") {
+    state.append(" ", element("progress", { max: 1, value: job.progress, className: "small" }));
+    if (job.message) state.append(element("div", { className: "hint", textContent: job.message }));
+  }
+  return element(
+    "tr",
+    {},
+    element("td", { textContent: job.kind }),
+    element("td", { textContent: job.of }),
+    element("td", { textContent: time(job.created) }),
+    state,
+    actions,
+  );
+}
+
+// --- one session ----------------------------------------------------------------------------------------------------
+
+async function select(session) {
+  selected = session.id;
+  $("session").hidden = false;
+  $("session-problem").textContent = "";
+  $("session-title").textContent = session.name || session.id;
+  const buttons = ["fit", "validate", "diagnose", "report"].map((kind) => {
+    const button = element("button", { textContent: kind[0].toUpperCase() + kind.slice(1) });
+    button.addEventListener(
+      "click",
+      guarded("session-problem", () => post(`/sessions/${session.id}/jobs`, { kind })),
+    );
+    return button;
+  });
+  $("session-actions").replaceChildren(...buttons.flatMap((b) => [b, " "]));
+  const filter = $("capture-filter").elements;
+  filter.kind.replaceChildren();
+  await showCaptures();
+  $("session").scrollIntoView({ block: "nearest" });
+}
+
+const option = (value) => element("option", { value, textContent: value || "all" });
+
+async function showCaptures() {
+  const captures = await ask(`/sessions/${selected}/captures?limit=5000`);
+  const filter = $("capture-filter").elements;
+  if (filter.kind.options.length <= 1) {
+    filter.kind.replaceChildren(...["", ...new Set(captures.map((c) => c.kind))].map(option));
+    filter.side.replaceChildren(...["", ...new Set(captures.map((c) => c.side))].map(option));
+  }
+  const chosen = captures.filter((c) => (!filter.kind.value || c.kind === filter.kind.value) && (!filter.side.value || c.side === filter.side.value));
+  const shown = chosen.slice(-PICTURES_AT_ONCE);
+  $("capture-count").textContent =
+    chosen.length > shown.length ? `The last ${shown.length} of ${chosen.length}.` : chosen.length ? `${chosen.length}.` : "None yet.";
+  show("captures", shown.map((c) => ({ ...c, picture: `${c.preview}?width=320${filter.stretch.checked ? "&stretch=true" : ""}` })), (c) =>
+    element(
+      "figure",
+      {},
+      element(
+        "a",
+        { href: `${c.picture.replace("width=320", "width=1600")}`, target: "_blank", rel: "noopener" },
+        element("img", { loading: "lazy", src: c.picture, alt: `${c.kind}, ${c.side}` }),
+      ),
+      element("figcaption", { textContent: `${c.name}${exposure(c.exposure_s)}` }),
+    ),
+  );
+}
+
+$("capture-filter").addEventListener("change", guarded("session-problem", showCaptures));
+
+async function refresh() {
+  if ($("desk").hidden) return;
+  const [sessions, jobs] = await Promise.all([ask("/sessions"), ask("/jobs")]);
+  const names = new Map(sessions.map((s) => [s.id, s.name || s.id]));
+  const live = sessions.find((s) => LIVE.includes(s.state));
+  if (live === undefined && !$("live").hidden) await showStations();
+  showLive(live);
+  show("sessions", sessions, sessionRow);
+  $("no-sessions").hidden = sessions.length > 0;
+  show("jobs", jobs.map((job) => ({ ...job, of: names.get(job.session_id) ?? job.session_id ?? `recordings ${job.recordings_id}` })), jobRow);
+  $("no-jobs").hidden = jobs.length > 0;
+  if (live && live.id === selected) await showCaptures();
+}
+
+setInterval(() => refresh().catch(() => {}), 3000);
+enter().catch(() => showLogin());

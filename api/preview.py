@@ -1,0 +1,36 @@
+"""A raw frame as a small picture for people: black taken off, one value a colour and mosaic cell, shrunk, gamma'd."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.recording import Camera
+from sim.sensor.mosaic import planes
+
+#: sRGB's curve is near enough a power of this.
+GAMMA = 2.2
+
+
+def preview_png(frame: NDArray[np.uint16], camera: Camera, width_px: int, stretch: bool = False) -> bytes:
+    """PNG of `frame` (rows, cols), at most `width_px` wide. Black is the data sheet's black level, white its white level, or
+    with `stretch` the frame's own 99.9th percentile, so that dark frames show what is in them. No white balance."""
+    black = camera.black_level_dn or 0.0
+    mosaic = {name: plane.astype(np.float32) for name, plane in planes(frame, camera.cfa).items()}
+    if camera.cfa == "MONO":
+        picture = mosaic["Y"]
+    else:
+        rows = min(plane.shape[0] for plane in mosaic.values())
+        cols = min(plane.shape[1] for plane in mosaic.values())
+        cut = {name: plane[:rows, :cols] for name, plane in mosaic.items()}
+        picture = np.stack([cut["B"], (cut["G1"] + cut["G2"]) / 2, cut["R"]], axis=-1)  # OpenCV's order
+    if picture.shape[1] > width_px:
+        height_px = max(1, round(picture.shape[0] * width_px / picture.shape[1]))
+        picture = cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA)
+    white = float(np.percentile(picture, 99.9)) if stretch else camera.saturation_dn
+    level = np.clip((picture - black) / max(white - black, 1.0), 0.0, 1.0)
+    done, encoded = cv2.imencode(".png", np.rint(255.0 * level ** (1.0 / GAMMA)).astype(np.uint8))
+    if not done:
+        raise ValueError(f"OpenCV couldn't encode a picture of shape {picture.shape}")
+    return encoded.tobytes()

@@ -1,0 +1,71 @@
+"""What the models know: who asks, quantities with unit, bounds and prior, effects with reference and rivals."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, HTTPException
+
+from api.errors import answers
+from api.keys import Permission, StoredKey
+from api.schemas import Effect, Me, Parameter
+from api.security import Demand
+from api.service import READ
+from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect as EffectType
+from sim.effects.library import effects
+from sim.parameters import Quantity, declared
+
+router = APIRouter()
+
+
+@router.get("/me", tags=["access"], responses=answers(401))
+def me(key: Annotated[StoredKey, Depends(Demand(Permission.READ))]) -> Me:
+    """The name and the scope of the key that asks."""
+    return Me(name=key.name, scope=key.scope)
+
+
+def _parameter(name: str, quantity: Quantity) -> Parameter:
+    return Parameter(
+        name=name,
+        unit=quantity.unit,
+        meaning=quantity.meaning,
+        lower=quantity.lower,
+        upper=quantity.upper,
+        prior=quantity.prior,
+        absent=quantity.absent,
+    )
+
+
+@router.get("/parameters", tags=["knowledge"], dependencies=[READ], responses=answers(401))
+def list_parameters() -> list[Parameter]:
+    """The camera model's quantities, as they are declared; the lens's with `lens.` before the name."""
+    camera = [_parameter(name, quantity) for name, quantity in declared(CameraModel).items()]
+    return camera + [_parameter(f"lens.{name}", quantity) for name, quantity in declared(Lens).items()]
+
+
+def _effect(effect: type[EffectType]) -> Effect:
+    return Effect(
+        name=effect.name,
+        stage=effect.stage.value,
+        reference=effect.reference,
+        sentence=effect.sentence,
+        parameters=tuple(_parameter(name, quantity) for name, quantity in effect.quantities().items()),
+        shown_by=tuple(sorted(effect.shown_by)),
+        rivals=tuple(sorted(effect.rivals)),
+        invariances=tuple(sorted(effect.invariances)),
+    )
+
+
+@router.get("/effects", tags=["knowledge"], dependencies=[READ], responses=answers(401))
+def list_effects() -> list[Effect]:
+    """The library that a diagnosis chooses from."""
+    return [_effect(effect) for effect in effects().values()]
+
+
+@router.get("/effects/{name}", tags=["knowledge"], dependencies=[READ], responses=answers(401, 404))
+def get_effect(name: str) -> Effect:
+    """One effect."""
+    if name not in effects():
+        raise HTTPException(404, f"no effect {name[:60]!r}; GET /api/v1/effects lists them")
+    return _effect(effects()[name])

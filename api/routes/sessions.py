@@ -1,0 +1,302 @@
+"""Stations, sessions on them, and what they captured."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Annotated, Any, get_args
+
+from fastapi import APIRouter, HTTPException, Query, Request, Response
+from sse_starlette.event import ServerSentEvent
+from sse_starlette.sse import EventSourceResponse
+
+from api.errors import answers, known
+from api.events import described, event, stream, watched
+from api.live import LiveSession
+from api.preview import preview_png
+from api.schemas import Capture, SequenceName, Session, SessionDetail, SessionStart, Station
+from api.service import OPERATE, READ, Here, RegistryId, Service, SessionId
+from lab.errors import InputError
+from lab.recording import Kind
+from lab.sequences.calibration import Calibration, full_calibration
+from lab.session import Progress
+from lab.station import Station as LabStation
+from lab.store import CaptureInfo, SessionInfo, npy_bytes
+from sim.camera import Side
+
+router = APIRouter()
+OVER = frozenset({"created", "interrupted", "failed", "finished"})
+#: A capture never changes, and its path has its session's random id in it.
+FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
+_INSTRUMENTS = ("monochromator", "spectroradiometer", "display", "stage")
+
+
+# --- stations ----------------------------------------------------------------------------------------------------------
+
+
+def _station(service: Service, name: str) -> Station:
+    try:
+        station = service.station(name)
+    except InputError as error:
+        return Station(name=name, title=name, problem=str(error))
+    possible = full_calibration(station)
+    return Station(
+        name=name,
+        title=station.name or name,
+        cameras=station.sides,
+        instruments={
+            family: entry.driver for family in _INSTRUMENTS if (entry := getattr(station, family)) is not None
+        },
+        targets=tuple(station.targets),
+        sequences=tuple(one for one in get_args(SequenceName) if getattr(possible, one) is not None),
+        busy_with=service.live.busy(station),
+    )
+
+
+@router.get("/stations", tags=["stations"], dependencies=[READ], responses=answers(401))
+def list_stations(service: Here) -> list[Station]:
+    """The station files in the folder `stations` of the data folder. They are written there, not sent: they name devices."""
+    return [_station(service, name) for name in service.station_files()]
+
+
+# --- sessions ----------------------------------------------------------------------------------------------------------
+
+
+def _state(info: SessionInfo, live: LiveSession | None) -> Any:
+    if live is None:
+        return info.state
+    if live.latest is None:
+        return "connecting"
+    return "pausing" if live.pausing and live.latest.state == "running" else live.latest.state
+
+
+def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
+    fields = info.model_dump(exclude={"packed"})
+    return fields | {"state": _state(info, service.live.find(info.id))}
+
+
+def _session(service: Service, session_id: str) -> Session:
+    return Session(**_fields(service, service.session(session_id)))
+
+
+def _calibration(station: LabStation, start: SessionStart) -> Calibration:
+    everything = full_calibration(station, start.quick)
+    if start.sequences is None:
+        return everything
+    missing = [name for name in start.sequences if getattr(everything, name) is None]
+    if missing:
+        raise InputError(
+            f"sequences: the station lacks instruments or targets for {', '.join(missing)}; "
+            "leave it out or add them to the station file"
+        )
+    return Calibration(**{name: getattr(everything, name) for name in start.sequences})
+
+
+@router.get("/sessions", tags=["sessions"], dependencies=[READ], responses=answers(401))
+def list_sessions(service: Here) -> list[Session]:
+    """All sessions, the newest first."""
+    return [Session(**_fields(service, info)) for info in service.store.sessions()]
+
+
+@router.post(
+    "/sessions",
+    status_code=201,
+    tags=["sessions"],
+    dependencies=[OPERATE],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def start_session(service: Here, start: SessionStart, response: Response) -> Session:
+    """Start a session; it runs on its own, follow its events. 409 while another runs on the same instruments."""
+    station = service.station(start.station)
+    session_id = service.live.start(station, _calibration(station, start), start.name, start.notes)
+    response.headers["Location"] = f"/api/v1/sessions/{session_id}"
+    return _session(service, session_id)
+
+
+@router.get("/sessions/{session_id}", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
+def get_session(service: Here, session_id: SessionId) -> SessionDetail:
+    """One session, with its provenance."""
+    info = service.session(session_id)
+    return SessionDetail(
+        **_fields(service, info),
+        station=service.store.station(session_id).name,
+        progress=service.progress(session_id),
+        runs=tuple(service.store.runs(session_id)),
+    )
+
+
+@router.post(
+    "/sessions/{session_id}/pause",
+    status_code=202,
+    tags=["sessions"],
+    dependencies=[OPERATE],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def pause_session(service: Here, session_id: SessionId) -> Session:
+    """Pause when the step under way is done: the shutter closes, the screen goes dark."""
+    service.session(session_id)
+    service.live.pause(session_id)
+    return _session(service, session_id)
+
+
+@router.post(
+    "/sessions/{session_id}/resume",
+    status_code=202,
+    tags=["sessions"],
+    dependencies=[OPERATE],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def resume_session(service: Here, session_id: SessionId) -> Session:
+    """Go on after a pause; or run a session on that ended early: finished steps aren't taken again."""
+    service.session(session_id)
+    service.live.resume(session_id)
+    return _session(service, session_id)
+
+
+@router.post(
+    "/sessions/{session_id}/abort",
+    status_code=202,
+    tags=["sessions"],
+    dependencies=[OPERATE],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def abort_session(service: Here, session_id: SessionId) -> Session:
+    """End the run now. The step under way is dropped, finished ones stay, and the session can be resumed."""
+    service.session(session_id)
+    service.live.abort(session_id, "aborted over the network")
+    return _session(service, session_id)
+
+
+async def _follow(service: Service, session_id: str) -> AsyncIterator[ServerSentEvent]:
+    def look() -> Session:
+        return _session(service, session_id)
+
+    seen = None
+    live = service.live.find(session_id)
+    if live is None:  # another process runs it, or nobody does
+        async for told in watched(look, lambda session: session.state in OVER, "state"):
+            yield told
+        return
+    yield event("state", await asyncio.to_thread(look))
+    async for progress in live.follow():
+        yield event("progress", progress)
+        if (progress.state, live.pausing) != seen:
+            seen = (progress.state, live.pausing)
+            yield event("state", await asyncio.to_thread(look))
+    yield event("end", await asyncio.to_thread(look))
+
+
+@router.get(
+    "/sessions/{session_id}/events",
+    tags=["sessions"],
+    dependencies=[READ],
+    response_class=EventSourceResponse,
+    responses=answers(401, 404, 422)
+    | described(
+        ("state", Session, "at once, and whenever the state changes"),
+        ("progress", Progress, "at once and at every step, while this service runs the session"),
+        ("end", Session, "when nothing more will come"),
+    ),
+)
+def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
+    """Follow a session."""
+    service.session(session_id)
+    return stream(_follow(service, session_id))
+
+
+# --- captures ----------------------------------------------------------------------------------------------------------
+
+
+def _capture(info: CaptureInfo) -> Capture:
+    here = f"/api/v1/sessions/{info.session_id}/captures/{info.id}"
+    return Capture(
+        **info.model_dump(),
+        exposure_s=info.document.get("exposure_s"),
+        preview=f"{here}/preview.png",
+        frame=f"{here}/frame.npy",
+    )
+
+
+def _known_capture(service: Service, session_id: str, capture_id: int) -> CaptureInfo:
+    missing = f"no capture {capture_id} in session {session_id[:60]!r}; GET /api/v1/sessions/ID/captures lists them"
+    info = known(missing, lambda: service.store.capture(capture_id))
+    if info.session_id != session_id:
+        raise HTTPException(404, missing)
+    return info
+
+
+@router.get("/sessions/{session_id}/captures", tags=["captures"], dependencies=[READ], responses=answers(401, 404, 422))
+def list_captures(
+    service: Here,
+    session_id: SessionId,
+    kind: Annotated[Kind | None, Query(description="only of this kind")] = None,
+    side: Annotated[Side | None, Query(description="only of this camera")] = None,
+    offset: Annotated[int, Query(ge=0)] = 0,
+    limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
+) -> list[Capture]:
+    """What a session captured, in the order in which it was taken."""
+    service.session(session_id)
+    chosen = [
+        info
+        for info in service.store.captures(session_id)
+        if (kind is None or info.kind == kind) and (side is None or info.side == side)
+    ]
+    return [_capture(info) for info in chosen[offset : offset + limit]]
+
+
+@router.get(
+    "/sessions/{session_id}/captures/{capture_id}",
+    tags=["captures"],
+    dependencies=[READ],
+    responses=answers(401, 404, 422),
+)
+def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) -> Capture:
+    """One capture."""
+    return _capture(_known_capture(service, session_id, capture_id))
+
+
+class Png(Response):
+    media_type = "image/png"
+
+
+class Npy(Response):
+    media_type = "application/x-npy"
+
+
+@router.get(
+    "/sessions/{session_id}/captures/{capture_id}/preview.png",
+    tags=["captures"],
+    dependencies=[READ],
+    response_class=Png,
+    responses=answers(401, 404, 422),
+)
+def preview_capture(
+    service: Here,
+    request: Request,
+    session_id: SessionId,
+    capture_id: RegistryId,
+    width: Annotated[int, Query(ge=16, le=4096, description="px, at most")] = 480,
+    stretch: Annotated[bool, Query(description="white is the frame's own brightest, not the data sheet's")] = False,
+) -> Response:
+    """A small picture: black taken off, one value a colour and mosaic cell, gamma'd, without white balance."""
+    info = _known_capture(service, session_id, capture_id)
+    tag = f'"{session_id}-{capture_id}-{width}-{int(stretch)}"'
+    headers = FOR_EVER | {"ETag": tag}
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
+    camera = service.store.recording_set(session_id).camera(info.side)  # type: ignore[arg-type]
+    return Png(preview_png(service.store.frame(capture_id), camera, width, stretch), headers=headers)
+
+
+@router.get(
+    "/sessions/{session_id}/captures/{capture_id}/frame.npy",
+    tags=["captures"],
+    dependencies=[READ],
+    response_class=Npy,
+    responses=answers(401, 404, 422),
+)
+def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) -> Response:
+    """The raw frame as .npy: uint16 (rows, cols), checked against its SHA-256."""
+    info = _known_capture(service, session_id, capture_id)
+    headers = FOR_EVER | {"Content-Disposition": f'attachment; filename="capture-{info.id}.npy"'}
+    return Npy(npy_bytes(service.store.frame(capture_id)), headers=headers)

@@ -1,0 +1,226 @@
+"""What the service says and takes, beyond the results of `lab.results`, which are the same as on the command line."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from api.keys import Permission
+from lab.session import Progress
+from lab.store import Run
+from sim.camera import Side
+
+SequenceName = Literal["dark", "flat", "narrowband", "chart", "edge", "screen", "stereo"]
+SessionState = Literal[
+    "created",
+    "connecting",
+    "running",
+    "pausing",
+    "paused",
+    "packing",
+    "interrupted",
+    "failed",
+    "finished",
+]
+JobKind = Literal["fit", "validate", "diagnose", "report"]
+JobState = Literal["queued", "running", "done", "failed", "cancelled"]
+
+
+class Schema(BaseModel):
+    """Base of all: immutable, and an unknown field is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Health(Schema):
+    """That the service is up; says nothing else, for it needs no key."""
+
+    status: Literal["ok"] = "ok"
+    version: str
+
+
+class Me(Schema):
+    """Whose key it is."""
+
+    name: str
+    scope: Permission
+
+
+class Login(Schema):
+    """A key, once, for a cookie."""
+
+    key: str = Field(min_length=1, max_length=200)
+
+
+class Station(Schema):
+    """A station file of the data folder; `problem` says why it can't be used."""
+
+    name: str = Field(description="what `POST /sessions` takes: the station file's name without `.toml`")
+    title: str = Field(description="what the station calls itself")
+    cameras: tuple[Side, ...] = ()
+    instruments: dict[str, str] = Field(default={}, description="family of the instrument -> its driver")
+    targets: tuple[str, ...] = ()
+    sequences: tuple[SequenceName, ...] = Field(default=(), description="what it has the instruments and targets for")
+    busy_with: str | None = Field(default=None, description="id of a session that uses its instruments now")
+    problem: str | None = None
+
+
+class SessionStart(Schema):
+    """What to capture, and on which station."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"station": "bench", "name": "after the move", "quick": True}}
+    )
+
+    station: str = Field(max_length=100)
+    name: str = Field(default="", max_length=120)
+    notes: str = Field(default="", max_length=4000)
+    quick: bool = Field(default=False, description="fewer frames of each")
+    sequences: tuple[SequenceName, ...] | None = Field(
+        default=None, min_length=1, description="only these; without it, all that the station can do"
+    )
+
+
+class Session(Schema):
+    """A session; `state` is `pausing` until the step under way is done."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "id": "20300101-120000-abcdef",
+                "name": "after the move",
+                "notes": "",
+                "created": "2030-01-01T12:00:00Z",
+                "closed": None,
+                "state": "running",
+                "error": None,
+                "steps": 310,
+                "steps_done": 42,
+            }
+        }
+    )
+
+    id: str
+    name: str
+    notes: str
+    created: datetime
+    closed: datetime | None
+    state: SessionState
+    error: str | None = Field(description="why it ended early, and the remedy")
+    steps: int
+    steps_done: int
+
+
+class SessionDetail(Session):
+    """A session with where it runs, how far it is, and with what it was taken."""
+
+    station: str
+    progress: Progress | None = Field(description="null unless this service runs it now")
+    runs: tuple[Run, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
+
+
+class Capture(Schema):
+    """One capture. `document` is its entry in the recording set's manifest."""
+
+    id: int
+    session_id: str
+    name: str
+    kind: str
+    side: Side
+    exposure_s: float | None
+    document: dict[str, Any]
+    preview: str = Field(description="path of its picture")
+    frame: str = Field(description="path of its raw frame, .npy, uint16 (rows, cols)")
+
+
+class JobStart(Schema):
+    """What to compute."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"kind": "diagnose"}})
+
+    kind: JobKind
+
+
+class Job(Schema):
+    """Work on one source: a session, or recordings that were sent in."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "id": "6f1d2c3b4a596877",
+                "kind": "fit",
+                "session_id": "20300101-120000-abcdef",
+                "recordings_id": None,
+                "state": "running",
+                "progress": 0.4,
+                "message": "noise of the left camera",
+                "error": None,
+                "created": "2030-01-01T12:20:00Z",
+                "started": "2030-01-01T12:20:00Z",
+                "finished": None,
+            }
+        }
+    )
+
+    id: str
+    kind: JobKind
+    session_id: str | None
+    recordings_id: str | None
+    state: JobState
+    progress: float = Field(ge=0, le=1)
+    message: str
+    error: str | None
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+
+
+class Recordings(Schema):
+    """A recording set that was sent in."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "id": "0123456789abcdef",
+                "name": "another lab's camera",
+                "notes": "",
+                "cameras": ["left"],
+                "captures": 212,
+                "warnings": [],
+            }
+        }
+    )
+
+    id: str
+    name: str
+    notes: str
+    cameras: tuple[Side, ...]
+    captures: int
+    warnings: tuple[str, ...] = ()
+
+
+class Parameter(Schema):
+    """A physical quantity as the models declare it."""
+
+    name: str
+    unit: str
+    meaning: str
+    lower: float | None
+    upper: float | None
+    prior: tuple[float, float] | None = Field(description="centre and one standard deviation; null: flat")
+    absent: float | None = Field(description="value at which an effect isn't there")
+
+
+class Effect(Schema):
+    """A physical effect that a first model leaves out."""
+
+    name: str
+    stage: str
+    reference: str
+    sentence: str
+    parameters: tuple[Parameter, ...]
+    shown_by: tuple[str, ...] = Field(description="kinds of capture that can show it")
+    rivals: tuple[str, ...] = Field(description="effects that can look the same in some captures")
+    invariances: tuple[str, ...] = Field(description="what it doesn't depend on")

@@ -1,0 +1,99 @@
+"""What the routes of one application share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import Depends, HTTPException, Request
+from fastapi import Path as PathParameter
+
+from api.errors import known
+from api.keys import Permission
+from api.live import LiveSessions
+from api.security import Demand, Gate
+from api.upload import Inbox
+from lab.errors import InputError
+from lab.jobs import JobInfo, JobRunner, ReportFile
+from lab.session import Progress
+from lab.station import Station, read_station
+from lab.store import SessionInfo, Store
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Caps on what is sent in."""
+
+    body_bytes: int = 1 << 20
+    upload_bytes: int = 4 << 30
+    unpacked_bytes: int = 16 << 30
+    unpacked_files: int = 20_000
+
+
+@dataclass(frozen=True)
+class Service:
+    """One per application."""
+
+    store: Store
+    stations: Path
+    live: LiveSessions
+    jobs: JobRunner
+    inbox: Inbox
+    gate: Gate
+    limits: Limits
+
+    def station_files(self) -> dict[str, Path]:
+        """The station files by name."""
+        return {file.stem: file for file in sorted(self.stations.glob("*.toml")) if file.is_file()}
+
+    def station(self, name: str) -> Station:
+        """A station by its file's name; 404 where there is none. Raises InputError where the file can't be used."""
+        file = self.station_files().get(name)  # looked up, never joined: a name can't leave the folder
+        if file is None:
+            raise HTTPException(404, f"no station {name[:100]!r}; GET /api/v1/stations lists them")
+        return read_station(file)
+
+    def session(self, session_id: str) -> SessionInfo:
+        """A session; 404 where there is none."""
+        return known(
+            f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them", lambda: self.store.session(session_id)
+        )
+
+    def job(self, job_id: str) -> JobInfo:
+        """A job; 404 where there is none."""
+        return known(f"no job {job_id[:60]!r}; GET /api/v1/jobs lists them", lambda: self.jobs.job(job_id))
+
+    def recordings(self, recordings_id: str) -> Path:
+        """The folder of recordings that were sent in; 404 where there are none of that id."""
+        return known(
+            f"no recordings {recordings_id[:60]!r}; GET /api/v1/recordings lists them",
+            lambda: self.inbox.folder(recordings_id),
+        )
+
+    def report(self, job_id: str) -> str:
+        """The page that a report's job wrote. Raises InputError where it is gone."""
+        written = ReportFile.model_validate(self.store.result(job_id).document)
+        try:
+            return (self.store.root / written.path).read_text(encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{written.path}: can't be read ({error.strerror}); make the report again") from error
+
+    def progress(self, session_id: str) -> Progress | None:
+        """How far a session is that this process runs."""
+        live = self.live.find(session_id)
+        return live.latest if live is not None else None
+
+
+def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+Here = Annotated[Service, Depends(_service)]
+READ = Depends(Demand(Permission.READ))
+OPERATE = Depends(Demand(Permission.OPERATE))
+CALIBRATE = Depends(Demand(Permission.CALIBRATE))
+SessionId = Annotated[str, PathParameter(pattern=r"^[0-9A-Za-z-]{1,40}$")]
+HexId = Annotated[str, PathParameter(pattern=r"^[0-9a-f]{16}$")]
+RegistryId = Annotated[int, PathParameter(ge=1, le=2**31 - 1)]
