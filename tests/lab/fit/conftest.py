@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -94,6 +95,20 @@ def draw(capture: Charuco, matrix, distortion, rotation, translation, blur_px=0.
     return image.reshape(SHAPE[0], OVER, SHAPE[1], OVER).mean(axis=(1, 3))
 
 
+@functools.cache
+def seen(dictionary: str, squares: tuple[int, int], side: str, turn: tuple[float, ...], middle: tuple[float, ...]):
+    """The board as the camera of `side` sees it; `turn` and `middle` are in the left camera's frame."""
+    capture = board_captures(side, dictionary, squares, 1)[0]
+    rotation = cv2.Rodrigues(np.array(turn, dtype=float))[0]
+    half = np.array([squares[1], squares[0], 0.0]) * capture.square_mm / 2
+    translation = np.array(middle, dtype=float) - rotation @ half
+    matrix = TRUTH.left
+    if side == "right":
+        rotation, translation = TRUTH.rotation @ rotation, TRUTH.rotation @ translation + TRUTH.translation_mm
+        matrix = TRUTH.right
+    return draw(capture, matrix, TRUTH.distortion, rotation, translation)
+
+
 def board_captures(side: str, dictionary: str, squares: tuple[int, int], poses: int) -> list[Charuco]:
     return [
         Charuco(
@@ -134,14 +149,7 @@ def make_boards(
     frames, captures = {}, []
     for side in sides:
         for capture, (turn, middle) in zip(board_captures(side, dictionary, squares, poses), POSES, strict=False):
-            rotation = cv2.Rodrigues(np.array(turn, dtype=float))[0]
-            half = np.array([squares[1], squares[0], 0.0]) * capture.square_mm / 2
-            translation = np.array(middle, dtype=float) - rotation @ half
-            matrix = TRUTH.left
-            if side == "right":
-                rotation, translation = TRUTH.rotation @ rotation, TRUTH.rotation @ translation + TRUTH.translation_mm
-                matrix = TRUTH.right
-            light = draw(capture, matrix, TRUTH.distortion, rotation, translation)
+            light = seen(capture.dictionary, squares, side, turn, middle)
             electrons = 6000 * (0.04 + 0.96 * light) * np.tile(gains, (SHAPE[0] // 2, SHAPE[1] // 2))
             frames[capture.frame] = (64 + 0.4 * rng.poisson(electrons)).astype(np.uint16)
             captures.append(capture)
