@@ -202,7 +202,10 @@ class JobRunner:
     as it lives.
     """
 
-    def __init__(self, store: Store, scheduler: str | None = None, workers: int = 1) -> None:
+    def __init__(
+        self, store: Store, scheduler: str | None = None, workers: int = 1, connect_timeout_s: float = 10.0
+    ) -> None:
+        self.connect_timeout_s = connect_timeout_s
         self.store = store
         self.scheduler = scheduler or store.settings.scheduler
         self.workers = workers
@@ -252,7 +255,7 @@ class JobRunner:
                             set_as_default=False,
                         )
                     else:
-                        self._client = Client(self.scheduler, timeout=10, set_as_default=False)
+                        self._client = Client(self.scheduler, timeout=self.connect_timeout_s, set_as_default=False)
                 except OSError as error:
                     raise InputError(
                         f"Dask scheduler {self.scheduler}: not reached ({error}); start it or unset CALIBENCH_SCHEDULER"

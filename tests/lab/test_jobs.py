@@ -1,0 +1,195 @@
+"""Jobs: what the table says of them, from queue to result, through failures, cancelling and the end of a process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+from distributed import LocalCluster
+
+import lab.jobs
+from lab.errors import InputError, NotDetermined
+from lab.jobs import JobInfo, JobRunner, ReportFile
+from lab.sequences.calibration import Calibration
+from lab.sequences.dark import DarkSequence
+from lab.session import CaptureSession
+from lab.store import JobRow, Store
+from tests.lab import fake_bench
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = Store(tmp_path / "data")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def session(store: Store) -> str:
+    darks = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.1), frames=2))
+    run = CaptureSession.start(store, fake_bench.station(), darks, connect=fake_bench.Bench().drivers)
+    return run.run().id
+
+
+def with_task(monkeypatch: pytest.MonkeyPatch, task: Any) -> None:
+    monkeypatch.setitem(lab.jobs.TASKS, "fit", task)
+
+
+def test_a_job_goes_from_the_queue_to_its_result(store: Store, session: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    go, seen = threading.Event(), []
+
+    def task(asked: Any) -> ReportFile:
+        asked.progress("half of it", 0.5)
+        seen.append(len(asked.recordings.captures()))
+        assert go.wait(20)
+        return ReportFile(path="made")
+
+    with_task(monkeypatch, task)
+    with JobRunner(store) as runner:
+        job = runner.submit("fit", session)
+        until = time.monotonic() + 20
+        while runner.job(job).progress < 0.5:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        info = runner.job(job)
+        assert (info.state, info.message, info.started is not None) == ("running", "half of it", True)
+        go.set()
+        info = runner.wait(job, 20)
+        assert (info.state, info.progress, info.error) == ("done", 1.0, None)
+        assert seen == [8]
+        assert [one.id for one in runner.jobs()] == [job]
+    result = store.result(job)
+    assert (result.kind, result.source, result.document) == ("fit", session, {"path": "made"})
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (InputError("folder: damaged; copy it again"), "folder: damaged; copy it again"),
+        (NotDetermined("noise", "no flats; capture some"), "noise: no flats; capture some"),
+        (ZeroDivisionError("by zero"), "ZeroDivisionError: by zero; this is a defect of calibench, report it"),
+    ],
+)
+def test_a_failure_is_said_and_the_runner_goes_on(
+    store: Store, session: str, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
+) -> None:
+    def task(asked: Any) -> ReportFile:
+        if not store.results():
+            store.add_result("validate", session, {})
+            raise error
+        return ReportFile(path="made")
+
+    with_task(monkeypatch, task)
+    with JobRunner(store) as runner:
+        first = runner.wait(runner.submit("fit", session), 20)
+        assert (first.state, first.error) == ("failed", said)
+        assert runner.wait(runner.submit("fit", session), 20).state == "done"
+
+
+def test_cancelling_ends_a_job_at_its_next_word_and_the_next_one_starts(
+    store: Store, session: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began, calls = threading.Event(), []
+
+    def task(asked: Any) -> ReportFile:
+        calls.append(asked.job_id)
+        if len(calls) > 1:
+            return ReportFile(path="made")
+        began.set()
+        for step in range(2000):  # 20 s, if nothing ended it
+            asked.progress(f"step {step}", step / 2000)
+            time.sleep(0.01)
+        raise AssertionError("not cancelled")
+
+    with_task(monkeypatch, task)
+    with JobRunner(store) as runner:
+        first, second, third = (runner.submit("fit", session) for _ in range(3))
+        assert began.wait(20)
+        assert runner.cancel(second).state == "cancelled"  # it is queued behind the first
+        assert runner.cancel(first).cancel_requested
+        assert runner.wait(first, 20).state == "cancelled"
+        assert runner.wait(third, 20).state == "done"
+        assert runner.cancel(third).state == "done"
+    assert calls == [first, third]
+    assert [r.job_id for r in store.results()] == [third]
+
+
+def test_closing_the_runner_ends_what_is_under_way(store: Store, session: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    began = threading.Event()
+
+    def task(asked: Any) -> ReportFile:
+        began.set()
+        while True:
+            asked.progress("on and on", 0.1)
+            time.sleep(0.01)
+
+    with_task(monkeypatch, task)
+    with JobRunner(store) as runner:
+        job = runner.submit("fit", session)
+        assert began.wait(20)
+    with JobRunner(store) as runner:
+        assert runner.job(job).state == "cancelled"
+
+
+def test_jobs_of_a_process_that_ended_are_failed_at_the_next_start(store: Store, session: str) -> None:
+    with JobRunner(store) as alive:
+        with store.transaction() as db:
+            for number, (state, runner) in enumerate(
+                [("queued", "gone"), ("running", "gone"), ("done", "gone"), ("running", alive.id)]
+            ):
+                row = JobRow(id=f"j{number}", kind="fit", source=session, state=state, runner=runner)
+                row.created = fake_bench.datetime.now(fake_bench.UTC)
+                db.add(row)
+        with JobRunner(store) as runner:
+            states = [runner.job(f"j{number}") for number in range(4)]
+    assert [info.state for info in states] == ["failed", "failed", "done", "running"]
+    assert "ended before it was done; start the job again" in (states[0].error or "")
+    with store.transaction() as db:
+        db.execute(sa.update(JobRow).values(state="done"))
+
+
+def test_what_is_not_there_is_said(store: Store) -> None:
+    with JobRunner(store) as runner:
+        with pytest.raises(InputError, match="job 'x'"):
+            runner.job("x")
+        with pytest.raises(InputError, match="choose from fit, validate, diagnose, report"):
+            runner.submit("paint", "s")  # type: ignore[arg-type]
+        info = runner.wait(runner.submit("fit", "/no/such/folder"), 20)
+        assert info.state == "failed"
+        assert "neither a recording set's folder nor a session" in (info.error or "")
+
+
+def test_a_real_fit_on_a_worker_process(store: Store, session: str) -> None:
+    # In a process of its own the task has only references: the store's folder and the job's id.
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        JobRunner(store, scheduler=cluster.scheduler_address) as runner,
+    ):
+        info: JobInfo = runner.wait(runner.submit("fit", session), 120)
+        assert (info.state, info.error) == ("done", None)
+    document = store.result(info.id).document
+    assert document["format"] == "calibench-fit"
+    assert document["source"] == session
+
+
+def test_a_scheduler_that_is_not_there_is_said(store: Store) -> None:
+    with (
+        JobRunner(store, scheduler="tcp://127.0.0.1:9", connect_timeout_s=0.3) as runner,
+        pytest.raises(InputError, match="not reached"),
+    ):
+        runner.submit("fit", "s")
+
+
+def test_a_settled_sessions_fit_is_not_made_twice(store: Store, session: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted = lab.jobs.FitResult(source=session, cameras={})
+    made: list[int] = []
+    monkeypatch.setattr(lab.jobs._Task, "fit", lambda asked: made.append(1) or fitted)
+    task = lab.jobs._Task(store, session, "j", lambda what, share: None)
+    for _ in range(2):
+        assert task._latest("fit", lab.jobs.FitResult, task.fit) == fitted
+    assert made == [1]
