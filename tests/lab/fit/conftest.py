@@ -67,7 +67,7 @@ def undistorted(x, y, distortion) -> NDArray[np.float64]:
     """Rays (n, 3) of normalised image points, by fixed-point iteration of Brown's model (contracts by ~0.1 a step)."""
     k1, k2, p1, p2, k3 = distortion
     u, v = x, y
-    for _ in range(15):
+    for _ in range(8):
         r2 = u * u + v * v
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         u, v = (
