@@ -29,7 +29,7 @@ from lab.recording import Camera, Capture, Dark, Flat, RecordingSet
 from lab.results import NoiseFit, PhotonTransfer
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
-from sim.spectrum import FloatArray
+from sim.spectrum import FloatArray, Spectrum
 
 QUANTISATION_DN2 = 1.0 / 12.0
 LINE_LIMIT = 0.7  # of saturation: EMVA's range of the photon-transfer line
@@ -491,15 +491,16 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in recordings.captures("dark", side) if (dark.gain_db or 0.0) == gain_db]
     dark_levels, bad = _dark_levels(recordings, darks, camera)
+    lamps = _lamps(recordings, flats)
     flat_levels = [
         Level(
             group[0].exposure_s,
             _light(group[0]),
-            _lamp(group[0]),
+            lamps[group[0].id],
             level_statistics((recordings.frame(capture) for capture in group), camera.cfa, camera.saturation_dn, bad),
             group[0].temperature_c,
         )
-        for group in _groups(flats, lambda flat: (flat.exposure_s, _light(flat), _lamp(flat)))
+        for group in _groups(flats, lambda flat: (flat.exposure_s, _light(flat), lamps[flat.id]))
     ]
     return noise_fit(dark_levels, flat_levels, camera, gain_db, 0 if bad is None else int(bad.sum()))
 
@@ -515,8 +516,28 @@ def _light(flat: Flat) -> float:
     return flat.photons_per_pixel if flat.photons_per_pixel is not None else flat.exposure_s
 
 
-def _lamp(flat: Flat) -> Hashable:
-    return flat.radiance, flat.photons_per_pixel is not None, flat.wavelength_nm
+#: Radiances that differ by less than this are one lamp, measured twice.
+_SAME_LAMP = 0.02
+
+
+def _lamps(recordings: RecordingSet, flats: Sequence[Flat]) -> dict[str, Hashable]:
+    """What light each flat (by its id) saw: a lamp that is measured before every pass over the levels is one lamp."""
+    seen: list[tuple[str, Spectrum]] = []
+    names: dict[str | None, str | None] = {None: None}
+    for path in dict.fromkeys(flat.radiance for flat in flats):
+        if path is None:
+            continue
+        spectrum = recordings.spectrum(path)
+        wavelength_nm = np.array(spectrum.wavelength_nm)
+        value = np.array(spectrum.value)
+        for name, other in seen:
+            if np.abs(value - other.at(wavelength_nm)).sum() <= _SAME_LAMP * np.abs(value).sum():
+                names[path] = name
+                break
+        else:
+            seen.append((path, spectrum))
+            names[path] = path
+    return {flat.id: (names[flat.radiance], flat.photons_per_pixel is not None, flat.wavelength_nm) for flat in flats}
 
 
 def _dark_levels(
