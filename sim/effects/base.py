@@ -36,6 +36,8 @@ class Effect(Frozen):
     form_tolerance: ClassVar[float] = 0.05
     #: What the effect doesn't depend on, of: f_number exposure wavelength field level orientation time.
     invariances: ClassVar[frozenset[str]] = frozenset()
+    #: Parameters that shape the effect without sizing it (a filter's edge): a score takes them from the prototype as they are.
+    shapes: ClassVar[frozenset[str]] = frozenset()
     #: Kinds of capture that can show it (`dark`, `flat`, `narrowband`, `slanted_edge`, ...).
     shown_by: ClassVar[frozenset[str]] = frozenset()
     #: Names of effects that can look the same in some set of captures.

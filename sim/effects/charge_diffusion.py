@@ -25,6 +25,7 @@ class ChargeDiffusion(Effect):
     reference: ClassVar[str] = "D. Seib, IEEE Trans. Electron Devices 21, 210 (1974)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "level", "orientation", "time"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"wavelength_power"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {

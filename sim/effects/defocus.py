@@ -62,4 +62,5 @@ class Defocus(Effect):
             camera.lens.f_number,
             lambda u, v, s, a: 2.0 * w020 * s * u,
             isotropic=True,
+            along_only=True,
         )

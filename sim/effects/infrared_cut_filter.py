@@ -22,6 +22,7 @@ class InfraredCutFilter(Effect):
     reference: ClassVar[str] = "H. A. Macleod, Thin-Film Optical Filters, chapter on edge filters"
     form_tolerance: ClassVar[float] = 0.02
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"cut_wavelength_nm", "width_nm"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband", "chart"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {"wavelength_offset", "source_bandwidth", "second_order_light", "stray_light"}

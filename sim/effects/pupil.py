@@ -28,24 +28,51 @@ def aberration_ratio(
     path_difference_um: PathDifference,
     *,
     isotropic: bool,
-    nodes: int = 20,
+    along_only: bool = False,
+    nodes: int = 16,
 ) -> FloatArray:
     """OTF of an aberrated circular pupil over that of the perfect one; shape of `fx_cy_per_um`; 1 beyond the cut-off.
 
     H(s) = (1/pi) integral over the overlap of two unit discs a distance s apart of cos(2 pi dW / lambda), for aberrations
     whose dW is odd in u (all even ones, such as defocus, spherical aberration and astigmatism). Gauss-Legendre in
-    coordinates that take the square roots at the rim away. An isotropic aberration is tabulated along the radius.
+    coordinates that take the square roots at the rim away. `isotropic`: dW doesn't depend on the angle; `along_only`: nor on v.
     Source: J. Goodman, Introduction to Fourier Optics, section 6.4.
     """
     fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
     radius = np.hypot(fx, fy)
     cutoff = 1.0 / (wavelength_nm * 1e-3 * f_number)
-    if isotropic and radius.size > 160:
-        grid = np.linspace(0.0, min(cutoff, float(radius.max()) * 1.0001), 161)
-        table = _ratio(grid / cutoff * 2.0, np.zeros_like(grid), wavelength_nm, path_difference_um, nodes)
-        return np.where(radius < cutoff, np.interp(radius, grid, table), 1.0)
-    flat = _ratio(radius.ravel() / cutoff * 2.0, np.arctan2(fy, fx).ravel(), wavelength_nm, path_difference_um, nodes)
-    return flat.reshape(radius.shape)
+    if not isotropic:
+        angle = np.arctan2(fy, fx).ravel()
+        return _ratio(radius.ravel() / cutoff * 2.0, angle, wavelength_nm, path_difference_um, nodes).reshape(
+            radius.shape
+        )
+    # the same radius comes again at other angles
+    grid, place = np.unique(np.round(radius / cutoff, 9), return_inverse=True)
+    if grid.size > 600:
+        table = np.linspace(0.0, min(1.0, float(grid[-1])), 301)
+        coarse = aberration_ratio(
+            table * cutoff, np.zeros_like(table), wavelength_nm, f_number, path_difference_um,
+            isotropic=True, along_only=along_only, nodes=nodes,
+        )  # fmt: skip
+        return np.where(radius < cutoff, np.interp(radius / cutoff, table, coarse), 1.0)
+    if along_only:
+        values = _ratio_along(2.0 * grid, wavelength_nm, path_difference_um, 2 * nodes)
+    else:
+        values = _ratio(2.0 * grid, np.zeros_like(grid), wavelength_nm, path_difference_um, nodes)
+    return np.asarray(values[place.reshape(radius.shape)])
+
+
+def _ratio_along(s: FloatArray, wavelength_nm: float, path_difference_um: PathDifference, nodes: int) -> FloatArray:
+    """For path errors that don't depend on v: the overlap's chord sqrt(1 - (u + s/2)^2) is the weight, u from 0 to 1 - s/2."""
+    node, weight = _nodes(nodes)
+    inside = np.clip(s, 0.0, 2.0 - 1e-9)[:, None]
+    # u = (1 - s/2) (1 - t^2) takes the chord's square root at the rim away
+    u = (1.0 - 0.5 * inside) * (1.0 - node[None, :] ** 2)
+    area = weight * node * np.sqrt(np.maximum(1.0 - (u + 0.5 * inside) ** 2, 0.0))
+    phase = (
+        2.0 * np.pi / (wavelength_nm * 1e-3) * path_difference_um(u, np.zeros_like(u), inside, np.zeros_like(inside))
+    )
+    return np.where(s < 2.0, (area * np.cos(phase)).sum(1) / np.maximum(area.sum(1), 1e-300), 1.0)
 
 
 def _ratio(

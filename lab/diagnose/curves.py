@@ -1,0 +1,109 @@
+"""What is free of the maker's sensitivity curves: a scale, a tilt, a bend and a smooth few per mille."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from lab.diagnose.summaries import SPECTRAL_HOOKS, Effects, Study, overrides
+from sim.effects.base import Effect
+from sim.forward import electron_rate
+from sim.spectrum import FloatArray, Spectrum
+
+LEAK_STD = 2.0e-4  # of the curve's peak: blindness that a data sheet rounds away
+CURVE_SCALE_STD = 0.2  # of the sensitivity: holds gain, aperture and lens too
+CURVE_TILT_STD = 0.05  # per 100 nm
+CURVE_BEND_STD = 0.01  # per (100 nm)^2
+CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
+
+
+class CurveSlopes:
+    """Electron rates of a list of (light, channel), and their slopes by what is free of the maker's curves.
+
+    Per channel: scale, tilt, bend and a rough part on knots with a squared-exponential prior. The slope by a factor
+    (1 + d(w)) on the curve is the rate with the curve times d: exact, as the rate is linear in the curve. The baseline's rates
+    are `sim.forward`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
+    """
+
+    def __init__(self, study: Study, items: Sequence[tuple[str, str, float, str, Spectrum | None]]) -> None:
+        self.study, self.items = study, items
+        self.kind = items[0][3]
+        lights = {path: study.spectrum(path) for path in {item[0] for item in items}}
+        camera = study.camera
+        low = min(light.arrays[0][0] for light in lights.values())
+        high = max(light.arrays[0][-1] for light in lights.values())
+        self.wavelength = np.arange(np.floor(low), np.ceil(high) + 1.0)
+        self.radiance = {path: light.at(self.wavelength) for path, light in lights.items()}
+        curve = {c: q.at(self.wavelength) * self.wavelength for c, q in camera.quantum_efficiency.items()}
+        ones = np.ones_like(self.wavelength)
+        self._curve = np.array(
+            [curve[c] * (r.at(self.wavelength) if r is not None else ones) for _, c, _, _, r in items]
+        )
+        self._weight = np.array([self.radiance[path] for path, *_ in items]) * self._curve
+        self._total = self._weight.sum(1)
+        self._rate = np.array(
+            [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
+        )
+        self._kept: dict[tuple[Effect, ...], tuple[FloatArray, FloatArray]] = {}
+        knots = np.arange(380.0, 781.0, 20.0)
+        cov = CURVE_ROUGH_STD**2 * np.exp(-0.5 * ((knots[:, None] - knots) / CURVE_ROUGH_NM) ** 2)
+        size, vector = np.linalg.eigh(cov)
+        keep = size > 1e-3 * size.max()
+        modes = [
+            np.full_like(knots, CURVE_SCALE_STD),
+            CURVE_TILT_STD * (knots - 560.0) / 100.0,
+            CURVE_BEND_STD * ((knots - 560.0) / 100.0) ** 2,
+        ]
+        modes += [vector[:, i] * np.sqrt(size[i]) for i in np.flatnonzero(keep)[::-1]]
+        self._modes = np.array([np.interp(self.wavelength, knots, mode) for mode in modes])
+
+    @cached_property
+    def blind(self) -> FloatArray:
+        """Electrons that a flat sensitivity of LEAK_STD of the curve's peak would leave, (n,)."""
+        found = []
+        for path, channel, exposure, _, reflectance in self.items:
+            curve = self.study.camera.quantum_efficiency[channel]
+            flat = self.study.camera.model_copy(
+                update={
+                    "quantum_efficiency": {channel: Spectrum.of((300.0, 1100.0), (LEAK_STD * max(curve.value),) * 2)}
+                }
+            )
+            found.append(electron_rate(flat, channel, self.study.spectrum(path), reflectance=reflectance) * exposure)
+        return np.array(found)
+
+    def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
+        """Rates (n,) and the modes' shares in them (n, modes)."""
+        spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
+        if spectral not in self._kept:
+            weight = self._weight
+            if any(type(e).radiance is not Effect.radiance for e in spectral):
+                lit = dict(self.radiance)
+                for effect in spectral:
+                    lit = {path: effect.radiance(self.wavelength, value, self.kind) for path, value in lit.items()}
+                weight = np.array([lit[path] for path, *_ in self.items]) * self._curve
+            for effect in spectral:
+                weight = weight * effect.transmittance(self.wavelength, np.asarray(0.0))
+            total = weight.sum(1)
+            rate = self._rate * total / np.maximum(self._total, 1e-300)
+            shares = weight @ self._modes.T / np.maximum(total, 1e-300)[:, None]
+            if len(self._kept) > 500:
+                self._kept.clear()
+            self._kept[spectral] = rate, rate[:, None] * shares
+        return self._kept[spectral]
+
+    def rates(self, effects: Effects) -> FloatArray:
+        """Electrons a second on axis, (n,)."""
+        return self._under(effects)[0]
+
+    def slopes(self, effects: Effects) -> dict[str, FloatArray]:
+        """By the free quantities, in electrons a second."""
+        table = self._under(effects)[1]
+        named = {}
+        for channel in self.study.channels:
+            mine = np.array([item[1] == channel for item in self.items])
+            if mine.any():
+                for i in range(len(self._modes)):
+                    named[f"curve:{channel}:{i}"] = np.where(mine, table[:, i], 0.0)
+        return named

@@ -1,0 +1,164 @@
+"""All blocks of one side together: one Gaussian model of everything that was measured, for any set of effects.
+
+y ~ N(m(effects), C),  C = noise + floors + J P J' (free quantities, marginalised) + sum_k eps_k^2 (dm_k dm_k') o K
+
+The last term is an effect's form tolerance: its law may be wrong by eps_k of its own change dm_k, smoothly along the axis.
+What is held out of choice and fit is judged by its distribution given the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+
+from lab.diagnose.summaries import Block, Effects, Prediction
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.spectrum import FloatArray
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """Mean and covariance of all numbers under one set of effects."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@dataclass
+class Evidence:
+    """The blocks of one side, in one vector. Predictions are kept, as most effects act on a few blocks only."""
+
+    blocks: tuple[Block, ...]
+    camera: CameraModel
+    _kept: dict[tuple[int, tuple[Effect, ...]], Prediction] = field(default_factory=dict)
+
+    @cached_property
+    def value(self) -> FloatArray:
+        return np.concatenate([b.value for b in self.blocks])
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        ends = np.cumsum([len(b.value) for b in self.blocks])
+        return tuple(slice(int(e) - len(b.value), int(e)) for b, e in zip(self.blocks, ends, strict=True))
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Which numbers choice and fit may see."""
+        return np.array([not label.held_out for b in self.blocks for label in b.labels])
+
+    @cached_property
+    def _noise(self) -> FloatArray:
+        covariance = np.zeros((len(self.value), len(self.value)))
+        for block, at in zip(self.blocks, self.slices, strict=True):
+            covariance[at, at] = block.covariance
+        return covariance
+
+    def _prediction(self, index: int, effects: Effects) -> Prediction:
+        block = self.blocks[index]
+        key = index, tuple(e for e in effects if block.touched_by(type(e)))
+        if key not in self._kept:
+            if len(self._kept) > 20000:
+                self._kept.clear()
+            self._kept[key] = block.predict(key[1])
+        return self._kept[key]
+
+    def mean(self, effects: Effects = ()) -> FloatArray:
+        """Prediction of everything, (n,)."""
+        return np.concatenate([self._prediction(i, effects).mean for i in range(len(self.blocks))])
+
+    def _free(self, effects: Effects) -> FloatArray:
+        """Slopes by all free quantities, (n, k), per prior standard deviation; one that several blocks share is one column."""
+        names: dict[str, int] = {}
+        parts = [self._prediction(i, effects).slopes for i in range(len(self.blocks))]
+        for part in parts:
+            for name in part:
+                names.setdefault(name, len(names))
+        table = np.zeros((len(self.value), len(names)))
+        for part, at in zip(parts, self.slices, strict=True):
+            for name, column in part.items():
+                table[at, names[name]] = column
+        return table
+
+    @cached_property
+    def _kinship(self) -> FloatArray:
+        """How alike the error of a law is at two points: smooth along the axis, less so between channels and conditions."""
+        kin = np.zeros((len(self.value), len(self.value)))
+        for block, at in zip(self.blocks, self.slices, strict=True):
+            x = np.array([label.x for label in block.labels])
+            channel = np.array([label.channel for label in block.labels])
+            condition = np.array([label.condition for label in block.labels])
+            near = np.exp(-0.5 * ((x[:, None] - x) / block.reach) ** 2)
+            near = near * np.where(channel[:, None] == channel, 1.0, 0.7)
+            if block.measurement == "slanted_edge":
+                near = near * np.where(condition[:, None] == condition, 1.0, 0.7)
+            kin[at, at] = near
+        return kin
+
+    def gaussian(self, effects: Effects = ()) -> Gaussian:
+        """Mean and covariance of everything under these effects."""
+        mean = self.mean(effects)
+        free = self._free(effects)
+        covariance = self._noise + free @ free.T
+        for i, effect in enumerate(effects):
+            change = mean - self.mean((*effects[:i], *effects[i + 1 :]))
+            covariance += effect.form_tolerance**2 * np.outer(change, change) * self._kinship
+        return Gaussian(mean, covariance)
+
+    def touched(self, effect: type[Effect]) -> np.ndarray:
+        """Numbers that an effect may change."""
+        mask = np.zeros(len(self.value), bool)
+        for block, at in zip(self.blocks, self.slices, strict=True):
+            mask[at] = block.touched_by(effect)
+        return mask
+
+    def held_out(self, effects: Effects = (), where: np.ndarray | None = None) -> tuple[float, int]:
+        """chi2 and number of the held-out numbers, given the seen ones, under these effects."""
+        out = ~self.seen if where is None else ~self.seen & where
+        if not out.any():
+            return 0.0, 0
+        model = self.gaussian(effects)
+        residual = self.value - model.mean
+        inside = cholesky(model.covariance[np.ix_(self.seen, self.seen)], lower=True)
+        cross = solve_triangular(inside, model.covariance[np.ix_(self.seen, out)], lower=True)
+        expected = cross.T @ solve_triangular(inside, residual[self.seen], lower=True)
+        left = model.covariance[np.ix_(out, out)] - cross.T @ cross
+        return chi2(residual[out] - expected, left), int(out.sum())
+
+    def captures(self, held_out: bool, where: np.ndarray | None = None) -> tuple[str, ...]:
+        labels = [label for b in self.blocks for label in b.labels]
+        names: dict[str, None] = {}
+        for i, label in enumerate(labels):
+            if label.held_out == held_out and (where is None or where[i]):
+                names.update(dict.fromkeys(label.captures))
+        return tuple(sorted(names))
+
+
+def chi2(residual: FloatArray, covariance: FloatArray) -> float:
+    """residual' covariance^-1 residual."""
+    white = solve_triangular(cholesky(covariance, lower=True), residual, lower=True)
+    return float(white @ white)
+
+
+def log_likelihood(residual: FloatArray, covariance: FloatArray) -> float:
+    """Of a normal distribution, without the constant."""
+    lower = cholesky(covariance, lower=True)
+    white = solve_triangular(lower, residual, lower=True)
+    return float(-0.5 * white @ white - np.log(np.diag(lower)).sum())
+
+
+def conditional(
+    residual: FloatArray, covariance: FloatArray, of: np.ndarray, given: np.ndarray
+) -> tuple[FloatArray, FloatArray]:
+    """Residual and covariance of some numbers, given others."""
+    inside = cholesky(covariance[np.ix_(given, given)], lower=True), True
+    gain = cho_solve(inside, covariance[np.ix_(given, of)])
+    return residual[of] - gain.T @ residual[given], covariance[np.ix_(of, of)] - gain.T @ covariance[np.ix_(given, of)]
+
+
+def blocks_named(blocks: Sequence[Block]) -> tuple[str, ...]:
+    return tuple(b.measurement for b in blocks)

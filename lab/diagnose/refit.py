@@ -1,0 +1,181 @@
+"""Fit the parameters of a set of effects to the seen numbers, and weigh it against other sets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import least_squares
+
+from lab.diagnose.evidence import Evidence, log_likelihood
+from lab.diagnose.summaries import Effects
+from sim.effects.base import Effect
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+PASSES = 3  # the covariance depends on the parameters by the form tolerance: refined so often
+#: Nats that a parameter has to earn: half the logarithm of the independent numbers it is fitted to, a few hundred.
+PARAMETER_NATS = 2.5
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One parameter of one effect, in the coordinate in which predictions have a slope at `absent`."""
+
+    index: int  # of the effect
+    name: str
+    quantity: Quantity
+
+    @property
+    def absent(self) -> float:
+        return self.quantity.absent or 0.0
+
+    def to(self, value: float) -> float:
+        away = value - self.absent
+        return float(np.sign(away) * abs(away) ** self.quantity.slope_power)
+
+    def back(self, u: float) -> float:
+        value = self.absent + float(np.sign(u) * abs(u) ** (1.0 / self.quantity.slope_power))
+        low = self.quantity.lower if self.quantity.lower is not None else -np.inf
+        high = self.quantity.upper if self.quantity.upper is not None else np.inf
+        return min(max(value, low), high)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        low, high = self.quantity.lower, self.quantity.upper
+        return (-np.inf if low is None else self.to(low), np.inf if high is None else self.to(high))
+
+    def scale(self, value: float) -> float:
+        """A typical step in u."""
+        spread = self.quantity.prior[1] if self.quantity.prior is not None else 5.0
+        if self.quantity.slope_power == 1:
+            return spread
+        return max(abs(self.to(value)), 0.05 * spread**self.quantity.slope_power)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A set of effects at their best parameters. `weight` is the log-likelihood less what the parameters cost."""
+
+    effects: tuple[Effect, ...]
+    std: tuple[dict[str, float | None], ...]
+    log_likelihood: float
+    weight: float
+    tangents: FloatArray  # (n, parameters), slopes of the prediction
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.effects)
+
+
+def coordinates(effects: Effects) -> list[Coordinate]:
+    return [Coordinate(i, name, q) for i, e in enumerate(effects) for name, q in type(e).quantities().items()]
+
+
+def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tuple[Effect, ...]:
+    """The same effects at other values of their coordinates."""
+    values: list[dict[str, float]] = [{} for _ in effects]
+    for c, at in zip(coords, u, strict=True):
+        values[c.index][c.name] = c.back(float(at))
+    return tuple(type(e)(**v) for e, v in zip(effects, values, strict=True))
+
+
+def likelihood(evidence: Evidence, effects: Effects) -> float:
+    """Of the seen numbers under the effects as they stand."""
+    model = evidence.gaussian(effects)
+    seen = evidence.seen
+    return log_likelihood((evidence.value - model.mean)[seen], model.covariance[np.ix_(seen, seen)])
+
+
+def refit(evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluations: int = 12) -> Fit:
+    """Maximum a posteriori of all parameters of `start`, by Gauss-Newton with bounds; the prior is three times as wide as
+    the declared one, as a camera at hand needn't be typical. Standard uncertainties follow from the slopes and hold the form
+    tolerance, as the covariance does."""
+    effects = tuple(start)
+    coords = coordinates(effects)
+    seen = evidence.seen
+    if not coords:
+        value = likelihood(evidence, effects)
+        return Fit(effects, (), value, value, np.zeros((len(evidence.value), 0)))
+    u = np.array([c.to(float(getattr(effects[c.index], c.name))) for c in coords])
+    low, high = (np.array(b) for b in zip(*(c.bounds for c in coords), strict=True))
+    scale = np.array([c.scale(float(getattr(effects[c.index], c.name))) for c in coords])
+    prior_centre = np.array(
+        [c.to(c.quantity.prior[0]) if c.quantity.prior and c.quantity.slope_power == 1 else 0.0 for c in coords]
+    )
+    prior_std = np.array([3.0 * c.quantity.prior[1] if c.quantity.prior else np.inf for c in coords])
+    prior_std = np.array([s**c.quantity.slope_power for s, c in zip(prior_std, coords, strict=True)])
+    jacobian = np.zeros((int(seen.sum()), len(coords)))
+    for turn in range(passes):
+        lower = cholesky(evidence.gaussian(moved(effects, coords, u)).covariance[np.ix_(seen, seen)], lower=True)
+
+        def residual(at: FloatArray, lower: FloatArray = lower) -> FloatArray:
+            white = solve_triangular(
+                lower, (evidence.value - evidence.mean(moved(effects, coords, at)))[seen], lower=True
+            )
+            return np.concatenate([white, (at - prior_centre) / prior_std])
+
+        def slope(at: FloatArray, lower: FloatArray = lower) -> FloatArray:
+            # steps of 2 % of a typical size, towards the inside of the bounds
+            base = evidence.mean(moved(effects, coords, at))[seen]
+            columns = []
+            for k in range(len(at)):
+                step = 0.02 * max(scale[k], 0.02 * abs(at[k]))
+                step = -step if at[k] + step > high[k] else step
+                shifted = at.copy()
+                shifted[k] += step
+                columns.append((base - evidence.mean(moved(effects, coords, shifted))[seen]) / step)
+            white = solve_triangular(lower, np.array(columns).T, lower=True)
+            return np.vstack([white, np.diag(1.0 / prior_std)])
+
+        inside = np.clip(u, low + 1e-9 * scale, high - 1e-9 * scale)
+        result = least_squares(
+            residual,
+            inside,
+            jac=slope,
+            bounds=(low, high),
+            x_scale=scale,
+            max_nfev=evaluations if turn == 0 else 5,
+            xtol=1e-5,
+            ftol=1e-5,
+        )
+        before, u = u, result.x
+        jacobian = result.jac[: -len(coords)]
+        if turn and np.all(np.abs(u - before) < 1e-3 * scale):
+            break
+    final = moved(effects, coords, u)
+    curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)
+    covariance = np.linalg.pinv(curvature)
+    std: list[dict[str, float | None]] = [{} for _ in final]
+    for k, c in enumerate(coords):
+        su = float(np.sqrt(max(covariance[k, k], 0.0)))
+        power = c.quantity.slope_power
+        away = abs(c.back(float(u[k])) - c.absent)
+        # at a power p the uncertainty of the value is su / (p |value|^(p - 1)), at 0 the p-th root of su bounds it
+        std[c.index][c.name] = (
+            su if power == 1 else min(su / max(power * away ** (power - 1), 1e-12), su ** (1.0 / power))
+        )
+    value = likelihood(evidence, final)
+    prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
+    tangents = _tangents(evidence, final, coords, u, scale, high)
+    return Fit(final, tuple(std), value, value + prior - PARAMETER_NATS * len(coords), tangents)
+
+
+def _tangents(
+    evidence: Evidence,
+    effects: Effects,
+    coords: Sequence[Coordinate],
+    u: FloatArray,
+    scale: FloatArray,
+    high: FloatArray,
+) -> FloatArray:
+    base = evidence.mean(effects)
+    columns = []
+    for k in range(len(u)):
+        step = 0.02 * scale[k] * (-1 if u[k] + 0.02 * scale[k] > high[k] else 1)
+        shifted = u.copy()
+        shifted[k] += step
+        columns.append((evidence.mean(moved(effects, coords, shifted)) - base) / 0.02)
+    return np.array(columns).T

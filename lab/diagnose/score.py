@@ -1,0 +1,133 @@
+"""The score of every effect: how much of the residual its signature takes, free quantities and known effects projected out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import nnls
+
+from lab.diagnose.evidence import Evidence
+from lab.diagnose.summaries import Effects
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.spectrum import FloatArray
+
+
+@dataclass(frozen=True)
+class Score:
+    """S = |r|^2 - min over u >= 0 of |r - G u|^2, r and G whitened: the likelihood-ratio statistic of a small effect."""
+
+    effect: type[Effect]
+    value: float
+    start: Effect  # where a refit begins
+
+
+@dataclass(frozen=True)
+class Signatures:
+    """Whitened signatures of all candidates about one model."""
+
+    white: FloatArray  # residual
+    columns: list[tuple[type[Effect], tuple[Effect, ...], FloatArray]]
+
+    def scores(self) -> list[Score]:
+        best: dict[str, Score] = {}
+        for effect, prototypes, table in self.columns:
+            value, share = _cone(table, self.white)
+            if effect.name not in best or value > best[effect.name].value:
+                best[effect.name] = Score(effect, value, _combined(effect, prototypes, share))
+        return sorted(best.values(), key=lambda s: -s.value)
+
+    def threshold(self, rng: np.random.Generator, quantile: float, draws: int = 400) -> float:
+        """The quantile of the largest score over a bootstrap of the model: noise drawn as the covariance says.
+
+        Only the span of the signatures matters, in which white noise stays white.
+        """
+        if not self.columns:
+            return float("inf")
+        stacked = np.concatenate([table for _, _, table in self.columns], axis=1)
+        basis = _span(stacked)
+        projected = [basis.T @ table for _, _, table in self.columns]
+        top = np.zeros(draws)
+        noise = rng.standard_normal((draws, basis.shape[1]))
+        for table in projected:
+            if table.shape[1] == 1:
+                size = float(np.linalg.norm(table))
+                if size > 0:
+                    top = np.maximum(top, np.square(np.maximum(noise @ table[:, 0] / size, 0.0)))
+            else:
+                # both signs of a parameter, or several: the norm of the projection bounds the cone's score from above
+                span = _span(table)
+                top = np.maximum(top, np.square(noise @ span).sum(1))
+        return float(np.quantile(top, quantile))
+
+
+def signatures(
+    evidence: Evidence,
+    camera: CameraModel,
+    current: Effects,
+    candidates: Iterable[type[Effect]],
+    tangents: FloatArray | None = None,
+) -> Signatures:
+    """About a model with `current` effects; `tangents` (n, p): slopes by the parameters of these, projected out."""
+    seen = evidence.seen
+    model = evidence.gaussian(current)
+    lower = cholesky(model.covariance[np.ix_(seen, seen)], lower=True)
+    white = solve_triangular(lower, (evidence.value - model.mean)[seen], lower=True)
+    out = np.zeros((len(white), 0))
+    if tangents is not None and tangents.size:
+        out = _span(solve_triangular(lower, tangents[seen], lower=True))
+        white = white - out @ (out.T @ white)
+    columns = []
+    for effect in candidates:
+        if not evidence.touched(effect).any():
+            continue
+        for prototypes in effect.prototypes(camera):
+            raw = np.stack([evidence.mean((*current, p)) - model.mean for p in prototypes], axis=1)[seen]
+            if not np.any(np.abs(raw) > 0):
+                continue
+            table = solve_triangular(lower, raw, lower=True)
+            table = table - out @ (out.T @ table)
+            columns.append((effect, prototypes, table))
+    return Signatures(white, columns)
+
+
+def _span(table: FloatArray) -> FloatArray:
+    if table.shape[1] == 0:
+        return table
+    size = np.linalg.norm(table, axis=0)
+    unit = table[:, size > 0] / size[size > 0]
+    u, s, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(u[:, s > 1e-6 * max(float(s.max(initial=0.0)), 1e-300)])
+
+
+def _cone(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray]:
+    size = np.linalg.norm(table, axis=0)
+    share, rest = nnls(table / np.where(size > 0, size, 1.0), white)
+    return float(white @ white - rest**2), share / np.where(size > 0, size, 1.0)
+
+
+def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray) -> Effect:
+    """The prototypes scaled in their slope coordinates by the shares found, within bounds."""
+    likest = prototypes[int(np.argmax(share))]
+    values: dict[str, float] = {}
+    for name, quantity in effect.quantities().items():
+        if name in effect.shapes:
+            values[name] = float(getattr(likest, name))
+            continue
+        absent = quantity.absent or 0.0
+        total = 0.0
+        for prototype, part in zip(prototypes, share, strict=True):
+            away = float(getattr(prototype, name)) - absent
+            total += float(part) * np.sign(away) * abs(away) ** quantity.slope_power
+        step = np.sign(total) * abs(total) ** (1.0 / quantity.slope_power)
+        values[name] = absent + float(step)
+        if quantity.upper is not None:
+            values[name] = min(values[name], absent + 0.9 * (quantity.upper - absent))
+        if quantity.lower is not None:
+            values[name] = max(
+                values[name], absent + 0.9 * (quantity.lower - absent) if quantity.lower < absent else quantity.lower
+            )
+    return effect(**values)

@@ -1,0 +1,251 @@
+"""What a diagnosis looks at: numbers taken from the recordings, their covariance, and how a model predicts them.
+
+A `Block` is one kind of measurement. Its prediction goes through the estimator that made the numbers; what the baseline leaves
+free (levels, gain, a smooth few per cent of the maker's curves) enters as slopes with a prior, and is marginalised by the
+covariance (`evidence.py`). A block that the recordings don't allow is left out with a reason (`NotDetermined`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from lab.predict import Field
+from lab.recording import Camera, Capture, RecordingSet
+from sim.camera import CameraModel, Side
+from sim.effects.base import Effect
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray, Spectrum
+
+Effects = Sequence[Effect]
+
+# --- what doesn't average out: floors that the covariance carries beside noise ---------------------------------------------
+LAMP_FLOOR = 1.0e-4  # of a level, common to the channels of a capture
+BLACK_FLOOR_DN = 0.01  # of a frame's mean: rounding of a quiet camera
+NARROWBAND_FLOOR = 5e-4  # of a level, each channel by itself
+TAIL_STD = 0.1  # of the light that the baseline's point spread itself sends into dark squares
+CLIPPED_SHARE = 2e-4
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Mean (n,) and its slopes by the free quantities, (n,) each, in units of their prior standard deviation."""
+
+    mean: FloatArray
+    slopes: dict[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Label:
+    """Where a number stands: for slices, held-out captures and pictures."""
+
+    x: float
+    channel: str
+    condition: str
+    captures: tuple[str, ...]
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class Block:
+    """One measurement: n numbers, their noise's covariance (n, n), labels, and the model's prediction with given effects."""
+
+    measurement: str
+    axis: str
+    unit: str
+    reach: float  # along the axis over which a smooth discrepancy may change
+    value: FloatArray
+    covariance: FloatArray
+    labels: tuple[Label, ...]
+    hooks: frozenset[str]  # hooks of an effect that can change the prediction
+    predict: Callable[[Effects], Prediction]
+    scale: FloatArray  # size of a discrepancy of 1, (n,)
+
+    def touched_by(self, effect: type[Effect]) -> bool:
+        """Whether the effect acts on anything that this measurement sees."""
+        return any(getattr(effect, hook) is not getattr(Effect, hook) for hook in self.hooks)
+
+
+SPECTRAL_HOOKS = frozenset({"radiance", "transmittance"})
+UNIFORM_HOOKS = frozenset({"drift", "exposure", "illumination", "ambient_e_per_s", "charge", "response", "offset_dn"})
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Means of one capture: DN by channel over the unclipped plane; None where it clips. Variance of that mean by noise."""
+
+    mean: dict[str, float | None]
+    pixels: dict[str, int]
+
+
+class Study:
+    """One side of a recording set, its frames summarised once; the blocks are made from it."""
+
+    def __init__(self, recordings: RecordingSet, side: Side, camera: CameraModel) -> None:
+        self.recordings, self.side, self.camera = recordings, side, camera
+        self.stated: Camera = recordings.camera(side)
+        self.channels = camera.channels
+        self._levels: dict[str, Levels] = {}
+        self._spectra: dict[str, Spectrum] = {}
+        times = [c.time for c in recordings.captures(side=side) if c.time is not None]
+        self._start = min(times) if times else None
+        self.field = Field.of(camera)
+        self.noise: NoiseGuess = noise_guess(self)
+        self.camera = camera.model_copy(
+            update={
+                "conversion_gain_dn_per_e": self.noise.gain,
+                "black_level_dn": self.noise.black,
+                "dark_current_e_per_s": self.noise.dark_dn_per_s / self.noise.gain,
+                "read_noise_e": self.noise.read_dn / self.noise.gain,
+                "full_well_e": (camera.white_level_dn - self.noise.black) / self.noise.gain,
+            }
+        )
+
+    def elapsed_s(self, capture: Capture) -> float:
+        return 0.0 if capture.time is None or self._start is None else (capture.time - self._start).total_seconds()
+
+    def spectrum(self, path: str) -> Spectrum:
+        if path not in self._spectra:
+            self._spectra[path] = self.recordings.spectrum(path)
+        return self._spectra[path]
+
+    def plane_mask(self, channel: str, shape: tuple[int, int]) -> FloatArray:
+        mask = np.zeros(shape, bool)
+        step = mosaic.step(self.camera.cfa)
+        for row, col in mosaic.phases(self.camera.cfa)[channel]:
+            mask[row::step, col::step] = True
+        return mask
+
+    def pixels_of(self, frame: Any, channel: str) -> FloatArray:
+        """All pixels of a channel, flat, as float."""
+        step = mosaic.step(self.camera.cfa)
+        parts = [frame[row::step, col::step] for row, col in mosaic.phases(self.camera.cfa)[channel]]
+        return np.concatenate([np.asarray(p, float).ravel() for p in parts])
+
+    def levels(self, capture: Capture) -> Levels:
+        if capture.id not in self._levels:
+            frame = self.recordings.frame(capture)
+            mean: dict[str, float | None] = {}
+            pixels = {}
+            for channel in self.channels:
+                values = self.pixels_of(frame, channel)
+                clipped = float(np.mean(values >= self.camera.white_level_dn))
+                mean[channel] = float(values.mean()) if clipped < CLIPPED_SHARE else None
+                pixels[channel] = values.size
+            self._levels[capture.id] = Levels(mean, pixels)
+        return self._levels[capture.id]
+
+    def groups(self, kind: Any, key: Callable[[Any], object]) -> list[list[Any]]:
+        """Captures of a kind by their settings, in the manifest's order."""
+        found: dict[object, list[Any]] = {}
+        for capture in self.recordings.captures(kind, self.side):
+            found.setdefault(key(capture), []).append(capture)
+        return list(found.values())
+
+    # --- parts that several blocks share ---
+
+    def offset(self, capture: Capture, effects: Effects) -> float:
+        elapsed = self.elapsed_s(capture)
+        return sum(e.offset_dn(elapsed, capture.temperature_c, self.camera) for e in effects)
+
+    def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
+        """Slopes by black level and dark current, whose priors are a few of their first guess's uncertainties."""
+        return {
+            "black": np.full(len(exposures), 1.0),
+            "dark": exposures * max(0.2 * self.noise.dark_dn_per_s, 0.5),
+        }
+
+
+@dataclass(frozen=True)
+class NoiseGuess:
+    """First guesses, good to a few per cent: about these the free quantities are linear."""
+
+    black: float
+    dark_dn_per_s: float
+    gain: float
+    read_dn: float
+    prnu: float
+    jitter_dn: float  # of a dark frame's mean
+    jitter_lamp: float  # of a flat frame's mean, relative
+
+
+def noise_guess(study: Study) -> NoiseGuess:
+    recordings, stated = study.recordings, study.stated
+    black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
+    dark, read, jitter = 0.0, 1.0, BLACK_FLOOR_DN
+    darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
+    if darks:
+        t = np.array([g[0].exposure_s for g in darks])
+        frames_mean = [np.array([float(recordings.frame(c).mean()) for c in g]) for g in darks]
+        level = np.array([m.mean() for m in frames_mean])
+        if len(t) > 1 and np.ptp(t) > 0:
+            dark, black = (float(v) for v in np.polyfit(t, level, 1))
+            dark = max(dark, 0.0)
+        else:
+            black = float(level[0])
+        spread = [m.std(ddof=1) for m in frames_mean if len(m) > 1]
+        jitter = max(float(np.sqrt(np.mean(np.square(spread)))) if spread else 0.05, BLACK_FLOOR_DN)
+        first = min(darks, key=lambda g: g[0].exposure_s)
+        if len(first) > 1:
+            read = float(np.sqrt(pair_variance([recordings.frame(c) for c in first[:4]])))
+    gain = stated.conversion_gain_dn_per_e
+    prnu, lamp = 0.008, 3e-4
+    signal, variance = [], []
+    scatter = []
+    for group in study.groups("flat", lambda c: (c.exposure_s, c.radiance, c.gain_db)):
+        if len(group) < 2:
+            continue
+        frames = [recordings.frame(c) for c in group]
+        for channel in study.channels:
+            planes = [study.pixels_of(f, channel) for f in frames]
+            if any(np.mean(p >= study.camera.white_level_dn) >= CLIPPED_SHARE for p in planes):
+                continue
+            means = np.array([p.mean() for p in planes])
+            signal.append(means.mean() - black)
+            variance.append(pair_variance(planes))
+            scatter.append(
+                np.var(means / (means.mean() - black), ddof=1) - variance[-1] / planes[0].size / signal[-1] ** 2
+            )
+            if 0.3 < signal[-1] / (study.camera.white_level_dn - black) < 0.8:
+                first_plane = np.mean(frames, axis=0)[mosaic.phases(study.camera.cfa)[channel][0][0] :: mosaic.step(study.camera.cfa),
+                                                      mosaic.phases(study.camera.cfa)[channel][0][1] :: mosaic.step(study.camera.cfa)]  # fmt: skip
+                rough = first_plane - ndimage.uniform_filter(first_plane, 9)
+                prnu = (
+                    float(np.sqrt(max(rough[6:-6, 6:-6].var() - variance[-1] / len(frames), 0.0)) / signal[-1]) * 1.006
+                )
+    if len(signal) > 1:
+        s, v = np.array(signal), np.array(variance)
+        weight = 1.0 / np.maximum(v, 1e-9)
+        low = s < 0.5 * (study.camera.white_level_dn - black)
+        use = low if low.sum() > 2 else np.ones_like(low)
+        gain = float(np.sum(weight[use] * s[use] * (v[use] - read**2)) / np.sum(weight[use] * s[use] ** 2))
+        lamp = float(np.sqrt(max(np.mean(scatter), 0.0)))
+    if gain is None or gain <= 0:
+        gain = 1.0
+    return NoiseGuess(black, dark, gain, read, prnu, jitter, max(lamp, LAMP_FLOOR))
+
+
+def pair_variance(frames: Sequence[Any]) -> float:
+    """Temporal variance from repeats: mean over pixels of the sample variance, frames' means taken out."""
+    stack = np.stack([np.asarray(f, np.float32) - np.float32(np.mean(f, dtype=float)) for f in frames])
+    n = len(frames)
+    return (
+        float(np.mean(stack.var(axis=0, ddof=1, dtype=np.float64))) * (1.0 + 1.0 / max(stack[0].size, 1))
+        if n > 1
+        else 0.0
+    )
+
+
+def held_out_of(group: Sequence[Capture], index: int, groups: int) -> set[str]:
+    """Captures that choice and fit don't see: the last third of the repeats; without repeats every third condition."""
+    if len(group) > 1:
+        return {c.id for c in group[len(group) - max(len(group) // 3, 1) :]}
+    return {group[0].id} if groups >= 3 and index % 3 == 1 else set()
+
+
+def overrides(effect: Effect, hooks: frozenset[str]) -> bool:
+    return any(getattr(type(effect), hook) is not getattr(Effect, hook) for hook in hooks)

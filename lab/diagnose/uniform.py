@@ -1,0 +1,318 @@
+"""Uniform light and none: dark frames, linearity and noise of flat fields, their shading, narrowband signals."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.diagnose.curves import CurveSlopes
+from lab.diagnose.summaries import (
+    BLACK_FLOOR_DN,
+    NARROWBAND_FLOOR,
+    SPECTRAL_HOOKS,
+    UNIFORM_HOOKS,
+    Block,
+    Effects,
+    Label,
+    Prediction,
+    Study,
+    held_out_of,
+    overrides,
+    pair_variance,
+)
+from lab.errors import NotDetermined
+from lab.predict import Field, collected_electrons, mean_dn
+from lab.recording import Narrowband
+from sim.forward import electron_rate
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+LEVEL_FLOOR = 1.0e-4  # of a level: non-linearity below what a linear camera may have, and rounding
+VARIANCE_FLOOR = 0.003  # of a variance
+RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels
+SHADING_FLOOR = 5e-4
+
+
+def dark_block(study: Study) -> Block:
+    """Mean of every dark frame: black level and dark current are free; what remains is time and temperature."""
+    groups = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
+    if not groups:
+        raise NotDetermined("dark", "no dark captures")
+    captures = [(c, c.id in held_out_of(g, i, len(groups))) for i, g in enumerate(groups) for c in g]
+    value = np.array([float(study.recordings.frame(c).mean()) for c, _ in captures])
+    exposures = np.array([c.exposure_s for c, _ in captures])
+    base = study.noise.black + study.noise.dark_dn_per_s * exposures
+
+    def predict(effects: Effects) -> Prediction:
+        shift = np.array([study.offset(c, effects) for c, _ in captures])
+        return Prediction(base + shift, study.free_offsets(exposures))
+
+    return Block(
+        measurement="dark", axis="exposure", unit="s", reach=float(max(np.ptp(exposures), 1e-3)), value=value,
+        covariance=np.diag(np.full(len(value), study.noise.jitter_dn**2 + BLACK_FLOOR_DN**2)),
+        labels=tuple(Label(c.exposure_s, "all", f"{c.exposure_s:g} s", (c.id,), out) for c, out in captures),
+        hooks=frozenset({"offset_dn"}), predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def linearity_block(study: Study) -> Block:
+    """Mean of every flat frame by channel against the exposure; each channel's rate is free, the line's straightness isn't."""
+    groups = study.groups("flat", lambda c: (c.exposure_s, c.radiance, c.gain_db, c.photons_per_pixel))
+    if len({(g[0].exposure_s, g[0].photons_per_pixel) for g in groups}) < 3:
+        raise NotDetermined("photon_transfer", "fewer than three levels of flat captures")
+    if any(g[0].radiance is None for g in groups):
+        raise NotDetermined("photon_transfer", "flat captures without a radiance file: their levels aren't comparable")
+    points = []
+    for i, group in enumerate(groups):
+        out = held_out_of(group, i, 0)
+        for capture in group:
+            for channel in study.channels:
+                mean = study.levels(capture).mean[channel]
+                if mean is not None:
+                    points.append((capture, channel, mean, capture.id in out))
+    if len(points) < 4:
+        raise NotDetermined("photon_transfer", "almost all flat captures are clipped: expose them shorter")
+    exposures = np.array([c.exposure_s for c, *_ in points])
+    value = np.array([mean for _, _, mean, _ in points])
+    noise = study.noise
+    signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 1e-3)
+    paths = sorted({c.radiance for c, *_ in points})
+    key = [(c.radiance, channel) for c, channel, *_ in points]
+    rate = {}
+    for pair in sorted(set(key)):
+        mine = np.array([k == pair for k in key])
+        low = mine & (signal < 0.6 * (study.camera.white_level_dn - noise.black))
+        use = low if low.sum() > 1 else mine
+        rate[pair] = float(np.sum(signal[use]) / np.sum(exposures[use])) / noise.gain / float(study.field.light.mean())
+    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
+    covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels + (LEVEL_FLOOR * signal) ** 2)
+    same = np.array([[a[0].id == b[0].id for b in points] for a in points])
+    covariance += same * (np.outer(signal, signal) * noise.jitter_lamp**2 + noise.jitter_dn**2)
+
+    def predict(effects: Effects) -> Prediction:
+        camera = study.camera
+        relative = dict.fromkeys(rate, 1.0)
+        if any(overrides(e, SPECTRAL_HOOKS) for e in effects):
+            for path, channel in relative:
+                light = study.spectrum(path)
+                below = electron_rate(camera, channel, light)
+                relative[path, channel] = electron_rate(camera, channel, light, effects) / below if below > 0 else 1.0
+        mean, lit = np.empty(len(points)), np.empty(len(points))
+        done: dict[tuple[str, str], dict[str, float]] = {}
+        for i, (capture, channel, _, _) in enumerate(points):
+            k = (capture.id, capture.radiance)
+            if k not in done:
+                rates = {c: rate[k[1], c] for c in study.channels if (k[1], c) in rate}
+                done[k] = mean_dn(camera, collected_electrons(camera, rates, capture.exposure_s, effects, field=study.field,
+                                                              elapsed_s=study.elapsed_s(capture)), effects)  # fmt: skip
+            lit[i] = done[k][channel] - noise.dark_dn_per_s * capture.exposure_s
+            mean[i] = noise.black + done[k][channel] + study.offset(capture, effects)
+        slopes = study.free_offsets(exposures)
+        for pair in rate:
+            slopes[f"rate:{paths.index(pair[0])}:{pair[1]}"] = np.where([k == pair for k in key], 0.05 * lit, 0.0)
+        return Prediction(mean, slopes)
+
+    return Block(
+        measurement="photon_transfer", axis="level", unit="DN", reach=0.3 * float(np.ptp(value)), value=value, covariance=covariance,
+        labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
+        hooks=UNIFORM_HOOKS, predict=predict, scale=signal,
+    )  # fmt: skip
+
+
+def variance_block(study: Study) -> Block:
+    """Temporal variance of flats by channel against their mean: gain and read noise are free, the line isn't."""
+    groups = [
+        g
+        for g in study.groups("flat", lambda c: (c.exposure_s, c.radiance, c.gain_db, c.photons_per_pixel))
+        if len(g) > 1
+    ]
+    points = []
+    for i, group in enumerate(groups):
+        for channel in study.channels:
+            levels = [study.levels(c).mean[channel] for c in group]
+            if any(level is None for level in levels):
+                continue
+            planes = [study.pixels_of(study.recordings.frame(c), channel) for c in group]
+            mean = float(np.mean([level for level in levels if level is not None]))
+            variance = pair_variance(planes)
+            std = variance * np.sqrt(2.0 / ((len(group) - 1) * planes[0].size))
+            points.append((group, channel, mean - study.noise.black, variance, std, i % 3 == 1))
+    if len(points) < 4:
+        raise NotDetermined(
+            "noise", "fewer than two repeats of unclipped flat captures: temporal noise isn't determined"
+        )
+    signal = np.array([p[2] for p in points])
+    value = np.array([p[3] for p in points])
+    covariance = np.diag(np.array([p[4] for p in points]) ** 2 + (VARIANCE_FLOOR * value) ** 2)
+    noise = study.noise
+
+    def predict(effects: Effects) -> Prediction:
+        camera = study.camera
+        # electrons behind the measured level: the effects' response undone by two fixed-point steps
+        e = np.maximum(signal / noise.gain, 1e-3)
+        target = e.copy()
+        slope = np.ones_like(e)
+        for _ in range(2):
+            out = e
+            for effect in effects:
+                out = effect.response(out, camera)
+            e = np.maximum(e * target / np.maximum(out, 1e-6), 1e-3)
+        step = 1e-3 * e
+        high, low = e + step, e - step
+        for effect in effects:
+            high, low = effect.response(high, camera), effect.response(low, camera)
+        slope = (high - low) / (2 * step)
+        shot = e * slope**2
+        total = shot + (noise.read_dn / noise.gain) ** 2
+        for effect in effects:
+            total = effect.noise_e2(e, total, camera)
+        mean = noise.gain**2 * total
+        return Prediction(
+            mean, {"gain": 0.05 * noise.gain**2 * shot, "read": np.full(len(e), 0.3 * noise.read_dn**2 + 0.05)}
+        )
+
+    return Block(
+        measurement="noise", axis="level", unit="DN", reach=0.3 * float(np.ptp(signal)), value=value, covariance=covariance,
+        labels=tuple(Label(float(p[2]), p[1], f"{p[0][0].exposure_s:.4g} s", tuple(c.id for c in p[0]), p[5]) for p in points),
+        hooks=frozenset({"response", "noise_e2"}), predict=predict, scale=value,
+    )  # fmt: skip
+
+
+def narrowband_block(study: Study) -> Block:
+    """Mean of every narrowband frame by channel against the maker's curves, of which a smooth few per cent are free."""
+    if not study.stated.quantum_efficiency:
+        raise NotDetermined(
+            "narrowband", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"
+        )
+    captures = study.recordings.captures(Narrowband, study.side)
+    groups = study.groups(Narrowband, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    out = set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
+    points = []
+    for capture in captures:
+        for channel in study.channels:
+            mean = study.levels(capture).mean[channel]
+            if mean is not None and channel in study.stated.quantum_efficiency:
+                points.append((capture, channel, mean, capture.id in out))
+    if len(points) < 4:
+        raise NotDetermined("narrowband", "fewer than four unclipped narrowband signals")
+    exposures = np.array([c.exposure_s for c, *_ in points])
+    value = np.array([p[2] for p in points])
+    noise = study.noise
+    signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 0.0)
+    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
+    same = np.array([[a[0].id == b[0].id for b in points] for a in points])
+    curves = CurveSlopes(study, [(c.radiance, channel, c.exposure_s, "narrowband", None) for c, channel, *_ in points])
+    every = list(dict.fromkeys(c.radiance for c, *_ in points))
+    known = [c for c in study.channels if c in study.camera.quantum_efficiency]
+    whole = CurveSlopes(study, [(path, c, 1.0, "narrowband", None) for path in every for c in known])
+    blind = (
+        curves.blind * float(study.field.light.mean()) * noise.gain
+    )  # DN that a curve at LEAK_STD of its peak would leave
+    covariance = np.diag(
+        (noise.gain * signal + noise.read_dn**2) / pixels + (NARROWBAND_FLOOR * signal) ** 2 + blind**2
+    )
+    covariance += same * (np.outer(signal, signal) * RADIOMETER_STD**2 + noise.jitter_dn**2)
+
+    def predict(effects: Effects) -> Prediction:
+        camera = study.camera
+        rates = curves.rates(effects)
+        lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
+        mean, share = np.empty(len(points)), np.empty(len(points))
+        done: dict[str, dict[str, float]] = {}
+        for i, (capture, channel, _, _) in enumerate(points):
+            if capture.id not in done:
+                by_channel = dict(zip(known, lit[capture.radiance].tolist(), strict=True))
+                electrons = collected_electrons(
+                    camera,
+                    by_channel,
+                    capture.exposure_s,
+                    effects,
+                    field=study.field,
+                    elapsed_s=study.elapsed_s(capture),
+                )
+                done[capture.id] = mean_dn(camera, electrons, effects)
+            mean[i] = noise.black + done[capture.id][channel] + study.offset(capture, effects)
+            share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
+        slopes = study.free_offsets(exposures) | {k: v * share for k, v in curves.slopes(effects).items()}
+        return Prediction(mean, slopes)
+
+    return Block(
+        measurement="narrowband", axis="wavelength", unit="nm", reach=25.0, value=value, covariance=covariance,
+        labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
+        hooks=UNIFORM_HOOKS | SPECTRAL_HOOKS, predict=predict, scale=np.maximum(signal, 1.0),
+    )  # fmt: skip
+
+
+def shading_block(study: Study) -> Block:
+    """Flat fields in cells against cos^4, each channel relative to its mean."""
+    if study.stated.focal_length_mm is None:
+        raise NotDetermined("flat_field", "the focal length isn't stated: the fall-off of the light isn't known")
+    flats = [
+        c
+        for c in study.recordings.captures("flat", study.side)
+        if all(m is not None for m in study.levels(c).mean.values())
+    ]
+    if not flats:
+        raise NotDetermined("flat_field", "no unclipped flat captures")
+    rows, cols = 6, 8
+    camera, noise = study.camera, study.noise
+    best = sorted(flats, key=lambda c: -sum(m or 0.0 for m in study.levels(c).mean.values()))
+    picked = best[: max(2, min(6, len(best)))]
+    out = {c.id for c in picked[1::2]}
+    points = []
+    step = mosaic.step(camera.cfa)
+    for part in ([c for c in picked if c.id not in out], [c for c in picked if c.id in out]):
+        if not part:
+            continue
+        frame = np.mean(
+            [study.recordings.frame(c).astype(float) - noise.black - noise.dark_dn_per_s * c.exposure_s for c in part],
+            axis=0,
+        )
+        for channel in study.channels:
+            phase = mosaic.phases(camera.cfa)[channel]
+            plane = np.mean([frame[r::step, c::step] for r, c in phase], axis=0)
+            cells = _cells(plane, rows, cols)
+            points.append(
+                (
+                    part,
+                    channel,
+                    cells / cells.mean(),
+                    plane.size / cells.size * len(phase),
+                    float(cells.mean()),
+                    part[0].id in out,
+                )
+            )
+    row = (np.arange(rows) + 0.5) / rows * camera.rows - 0.5
+    col = (np.arange(cols) + 0.5) / cols * camera.cols - 0.5
+    grid_row, grid_col = np.meshgrid(row, col, indexing="ij")
+    place = Field.at(camera, grid_row.ravel(), grid_col.ravel())
+    value = np.concatenate([p[2].ravel() for p in points])
+    n = rows * cols
+    std = np.concatenate([np.full(n, np.sqrt((noise.gain / p[4] / len(p[0]) + noise.prnu**2) / p[3])) for p in points])
+
+    def predict(effects: Effects) -> Prediction:
+        means = []
+        for p in points:
+            light = (
+                place.light * np.prod([e.illumination(place.x_um, place.y_um, camera) for e in effects], axis=0)
+                if effects
+                else place.light
+            )
+            electrons = light / light.mean() * p[4] / noise.gain
+            for effect in effects:
+                electrons = effect.response(electrons, camera)
+            means.append(electrons / electrons.mean())
+        return Prediction(np.concatenate(means), {})
+
+    radius = np.hypot(place.x_um, place.y_um) * 1e-3
+    return Block(
+        measurement="flat_field", axis="field", unit="mm", reach=0.5 * float(np.ptp(radius)), value=value,
+        covariance=np.diag(std**2 + SHADING_FLOOR**2),
+        labels=tuple(Label(float(r), p[1], f"cell {k // cols},{k % cols}", tuple(c.id for c in p[0]), p[5]) for p in points for k, r in enumerate(radius)),
+        hooks=frozenset({"illumination", "response"}), predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def _cells(plane: FloatArray, rows: int, cols: int) -> FloatArray:
+    r = np.linspace(0, plane.shape[0], rows + 1).astype(int)
+    c = np.linspace(0, plane.shape[1], cols + 1).astype(int)
+    return np.add.reduceat(np.add.reduceat(plane, r[:-1], 0), c[:-1], 1) / np.outer(np.diff(r), np.diff(c))
