@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
+import anyio
 from pydantic import BaseModel
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
@@ -18,13 +19,21 @@ def event(name: str, content: BaseModel) -> ServerSentEvent:
     return ServerSentEvent(event=name, data=content.model_dump_json())
 
 
-def stream(events: AsyncIterator[ServerSentEvent]) -> EventSourceResponse:
-    """The answer; a comment goes out every 15 s, so that proxies don't cut the line."""
-    return EventSourceResponse(events, ping=KEEP_ALIVE_S, send_timeout=30.0)
+def stream(events: Callable[[anyio.Event], AsyncIterator[ServerSentEvent]]) -> EventSourceResponse:
+    """The answer; a comment goes out every 15 s, so that proxies don't cut the line. `events` gets what is set when the
+    service stops, and ends then."""
+    stopping = anyio.Event()
+    return EventSourceResponse(
+        events(stopping), ping=KEEP_ALIVE_S, send_timeout=30.0, shutdown_event=stopping, shutdown_grace_period=2.0
+    )
 
 
 async def watched(
-    look: Callable[[], BaseModel], over: Callable[[Any], bool], name: str, every_s: float = 0.5
+    look: Callable[[], BaseModel],
+    over: Callable[[Any], bool],
+    name: str,
+    stopping: anyio.Event,
+    every_s: float = 0.5,
 ) -> AsyncIterator[ServerSentEvent]:
     """How something stands now and after each change, by looking at the registry, which other processes write too; the last
     one is called `end`."""
@@ -38,7 +47,9 @@ async def watched(
         if ended:
             yield event("end", found)
             return
-        await asyncio.sleep(every_s)
+        with anyio.move_on_after(every_s):
+            await stopping.wait()
+            return
 
 
 def described(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:

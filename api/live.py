@@ -9,6 +9,8 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable
 
+import anyio
+
 from api.errors import Conflict
 from lab.errors import DeviceError, InputError
 from lab.sequences.calibration import Calibration
@@ -86,8 +88,9 @@ class LiveSession:
         """Let the followers look again."""
         self._changed()
 
-    async def follow(self) -> AsyncIterator[Progress]:
-        """The latest progress, then each later one, until the run ends. A slow follower misses some, never the last."""
+    async def follow(self, stopping: anyio.Event) -> AsyncIterator[Progress]:
+        """The latest progress, then each later one, until the run ends or the service stops. A slow follower misses some,
+        never the last."""
         wake = asyncio.Event()
         me = (asyncio.get_running_loop(), wake)
         with self._lock:
@@ -101,9 +104,10 @@ class LiveSession:
                 if number != seen and latest is not None:
                     seen = number
                     yield latest
-                if ended:
+                if ended or stopping.is_set():
                     return
-                await wake.wait()
+                with anyio.move_on_after(0.5):  # to look whether the service stops
+                    await wake.wait()
         finally:
             with self._lock:
                 self._followers.discard(me)

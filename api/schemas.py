@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-from typing import Any, Literal
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from api.keys import Permission
 from lab.session import Progress
 from lab.store import Run
 from sim.camera import Side
 
+#: Databases that forget the time zone give back UTC.
+Utc = Annotated[datetime, AfterValidator(lambda at: at if at.tzinfo else at.replace(tzinfo=UTC))]
 SequenceName = Literal["dark", "flat", "narrowband", "chart", "edge", "screen", "stereo"]
 SessionState = Literal[
     "created",
@@ -105,8 +107,8 @@ class Session(Schema):
     id: str
     name: str
     notes: str
-    created: datetime
-    closed: datetime | None
+    created: Utc
+    closed: Utc | None
     state: SessionState
     error: str | None = Field(description="why it ended early, and the remedy")
     steps: int
@@ -172,9 +174,9 @@ class Job(Schema):
     progress: float = Field(ge=0, le=1)
     message: str
     error: str | None
-    created: datetime
-    started: datetime | None
-    finished: datetime | None
+    created: Utc
+    started: Utc | None
+    finished: Utc | None
 
 
 class Recordings(Schema):

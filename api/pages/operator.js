@@ -4,6 +4,7 @@ const $ = (id) => document.getElementById(id);
 const api = "/api/v1";
 const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
 const PICTURES_AT_ONCE = 48;
+let atOnce = PICTURES_AT_ONCE;
 let selected = null; // the session whose captures are shown
 let following = null; // the open event stream, with the session it follows
 
@@ -234,6 +235,7 @@ function jobRow(job) {
 
 async function select(session) {
   selected = session.id;
+  atOnce = PICTURES_AT_ONCE;
   $("session").hidden = false;
   $("session-problem").textContent = "";
   $("session-title").textContent = session.name || session.id;
@@ -261,10 +263,14 @@ async function showCaptures() {
     filter.kind.replaceChildren(...["", ...new Set(captures.map((c) => c.kind))].map(option));
     filter.side.replaceChildren(...["", ...new Set(captures.map((c) => c.side))].map(option));
   }
-  const chosen = captures.filter((c) => (!filter.kind.value || c.kind === filter.kind.value) && (!filter.side.value || c.side === filter.side.value));
-  const shown = chosen.slice(-PICTURES_AT_ONCE);
-  $("capture-count").textContent =
-    chosen.length > shown.length ? `The last ${shown.length} of ${chosen.length}.` : chosen.length ? `${chosen.length}.` : "None yet.";
+  // Captures of one frame (an edge's regions, say) are one picture.
+  const frames = new Map();
+  for (const c of captures) frames.set(c.document.frame, [...(frames.get(c.document.frame) ?? []), c]);
+  const pictures = [...frames.values()].map((of) => ({ ...of[0], more: of.length - 1 }));
+  const chosen = pictures.filter((c) => (!filter.kind.value || c.kind === filter.kind.value) && (!filter.side.value || c.side === filter.side.value));
+  const shown = chosen.slice(-atOnce);
+  $("capture-count").textContent = chosen.length ? `${shown.length} of ${chosen.length} frames, the newest last` : "None yet.";
+  $("more").hidden = shown.length === chosen.length;
   show("captures", shown.map((c) => ({ ...c, picture: `${c.preview}?width=320${filter.stretch.checked ? "&stretch=true" : ""}` })), (c) =>
     element(
       "figure",
@@ -274,11 +280,18 @@ async function showCaptures() {
         { href: `${c.picture.replace("width=320", "width=1600")}`, target: "_blank", rel: "noopener" },
         element("img", { loading: "lazy", src: c.picture, alt: `${c.kind}, ${c.side}` }),
       ),
-      element("figcaption", { textContent: `${c.name}${exposure(c.exposure_s)}` }),
+      element("figcaption", { textContent: `${c.name}${c.more ? ` and ${c.more} more` : ""}${exposure(c.exposure_s)}` }),
     ),
   );
 }
 
+$("more").addEventListener(
+  "click",
+  guarded("session-problem", async () => {
+    atOnce = Infinity;
+    await showCaptures();
+  }),
+);
 $("capture-filter").addEventListener("change", guarded("session-problem", showCaptures));
 
 async function refresh() {

@@ -95,7 +95,11 @@ def job_events(service: Here, job_id: HexId) -> EventSourceResponse:
     """Follow a job."""
     service.job(job_id)
     over = ("done", "failed", "cancelled")
-    return stream(watched(lambda: _job(service, service.jobs.job(job_id)), lambda job: job.state in over, "progress"))
+
+    def look() -> Job:
+        return _job(service, service.jobs.job(job_id))
+
+    return stream(lambda stopping: watched(look, lambda job: job.state in over, "progress", stopping))
 
 
 def _done(service: Service, job_id: str) -> JobInfo:

@@ -63,7 +63,7 @@ def list_effects() -> list[Effect]:
     return [_effect(effect) for effect in effects().values()]
 
 
-@router.get("/effects/{name}", tags=["knowledge"], dependencies=[READ], responses=answers(401, 404))
+@router.get("/effects/{name}", tags=["knowledge"], dependencies=[READ], responses=answers(401, 404, 422))
 def get_effect(name: str) -> Effect:
     """One effect."""
     if name not in effects():

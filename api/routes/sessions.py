@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, get_args
 
+import anyio
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
@@ -71,8 +72,9 @@ def _state(info: SessionInfo, live: LiveSession | None) -> Any:
 
 
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
-    fields = info.model_dump(exclude={"packed"})
-    return fields | {"state": _state(info, service.live.find(info.id))}
+    live = service.live.find(info.id)
+    fields = info.model_dump(exclude={"packed"}) | {"state": _state(info, live)}
+    return fields | ({"error": None} if live is not None else {})  # what ended the run before is mended
 
 
 def _session(service: Service, session_id: str) -> Session:
@@ -167,23 +169,24 @@ def abort_session(service: Here, session_id: SessionId) -> Session:
     return _session(service, session_id)
 
 
-async def _follow(service: Service, session_id: str) -> AsyncIterator[ServerSentEvent]:
+async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> AsyncIterator[ServerSentEvent]:
     def look() -> Session:
         return _session(service, session_id)
 
     seen = None
     live = service.live.find(session_id)
     if live is None:  # another process runs it, or nobody does
-        async for told in watched(look, lambda session: session.state in OVER, "state"):
+        async for told in watched(look, lambda session: session.state in OVER, "state", stopping):
             yield told
         return
     yield event("state", await asyncio.to_thread(look))
-    async for progress in live.follow():
+    async for progress in live.follow(stopping):
         yield event("progress", progress)
         if (progress.state, live.pausing) != seen:
             seen = (progress.state, live.pausing)
             yield event("state", await asyncio.to_thread(look))
-    yield event("end", await asyncio.to_thread(look))
+    if not stopping.is_set():
+        yield event("end", await asyncio.to_thread(look))
 
 
 @router.get(
@@ -201,7 +204,7 @@ async def _follow(service: Service, session_id: str) -> AsyncIterator[ServerSent
 def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
     """Follow a session."""
     service.session(session_id)
-    return stream(_follow(service, session_id))
+    return stream(lambda stopping: _follow(service, session_id, stopping))
 
 
 # --- captures ----------------------------------------------------------------------------------------------------------
