@@ -2,9 +2,9 @@
 
 The light's measured spectrum is in L, so the bandwidth of the source is taken out instead of smeared in (which is what division
 of C by the light's power does). The problem is ill-posed below the bandwidth: the second difference of S has a normal prior
-(Tikhonov), whose strength is what makes the signals most probable (evidence, with the null space integrated out), and which may
-be rougher where the curve bends more: its local scale is the curvature found in a first pass, smoothed, plus a floor that the
-evidence chooses. S >= 0.
+(Tikhonov), whose strength is what makes the signals most probable (evidence, with the line left free integrated out), and which
+is wider where the curve bends and is high: its local scale is the geometric mean of curvature and height found in a first pass,
+smoothed, plus a floor that the evidence chooses. S >= 0.
 
 Signals have the noise of the pixels and 0.3 % of the radiometer's repeatability (independent from spectrum to spectrum). What all
 signals share (conversion gain, PRNU of the region) is a scale, added to the bands at the end. The radiometer's absolute
@@ -101,19 +101,15 @@ def _solve(
     wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, bounds: _Bounds | None = None
 ) -> Sensitivity:
     """Solution of value = operator S + noise in two passes: alike roughness everywhere, then local."""
-    mean, covariance, _ = _tikhonov(wave, operator, value, std, np.ones_like(wave))
+    mean, covariance = _tikhonov(wave, operator, value, std, [np.ones_like(wave)])
     distance = (wave[:, None] - wave) / LOCAL_WIDTH_NM
     average = np.exp(-0.5 * distance**2)
     average /= average.sum(axis=1, keepdims=True)
     for _ in range(2):
-        if wave.size < 5:
+        local = _roughness(wave, mean, average)
+        if local is None:
             break
-        bend = np.gradient(np.gradient(mean, wave), wave)
-        local = np.sqrt(average @ bend**2)
-        if local.max() <= 0:
-            break
-        passes = [_tikhonov(wave, operator, value, std, local / local.max() + floor) for floor in ROUGHNESS_FLOORS]
-        mean, covariance, _ = min(passes, key=lambda found: found[2])
+        mean, covariance = _tikhonov(wave, operator, value, std, [local + floor for floor in ROUGHNESS_FLOORS])
     everywhere = _Bounds(np.eye(wave.size), np.zeros(wave.size))
     if bounds is not None:
         everywhere = _Bounds(
@@ -127,6 +123,16 @@ def _solve(
     )
 
 
+def _roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) -> FloatArray | None:
+    """Where a curve is rough, maximum 1: the geometric mean of its bend and its height, both smoothed. None for a line."""
+    if wave.size < 5:
+        return None
+    bend = np.sqrt(average @ np.gradient(np.gradient(curve, wave), wave) ** 2)
+    height = np.sqrt(average @ np.clip(curve, 0.0, None) ** 2)
+    local = np.sqrt(bend * height)
+    return local / local.max() if local.max() > 0 else None
+
+
 def _smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
     """(m, m): columns span curves whose second difference is white with standard deviation `roughness`, but for the line."""
     return np.clip(wave[:, None] - wave, 0.0, None) * (np.sqrt(np.gradient(wave)) * roughness)
@@ -137,22 +143,19 @@ def _line(wave: FloatArray) -> FloatArray:
     return np.stack([np.ones_like(wave), 2.0 * (wave - wave.mean()) / np.ptp(wave)], axis=1)
 
 
-def _tikhonov(
-    wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, roughness: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Posterior mean and covariance of S under a second-difference prior of shape `roughness` and free line, and the negative
-    log evidence at the strength that maximises it (the line integrated out)."""
-    line = _line(wave)
-    root = _smooth_root(wave, roughness)
-    root -= line @ np.linalg.lstsq(line, root, rcond=None)[0]  # the line is free: what is left is well scaled
+def _evidence(
+    root: FloatArray, line: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray
+) -> tuple[float, float]:
+    """Negative log evidence of S = line a + strength root u (u standard normal, a free and integrated out) at the strength
+    that maximises it, and that strength."""
     z, h, f = value / std, operator @ line / std[:, None], operator @ root / std[:, None]
     rest = linalg.qr(h)[0][:, line.shape[1] :]
     eigenvalue, vector = np.linalg.eigh((rest.T @ f) @ (rest.T @ f).T)
     eigenvalue = np.clip(eigenvalue, 0.0, None)
     power = (vector.T @ (rest.T @ z)) ** 2
 
-    def loss(log_strength: float) -> float:
-        variance = np.exp(log_strength) * eigenvalue + 1.0
+    def loss(log_square: float) -> float:
+        variance = np.exp(log_square) * eigenvalue + 1.0
         return 0.5 * float(np.sum(power / variance + np.log(variance)))
 
     start = -np.log(max(float(eigenvalue.max()), 1e-300))
@@ -161,15 +164,34 @@ def _tikhonov(
     found = optimize.minimize_scalar(
         loss, bounds=(grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]), method="bounded"
     )
-    strength = float(np.exp(found.x))
-    inverse = np.linalg.inv(strength * f @ f.T + np.eye(value.size))
-    line_covariance = np.linalg.inv(h.T @ inverse @ h)
-    coefficient = line_covariance @ (h.T @ (inverse @ z))
-    gain = strength * root @ (f.T @ inverse)
-    mean = line @ coefficient + gain @ (z - h @ coefficient)
-    left = line - gain @ h
-    covariance = strength * root @ root.T - gain @ (strength * f @ root.T) + left @ line_covariance @ left.T
-    return mean, 0.5 * (covariance + covariance.T), float(found.fun)
+    return float(found.fun), float(np.exp(0.5 * found.x))
+
+
+def _tikhonov(
+    wave: FloatArray,
+    operator: FloatArray,
+    value: FloatArray,
+    std: FloatArray,
+    shapes: Sequence[FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Posterior mean and covariance of S under a second-difference prior and free line; of the prior's `shapes` (roughness
+    against wavelength) that with the highest evidence, at its best strength."""
+    line = _line(wave)
+    roots = [_smooth_root(wave, shape) for shape in shapes]
+    roots = [root - line @ np.linalg.lstsq(line, root, rcond=None)[0] for root in roots]  # the line is free anyway
+    evidence = [_evidence(root, line, operator, value, std) for root in roots]
+    best = min(range(len(roots)), key=lambda i: evidence[i][0])
+    # The free line as a normal prior a thousand times as wide as the curve is high. The singular values keep what is well known
+    # apart from what isn't: differences of covariances lose that where noise is small.
+    height = float(np.max(np.abs(value / operator.sum(axis=1))))
+    prior = np.concatenate([1e3 * height * line, evidence[best][1] * roots[best]], axis=1)
+    left, singular, right = np.linalg.svd(operator @ prior / std[:, None], full_matrices=True)
+    mean = prior @ (
+        right[: singular.size].T @ (singular / (1.0 + singular**2) * (left[:, : singular.size].T @ (value / std)))
+    )
+    known = np.append(1.0 / np.sqrt(1.0 + singular**2), np.ones(right.shape[0] - singular.size))
+    half = prior @ right.T * known
+    return mean, half @ half.T
 
 
 def _within(mean: FloatArray, covariance: FloatArray, bounds: _Bounds) -> FloatArray:
