@@ -4,10 +4,16 @@
 An error is one line on stderr (one for each problem of a folder), never a traceback; CALIBENCH_DEBUG=1 shows that too.
 """
 
+# ruff: noqa: E402  (libraries read the number of threads when they are imported)
 from __future__ import annotations
 
-import contextlib
 import os
+
+# Both cameras are fitted at the same time; libraries that start threads of their own under these take four times as long.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import contextlib
 import re
 import subprocess
 import sys
@@ -46,7 +52,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-out = Console(soft_wrap=True, highlight=False)
+# Into a file or a pipe, a table isn't squeezed into 80 columns.
+out = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 Source = Annotated[str, typer.Argument(metavar="SOURCE", help="a recording set's folder, or a stored session's id")]
@@ -57,6 +64,9 @@ StationFile = Annotated[
 Quick = Annotated[bool, typer.Option("--quick", help="fewer exposures and repeats")]
 DataFolder = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
+]
+StoreFolder = Annotated[
+    Path | None, typer.Option("--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
 ]
 Resume = Annotated[str, typer.Option(metavar="SESSION", help="go on with this session")]
 BENCH_START_S, BENCH_END_S = 60.0, 10.0
@@ -200,14 +210,14 @@ def _print_fit(recordings: RecordingSet, fit: FitResult) -> None:
     table = Table(box=None, pad_edge=False)
     table.add_column("quantity")
     for side in sides:
-        table.add_column(f"{side}, ± one standard uncertainty")
+        table.add_column(f"{side} (± one standard uncertainty)")
     for name, figures in by_side(fit, recordings.manifest.cameras):
         table.add_row(name, *(figures[side].text if side in figures else "-" for side in sides))
     if table.row_count:
         out.print(table)
     if fit.stereo is not None:
         for figure in stereo_figures(fit.stereo):
-            out.print(f"stereo {figure.name}: {figure.text}")
+            out.print(f"{figure.name}: {figure.text}")
     for side, camera in fit.cameras.items():
         for remark in camera.noise.remarks if camera.noise else ():
             out.print(f"{side}: {escape(remark)}")
@@ -385,12 +395,12 @@ def run(
 
 
 @app.command()
-def sessions(out_folder: DataFolder = None) -> None:
+def sessions(data: StoreFolder = None) -> None:
     """List the stored sessions."""
     table = Table(box=None, pad_edge=False)
     for heading in ("session", "name", "created", "state", "steps done"):
         table.add_column(heading)
-    for info in _store(out_folder).sessions():
+    for info in _store(data).sessions():
         created = f"{info.created:%Y-%m-%d %H:%M}"
         table.add_row(info.id, escape(info.name), created, info.state, f"{info.steps_done} of {info.steps}")
     out.print(table)
@@ -400,9 +410,10 @@ def sessions(out_folder: DataFolder = None) -> None:
 def export(
     session: Annotated[str, typer.Argument(metavar="SESSION", help="a stored session's id")],
     to: Annotated[Path, typer.Option("--to", metavar="DIR", help="the recording set to write")],
+    data: StoreFolder = None,
 ) -> None:
     """Write a stored session as a recording set."""
-    recordings = _stored_recordings(_store(), session)
+    recordings = _stored_recordings(_store(data), session)
     _warn(recordings.warnings)
     folder = recording.write(recordings, to)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
@@ -486,17 +497,23 @@ def _await_ready(bench: subprocess.Popen[str]) -> None:
 # --- entry -------------------------------------------------------------------------------------------------------------
 
 
-def _attach_mocks() -> None:
-    """`calibench mock` and `calibench bench`: the mocks belong to the distribution, but nothing else here knows them."""
-    from mocks.command import commands
+def _attach_others() -> None:
+    """`calibench serve`, `key`, `mock` and `bench`: the service and the mocks bring their own commands, and nothing else here
+    knows them."""
+    from api.command import commands as service
+    from mocks.command import commands as mocks
 
-    app.add_typer(commands)
+    names = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
+    if "bench" not in names:  # once in a process
+        for others in (service, mocks):
+            app.registered_commands += others.registered_commands
+            app.registered_groups += others.registered_groups
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     try:
-        _attach_mocks()
+        _attach_others()
         code = app(arguments, standalone_mode=False)
     except (InputError, DeviceError) as error:
         if os.environ.get("CALIBENCH_DEBUG"):
@@ -505,8 +522,7 @@ def main(arguments: list[str] | None = None) -> int:
             err.print(f"[red]calibench:[/] {escape(line)}")
         return error.exit_code
     except KeyboardInterrupt:
-        err.print("calibench: interrupted")
-        return EXIT_INTERRUPTED
+        code = EXIT_INTERRUPTED
     except Exception as error:
         usage = getattr(error, "format_message", None)
         if usage is not None:
@@ -520,6 +536,8 @@ def main(arguments: list[str] | None = None) -> int:
             "report it with what CALIBENCH_DEBUG=1 shows"
         )
         return EXIT_INTERNAL
+    if code == EXIT_INTERRUPTED:
+        err.print("[red]calibench:[/] interrupted")
     return int(code or 0)
 
 

@@ -110,13 +110,13 @@ def geometry_figures(geometry: GeometryFit) -> Iterator[Figure]:
 
 def stereo_figures(stereo: StereoFit) -> Iterator[Figure]:
     """Baseline, translation and rotation of the pair."""
-    yield Figure("baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
+    yield Figure("stereo baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
     for name, value, number in zip("xyz", stereo.translation_mm, range(3), strict=True):
         std = stereo.translation_mm_std
-        yield Figure(f"translation {name}", "mm", value, std[number] if std else None)
+        yield Figure(f"stereo translation {name}", "mm", value, std[number] if std else None)
     for name, value, number in zip("xyz", rotation_vector_mrad(stereo.rotation), range(3), strict=True):
         turns = stereo.rotation_std_rad
-        yield Figure(f"rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
+        yield Figure(f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
     yield Figure("stereo rms", "px", stereo.rms_px)
 
 
@@ -133,9 +133,14 @@ def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tu
 
 
 def by_side(fit: FitResult, cameras: dict[Side, Camera]) -> list[tuple[str, dict[Side, Figure]]]:
-    """Rows of the table of key figures: name -> figure of each side, in the order of the first side that has it."""
+    """Rows of the table of key figures, name -> figure of each side; what one side lacks keeps its place in the order."""
+    names: list[str] = []
     rows: dict[str, dict[Side, Figure]] = {}
     for side, camera_fit in fit.cameras.items():
+        place = 0
         for figure in camera_figures(camera_fit, cameras.get(side)):
+            if figure.name not in rows:
+                names.insert(place, figure.name)
             rows.setdefault(figure.name, {})[side] = figure
-    return list(rows.items())
+            place = names.index(figure.name) + 1
+    return [(name, rows[name]) for name in names]
