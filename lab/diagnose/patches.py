@@ -21,11 +21,11 @@ from lab.diagnose.summaries import (
     Prediction,
     Study,
     held_out_of,
+    wide_contrast,
 )
 from lab.errors import NotDetermined
 from lab.predict import Field, mixed_charge
 from lab.recording import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
-from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.forward import optical_transfer
 from sim.optics.illumination import relative_illumination
@@ -43,7 +43,7 @@ SCREEN_FLOOR = (
 
 
 @dataclass(frozen=True)
-class _Patch:
+class Patch:
     """One patch in one channel, averaged over a capture's repeats; DN."""
 
     captures: tuple[Chart, ...]
@@ -65,7 +65,7 @@ def chart_block(study: Study) -> Block:
         raise NotDetermined(
             "chart", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"
         )
-    points = _patch_levels(study)
+    points = patch_levels(study)
     if len(points) < 12:
         raise NotDetermined("chart", "fewer than twelve unclipped patches of a ColorChecker24")
     noise, camera = study.noise, study.camera
@@ -115,7 +115,7 @@ def chart_block(study: Study) -> Block:
         unit="DN",
         reach=0.3 * float(signal.max()),
         value=value,
-        covariance=_patch_covariance(study, points, signal),
+        covariance=patch_covariance(study, points, signal),
         labels=tuple(
             Label(float(names[p.name]), p.channel, p.name, tuple(c.id for c in p.captures), p.held_out) for p in points
         ),
@@ -125,7 +125,7 @@ def chart_block(study: Study) -> Block:
     )
 
 
-def _patch_levels(study: Study) -> list[_Patch]:
+def patch_levels(study: Study) -> list[Patch]:
     groups = study.groups(Chart, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
     groups = [g for g in groups if g[0].chart == "ColorChecker24"]
     step = mosaic.step(study.camera.cfa)
@@ -148,12 +148,12 @@ def _patch_levels(study: Study) -> list[_Patch]:
                         continue
                     tail = spread[rows[0] // step : rows[1] // step, cols[0] // step : cols[1] // step].mean()
                     points.append(
-                        _Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, size, mean, float(tail), part[0].id in out)
+                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, size, mean, float(tail), part[0].id in out)
                     )  # fmt: skip
     return points
 
 
-def _patch_covariance(study: Study, points: list[_Patch], signal: FloatArray) -> FloatArray:
+def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> FloatArray:
     """Noise, the patches' tolerance (one for all repeats and channels, and one a channel), and the point spread's."""
     noise = study.noise
     pixels = np.array([p.pixels for p in points])
@@ -190,7 +190,7 @@ def _spread(study: Study, frame: FloatArray, channel: str, light: str) -> FloatA
     return np.asarray(blurred[: plane.shape[0], : plane.shape[1]] - plane)
 
 
-def _mixing(study: Study, points: list[_Patch], electrons: FloatArray, effects: Effects) -> FloatArray:
+def _mixing(study: Study, points: list[Patch], electrons: FloatArray, effects: Effects) -> FloatArray:
     """Factors on the patches by effects that move charge between the channels of a uniform patch."""
     factor = np.ones(len(points))
     by_patch: dict[tuple[str, str], dict[str, int]] = {}
@@ -202,17 +202,6 @@ def _mixing(study: Study, points: list[_Patch], electrons: FloatArray, effects: 
             for c, i in members.items():
                 factor[i] = mixed.get(c, 1.0)
     return factor
-
-
-def wide_contrast(camera: CameraModel, size_px: float, effects: Effects) -> float:
-    """Contrast that the effects leave to detail of some size against the frame's mean: below 1 where light is spread widely."""
-    f = np.array([0.5 / size_px]) / camera.pixel_pitch_um
-    contrast = 1.0
-    for effect in effects:
-        if effect.name == "veiling_glare":
-            factor = effect.transfer(f, np.zeros(1), 550.0, camera)
-            contrast *= 1.0 if factor is None else float(np.real(factor[0]))
-    return contrast
 
 
 def _patches(capture: Chart) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float, float]]:

@@ -18,6 +18,7 @@ from lab.diagnose.summaries import (
     held_out_of,
     overrides,
     pair_variance,
+    wide_contrast,
 )
 from lab.errors import NotDetermined
 from lab.predict import Field, collected_electrons, mean_dn
@@ -290,13 +291,14 @@ def shading_block(study: Study) -> Block:
     std = np.concatenate([np.full(n, np.sqrt((noise.gain / p[4] / len(p[0]) + noise.prnu**2) / p[3])) for p in points])
 
     def predict(effects: Effects) -> Prediction:
+        light = place.light
+        for effect in effects:
+            light = light * effect.illumination(place.x_um, place.y_um, camera)
+        # a veil evens out what the lens's fall-off leaves
+        contrast = wide_contrast(camera, 0.25 * camera.cols, effects)
+        light = contrast * light + (1.0 - contrast) * light.mean()
         means = []
         for p in points:
-            light = (
-                place.light * np.prod([e.illumination(place.x_um, place.y_um, camera) for e in effects], axis=0)
-                if effects
-                else place.light
-            )
             electrons = light / light.mean() * p[4] / noise.gain
             for effect in effects:
                 electrons = effect.response(electrons, camera)
@@ -308,7 +310,7 @@ def shading_block(study: Study) -> Block:
         measurement="flat_field", axis="field", unit="mm", reach=0.5 * float(np.ptp(radius)), value=value,
         covariance=np.diag(std**2 + SHADING_FLOOR**2),
         labels=tuple(Label(float(r), p[1], f"cell {k // cols},{k % cols}", tuple(c.id for c in p[0]), p[5]) for p in points for k, r in enumerate(radius)),
-        hooks=frozenset({"illumination", "response"}), predict=predict, scale=np.ones(len(value)),
+        hooks=frozenset({"illumination", "response", "transfer"}), predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
