@@ -48,22 +48,27 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
 
     Both sides, and each side's geometry beside its radiometry, run at the same time.
     """
-    from lab.fit import geometry, mtf, noise, psf, spectral, stereo  # noqa: PLC0415  (all of it only where all is run)
+    from lab.fit.geometry import fit_geometry
+    from lab.fit.mtf import fit_mtf
+    from lab.fit.noise import fit_noise
+    from lab.fit.psf import fit_psf
+    from lab.fit.spectral import fit_spectral
+    from lab.fit.stereo import fit_stereo
 
     sides = recordings.sides
     run = _Run(len(STEPS) * len(sides) + 1, progress)
 
     def radiometry(side: Side) -> CameraFit:
-        levels = run.step("noise", side, lambda: noise.fit_noise(recordings, side))
+        levels = run.step("noise", side, lambda: fit_noise(recordings, side))
         return CameraFit(
             noise=levels,
-            spectral=run.step("spectral", side, lambda: spectral.fit_spectral(recordings, side, levels)),
-            mtf=run.step("mtf", side, lambda: mtf.fit_mtf(recordings, side, levels)) or (),
-            psf=run.step("psf", side, lambda: psf.fit_psf(recordings, side, levels)) or (),
+            spectral=run.step("spectral", side, lambda: fit_spectral(recordings, side, levels)),
+            mtf=run.step("mtf", side, lambda: fit_mtf(recordings, side, levels)) or (),
+            psf=run.step("psf", side, lambda: fit_psf(recordings, side, levels)) or (),
         )
 
     def pinhole(side: Side) -> GeometryFit | None:
-        return run.step("geometry", side, lambda: geometry.fit_geometry(recordings, side))
+        return run.step("geometry", side, lambda: fit_geometry(recordings, side))
 
     with ThreadPoolExecutor(WORKERS, thread_name_prefix="fit") as pool:
         radiometries: dict[Side, Future[CameraFit]] = {side: pool.submit(radiometry, side) for side in sides}
@@ -77,7 +82,7 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
         if "left" not in both or "right" not in both:
             missing = " and ".join(side for side in ("left", "right") if side not in both)
             raise NotDetermined("stereo", f"no geometry of the {missing} side; capture charuco poses with both cameras")
-        return stereo.fit_stereo(recordings, both["left"], both["right"])
+        return fit_stereo(recordings, both["left"], both["right"])
 
     found = run.step("stereo", None, pair)
     order = {side: number for number, side in enumerate((*sides, None))}

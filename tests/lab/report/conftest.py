@@ -31,10 +31,7 @@ from lab.results import (
 from sim.camera import Side
 
 Results = tuple[FitResult, ValidationResult, DiagnosisResult]
-PATCHES = (
-    "dark skin|light skin|blue sky|foliage|blue flower|bluish green|orange|purplish blue|moderate red|purple|yellow green|"
-    "orange yellow|blue|green|red|yellow|magenta|cyan|white 9.5|neutral 8|neutral 6.5|neutral 5|neutral 3.5|black 2"
-).split("|")
+PATCHES = ["dark skin", "light skin", "blue sky", "foliage", "blue flower", "bluish green", "orange", "purplish blue", "moderate red", "purple", "yellow green", "orange yellow", "blue", "green", "red", "yellow", "magenta", "cyan", "white 9.5", "neutral 8", "neutral 6.5", "neutral 5", "neutral 3.5", "black 2"]
 EDGES = [f"edge-{k} {where}" for k in range(1, 5) for where in ("centre", "mid", "corner")]
 
 
@@ -94,7 +91,9 @@ def _transfer(f: np.ndarray, blur: float, oblique: bool = False) -> np.ndarray:
 
 def _kernel(width: float, split: float) -> np.ndarray:
     y, x = np.mgrid[-7:8, -7:8]
-    spots = sum(np.exp(-0.5 * ((x - dx) ** 2 + (y - dy) ** 2) / width**2) for dx in (-split, split) for dy in (-split, split))
+    spots = sum(
+        np.exp(-0.5 * ((x - dx) ** 2 + (y - dy) ** 2) / width**2) for dx in (-split, split) for dy in (-split, split)
+    )
     return spots / spots.sum()
 
 
@@ -191,14 +190,25 @@ def _made_up(seed: int = 3, verdict: str = "explained", sides: tuple[Side, ...] 
                 channel=channel,
                 predicted_dn=2000 * reflectance[k, j],
                 predicted_dn_std=20 * reflectance[k, j],
-                measured_dn=2000 * reflectance[k, j] * (0.93 if concealed and channel == "R" else 1 + 0.008 * rng.normal()),
+                measured_dn=2000
+                * reflectance[k, j]
+                * (0.93 if concealed and channel == "R" else 1 + 0.008 * rng.normal()),
                 measured_dn_std=2.0,
             )
             for k, name in enumerate(PATCHES)
             for j, channel in enumerate("RGB")
         ]
         checks.append(
-            Check(name="colorchecker", side=side, capture="chart-1", n=72, chi2=70.1, rms_relative_percent=1.2, passed=True, patches=tuple(patches))
+            Check(
+                name="colorchecker",
+                side=side,
+                capture="chart-1",
+                n=72,
+                chi2=70.1,
+                rms_relative_percent=1.2,
+                passed=True,
+                patches=tuple(patches),
+            )
         )
         cameras[side] = CameraFit(
             noise=_noise(rng),
@@ -233,7 +243,11 @@ def _made_up(seed: int = 3, verdict: str = "explained", sides: tuple[Side, ...] 
     )
     validation = ValidationResult(source="made up", checks=tuple(checks))
     if verdict == "no_mismatch":
-        return fit, validation, DiagnosisResult(source="made up", verdict="no_mismatch", threshold=4.4, false_alarm_rate=0.01)
+        return (
+            fit,
+            validation,
+            DiagnosisResult(source="made up", verdict="no_mismatch", threshold=4.4, false_alarm_rate=0.01),
+        )
     diagnosis = DiagnosisResult(
         source="made up",
         verdict="explained",

@@ -1,0 +1,286 @@
+"""The report: one self-contained page that says what the results say, whatever is missing from them."""
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from lab.errors import InputError
+from lab.recording import Camera, RecordingSet
+from lab.report import charts, provenance_of, render_report, write_report
+from lab.report.figures import by_side, measured, rotation_vector_mrad
+from lab.report.pictures import (
+    difference_picture,
+    frame_picture,
+    kernel_picture,
+    patch_colours,
+    png_data_uri,
+    trimmed_margin,
+)
+from lab.results import CameraFit, FitResult, Patch, Unexplained
+
+MadeUp = Callable[..., Any]
+
+
+class Page(HTMLParser):
+    """What a browser would find: text, outside addresses, figures; and that every element is closed."""
+
+    EMPTY = frozenset({"meta", "img", "br", "link", "input", "hr"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.addresses: list[str] = []
+        self.figures: list[dict[str, Any]] = []
+        self.open: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self.addresses += [value for key, value in found.items() if key in ("src", "href", "data") and value]
+        if tag not in self.EMPTY:
+            self.open.append((tag, found))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop()[0] == tag
+
+    def handle_data(self, data: str) -> None:
+        tag, attrs = self.open[-1] if self.open else ("", {})
+        if tag == "script":
+            if attrs.get("type") == "application/json":
+                self.figures.append(json.loads(data))
+        elif tag != "style":
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture
+def page(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> Page:
+    recordings = small_set()
+    instruments = {"monochromator": {"model": "Cornerstone 260", "serial": "C-1"}}
+    return Page(render_report(recordings, *made_up(), provenance_of(recordings, instruments)))
+
+
+def test_page_needs_nothing_from_elsewhere(page: Page) -> None:
+    assert all(address.startswith(("#", "data:image/png;base64,")) for address in page.addresses)
+
+
+def test_every_anchor_leads_somewhere(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
+    recordings = small_set()
+    text = render_report(recordings, *made_up(), provenance_of(recordings))
+    for anchor in re.findall(r'href="#(\w+)"', text):
+        assert f'id="{anchor}"' in text
+
+
+def test_page_says_what_the_results_say(page: Page) -> None:
+    for words in (
+        "The baseline model leaves physics out, and it has a name.",
+        "Optical low pass filter (left, probability 0.994): displacement x 2.104 ± 0.051 µm",
+        "The right camera conceals nothing that these recordings would show.",
+        "0.18..0.41 cy/px, all channels",
+        "χ² falls from 9120 to 480 over 468 numbers",
+        "defocus (0.006)",
+        "0.42000 ± 0.00090 DN/e",
+        "the lamp drifted by 0.08 % between repeats",
+        "stereo baseline 60.020 ± 0.021 mm",
+        "no bernoulli captures of pose p2; capture one",
+        "serial C-1",
+        "numpy",
+    ):
+        assert words in page.text, words
+
+
+def test_charts_carry_uncertainty_and_labelled_axes(page: Page) -> None:
+    assert len(page.figures) >= 2 + 4 + 4 + 2 + 2 + 2  # diagnosis, residuals, transfer, QE, MTF, chart
+    for figure in page.figures:
+        axes = [value for key, value in figure["layout"].items() if re.fullmatch(r"[xy]axis\d*", key)]
+        assert axes
+        assert all("gridcolor" in one for one in axes)
+    transfer = [figure for figure in page.figures if "variance" in json.dumps(figure["layout"])]
+    assert len(transfer) == 2
+    for figure in transfer:
+        points = [trace for trace in figure["data"] if trace["mode"] == "markers"]
+        assert all(len(trace["error_y"]["array"]) == len(trace["x"]) for trace in points)
+    bands = [trace for figure in page.figures for trace in figure["data"] if trace.get("fill") == "toself"]
+    assert len(bands) >= 3 * 2 + 3 * 12 * 2  # QE, and every MTF
+
+
+def test_line_of_the_photon_transfer_has_the_fitted_slope(made_up: MadeUp) -> None:
+    noise = made_up()[0].cameras["left"].noise
+    figure = charts.photon_transfer(noise)
+    assert figure is not None
+    (line,) = (trace for trace in figure["data"] if trace["mode"] == "lines")
+    assert line["y"][1] / line["x"][1] == pytest.approx(noise.conversion_gain_dn_per_e, rel=1e-12)
+
+
+def test_nothing_determined_still_makes_a_page(small_set: Callable[..., RecordingSet]) -> None:
+    recordings = small_set(sides=("left",))
+    fit = FitResult(source="x", cameras={"left": CameraFit()})
+    page = Page(render_report(recordings, fit, None, None, provenance_of(recordings)))
+    assert "they were not diagnosed" in page.text
+    assert page.figures == []
+
+
+def test_baseline_that_explains_everything(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
+    recordings = small_set(sides=("left",))
+    page = Page(render_report(recordings, *made_up(verdict="no_mismatch", sides=("left",)), provenance_of(recordings)))
+    assert "The baseline model explains these recordings." in page.text
+    assert "false-alarm rate of 0.01" in page.text
+    assert "conceals" not in page.text
+
+
+def test_mismatch_without_a_name(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
+    recordings = small_set()
+    fit, validation, diagnosis = made_up()
+    nameless = Unexplained(
+        side="left", measurement="flat", axis="time", where="0..10 s", shape="a slow fall", significance_sigma=9.1,
+        chi2_before=300.0, chi2_after=98.0, n=100,
+    )  # fmt: skip
+    changed = diagnosis.model_copy(update={"verdict": "unexplained", "effects": (), "unexplained": (nameless,)})
+    page = Page(render_report(recordings, fit, validation, changed, provenance_of(recordings)))
+    assert "no effect in the library accounts for" in page.text
+    assert "a slow fall" in page.text
+
+
+def test_text_from_outside_stays_text(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
+    recordings = small_set()
+    evil = '</script><script>alert("x")</script><img src=x onerror=alert(1)>'
+    manifest = recordings.manifest.model_copy(update={"name": evil, "notes": evil})
+    recordings = RecordingSet(manifest, store=recordings._store, source=evil, warnings=(evil,))
+    fit, validation, diagnosis = made_up()
+    check = validation.checks[0]
+    curve = check.curves[0].model_copy(update={"label": evil})
+    checks = (check.model_copy(update={"curves": (curve,), "capture": evil}), *validation.checks[1:])
+    page = Page(
+        render_report(
+            recordings, fit, validation.model_copy(update={"checks": checks}), diagnosis, provenance_of(recordings)
+        )
+    )
+    assert page.text.count('alert("x")') >= 4
+    assert not any("onerror" in address for address in page.addresses)
+
+
+def test_writing_is_whole_or_not_at_all(
+    small_set: Callable[..., RecordingSet], made_up: MadeUp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recordings, results = small_set(), made_up()
+    file = write_report(tmp_path / "deep" / "report.html", recordings, *results)
+    assert file.read_text().startswith("<!doctype html>")
+    assert file.stat().st_size < 8e6
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_report(tmp_path / "deep" / "other.html", recordings, *results)
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["report.html"]
+
+
+def test_provenance_has_a_digest_of_every_frame(small_set: Callable[..., RecordingSet]) -> None:
+    one, same, other = small_set(1), small_set(1), small_set(2)
+    first = provenance_of(one)
+    assert set(first.frame_sha256) == {capture.id for capture in one.captures()}
+    assert first.frame_sha256 == provenance_of(same).frame_sha256
+    assert not set(first.frame_sha256.values()) & set(provenance_of(other).frame_sha256.values())
+    assert {"python", "calibench", "numpy"} <= set(first.versions)
+
+
+# --- figures and pictures -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (0.28034, 0.00041, "0.28034 ± 0.00041 DN"),
+        (9120.4, 21.3, "9120 ± 21 DN"),
+        (9120.4, 213.0, "9120 ± 213 DN"),
+        (-2.5, 0.5, "-2.50 ± 0.50 DN"),
+        (1.5e7, 2.0e5, "(1.500 ± 0.020)e+07 DN"),
+        (3.2e-11, 4e-13, "(3.200 ± 0.040)e-11 DN"),
+        (0.123456, None, "0.1235 DN"),
+        (5.0, 0.0, "5 DN"),
+        (5.0, float("nan"), "5 DN"),
+    ],
+)
+def test_values_are_rounded_to_their_uncertainty(value: float, std: float | None, text: str) -> None:
+    assert measured(value, std, "DN") == text
+
+
+def test_what_one_side_lacks_keeps_its_place(made_up: MadeUp) -> None:
+    fit = made_up()[0]
+    noise = fit.cameras["left"].noise.model_copy(update={"full_well_e": None})
+    left = fit.cameras["left"].model_copy(update={"noise": noise})
+    names = [
+        name
+        for name, _ in by_side(fit.model_copy(update={"cameras": {"left": left, "right": fit.cameras["right"]}}), {})
+    ]
+    assert names.index("full well") == names.index("dark current") + 1
+
+
+def test_rotation_vector_of_known_turns() -> None:
+    angle = 0.02
+    about_y = ((np.cos(angle), 0, np.sin(angle)), (0, 1, 0), (-np.sin(angle), 0, np.cos(angle)))
+    assert rotation_vector_mrad(about_y) == pytest.approx((0, 20, 0), abs=1e-9)
+    assert rotation_vector_mrad(((1, 0, 0), (0, 1, 0), (0, 0, 1))) == (0, 0, 0)
+
+
+def decoded(uri: str) -> np.ndarray:
+    data = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
+    return cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def test_pictures_have_the_right_way_up_and_the_right_colours() -> None:
+    image = np.zeros((3, 5, 3), np.uint8)
+    image[0, 4] = (255, 0, 10)
+    np.testing.assert_array_equal(decoded(png_data_uri(image)), image)
+    sign = decoded(difference_picture(np.array([[-1.0, 0.0, 1.0]]), 1.0))
+    assert sign[0, 0, 2] > sign[0, 0, 0]  # too little: blue
+    assert tuple(sign[0, 1]) == (255, 255, 255)
+    assert sign[0, 2, 0] > sign[0, 2, 2]  # too much: red
+    kernel = np.zeros((5, 5))
+    kernel[1, 3] = 1
+    assert decoded(kernel_picture(kernel, 1.0))[1, 3].sum() > decoded(kernel_picture(kernel, 1.0))[3, 1].sum()
+
+
+def test_frame_picture_puts_the_mosaic_channels_where_they_belong() -> None:
+    camera = Camera(rows=4, cols=4, cfa="GBRG", bit_depth=12, black_level_dn=10)
+    frame = np.full((4, 4), 10, np.uint16)
+    frame[0::2, 1::2] = 1000  # blue of GBRG
+    assert tuple(decoded(frame_picture(frame, camera))[0, 0]) == (0, 0, 255)
+
+
+def test_border_that_holds_nothing_is_cut_off() -> None:
+    kernel = np.zeros((21, 21))
+    kernel[10, 10], kernel[10, 14] = 1.0, 0.1
+    assert trimmed_margin([kernel]) == 6
+    assert trimmed_margin([np.ones((9, 9))]) == 0
+
+
+def test_patch_colours_are_balanced_on_the_measured_white() -> None:
+    values = {"R": 500.0, "G": 1000.0, "B": 250.0}
+    white = [
+        Patch(patch="white", channel=c, predicted_dn=v, predicted_dn_std=1, measured_dn=v, measured_dn_std=1)
+        for c, v in values.items()
+    ]
+    red = [
+        Patch(patch="red", channel=c, predicted_dn=0.5 * v, predicted_dn_std=1, measured_dn=v * (0.5 if c == "R" else 0.0), measured_dn_std=1)
+        for c, v in values.items()
+    ]  # fmt: skip
+    colours = patch_colours((*white, *red))
+    level = round(255 * 0.9 ** (1 / 2.2))
+    assert colours["white"] == (f"#{level:02x}" + f"{level:02x}" * 2,) * 2
+    assert colours["red"][0].endswith("0000")
+    assert len(set(re.findall("..", colours["red"][1][1:]))) == 1  # the prediction is grey
