@@ -107,7 +107,8 @@ def _curves(
     for channel in channels:
         stated = (camera.quantum_efficiency or {}).get(channel)
         if fitted is not None and channel in fitted.quantum_efficiency and not (maker_curves and stated):
-            curves[channel] = Spectrum.of(fitted.wavelength_nm, np.maximum(fitted.quantum_efficiency[channel], 0.0))
+            curve = Spectrum.of(fitted.wavelength_nm, np.maximum(fitted.quantum_efficiency[channel], 0.0))
+            curves[channel] = _continued(curve, recordings.spectrum(stated)) if stated else curve
             if channel in fitted.quantum_efficiency_std:
                 spread[channel] = Spectrum.of(fitted.wavelength_nm, fitted.quantum_efficiency_std[channel])
         elif stated:
@@ -117,6 +118,22 @@ def _curves(
             grid = np.arange(380.0, 781.0, 5.0)
             curves[channel] = Spectrum.of(grid, 0.5 * np.exp(-0.5 * ((grid - peak) / width) ** 2))
     return curves, spread
+
+
+def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:
+    """A fitted sensitivity, continued beyond the wavelengths of its lights by the maker's curve at the level of its ends.
+
+    A lamp shines beyond the sweep too: without this, 10 nm of it at the red end can miss 8 % of a red channel's signal.
+    """
+    wavelength_nm, value = np.array(fitted.wavelength_nm), np.array(fitted.value)
+    outer = np.array(stated.wavelength_nm)
+    parts = []
+    for beyond, end in ((outer < wavelength_nm[0], 0), (outer > wavelength_nm[-1], -1)):
+        level = float(stated.at(wavelength_nm[end]))
+        factor = value[end] / level if level > 0 else 0.0
+        parts.append((outer[beyond], factor * stated.at(outer[beyond])))
+    (before, low), (after, high) = parts
+    return Spectrum.of(np.concatenate([before, wavelength_nm, after]), np.concatenate([low, value, high]))
 
 
 # --- uniform light -----------------------------------------------------------------------------------------------------
