@@ -90,6 +90,7 @@ def serve(
             port=port,
             log_config=logging_config(),
             server_header=False,
+            ws="none",
             proxy_headers=False,
             timeout_graceful_shutdown=5,
             ssl_certfile=tls_certificate,

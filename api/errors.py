@@ -10,6 +10,7 @@ from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from lab.errors import DeviceError, InputError
 
@@ -47,8 +48,9 @@ _MEANINGS = {
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The error answers of a route, for OpenAPI."""
-    return {status: {"model": Problem, "description": _MEANINGS[status]} for status in statuses}
+    """The error answers of a route, for OpenAPI; JSON whatever the route answers else, so not by FastAPI's `model`."""
+    content = {"application/json": {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
+    return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
 
 def known(what: str, look: Callable[[], T]) -> T:
@@ -79,9 +81,29 @@ def _invalid(request: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"detail": "; ".join(lines)}, 422)
 
 
-def _defect(request: Request, error: Exception) -> JSONResponse:
-    log.error("%s %s: a defect", request.method, request.url.path, exc_info=error)
-    return JSONResponse({"detail": f"{type(error).__name__}: a defect of calibench; its log says more"}, 500)
+class Defects:
+    """Answers what nobody expected with 500 and without its text, which stays in the log."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let the request pass, and catch what comes of it."""
+        begun = False
+
+        async def watched(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self.app(scope, receive, watched)
+        except Exception as error:
+            log.exception("%s %s: a defect", scope.get("method"), scope.get("path"))
+            if begun:
+                raise
+            said = f"{type(error).__name__}: a defect of calibench; its log says more"
+            await JSONResponse({"detail": said}, 500)(scope, receive, send)
 
 
 def install(app: FastAPI) -> None:
@@ -90,4 +112,3 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(DeviceError, _answer(503))
     app.add_exception_handler(Conflict, _answer(409))
     app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(Exception, _defect)

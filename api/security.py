@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import urlsplit
 
 from fastapi import HTTPException, Request, Response, Security
@@ -225,10 +225,6 @@ class SafeHeaders:
         await self.app(scope, receive, with_headers if scope["type"] == "http" else send)
 
 
-class TooLarge(Exception):
-    """A body beyond the cap, seen while it was read."""
-
-
 class SmallBodies:
     """Refuses bodies beyond a cap, stated or streamed, before they fill the memory; `except_path` has a cap of its own."""
 
@@ -244,28 +240,23 @@ class SmallBodies:
         if not stated.isdigit() or int(stated) > self.limit_bytes:
             await self._refuse(scope, receive, send)
             return
-        taken, begun = 0, False
+        taken = 0
 
         async def counted() -> Message:
             nonlocal taken
             message: Message = await receive()
             taken += len(message.get("body", b""))
             if taken > self.limit_bytes:
-                raise TooLarge
+                raise HTTPException(
+                    413, self._why, headers={"Connection": "close"}
+                )  # FastAPI's, while it reads the body
             return message
 
-        async def watched(message: Message) -> None:
-            nonlocal begun
-            begun = True
-            await send(message)
+        await self.app(scope, counted, send)
 
-        try:
-            await self.app(scope, counted, watched)
-        except TooLarge:
-            if begun:
-                raise
-            await self._refuse(scope, receive, send)
+    @property
+    def _why(self) -> str:
+        return f"the body is larger than {self.limit_bytes} bytes; send less"
 
     async def _refuse(self, scope: Scope, receive: Receive, send: Send) -> None:
-        answer: dict[str, Any] = {"detail": f"the body is larger than {self.limit_bytes} bytes; send less"}
-        await JSONResponse(answer, 413, headers={"Connection": "close"})(scope, receive, send)
+        await JSONResponse({"detail": self._why}, 413, headers={"Connection": "close"})(scope, receive, send)

@@ -1,0 +1,136 @@
+"""The application: its schema, its pages, its errors."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.app import ASSETS, PAGES, TAGS
+from lab.errors import DeviceError
+from tests.api.conftest import Running
+
+
+def test_health_needs_no_key(shared: Running) -> None:
+    with shared.client(None) as client:
+        assert client.get("/health").json()["status"] == "ok"
+
+
+def operations(shared: Running) -> list[tuple[str, str, dict[str, Any]]]:
+    paths = shared.app.openapi()["paths"]
+    return [(method, path, one) for path, methods in paths.items() for method, one in methods.items()]
+
+
+def test_every_route_says_what_it_answers(shared: Running) -> None:
+    tags = {tag["name"] for tag in TAGS}
+    for method, path, one in operations(shared):
+        where = f"{method} {path}"
+        assert one["description"], where
+        assert set(one["tags"]) <= tags and one["tags"], where
+        good = [one["responses"][status] for status in one["responses"] if status.startswith("2")]
+        assert len(good) == 1, where
+        if path == "/logout":
+            continue
+        for kind, content in good[0]["content"].items():
+            assert content["schema"] or kind in ("image/png", "application/x-npy"), where
+        for status, answer in one["responses"].items():
+            if status.startswith("4"):
+                assert answer["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Problem"}, (
+                    where
+                )
+
+
+def test_all_but_logins_and_health_state_their_security(shared: Running) -> None:
+    schemes = shared.app.openapi()["components"]["securitySchemes"]
+    assert schemes["key"]["scheme"] == "bearer" and schemes["login"]["in"] == "cookie"
+    for _, path, one in operations(shared):
+        wanted = [{"key": []}, {"login": []}] if path.startswith("/api/") else None
+        assert one.get("security") == wanted, path
+
+
+def test_the_schema_is_closed(shared: Running) -> None:
+    """Every reference leads somewhere, every operation has an id of its own, every path parameter is declared."""
+    schema = shared.app.openapi()
+    assert schema["openapi"].startswith("3.1")
+
+    def references(of: Any) -> list[str]:
+        if isinstance(of, dict):
+            here = [of["$ref"]] if isinstance(of.get("$ref"), str) else []
+            return here + [one for value in of.values() for one in references(value)]
+        return [one for value in of for one in references(value)] if isinstance(of, list) else []
+
+    models = schema["components"]["schemas"]
+    assert {one.removeprefix("#/components/schemas/") for one in references(schema)} <= set(models)
+    assert "HTTPValidationError" not in models
+    ids = [one["operationId"] for _, _, one in operations(shared)]
+    assert len(ids) == len(set(ids))
+    for method, path, one in operations(shared):
+        stated = {p["name"] for p in one.get("parameters", []) if p["in"] == "path"}
+        assert stated == set(re.findall(r"\{(\w+)\}", path)), f"{method} {path}"
+
+
+def test_results_are_described_by_the_models_of_the_command_line(shared: Running) -> None:
+    answer = shared.app.openapi()["paths"]["/api/v1/jobs/{job_id}/result"]["get"]["responses"]["200"]
+    named = {one["$ref"].rpartition("/")[2] for one in answer["content"]["application/json"]["schema"]["anyOf"]}
+    assert named == {"FitResult", "ValidationResult", "DiagnosisResult"}
+
+
+@pytest.mark.parametrize("path", ["/", "/docs"])
+def test_pages_need_nothing_from_elsewhere(shared: Running, path: str) -> None:
+    with shared.client(None) as client:
+        page = client.get(path).text
+        loaded = re.findall(r'(?:src|href)="([^"]+)"', page)
+        assert loaded and all(one.startswith("/") and not one.startswith("//") for one in loaded)
+        for one in loaded:
+            assert client.get(one).status_code == 200, one
+    assert "<script>" not in page and "style=" not in page and " onclick=" not in page  # the policy forbids inline code
+
+
+def test_static_files_are_those_of_the_folder() -> None:
+    there = {file.name for file in PAGES.iterdir() if file.suffix in (".css", ".js")}
+    assert there == set(ASSETS)
+    for name in there:
+        assert not re.search(r"https?://", (PAGES / name).read_text()), name
+
+
+def test_no_swagger_from_a_cdn(shared: Running) -> None:
+    with shared.client(None) as client:
+        assert client.get("/redoc").status_code == 404
+        assert "cdn" not in client.get("/docs").text
+
+
+def test_errors_are_one_line(shared: Running) -> None:
+    with shared.client("admin") as client:
+        for response, status in [
+            (client.post("/api/v1/sessions", json={"station": 5, "x": 1}), 422),
+            (client.post("/api/v1/sessions", content=b"{"), 422),
+            (client.get("/api/v1/sessions/none"), 404),
+            (client.get("/nothing"), 404),
+            (client.put("/api/v1/sessions"), 405),
+        ]:
+            assert response.status_code == status
+            assert isinstance(response.json()["detail"], str) and "\n" not in response.json()["detail"]
+        said = client.post("/api/v1/sessions", json={"station": "fakes", "colour": "red"}).json()["detail"]
+        assert "colour" in said
+
+
+def test_a_device_that_fails_is_503_and_a_defect_500(
+    shared: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def failing(error: Exception) -> Any:
+        def sessions(self: Any) -> Any:
+            raise error
+
+        return sessions
+
+    with shared.client("admin") as client:
+        monkeypatch.setattr(type(shared.store), "sessions", failing(DeviceError("lamp: out\nburnt")))
+        response = client.get("/api/v1/sessions")
+        assert (response.status_code, response.json()) == (503, {"detail": "lamp: out; burnt"})
+        monkeypatch.setattr(type(shared.store), "sessions", failing(KeyError(str(Path("/secret/place")))))
+        response = client.get("/api/v1/sessions")
+        assert response.status_code == 500
+        assert "secret" not in response.text and response.headers["x-content-type-options"] == "nosniff"
+        assert "secret" in caplog.text

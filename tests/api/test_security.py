@@ -1,0 +1,246 @@
+"""What keeps others out: scopes, cookies, Host, Origin, caps, headers."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from fastapi import HTTPException
+
+from api.keys import Permission, StoredKey, digest
+from api.security import COOKIE, COOKIE_LIFETIME_S, Logins, Patience
+from tests.api.conftest import Running
+
+#: Every route under /api/v1 with the least scope that it needs.
+ROUTES = [
+    ("GET", "/me", "read"),
+    ("GET", "/parameters", "read"),
+    ("GET", "/effects", "read"),
+    ("GET", "/effects/{name}", "read"),
+    ("GET", "/stations", "read"),
+    ("GET", "/sessions", "read"),
+    ("POST", "/sessions", "operate"),
+    ("GET", "/sessions/{session_id}", "read"),
+    ("POST", "/sessions/{session_id}/pause", "operate"),
+    ("POST", "/sessions/{session_id}/resume", "operate"),
+    ("POST", "/sessions/{session_id}/abort", "operate"),
+    ("GET", "/sessions/{session_id}/events", "read"),
+    ("GET", "/sessions/{session_id}/captures", "read"),
+    ("GET", "/sessions/{session_id}/captures/{capture_id}", "read"),
+    ("GET", "/sessions/{session_id}/captures/{capture_id}/preview.png", "read"),
+    ("GET", "/sessions/{session_id}/captures/{capture_id}/frame.npy", "read"),
+    ("POST", "/sessions/{session_id}/jobs", "calibrate"),
+    ("GET", "/recordings", "read"),
+    ("POST", "/recordings", "calibrate"),
+    ("GET", "/recordings/{recordings_id}", "read"),
+    ("POST", "/recordings/{recordings_id}/jobs", "calibrate"),
+    ("GET", "/jobs", "read"),
+    ("GET", "/jobs/{job_id}", "read"),
+    ("POST", "/jobs/{job_id}/cancel", "calibrate"),
+    ("GET", "/jobs/{job_id}/events", "read"),
+    ("GET", "/jobs/{job_id}/result", "read"),
+    ("GET", "/jobs/{job_id}/report", "read"),
+]
+BODIES: dict[str, Any] = {"/sessions": {"station": "nowhere"}, "jobs": {"kind": "fit"}}
+
+
+def test_the_list_of_routes_is_complete(shared: Running) -> None:
+    paths = shared.app.openapi()["paths"]
+    there = {
+        (method.upper(), path) for path, methods in paths.items() for method in methods if path.startswith("/api/")
+    }
+    assert there == {(method, f"/api/v1{path}") for method, path, _ in ROUTES}
+
+
+@pytest.mark.parametrize(("method", "path", "least"), ROUTES)
+def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path: str, least: str) -> None:
+    ids = {"session_id": "0", "capture_id": "1", "job_id": "0" * 16, "recordings_id": "0" * 16, "name": "nothing"}
+    asked = "/api/v1" + re.sub(r"\{(\w+)\}", lambda found: ids[found[1]], path)
+    body = BODIES.get(path, BODIES["jobs"] if path.endswith("/jobs") and method == "POST" else None)
+    for scope, key in [(None, None), ("wrong", "calibench_" + "x" * 43), *shared.keys.items()]:
+        with shared.client(None) as client:
+            headers = {"Authorization": f"Bearer {key}"} if key else {}
+            response = client.request(method, asked, json=body, headers=headers)
+        if scope in (None, "wrong"):
+            assert response.status_code == 401
+            assert response.headers["www-authenticate"] == "Bearer"
+        elif Permission(scope).allows(Permission(least)):
+            # What is asked for isn't there, or is an empty upload: the key was good enough to be told so.
+            assert response.status_code == (
+                200 if "{" not in path and method == "GET" else 422 if path == "/recordings" else 404
+            )
+        else:
+            assert response.status_code == 403
+            assert f"needs '{least}'" in response.json()["detail"]
+
+
+@pytest.mark.parametrize("header", ["Bearer", "Basic {}", "{}", "Bearer {}x", "Token {}", "Bearer {} {}"])
+def test_other_ways_to_send_a_key_are_refused(shared: Running, header: str) -> None:
+    with shared.client(None) as client:
+        sent = header.replace("{}", shared.keys["admin"])
+        assert client.get("/api/v1/me", headers={"Authorization": sent}).status_code == 401
+        assert client.get("/api/v1/me", params={"key": shared.keys["admin"]}).status_code == 401
+        assert client.get("/api/v1/me", headers={"Authorization": f"bearer {shared.keys['read']}"}).status_code == 200
+
+
+def test_a_login_gives_a_cookie_that_scripts_and_other_sites_cannot_use(running: Running) -> None:
+    with running.client(None) as client:
+        assert client.post("/login", json={"key": "calibench_wrong"}).status_code == 401
+        response = client.post("/login", json={"key": running.keys["operate"]})
+        assert response.json() == {"name": "operate", "scope": "operate"}
+        cookie = response.headers["set-cookie"].lower()
+        assert "httponly" in cookie and "samesite=strict" in cookie and "path=/" in cookie
+        assert running.keys["operate"].lower() not in cookie
+        assert client.get("/api/v1/me").json()["name"] == "operate"
+        # A header speaks for itself: a wrong key in it isn't mended by the cookie.
+        assert client.get("/api/v1/me", headers={"Authorization": "Bearer wrong"}).status_code == 401
+        kept = client.cookies[COOKIE]
+        assert client.post("/logout").status_code == 204
+        assert COOKIE not in client.cookies
+        assert client.get("/api/v1/me", headers={"Cookie": f"{COOKIE}={kept}"}).status_code == 401
+
+
+def test_a_removed_key_takes_its_logins_along(running: Running) -> None:
+    with running.client(None) as client:
+        client.post("/login", json={"key": running.keys["read"]})
+        assert client.get("/api/v1/me").status_code == 200
+        running.store.remove_key("read")
+        assert client.get("/api/v1/me").status_code == 401
+
+
+def test_logins_end_after_twelve_hours() -> None:
+    clock = [0.0]
+    logins = Logins(clock=lambda: clock[0])
+    key = StoredKey("ada", Permission.READ, digest("x"))
+    token = logins.open(key)
+    clock[0] = COOKIE_LIFETIME_S - 1
+    assert logins.holder(token) == key
+    clock[0] = COOKIE_LIFETIME_S + 1
+    assert logins.holder(token) is None
+    logins.open(key)
+    assert len(logins._tokens) == 1  # what has run out isn't kept
+
+
+def test_failed_logins_wait_in_line_and_only_so_many() -> None:
+    async def guess() -> tuple[float, list[Any]]:
+        patience = Patience(pause_s=0.02, queue=4)
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        answers = await asyncio.gather(*(patience.after_failure() for _ in range(7)), return_exceptions=True)
+        return loop.time() - began, answers
+
+    took_s, answers = asyncio.run(guess())
+    refused = [answer for answer in answers if isinstance(answer, HTTPException)]
+    assert [answer.status_code for answer in refused] == [429] * 3
+    assert took_s >= 4 * 0.02
+
+
+# --- Host, Origin ------------------------------------------------------------------------------------------------------
+
+
+def raw(running: Running, request: str) -> str:
+    """The answer to bytes that no client library would send."""
+    address = urlsplit(running.url)
+    with socket.create_connection((address.hostname, address.port), timeout=10) as line:
+        line.sendall(request.encode())
+        answer = b""
+        while chunk := line.recv(65536):
+            answer += chunk
+    return answer.decode(errors="replace")
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "localhost@evil.example:80", "", "[", "127.0.0.2"]
+)
+@pytest.mark.parametrize("path", ["/", "/health", "/api/v1/me"])
+def test_a_foreign_host_is_refused(shared: Running, host: str, path: str) -> None:
+    answer = raw(shared, f"GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n")
+    assert answer.startswith("HTTP/1.1 400")
+    assert "x-content-type-options: nosniff" in answer
+
+
+@pytest.mark.parametrize("hosts", [["127.0.0.1", "evil.example"], ["evil.example", "127.0.0.1"], []])
+def test_one_host_is_named_and_no_more(shared: Running, hosts: list[str]) -> None:
+    lines = "".join(f"Host: {host}\r\n" for host in hosts)
+    assert raw(shared, f"GET /health HTTP/1.1\r\n{lines}Connection: close\r\n\r\n").startswith("HTTP/1.1 400")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:9", "localhost", "LOCALHOST:1", "[::1]:80"])
+def test_our_own_names_pass(shared: Running, host: str) -> None:
+    assert raw(shared, f"GET /health HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").startswith("HTTP/1.1 200")
+
+
+@pytest.mark.parametrize("origin", ["https://evil.example", "null", "http://127.0.0.1:1", "http://[", ""])
+def test_a_foreign_origin_changes_nothing(shared: Running, origin: str) -> None:
+    with shared.client("admin") as client:
+        headers = {"Origin": origin}
+        assert client.post("/api/v1/sessions", json={"station": "nowhere"}, headers=headers).status_code == 403
+        assert client.post("/login", json={"key": shared.keys["read"]}, headers=headers).status_code == 403
+        assert client.get("/api/v1/me", headers=headers).status_code == 200
+        own = client.post("/api/v1/sessions", json={"station": "nowhere"}, headers={"Origin": shared.url})
+        assert own.status_code == 404  # heard, and there is no such station
+
+
+def test_no_answer_invites_other_sites(shared: Running) -> None:
+    with shared.client("admin") as client:
+        asked = {"Origin": "https://evil.example", "Access-Control-Request-Method": "POST"}
+        for response in (client.options("/api/v1/sessions", headers=asked), client.get("/api/v1/me", headers=asked)):
+            assert not [name for name in response.headers if name.startswith("access-control")]
+
+
+# --- headers and bodies ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", ["/", "/docs", "/health", "/static/operator.js", "/api/v1/me", "/nothing"])
+def test_every_answer_has_the_security_headers(shared: Running, path: str) -> None:
+    with shared.client(None) as client:
+        headers = client.get(path).headers
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["referrer-policy"] == "no-referrer"
+    assert headers["x-frame-options"] == "DENY"
+    policy = headers["content-security-policy"]
+    assert "frame-ancestors 'none'" in policy and "default-src 'none'" in policy and "unsafe" not in policy
+    assert "server" not in headers or "uvicorn" in headers["server"]
+
+
+def test_a_large_body_is_refused_stated_or_not(shared: Running) -> None:
+    limit = shared.app.state.service.limits.body_bytes
+    with shared.client("admin") as client:
+        assert client.post("/api/v1/sessions", content=b" " * (limit + 1)).status_code == 413
+
+        def chunks() -> Any:
+            for _ in range(limit // 65536 + 2):
+                yield b" " * 65536
+
+        assert client.post("/api/v1/sessions", content=chunks()).status_code == 413
+        assert client.post("/login", json={"key": "x" * 300}).status_code == 422
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../security.py",
+        "/static/..%2fsecurity.py",
+        "/static/%2e%2e/security.py",
+        "/static//etc/passwd",
+        "/static/operator.html",
+        "/api/v1/sessions/..%2f..%2fregistry.sqlite",
+        "/api/v1/sessions/%00",
+        "/api/v1/sessions/0/captures/../../../keys",
+        "/api/v1/jobs/..%2f..%2fregistry/report",
+        "/api/v1/recordings/..",
+        "/api/v1/recordings/..%2fstations",
+        "/api/v1/recordings/%2e%2e%2fstations",
+    ],
+)
+def test_no_path_leads_to_a_file(shared: Running, path: str) -> None:
+    answer = raw(
+        shared,
+        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {shared.keys['admin']}\r\nConnection: close\r\n\r\n",
+    )
+    assert answer.split()[1] in ("404", "422"), answer[:200]
+    assert "root:" not in answer and "SQLite" not in answer and "import" not in answer
