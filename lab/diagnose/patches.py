@@ -53,7 +53,6 @@ class Patch:
     pixels: int
     row: float
     col: float
-    size_px: float
     frame: float  # mean of the whole frame in this channel
     tail: float  # what the point spread adds from the surroundings
     held_out: bool
@@ -78,7 +77,6 @@ def chart_block(study: Study) -> Block:
     surround = np.array([p.frame for p in points]) - offset  # what a veil carries
     light = relative_illumination(camera, row, col)
     place = Field.at(camera, row, col)
-    size_px = float(np.mean([p.size_px for p in points]))
     known = reflectances(points[0].captures[0].chart)
     curves = CurveSlopes(
         study, [(p.captures[0].radiance, p.channel, p.captures[0].exposure_s, "chart", known[p.name]) for p in points]
@@ -95,7 +93,7 @@ def chart_block(study: Study) -> Block:
         electrons = rates * local * time
         if any(type(e).charge is not Effect.charge for e in effects):
             electrons = electrons * _mixing(study, points, electrons, effects)
-        contrast = wide_contrast(camera, size_px, effects)
+        contrast = wide_contrast(effects)
         electrons = contrast * electrons + ((1.0 - contrast) * surround + tail) / noise.gain + ambient
         out = electrons + noise.dark_dn_per_s / noise.gain * exposures
         for effect in effects:
@@ -119,7 +117,7 @@ def chart_block(study: Study) -> Block:
         labels=tuple(
             Label(float(names[p.name]), p.channel, p.name, tuple(c.id for c in p.captures), p.held_out) for p in points
         ),
-        hooks=(UNIFORM_HOOKS - {"drift"}) | SPECTRAL_HOOKS | {"transfer"},
+        hooks=(UNIFORM_HOOKS - {"drift"}) | SPECTRAL_HOOKS | {"veil"},
         predict=predict,
         scale=signal,
     )
@@ -141,14 +139,14 @@ def patch_levels(study: Study) -> list[Patch]:
                 spread = _spread(study, frame, channel, part[0].radiance)
                 mean = float(study.pixels_of(frame, channel).mean())
                 mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))
-                for name, rows, cols, row, col, size in _patches(part[0]):
+                for name, rows, cols, row, col in _patches(part[0]):
                     box = (slice(*rows), slice(*cols))
                     values = frame[box][mask[box]]
                     if values.size < 16 or np.mean(clipped[box][mask[box]]) >= CLIPPED_SHARE:
                         continue
                     tail = spread[rows[0] // step : rows[1] // step, cols[0] // step : cols[1] // step].mean()
                     points.append(
-                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, size, mean, float(tail), part[0].id in out)
+                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, mean, float(tail), part[0].id in out)
                     )  # fmt: skip
     return points
 
@@ -204,8 +202,8 @@ def _mixing(study: Study, points: list[Patch], electrons: FloatArray, effects: E
     return factor
 
 
-def _patches(capture: Chart) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float, float]]:
-    """Patches' inner halves: name, rows, cols, centre, size in px."""
+def _patches(capture: Chart) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
+    """Patches' inner halves: name, rows, cols, centre."""
     corners = np.array(capture.corners, float)
     found = []
     names = list(reflectances(capture.chart))
@@ -217,7 +215,7 @@ def _patches(capture: Chart) -> list[tuple[str, tuple[int, int], tuple[int, int]
         half = 0.22 * min(np.linalg.norm(right), np.linalg.norm(down))
         rows = (int(np.ceil(centre[0] - half)), int(np.floor(centre[0] + half)) + 1)
         cols = (int(np.ceil(centre[1] - half)), int(np.floor(centre[1] + half)) + 1)
-        found.append((name, rows, cols, float(centre[0]), float(centre[1]), float(2 * half / 0.44)))
+        found.append((name, rows, cols, float(centre[0]), float(centre[1])))
     return found
 
 
@@ -277,7 +275,7 @@ def screen_block(study: Study) -> Block:
     )
 
     def predict(effects: Effects) -> Prediction:
-        contrast = wide_contrast(camera, 16.0, effects)
+        contrast = wide_contrast(effects)
         shift = np.zeros(len(points))
         if any(type(e).response is not Effect.response for e in effects):
             low = np.maximum(tail, 0.0) / noise.gain
@@ -291,7 +289,7 @@ def screen_block(study: Study) -> Block:
     return Block(
         measurement="screen", axis="level", unit="DN", reach=1e9, value=value, covariance=covariance,
         labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
-        hooks=frozenset({"transfer", "response"}), predict=predict, scale=np.array([p.white for p in points]),
+        hooks=frozenset({"veil", "response"}), predict=predict, scale=np.array([p.white for p in points]),
     )  # fmt: skip
 
 

@@ -251,12 +251,6 @@ def overrides(effect: Effect, hooks: frozenset[str]) -> bool:
     return any(getattr(type(effect), hook) is not getattr(Effect, hook) for hook in hooks)
 
 
-def wide_contrast(camera: CameraModel, size_px: float, effects: Effects) -> float:
-    """Contrast that the effects leave to detail of some size against the frame's mean: below 1 where light is spread widely."""
-    f = np.array([0.5 / size_px]) / camera.pixel_pitch_um
-    contrast = 1.0
-    for effect in effects:
-        if effect.name == "veiling_glare":
-            factor = effect.transfer(f, np.zeros(1), 550.0, camera)
-            contrast *= 1.0 if factor is None else float(np.real(factor[0]))
-    return contrast
+def wide_contrast(effects: Effects) -> float:
+    """Contrast that the effects leave to anything smaller than the frame: the rest of the light is its mean."""
+    return float(np.prod([1.0 - e.veil() for e in effects]))

@@ -295,7 +295,7 @@ def shading_block(study: Study) -> Block:
         for effect in effects:
             light = light * effect.illumination(place.x_um, place.y_um, camera)
         # a veil evens out what the lens's fall-off leaves
-        contrast = wide_contrast(camera, 0.25 * camera.cols, effects)
+        contrast = wide_contrast(effects)
         light = contrast * light + (1.0 - contrast) * light.mean()
         means = []
         for p in points:
@@ -310,7 +310,7 @@ def shading_block(study: Study) -> Block:
         measurement="flat_field", axis="field", unit="mm", reach=0.5 * float(np.ptp(radius)), value=value,
         covariance=np.diag(std**2 + SHADING_FLOOR**2),
         labels=tuple(Label(float(r), p[1], f"cell {k // cols},{k % cols}", tuple(c.id for c in p[0]), p[5]) for p in points for k, r in enumerate(radius)),
-        hooks=frozenset({"illumination", "response", "transfer"}), predict=predict, scale=np.ones(len(value)),
+        hooks=frozenset({"illumination", "response", "veil"}), predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 

@@ -118,6 +118,10 @@ class Effect(Frozen):
         """
         return None
 
+    def veil(self) -> float:
+        """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""
+        return 0.0
+
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
         """CHARGE: mean electrons of a whole frame (rows, cols), after light and dark current were added."""
         return electrons

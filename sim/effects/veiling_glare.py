@@ -45,3 +45,6 @@ class VeilingGlare(Effect):
         share = self.share_percent / 100.0
         veil = np.exp(-2.0 * np.pi**2 * VEIL_UM**2 * (fx_cy_per_um**2 + fy_cy_per_um**2))
         return np.asarray(1.0 - share + share * veil)
+
+    def veil(self) -> float:
+        return self.share_percent / 100.0
