@@ -82,7 +82,8 @@ class _Pace:
 class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
-    `on_progress` is called from the thread of the run; what it raises ends the run.
+    `station`: the one that the session began on, unless its instruments have moved to other addresses since. `on_progress`
+    is called from a thread of the run; what it raises ends the run.
     """
 
     def __init__(
@@ -90,11 +91,12 @@ class CaptureSession:
         store: Store,
         session_id: str,
         *,
+        station: Station | None = None,
         on_progress: Callable[[Progress], None] | None = None,
         connect: Callable[[Station], Drivers] = drivers_of,
     ) -> None:
         self.store, self.id = store, session_id
-        self.station = store.station(session_id)
+        self.station = station or store.station(session_id)
         self._on_progress = on_progress
         self._connect = connect
         self._engine: RunEngine | None = None

@@ -16,9 +16,10 @@ from sim.parameters import Frozen
 
 DARK_S = (0.0005, 0.05, 0.5, 2.0, 5.0)
 QUICK_DARK_S = (0.0005, 0.5, 2.0, 5.0)
-#: Shares of saturation: dense where the photon transfer bends, and two beyond it, for the full well.
-LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.88, 0.95, 1.03, 1.15)
-QUICK_LEVELS = (0.03, 0.1, 0.25, 0.4, 0.55, 0.7, 0.85, 0.95, 1.1)
+#: Shares of the brightest channel's saturation: dense where its photon transfer bends, and beyond it, for the full well
+#: (the corners of a frame get less light) and for the half and full ranges of the channels that a lamp lights less.
+LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.15, 1.4, 1.8, 2.3)
+QUICK_LEVELS = (0.03, 0.1, 0.25, 0.4, 0.55, 0.7, 0.87, 1.2, 1.6)
 
 
 class Calibration(Frozen):
