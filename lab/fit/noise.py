@@ -44,6 +44,7 @@ PILED_LIMIT = 2e-3  # share of pixels on the plane's own highest code that says 
 DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
 SHADING_DEGREE = 6
 MIN_LEVELS = 3
+MIN_SIZE_PX = 16
 
 
 F = TypeVar("F", bound=np.floating[Any])
@@ -486,6 +487,11 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     flats = recordings.captures("flat", side)
     if not flats:
         raise NotDetermined("noise", "no flats: capture two or more at each of several exposures up to saturation")
+    if min(camera.rows, camera.cols) < MIN_SIZE_PX:
+        raise NotDetermined(
+            "noise",
+            f"{camera.rows} x {camera.cols} px are too few for a variance: give frames of {MIN_SIZE_PX} x {MIN_SIZE_PX} or more",
+        )
     gains = [flat.gain_db or 0.0 for flat in flats]
     gain_db = max(sorted(set(gains)), key=gains.count)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
@@ -758,9 +764,13 @@ class _Evaluation:
     # --- what follows from K ---
 
     def _read_noise(self) -> tuple[float | None, float | None]:
-        if not any(level.repeats > 1 for level in self.darks):
-            return None, None
         t = self.transfer
+        if not any(level.lamp == "dark" for level, _ in self.points):
+            if any(level.repeats > 1 for level in self.darks):
+                self.remarks.append(
+                    f"repeated dark frames are all alike: rounding hides the read noise, which is below {0.4 / t.gain:.2f} e"
+                )
+            return None, None
         count = t.floor.size
         own = t.covariance[2:, 2:]
         weight = 1.0 / np.diag(own)

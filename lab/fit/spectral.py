@@ -335,7 +335,7 @@ class _Recording:
         self.recordings, self.side, self.noise = recordings, side, noise
         self.camera = recordings.camera(side)
         self.remarks: list[str] = []
-        self.narrowband = recordings.captures("narrowband", side)
+        self.narrowband = [c for c in recordings.captures("narrowband", side) if c.exposure_s > 0]
         if not self.narrowband:
             raise NotDetermined("spectral", "no narrowband captures: capture them over the visible by 10 nm or finer")
         self.gain, self.gain_std = self._conversion_gain()
@@ -523,7 +523,7 @@ class _Recording:
         rates: dict[tuple[str, str], list[tuple[float, float]]] = {}
         used: dict[str, list[Flat]] = {}
         for flat in self.recordings.captures("flat", self.side):
-            if flat.radiance is not None:
+            if flat.radiance is not None and flat.exposure_s > 0:
                 used.setdefault(flat.radiance, []).append(flat)
         for path, flats in used.items():
             for flat in flats:

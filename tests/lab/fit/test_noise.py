@@ -21,6 +21,7 @@ from lab.fit.noise import (
     noise_fit,
     shading,
 )
+from lab.importers.emva1288 import read_emva1288
 from lab.recording import Camera, Manifest, RecordingSet, read
 from lab.results import NoiseFit
 from sim.sensor.mosaic import planes
@@ -375,6 +376,19 @@ def test_clipped_black_is_said() -> None:
     assert fit.conversion_gain_dn_per_e == pytest.approx(0.5, rel=0.03)
 
 
+def test_rounding_hides_a_small_read_noise_and_that_is_said() -> None:
+    sensor = Sensor(read=0.2, dsnu=0.0)  # 0.1 DN about a whole DN: all dark pixels are alike
+    fit = fit_noise(recording_set(sensor, [(0.001, 4)], LADDER), "left")
+    assert fit.read_noise_e is None
+    assert any("rounding hides" in remark for remark in fit.remarks)
+    assert abs(fit.conversion_gain_dn_per_e - 0.5) < 3.5 * fit.conversion_gain_dn_per_e_std
+
+
+def test_a_frame_of_a_few_pixels_is_refused() -> None:
+    with pytest.raises(NotDetermined, match="too few"):
+        fit_noise(recording_set(Sensor(shape=(4, 4)), [(0.001, 2)], LADDER), "left")
+
+
 # --- recordings of others ----------------------------------------------------------------------------------------------
 
 
@@ -404,23 +418,7 @@ def test_a_real_ccd() -> None:
     folder = DATA / "emva1288_ccd"
     if not folder.exists():
         pytest.skip("the shared recordings aren't here")
-    cv2 = pytest.importorskip("cv2")
-    darks: list[Level] = []
-    flats: list[Level] = []
-    current: tuple[str, float, float, list[Path]] | None = None
-    listed = []
-    for line in (folder / "EMVA1288_Data.txt").read_text().splitlines():
-        key, *values = line.split() or ["#"]
-        if key in "bd":
-            current = (key, float(values[0]) * 1e-9, float(values[1]) if key == "b" else 0.0, [])
-            listed.append(current)
-        elif key == "i" and (file := folder / values[0].replace("\\", "/")).exists():
-            current[3].append(file)
-    for key, exposure, photons, files in listed:
-        statistics = level_statistics((cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files), "MONO", 4095)
-        lamp = ("", True, 545.0) if key == "b" else "dark"
-        (flats if key == "b" else darks).append(Level(exposure, photons, lamp, statistics))
-    fit = noise_fit(darks, flats, Camera(rows=480, cols=640, cfa="MONO", bit_depth=12))
+    fit = fit_noise(read_emva1288(folder), "left")
     assert fit.conversion_gain_dn_per_e == pytest.approx(0.280, rel=0.02)
     assert fit.read_noise_e == pytest.approx(10.9, rel=0.1)
     assert fit.quantum_efficiency == pytest.approx(0.453, rel=0.03)
