@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,7 @@ Folder = Annotated[
     Path | None, typer.Option("--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
 ]
 FIRST_KEY = "first"
+_ANY = ("0.0.0.0", "::", "")  # addresses of this computer that are nobody's name
 
 
 def _store(folder: Path | None) -> Store:
@@ -47,6 +49,17 @@ def logging_config() -> dict[str, Any]:
     for name in ("api", "lab"):
         config["loggers"][name] = {"handlers": ["default"], "level": "INFO", "propagate": False}
     return config
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    try:
+        found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, _, _, _, address = found[0]
+        return socket.create_server(address[:2], family=family, backlog=128)
+    except OSError as error:
+        raise InputError(
+            f"{host}:{port}: can't be listened at ({error.strerror}); choose another --port or --host, or end what uses it"
+        ) from error
 
 
 @commands.command()
@@ -76,31 +89,30 @@ def serve(
         if file is not None and not os.access(file, os.R_OK):
             raise InputError(f"{file}: can't be read; give a PEM file")
     store = _store(data)
-    if (is_loopback(host) or create_first_key) and not stored_keys(store):
-        _first_key(store)
-    check_bind(host, stored_keys(store))
-    names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in ("0.0.0.0", "::", "")}
-    scheme = "https" if tls_certificate is not None else "http"
-    shown = "127.0.0.1" if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
-    app = create_app(store, hosts=names)
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app,
-            host=host,
-            port=port,
-            log_config=logging_config(),
-            server_header=False,
-            ws="none",
-            proxy_headers=False,
-            timeout_graceful_shutdown=5,
-            ssl_certfile=tls_certificate,
-            ssl_keyfile=tls_key,
+    makes_key = (is_loopback(host) or create_first_key) and not stored_keys(store)
+    if not makes_key:
+        check_bind(host, stored_keys(store))
+    with _listening(host, port) as line:
+        if makes_key:
+            _first_key(store)
+        names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
+        app = create_app(store, hosts=names)
+        server = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                log_config=logging_config(),
+                server_header=False,
+                ws="none",
+                proxy_headers=False,
+                timeout_graceful_shutdown=5,
+                ssl_certfile=tls_certificate,
+                ssl_keyfile=tls_key,
+            )
         )
-    )
-    typer.echo(f"operator's page: {scheme}://{shown}:{port}/    REST: {scheme}://{shown}:{port}/docs")
-    server.run()
-    if not server.started:
-        raise InputError(f"{host}:{port}: can't be listened at; choose another --port or end what uses it")
+        shown = "127.0.0.1" if host in _ANY else f"[{host}]" if ":" in host else host
+        url = f"{'http' if tls_certificate is None else 'https'}://{shown}:{line.getsockname()[1]}"
+        typer.echo(f"operator's page: {url}/    REST: {url}/docs")
+        server.run(sockets=[line])
 
 
 @key.command("create")

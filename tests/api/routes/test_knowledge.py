@@ -1,0 +1,36 @@
+"""What the models declare is what the service tells."""
+
+from __future__ import annotations
+
+from sim.camera import CameraModel
+from sim.effects.library import effects
+from sim.parameters import declared
+from tests.api.conftest import Running
+
+
+def test_parameters_are_those_of_the_camera_model(shared: Running) -> None:
+    with shared.client("read") as client:
+        told = {one["name"]: one for one in client.get("/api/v1/parameters").json()}
+    for name, quantity in declared(CameraModel).items():
+        assert told[name]["unit"] == quantity.unit and told[name]["meaning"] == quantity.meaning
+        assert told[name]["lower"] == quantity.lower and told[name]["upper"] == quantity.upper
+    assert told["lens.f_number"]["unit"] == "1"
+
+
+def test_effects_are_those_of_the_library(shared: Running) -> None:
+    with shared.client("read") as client:
+        told = client.get("/api/v1/effects").json()
+        assert [one["name"] for one in told] == list(effects())
+        for one in told:
+            effect = effects()[one["name"]]
+            assert one["reference"] == effect.reference and set(one["shown_by"]) == effect.shown_by
+            assert set(one["rivals"]) == effect.rivals
+            assert [p["name"] for p in one["parameters"]] == list(effect.quantities())
+        assert client.get("/api/v1/effects/optical_low_pass_filter").json() in told
+        assert client.get("/api/v1/effects/magic").status_code == 404
+
+
+def test_who_asks(shared: Running) -> None:
+    for scope in shared.keys:
+        with shared.client(scope) as client:
+            assert client.get("/api/v1/me").json() == {"name": scope, "scope": scope}

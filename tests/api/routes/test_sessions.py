@@ -1,0 +1,260 @@
+"""Stations, sessions and captures over REST, on instruments that are not there."""
+
+from __future__ import annotations
+
+import io
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from drivers.errors import Disconnected
+from tests.api.conftest import Running, events, serving, until, until_state
+from tests.lab.fake_bench import BLACK, COLS, ROWS
+
+DARKS = {"station": "fakes", "name": "darks", "quick": True, "sequences": ["dark"]}
+
+
+def start(client: httpx.Client, **changes: Any) -> str:
+    response = client.post("/api/v1/sessions", json=DARKS | changes)
+    assert response.status_code == 201, response.text
+    session_id: str = response.json()["id"]
+    assert response.headers["location"] == f"/api/v1/sessions/{session_id}"
+    return session_id
+
+
+def only_session(shared: Running) -> str:
+    return shared.store.sessions()[0].id
+
+
+# --- stations ----------------------------------------------------------------------------------------------------------
+
+
+def test_stations_are_the_files_of_the_folder(running: Running) -> None:
+    folder: Path = running.store.root / "stations"
+    (folder / "broken.toml").write_text("name = ")
+    (folder / "notes.txt").write_text("not a station")
+    (running.store.root / "outside.toml").write_text((folder / "fakes.toml").read_text())
+    with running.client("read") as client:
+        broken, fakes = client.get("/api/v1/stations").json()
+    assert broken["name"] == "broken" and "TOML" in broken["problem"]
+    assert fakes["name"] == "fakes" and fakes["title"] == "a bench of fakes" and fakes["problem"] is None
+    assert fakes["cameras"] == ["left", "right"]
+    assert fakes["sequences"] == ["dark", "flat", "narrowband"]  # neither a screen nor a chart, an edge, a board
+    assert fakes["busy_with"] is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "said"),
+    [
+        ({"station": "nowhere"}, 404, "nowhere"),
+        ({"station": "../outside"}, 404, "outside"),
+        ({"station": "broken"}, 422, "TOML"),
+        ({"sequences": ["dark", "screen"]}, 422, "screen"),
+        ({"sequences": []}, 422, "sequences"),
+        ({"sequences": ["light"]}, 422, "sequences"),
+        ({"name": "x" * 200}, 422, "name"),
+    ],
+)
+def test_what_cannot_be_started_is_one_line(shared: Running, changes: dict[str, Any], status: int, said: str) -> None:
+    (shared.store.root / "stations" / "broken.toml").write_text("name = ")
+    (shared.store.root / "outside.toml").write_text("")
+    before = len(shared.store.sessions())
+    with shared.client("operate") as client:
+        response = client.post("/api/v1/sessions", json=DARKS | changes)
+    assert response.status_code == status
+    assert said in response.json()["detail"] and "\n" not in response.json()["detail"]
+    assert len(shared.store.sessions()) == before
+
+
+# --- sessions ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_session_from_its_start_to_its_captures(running: Running) -> None:
+    with running.client("operate") as client:
+        session_id = start(client, notes="by a test")
+        found = until_state(client, session_id, "finished")
+        assert found["notes"] == "by a test" and found["error"] is None
+        assert found["steps_done"] == found["steps"] > 0
+        assert found["station"] == "a bench of fakes" and found["progress"] is None
+        assert found["runs"][0]["instruments"]["camera left"]["serial_number"] == "SN-1"
+        assert found["created"].endswith("Z") and found["closed"].endswith("Z")
+        listed = client.get("/api/v1/sessions").json()
+        assert [one["id"] for one in listed] == [session_id] and listed[0]["state"] == "finished"
+        assert client.post(f"/api/v1/sessions/{session_id}/resume").status_code == 409
+        assert client.post(f"/api/v1/sessions/{session_id}/pause").status_code == 409
+        assert client.post(f"/api/v1/sessions/{session_id}/abort").status_code == 409
+
+
+def test_events_tell_each_step_and_the_end(tmp_path: Path) -> None:
+    with serving(tmp_path, delay_s=0.02) as running, running.client("operate") as client:
+        session_id = start(client)
+        told = events(client, f"/api/v1/sessions/{session_id}/events")
+    names = [name for name, _ in told]
+    assert names[0] == "state" and names[-1] == "end" and set(names) == {"state", "progress", "end"}
+    steps = [data for name, data in told if name == "progress" and data["state"] == "running"]
+    assert [data["done"] for data in steps] == sorted(data["done"] for data in steps)
+    assert all(data["total"] == told[-1][1]["steps"] and data["session"] == session_id for data in steps)
+    assert any(data["left_s"] is not None and data["left_s"] >= 0 for data in steps)
+    assert told[-1][1]["state"] == "finished"
+    states = [data["state"] for name, data in told if name == "state"]
+    assert states[-1] == "finished" and "running" in states
+
+
+def test_who_comes_late_hears_how_things_stand(shared: Running) -> None:
+    with shared.client("read") as client:
+        told = events(client, f"/api/v1/sessions/{only_session(shared)}/events")
+    assert [name for name, _ in told] == ["state", "end"]
+    assert told[0][1] == told[1][1] and told[0][1]["state"] == "finished"
+
+
+def test_pause_resume_and_abort(tmp_path: Path) -> None:
+    with serving(tmp_path, delay_s=0.05) as running, running.client("operate") as client:
+        session_id = start(client)
+        here = f"/api/v1/sessions/{session_id}"
+        until_state(client, session_id, "running")
+        assert client.post(f"{here}/resume").status_code == 409  # it runs
+        busy = client.get("/api/v1/stations").json()[0]["busy_with"]
+        second = client.post("/api/v1/sessions", json=DARKS)
+        assert busy == session_id and second.status_code == 409 and session_id in second.json()["detail"]
+
+        paused = client.post(f"{here}/pause")
+        assert paused.status_code == 202 and paused.json()["state"] in ("pausing", "paused")
+        found = until_state(client, session_id, "paused")
+        assert not running.bench.opened
+        assert client.post(f"{here}/pause").status_code == 409
+        # A follower of a paused session hears that at once.
+        assert events(client, f"{here}/events", "progress")[-1][1]["state"] == "paused"
+
+        assert client.post(f"{here}/resume").status_code == 202
+        until(client, here, lambda now: now["steps_done"] > found["steps_done"])
+        assert client.post(f"{here}/abort").status_code == 202
+        found = until_state(client, session_id, "interrupted")
+        assert "aborted" in found["error"] and 0 < found["steps_done"] < found["steps"]
+        assert not running.bench.opened
+        assert client.get("/api/v1/stations").json()[0]["busy_with"] is None
+
+        running.bench.delay_s = 0.0
+        resumed = client.post(f"{here}/resume")
+        assert resumed.status_code == 202 and resumed.json()["error"] is None
+        found = until_state(client, session_id, "finished")
+        assert len(found["runs"]) == 2
+        names = [one["name"] for one in client.get(f"{here}/captures").json()]
+        assert len(names) == len(set(names)) == 2 * found["steps"]  # nothing twice, nothing missing
+
+
+def test_a_paused_session_can_be_aborted(tmp_path: Path) -> None:
+    with serving(tmp_path, delay_s=0.05) as running, running.client("operate") as client:
+        session_id = start(client)
+        until_state(client, session_id, "running")
+        client.post(f"/api/v1/sessions/{session_id}/pause")
+        until_state(client, session_id, "paused")
+        assert client.post(f"/api/v1/sessions/{session_id}/abort").status_code == 202
+        until_state(client, session_id, "interrupted")
+
+
+def test_an_instrument_that_fails_is_said_and_the_session_resumes(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running.bench.unplugged.add("stage")
+    with running.client("operate") as client:
+        session_id = start(client)
+        told = events(client, f"/api/v1/sessions/{session_id}/events")
+        assert told[-1][1]["state"] == "failed" and "stage" in told[-1][1]["error"]
+        running.bench.unplugged.clear()
+        assert client.post(f"/api/v1/sessions/{session_id}/resume").status_code == 202
+        until_state(client, session_id, "finished")
+    assert Disconnected.__name__ not in told[-1][1]["error"]
+
+
+def test_stopping_the_service_leaves_sessions_resumable(tmp_path: Path) -> None:
+    with serving(tmp_path, delay_s=0.05) as running, running.client("operate") as client:
+        session_id = start(client)
+        until(client, f"/api/v1/sessions/{session_id}", lambda now: now["steps_done"] > 1)
+        bench = running.bench
+    assert not bench.opened and "close monochromator" in bench.log
+    from lab.store import Store
+
+    store = Store(tmp_path)
+    info = store.session(session_id)
+    store.close()
+    assert info.state == "interrupted" and info.error == "the service was stopped"
+    assert 1 < info.steps_done < info.steps
+
+
+def test_two_follow_and_one_leaves(tmp_path: Path) -> None:
+    with serving(tmp_path, delay_s=0.02) as running, running.client("operate") as client:
+        session_id = start(client)
+        path = f"/api/v1/sessions/{session_id}/events"
+        heard: list[str] = []
+
+        def listen() -> None:
+            with running.client("read") as other:
+                heard.extend(name for name, _ in events(other, path))
+
+        listener = threading.Thread(target=listen)
+        listener.start()
+        assert events(client, path, "progress")  # leaves after the first word
+        listener.join(30.0)
+    assert heard[-1] == "end"
+
+
+# --- captures ----------------------------------------------------------------------------------------------------------
+
+
+def test_captures_by_kind_and_side(shared: Running) -> None:
+    here = f"/api/v1/sessions/{only_session(shared)}/captures"
+    with shared.client("read") as client:
+        every = client.get(here).json()
+        left = client.get(here, params={"side": "left"}).json()
+        assert len(every) == 2 * len(left) and {one["side"] for one in left} == {"left"}
+        assert client.get(here, params={"kind": "dark"}).json() == every
+        assert client.get(here, params={"kind": "flat"}).json() == []
+        assert client.get(here, params={"kind": "soup"}).status_code == 422
+        assert client.get(here, params={"offset": 2, "limit": 3}).json() == every[2:5]
+        one = client.get(f"{here}/{every[0]['id']}").json()
+        assert one == every[0]
+        assert one["document"]["kind"] == "dark" and one["document"]["exposure_s"] == one["exposure_s"]
+
+
+def test_a_frame_is_what_was_captured(shared: Running) -> None:
+    session_id = only_session(shared)
+    with shared.client("read") as client:
+        one = client.get(f"/api/v1/sessions/{session_id}/captures").json()[0]
+        response = client.get(one["frame"])
+    frame = np.load(io.BytesIO(response.content), allow_pickle=False)
+    assert frame.dtype == np.uint16 and frame.shape == (ROWS, COLS)
+    np.testing.assert_array_equal(frame, shared.store.frame(one["id"]))
+    assert "attachment" in response.headers["content-disposition"]
+
+
+def test_a_preview_is_a_small_picture_that_browsers_keep(shared: Running) -> None:
+    session_id = only_session(shared)
+    with shared.client("read") as client:
+        one = client.get(f"/api/v1/sessions/{session_id}/captures").json()[0]
+        response = client.get(one["preview"])
+        assert response.headers["content-type"] == "image/png"
+        assert "immutable" in response.headers["cache-control"] and "private" in response.headers["cache-control"]
+        picture = cv2.imdecode(np.frombuffer(response.content, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert picture.shape == (ROWS // 2, COLS // 2, 3)
+        # Black within read noise of 2 DN: (3 sigma / (4095 - 64)) ** (1 / 2.2) * 255 < 13.
+        assert picture.mean() < 13 and BLACK == 64
+        again = client.get(one["preview"], headers={"If-None-Match": response.headers["etag"]})
+        assert again.status_code == 304 and not again.content
+        assert client.get(one["preview"], params={"width": 2}).status_code == 422
+        stretched = client.get(one["preview"], params={"stretch": True}).content
+        assert cv2.imdecode(np.frombuffer(stretched, np.uint8), cv2.IMREAD_UNCHANGED).max() > 200
+
+
+def test_a_capture_belongs_to_its_session(shared: Running) -> None:
+    session_id = only_session(shared)
+    with shared.client("read") as client:
+        one = client.get(f"/api/v1/sessions/{session_id}/captures").json()[0]["id"]
+        for path in (f"other/captures/{one}", f"other/captures/{one}/preview.png", f"{session_id}/captures/99999"):
+            assert client.get(f"/api/v1/sessions/{path}").status_code == 404
+        for odd in ("0", "-1", "x", str(2**70), "1.5"):
+            assert client.get(f"/api/v1/sessions/{session_id}/captures/{odd}").status_code == 422
