@@ -146,8 +146,9 @@ class LiveSessions:
             live.begin(capture)
         return capture.id
 
-    def resume(self, session_id: str) -> None:
-        """Go on after a pause, or run a session again that ended early. Raises Conflict where it is neither."""
+    def resume(self, session_id: str, moved: Station | None = None) -> None:
+        """Go on after a pause, or run a session again that ended early, on `moved` if its instruments have other addresses
+        now. Raises Conflict where it is neither."""
         with self._lock:
             live = self.find(session_id)
             if live is not None and live.capture is not None:
@@ -161,11 +162,14 @@ class LiveSessions:
                 raise Conflict(f"session {session_id} is finished; start a new one")
             if info.state in RUNS:
                 raise Conflict(f"session {session_id} is run by another process; resume it there")
-            station = self._store.station(session_id)
+            station = moved or self._store.station(session_id)
             self._check_free(station)
             live = LiveSession(station)
+            capture = CaptureSession(
+                self._store, session_id, station=station, on_progress=live.tell, connect=self._connect
+            )
             self._live[session_id] = live
-            live.begin(CaptureSession(self._store, session_id, on_progress=live.tell, connect=self._connect))
+            live.begin(capture)
 
     def pause(self, session_id: str) -> None:
         """Pause when the step under way is done. Raises Conflict where nothing can be paused now."""

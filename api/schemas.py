@@ -85,6 +85,16 @@ class SessionStart(Schema):
     )
 
 
+class SessionResume(Schema):
+    """Where to go on, if its instruments have moved."""
+
+    station: str | None = Field(
+        default=None,
+        max_length=100,
+        description="a station with the same instruments at other addresses; null: as it began",
+    )
+
+
 class Session(Schema):
     """A session; `state` is `pausing` until the step under way is done."""
 

@@ -175,6 +175,13 @@ for (const verb of ["pause", "resume", "abort"]) {
   );
 }
 
+// A session that ended early goes on where its station is now: the file of that name may have other addresses.
+async function resume(session) {
+  const [detail, stations] = await Promise.all([ask(`/sessions/${session.id}`), ask("/stations")]);
+  const same = stations.filter((s) => !s.problem && s.title === detail.station);
+  await post(`/sessions/${session.id}/resume`, { station: same.length === 1 ? same[0].name : null });
+}
+
 // --- tables ---------------------------------------------------------------------------------------------------------
 
 function stateCell(item) {
@@ -187,7 +194,7 @@ function sessionRow(session) {
   const actions = element("td");
   if (["created", "interrupted", "failed"].includes(session.state)) {
     const resume = element("button", { textContent: "Resume" });
-    resume.addEventListener("click", guarded("live-problem", () => post(`/sessions/${session.id}/resume`)));
+    resume.addEventListener("click", guarded("live-problem", () => resume(session)));
     actions.append(resume, " ");
   }
   const open = element("button", { textContent: "Open" });

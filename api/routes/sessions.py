@@ -15,7 +15,7 @@ from api.errors import answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
 from api.preview import preview_png
-from api.schemas import Capture, SequenceName, Session, SessionDetail, SessionStart, Station
+from api.schemas import Capture, SequenceName, Session, SessionDetail, SessionResume, SessionStart, Station
 from api.service import OPERATE, READ, Here, RegistryId, Service, SessionId
 from lab.errors import InputError
 from lab.recording import Kind
@@ -148,10 +148,10 @@ def pause_session(service: Here, session_id: SessionId) -> Session:
     dependencies=[OPERATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def resume_session(service: Here, session_id: SessionId) -> Session:
+def resume_session(service: Here, session_id: SessionId, resume: SessionResume | None = None) -> Session:
     """Go on after a pause; or run a session on that ended early: finished steps aren't taken again."""
     service.session(session_id)
-    service.live.resume(session_id)
+    service.live.resume(session_id, service.station(resume.station) if resume and resume.station else None)
     return _session(service, session_id)
 
 

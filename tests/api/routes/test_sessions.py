@@ -166,7 +166,14 @@ def test_an_instrument_that_fails_is_said_and_the_session_resumes(
         told = events(client, f"/api/v1/sessions/{session_id}/events")
         assert told[-1][1]["state"] == "failed" and "stage" in told[-1][1]["error"]
         running.bench.unplugged.clear()
-        assert client.post(f"/api/v1/sessions/{session_id}/resume").status_code == 202
+        here = f"/api/v1/sessions/{session_id}/resume"
+        assert client.post(here, json={"station": "nowhere"}).status_code == 404
+        stations: Path = running.store.root / "stations"
+        text = (stations / "fakes.toml").read_text()
+        (stations / "moved.toml").write_text(text.replace('address = "left"', 'address = "further left"'))
+        assert client.post(here, json={"station": "moved"}).status_code == 202
+        live = running.app.state.service.live._live[session_id]
+        assert live.station.cameras["left"].address == "further left"
         until_state(client, session_id, "finished")
     assert Disconnected.__name__ not in told[-1][1]["error"]
 
