@@ -74,16 +74,8 @@ def decide(evidence: Evidence, rng: np.random.Generator, report: Callable[[str],
             evidence, evidence.camera, current.effects, _others(known, current), current.tangents
         ).scores()
 
-    named: list[Candidate] = []
-    abstained: list[Candidate] = []
-    for index in range(len(current.effects)):
-        report(f"weighing {current.effects[index].name} against its rivals")
-        candidate = _weighed(evidence, current, index, known)
-        (named if candidate.probability >= NAMED_FROM else abstained).append(candidate)
+    named, abstained = _believed(evidence, current, known, threshold, report)
     effects = tuple(c.effect for c in named)
-    if abstained and effects:
-        effects = refit(evidence, effects, passes=2).effects
-        named = [Candidate(e, c.std, c.probability, c.rivals, c.gain) for e, c in zip(effects, named, strict=True)]
     model = evidence.gaussian(effects)
     after = tuple(s for s in look(evidence, model) if s.significant)
     unexplained = {id(s.block): evidence.blocks.index(s.block) for s in after}
@@ -154,6 +146,53 @@ def _start_like(evidence: Evidence, other: type[Effect], effects: tuple[Effect, 
     rest = (*effects[:index], *effects[index + 1 :])
     found = signatures(evidence, evidence.camera, rest, [other]).scores()
     return found[0].start if found else None
+
+
+def _believed(
+    evidence: Evidence, current: Fit, known: Iterable[type[Effect]], threshold: float, report: Callable[[str], None]
+) -> tuple[list[Candidate], list[Candidate]]:
+    """The effects whose names hold against rivals and the unknown, and those that were given up, least likely first.
+
+    What is given up no longer props up the others: these are fitted and weighed again without it.
+    """
+    given_up: list[Candidate] = []
+    while current.effects:
+        members = []
+        for index, e in enumerate(current.effects):
+            report(f"weighing {e.name} against its rivals")
+            members.append(_weighed(evidence, current, index, known))
+        crowd = _crowd(evidence, current)
+        if crowd:
+            lost = [members[i] for i in crowd]
+        else:
+            worst = min(members, key=lambda c: c.probability)
+            lost = [worst] if worst.probability < NAMED_FROM or 2.0 * worst.gain < threshold else []
+        if not lost:
+            return members, given_up
+        given_up += lost
+        left = tuple(c.effect for c in members if c not in lost)
+        current = refit(evidence, left, passes=2)
+    return [], given_up
+
+
+def _crowd(evidence: Evidence, fit: Fit) -> list[int]:
+    """Indices of effects that only together stand for one smooth discrepancy: two or more on one measurement that a process
+    without a name replaces at less cost."""
+    by_block: dict[int, list[int]] = {}
+    for i, e in enumerate(fit.effects):
+        rest = (*fit.effects[:i], *fit.effects[i + 1 :])
+        touched = [k for k, b in enumerate(evidence.blocks) if b.touched_by(type(e))]
+        if touched:
+            by_block.setdefault(max(touched, key=lambda k, e=e, rest=rest: _gain(evidence, e, rest, k)), []).append(i)  # type: ignore[misc]
+    full = evidence.gaussian(fit.effects)
+    for index, members in by_block.items():
+        if len(members) < 2:
+            continue
+        fewer = refit(evidence, tuple(e for i, e in enumerate(fit.effects) if i not in members), passes=2)
+        bare = evidence.gaussian(fewer.effects)
+        if fewer.weight + discrepancy(evidence, bare, index).gain > fit.weight + discrepancy(evidence, full, index).gain:
+            return members
+    return []
 
 
 def _weighed(evidence: Evidence, fit: Fit, index: int, known: Iterable[type[Effect]]) -> Candidate:

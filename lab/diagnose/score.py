@@ -106,7 +106,7 @@ def _span(table: FloatArray) -> FloatArray:
 def _cone(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray]:
     size = np.linalg.norm(table, axis=0)
     share, rest = nnls(table / np.where(size > 0, size, 1.0), white)
-    return float(white @ white - rest**2), share / np.where(size > 0, size, 1.0)
+    return max(float(white @ white - rest**2), 0.0), share / np.where(size > 0, size, 1.0)
 
 
 def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray) -> Effect:

@@ -12,6 +12,8 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import gaussian_filter
 from scipy.special import erfc, j0, j1
 
 from lab.recording import Manifest, RecordingSet
@@ -58,8 +60,8 @@ class Body:
         edge = 1.0 / (1.0 + np.exp((WL - 705.0) / 8.0))
         self.maker, self.qe = {}, {}
         scale, tilt = 1 + 0.02 * rng.standard_normal(), 0.015 * rng.standard_normal()
-        for c, (mu, sd, top) in peaks.items():
-            mu, sd = mu + rng.uniform(-8, 8), sd * rng.uniform(0.9, 1.1)
+        for c, (peak, width, top) in peaks.items():
+            mu, sd = peak + rng.uniform(-8, 8), width * rng.uniform(0.9, 1.1)
             curve = (top * np.exp(-0.5 * ((WL - mu) / sd) ** 2) + 0.02 * edge) * edge
             self.maker[c] = curve
             self.qe[c] = curve * (scale + 0.003 * rng.standard_normal() + tilt * (WL - 560.0) / 160.0)
@@ -182,17 +184,14 @@ class Body:
         e = np.zeros((self.rows, self.cols))
         if images is not None:
             lit = {}
-            for c, im in images.items():
-                im = np.asarray(im, float) * self.shade
-                if "veiling_glare" in self.effects:
-                    g = self.effects["veiling_glare"] / 100
-                    if self.variant % 3 == 2:  # half of it within a wide halo
-                        from scipy.ndimage import gaussian_filter
-
-                        im = (1 - g) * im + g * 0.5 * (im.mean() + gaussian_filter(im, 120, mode="nearest"))
-                    else:
-                        im = (1 - g) * im + g * im.mean()
-                lit[c] = im
+            for c, image in images.items():
+                im = np.asarray(image, float) * self.shade
+                g = self.effects.get("veiling_glare", 0.0) / 100
+                # in one of three variants half of it stays within a wide halo
+                veil = (
+                    0.5 * (im.mean() + gaussian_filter(im, 120, mode="nearest")) if self.variant % 3 == 2 else im.mean()
+                )
+                lit[c] = (1 - g) * im + g * veil if g else im
             e = self.mosaic(lit) * exposure_s * self.prnu_map
             if "tap_gain" in self.effects:
                 e[:, self.cols // 2 :] *= 1 + self.effects["tap_gain"]
@@ -262,8 +261,6 @@ class Body:
         fy, fx = np.fft.fftfreq(fine.shape[0], 1 / over)[:, None], np.fft.rfftfreq(fine.shape[1], 1 / over)[None, :]
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx)
         grid_f, grid_a = np.linspace(0, 2.9, 60), np.linspace(-np.pi / 2, np.pi / 2, 25)
-        from scipy.interpolate import RegularGridInterpolator
-
         out = {}
         for ch in self.qe:
             table = np.array([self.otf(grid_f, a, radiance * WL, ch) for a in grid_a])

@@ -1,0 +1,79 @@
+"""Diagnosis of recordings that a second image former made, and of the two foreign sets beside the project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lab.diagnose import diagnose
+from lab.recording import read
+from lab.results import DiagnosisResult
+from tests.proof.foreign import Body
+
+DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+
+
+def _shared(name: str) -> DiagnosisResult:
+    folder = DATA / name
+    if not folder.is_dir():
+        pytest.skip(f"{name} isn't beside the project")
+    return diagnose(read(folder))
+
+
+def test_healthy_camera_of_another_image_former_is_believed() -> None:
+    result = _shared("foreign_healthy")
+    assert result.verdict == "no_mismatch"
+    assert not result.effects
+    assert not result.mismatches
+
+
+def test_two_effects_of_another_image_former_are_named() -> None:
+    """Truth: 1.9 um along rows and columns, cut at 652 nm; wanted within 5 % and 3 nm."""
+    result = _shared("foreign_two_effects")
+    assert result.verdict == "explained"
+    assert {e.name for e in result.effects} == {"optical_low_pass_filter", "infrared_cut_filter"}
+    by_name = {e.name: e for e in result.effects}
+    for field in ("displacement_x_um", "displacement_y_um"):
+        assert by_name["optical_low_pass_filter"].parameters[field].value == pytest.approx(1.9, rel=0.05)
+    assert by_name["infrared_cut_filter"].parameters["cut_wavelength_nm"].value == pytest.approx(652.0, abs=3.0)
+    assert result.held_out is not None
+    assert result.held_out.chi2_after < 0.05 * result.held_out.chi2_before
+    assert result.held_out.chi2_after < 1.3 * result.held_out.n
+
+
+CASES = [
+    ("healthy mono", {}, 1, "MONO"),
+    ("glare", {"veiling_glare": 2.0}, 1, "GRBG"),
+    ("bend", {"nonlinearity": 2.0}, 0, "BGGR"),
+]
+
+
+@pytest.mark.parametrize(("name", "concealed", "variant", "cfa"), CASES, ids=[c[0] for c in CASES])
+def test_one_effect_by_another_law_is_named_alone(
+    name: str, concealed: dict[str, float], variant: int, cfa: str
+) -> None:
+    result = diagnose(Body(900, concealed, variant=variant, cfa=cfa).record())
+    assert {e.name for e in result.effects} == set(concealed)
+    assert result.verdict == ("explained" if concealed else "no_mismatch")
+
+
+MORE = [
+    ({"defocus": 12.0}, 1), ({"charge_diffusion": 0.7}, 2), ({"optical_low_pass_filter": 1.4}, 1), ({"infrared_cut_filter": 665.0}, 1),
+    ({"defocus": 14.0, "nonlinearity": 1.5}, 0), ({"charge_diffusion": 0.8, "veiling_glare": 2.0}, 1),
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("concealed", "variant"), MORE)
+def test_more_concealed_effects(concealed: dict[str, float], variant: int) -> None:
+    result = diagnose(Body(910, concealed, variant=variant, cfa="RGGB").record())
+    assert {e.name for e in result.effects} == set(concealed)
+
+
+@pytest.mark.slow
+def test_what_nobody_lists_is_located_and_not_named() -> None:
+    result = diagnose(Body(920, {"fringe": 0.03}, cfa="GBRG").record())
+    assert not result.effects
+    assert result.verdict == "unexplained"
+    assert any(m.measurement == "narrowband" for m in result.mismatches)
