@@ -36,7 +36,7 @@ from lab.errors import DeviceError, InputError
 from lab.fit import Progress as Advance
 from lab.fit import fit_recording_set
 from lab.recording import RecordingError, RecordingSet
-from lab.report.figures import by_side, measured, stereo_figures
+from lab.report.figures import by_side, stereo_figures
 from lab.results import DiagnosisResult, FitResult, Skipped, ValidationResult
 
 if TYPE_CHECKING:
@@ -247,17 +247,10 @@ def _print_diagnosis(diagnosis: DiagnosisResult) -> None:
     out.print(f"verdict: [bold]{diagnosis.verdict}[/]")
     for sentence in diagnosis.summary:
         out.print(escape(sentence))
-    for effect in diagnosis.effects:
-        values = ", ".join(
-            f"{name.removesuffix('_' + value.unit)} {measured(value.value, value.std, value.unit)}"
-            for name, value in effect.parameters.items()
-        )
-        out.print(f"  {effect.name} ({', '.join(effect.sides)}), probability {effect.probability:.3f}: {values}")
     if diagnosis.held_out is not None:
         held = diagnosis.held_out
-        out.print(
-            f"held out ({', '.join(held.captures)}): chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after, n = {held.n}"
-        )
+        captures = f"{len(held.captures)} held-out captures"
+        out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after, n = {held.n}")
     if diagnosis.next_capture:
         out.print(f"next: {escape(diagnosis.next_capture)}")
     _print_skipped(diagnosis.skipped)

@@ -70,6 +70,15 @@ class _Kernel:
         )
 
 
+def _without_repeats(recordings: RecordingSet, checks: list[Check]) -> list[Check]:
+    """The first check of each edge: repeats of the same region at the same angle would only fill the page."""
+    places = {capture.id: (capture.region, capture.angle_deg) for capture in recordings.captures("slanted_edge")}
+    first: dict[Any, Check] = {}
+    for check in checks:
+        first.setdefault(places.get(check.capture, check.capture), check)
+    return list(first.values())
+
+
 def _chart_item(recordings: RecordingSet, check: Check) -> dict[str, Any]:
     captures = [capture for capture in recordings.captures("chart", check.side) if capture.id == check.capture]
     photo = frame_picture(recordings.frame(captures[0]), recordings.camera(check.side)) if captures else None
@@ -194,8 +203,14 @@ def render_report(
             side: charts.quantum_efficiency(camera.spectral, recordings, side) if camera.spectral else None
             for side, camera in fit.cameras.items()
         },
+        "mtf_explained": {
+            side: charts.transfer_overlays(
+                charts.explained_overlays([curve for curve in curves if curve.side == side]), 2
+            )
+            for side in sides
+        },
         "mtf": {
-            side: charts.transfer_overlays(of(side, "mtf"), [curve for curve in curves if curve.side == side])
+            side: charts.transfer_overlays(charts.validated_overlays(_without_repeats(recordings, of(side, "mtf"))))
             for side in sides
         },
         "kernels": {

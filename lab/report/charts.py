@@ -3,7 +3,8 @@ script puts them in. Uncertainty is drawn wherever the results state one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from lab.recording import RecordingSet
 from lab.report.figures import measured
 from lab.results import (
     Check,
-    Curve,
     DiagnosisResult,
     NoiseFit,
     Patch,
@@ -209,23 +209,6 @@ def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Si
     }
 
 
-def _grid(panels: int, columns: int, height: int) -> tuple[dict[str, Any], int]:
-    """Layout of `panels` subplots in a grid, and its height."""
-    rows = -(-panels // columns)
-    return (
-        {
-            "grid": {
-                "rows": rows,
-                "columns": columns,
-                "pattern": "independent",
-                "xgap": 0.16,
-                "ygap": 0.3 if rows < 4 else 0.34,
-            }
-        },
-        60 + rows * height,
-    )
-
-
 def _panel_title(number: int, text: str) -> dict[str, Any]:
     suffix = "" if number == 0 else str(number + 1)
     return {
@@ -241,79 +224,104 @@ def _panel_title(number: int, text: str) -> dict[str, Any]:
     }
 
 
-def curves_by_label(checks: Sequence[Check]) -> dict[str, list[Curve]]:
-    """Label -> the channels' curves of it, in the order of the checks."""
-    found: dict[str, list[Curve]] = {}
-    for check in checks:
-        for curve in check.curves:
-            found.setdefault(curve.label, []).append(curve)
-    return found
+@dataclass(frozen=True)
+class Overlay:
+    """One channel's measured curve with its predictions: by the baseline, and with the named effects where there are any."""
+
+    channel: str
+    x: Sequence[float]
+    measured: Sequence[float]
+    measured_std: Sequence[float]
+    baseline: Sequence[float]
+    explained: Sequence[float] | None = None
 
 
-def transfer_overlays(
-    checks: Sequence[Check], explained: Sequence[ResidualCurve] = (), columns: int = 3
-) -> Figure | None:
+def validated_overlays(checks: Sequence[Check]) -> dict[str, list[Overlay]]:
+    """Panel title -> curves, one panel for each check."""
+    return {
+        check.curves[0].label: [
+            Overlay(curve.channel, curve.x, curve.measured, curve.measured_std, curve.predicted)
+            for curve in check.curves
+        ]
+        for check in checks
+        if check.curves
+    }
+
+
+def explained_overlays(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
+    """Panel title -> curves of one measurement as the diagnosis has them, the held-out ones where there are both."""
+    chosen: dict[tuple[str, str], ResidualCurve] = {}
+    for curve in curves:
+        key = (curve.label, curve.channel)
+        if curve.measurement == measurement and (key not in chosen or curve.held_out):
+            chosen[key] = curve
+    panels: dict[str, list[Overlay]] = {}
+    for (label, channel), curve in chosen.items():
+        title = f"{label}{', held out' if curve.held_out else ''}"
+        panels.setdefault(title, []).append(
+            Overlay(channel, curve.x, curve.measured, curve.measured_std, curve.before, curve.after)
+        )
+    return panels
+
+
+def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3) -> Figure | None:
     """Measured MTF (points) over the baseline's prediction (dashed) and, where effects were named, theirs (solid)."""
-    labels = curves_by_label(checks)
-    after = {(curve.label, curve.channel): curve for curve in explained}
-    if not labels:
+    if not panels:
         return None
-    layout, height = _grid(len(labels), columns, 190)
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    height = 60 + rows * 190
+    layout: dict[str, Any] = {
+        "grid": {
+            "rows": rows,
+            "columns": columns,
+            "pattern": "independent",
+            "xgap": 0.16,
+            "ygap": 0.3 if rows < 4 else 0.34,
+        }
+    }
     data: list[Trace] = []
     titles = []
-    for number, (label, curves) in enumerate(labels.items()):
-        on = {"xaxis": f"x{number + 1}" if number else "x", "yaxis": f"y{number + 1}" if number else "y"}
-        titles.append(_panel_title(number, label))
-        for curve in curves:
-            colour = CHANNEL.get(curve.channel, "#888888")
-            named = {"legendgroup": curve.channel, "showlegend": False} | on
-            data.append(_band(curve.x, np.asarray(curve.measured), np.asarray(curve.measured_std), colour, **on))
-            data.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "name": f"{curve.channel} measured",
-                    "x": list(curve.x),
-                    "y": list(curve.measured),
-                    "marker": {"color": colour, "size": 4},
-                }
-                | named
-                | {"showlegend": number == 0, "legendrank": 1}
-            )
-            data.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "name": "predicted, baseline",
-                    "x": list(curve.x),
-                    "y": list(curve.predicted),
-                    "line": {"color": colour, "width": 1.3, "dash": "dash"},
-                }
-                | named
-                | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "baseline", "legendrank": 2}
-            )
-            if (explained_curve := after.get((curve.label, curve.channel))) is not None:
-                data.append(
-                    {
-                        "type": "scatter",
-                        "mode": "lines",
-                        "name": "predicted, with the named effects",
-                        "x": list(explained_curve.x),
-                        "y": list(explained_curve.after),
-                        "line": {"color": colour, "width": 1.8},
-                    }
-                    | named
-                    | {"showlegend": number == 0 and curve is curves[0], "legendgroup": "after", "legendrank": 3}
-                )
+    in_legend: set[str] = set()
+
+    def add(overlay: Overlay, name: str, rank: int, on: dict[str, str], **trace: Any) -> None:
+        data.append(
+            {
+                "type": "scatter",
+                "name": name,
+                "x": list(overlay.x),
+                "legendgroup": name,
+                "legendrank": rank,
+                "showlegend": name not in in_legend,
+            }
+            | on
+            | trace
+        )
+        in_legend.add(name)
+
+    for number, (title, overlays) in enumerate(panels.items()):
+        suffix = str(number + 1) if number else ""
+        on = {"xaxis": f"x{suffix}", "yaxis": f"y{suffix}"}
+        titles.append(_panel_title(number, title))
+        for overlay in overlays:
+            colour = CHANNEL.get(overlay.channel, "#888888")
+            data.append(_band(overlay.x, np.asarray(overlay.measured), np.asarray(overlay.measured_std), colour, **on))
+            marker = {"color": colour, "size": 4}
+            add(overlay, f"{overlay.channel} measured", 1, on, mode="markers", y=list(overlay.measured), marker=marker)
+            dashed = {"color": colour, "width": 1.3, "dash": "dash"}
+            add(overlay, "baseline", 2, on, mode="lines", y=list(overlay.baseline), line=dashed)
+            if overlay.explained is not None:
+                solid = {"color": colour, "width": 1.8}
+                add(overlay, "with the named effects", 3, on, mode="lines", y=list(overlay.explained), line=solid)
         layout |= {
-            f"xaxis{number + 1 if number else ''}": axis("cy/px" if number >= len(labels) - columns else ""),
-            f"yaxis{number + 1 if number else ''}": axis("MTF" if number % columns == 0 else "", range=[-0.02, 1.08]),
+            f"xaxis{suffix}": axis("cy/px" if number >= len(panels) - columns else ""),
+            f"yaxis{suffix}": axis("MTF" if number % columns == 0 else "", range=[-0.02, 1.08]),
         }
     legend = {"orientation": "h", "y": 1 + 26 / height, "yanchor": "bottom", "x": 0, "font": {"size": 11}}
+    margin = {"l": 56, "r": 14, "t": 56, "b": 44}
     return {
         "data": data,
-        "layout": _layout(height, annotations=titles, **layout)
-        | {"legend": legend, "margin": {"l": 56, "r": 14, "t": 56, "b": 44}},
+        "layout": _layout(height, annotations=titles, **layout) | {"legend": legend, "margin": margin},
     }
 
 

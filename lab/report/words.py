@@ -52,13 +52,22 @@ def effect_sentence(effect: NamedEffect) -> str:
 def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult | None) -> Iterator[str]:
     """The report in a few sentences, the verdict's own first."""
     if diagnosis is not None:
-        yield from diagnosis.summary or [effect_sentence(effect) for effect in diagnosis.effects]
+        yield from (effect_sentence(effect) for effect in diagnosis.effects)
+        if diagnosis.unexplained:
+            places = sorted({f"{item.measurement.replace('_', ' ')} ({item.side})" for item in diagnosis.unexplained})
+            yield f"Without a name so far: {', '.join(places)}."
         named = {side for effect in diagnosis.effects for side in effect.sides}
         clean = [
             side for side in fit.cameras if side not in named and not any(m.side == side for m in diagnosis.mismatches)
         ]
         if named and clean:
             yield f"The {' and '.join(clean)} camera conceals nothing that these recordings would show."
+        if diagnosis.held_out is not None and diagnosis.effects:
+            held = diagnosis.held_out
+            yield (
+                f"On {len(held.captures)} captures that no part of this has seen, χ² falls from {held.chi2_before:.0f} to "
+                f"{held.chi2_after:.0f} over {held.n} numbers."
+            )
     for side, camera in fit.cameras.items():
         noise = camera.noise
         if noise is not None and noise.conversion_gain_dn_per_e is not None:
