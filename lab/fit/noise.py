@@ -117,7 +117,8 @@ def shading(image: NDArray[F], degree: int = SHADING_DEGREE) -> NDArray[F]:
         full.append(basis)
         small.append(basis[: count * width].reshape(count, width, -1).mean(axis=1))
     coefficients = np.linalg.pinv(small[0]) @ means @ np.linalg.pinv(small[1]).T
-    return (full[0] @ coefficients @ full[1].T).astype(image.dtype)
+    # In the image's own precision: the surface's error is then the image's.
+    return (full[0] @ coefficients).astype(image.dtype) @ full[1].T.astype(image.dtype)
 
 
 def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> NDArray[np.bool_]:
