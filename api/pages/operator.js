@@ -6,6 +6,7 @@ const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
 const PICTURES_AT_ONCE = 48;
 let atOnce = PICTURES_AT_ONCE;
 let selected = null; // the session whose captures are shown
+let live = null; // the id of the session that runs now
 let following = null; // the open event stream, with the session it follows
 
 class Problem extends Error {}
@@ -120,6 +121,7 @@ $("logout").addEventListener("click", async () => {
 // --- what runs now --------------------------------------------------------------------------------------------------
 
 function showLive(session) {
+  live = session?.id ?? null;
   $("live").hidden = !session;
   $("live-idle").hidden = Boolean(session);
   if (!session) return;
@@ -170,13 +172,13 @@ for (const verb of ["pause", "resume", "abort"]) {
     "click",
     guarded("live-problem", async () => {
       if (verb === "abort" && !confirm("Abort the run? What was captured stays, and the session can be resumed.")) return;
-      await post(`/sessions/${following.id}/${verb}`);
+      await post(`/sessions/${live}/${verb}`);
     }),
   );
 }
 
 // A session that ended early goes on where its station is now: the file of that name may have other addresses.
-async function resume(session) {
+async function goOn(session) {
   const [detail, stations] = await Promise.all([ask(`/sessions/${session.id}`), ask("/stations")]);
   const same = stations.filter((s) => !s.problem && s.title === detail.station);
   await post(`/sessions/${session.id}/resume`, { station: same.length === 1 ? same[0].name : null });
@@ -194,7 +196,7 @@ function sessionRow(session) {
   const actions = element("td");
   if (["created", "interrupted", "failed"].includes(session.state)) {
     const resume = element("button", { textContent: "Resume" });
-    resume.addEventListener("click", guarded("live-problem", () => resume(session)));
+    resume.addEventListener("click", guarded("live-problem", () => goOn(session)));
     actions.append(resume, " ");
   }
   const open = element("button", { textContent: "Open" });
@@ -266,9 +268,11 @@ const option = (value) => element("option", { value, textContent: value || "all"
 async function showCaptures() {
   const captures = await ask(`/sessions/${selected}/captures?limit=5000`);
   const filter = $("capture-filter").elements;
-  if (filter.kind.options.length <= 1) {
-    filter.kind.replaceChildren(...["", ...new Set(captures.map((c) => c.kind))].map(option));
-    filter.side.replaceChildren(...["", ...new Set(captures.map((c) => c.side))].map(option));
+  for (const key of ["kind", "side"]) {
+    const values = ["", ...new Set(captures.map((c) => c[key]))];
+    const kept = filter[key].value;
+    if (filter[key].options.length !== values.length) filter[key].replaceChildren(...values.map(option));
+    filter[key].value = values.includes(kept) ? kept : "";
   }
   // Captures of one frame (an edge's regions, say) are one picture.
   const frames = new Map();
@@ -305,14 +309,14 @@ async function refresh() {
   if ($("desk").hidden) return;
   const [sessions, jobs] = await Promise.all([ask("/sessions"), ask("/jobs")]);
   const names = new Map(sessions.map((s) => [s.id, s.name || s.id]));
-  const live = sessions.find((s) => LIVE.includes(s.state));
-  if (live === undefined && !$("live").hidden) await showStations();
-  showLive(live);
+  const running = sessions.find((s) => LIVE.includes(s.state));
+  if (!running && live) await showStations();
+  showLive(running);
   show("sessions", sessions, sessionRow);
   $("no-sessions").hidden = sessions.length > 0;
   show("jobs", jobs.map((job) => ({ ...job, of: names.get(job.session_id) ?? job.session_id ?? `recordings ${job.recordings_id}` })), jobRow);
   $("no-jobs").hidden = jobs.length > 0;
-  if (live && live.id === selected) await showCaptures();
+  if (live && live === selected) await showCaptures();
 }
 
 setInterval(() => refresh().catch(() => {}), 3000);
