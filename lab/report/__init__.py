@@ -137,9 +137,6 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
     )
 
-    def parameter_name(name: str, value: ParameterValue) -> str:
-        return name.removesuffix(f"_{value.unit}").replace("_", " ")
-
     def parameter_value(value: ParameterValue) -> str:
         return measured(value.value, value.std, value.unit)
 
@@ -149,7 +146,7 @@ def _environment() -> jinja2.Environment:
     environment.filters |= {
         "words": lambda text: str(text).replace("_", " "),
         "chart_json": _chart_json,
-        "parameter_name": parameter_name,
+        "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,
     }

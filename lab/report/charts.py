@@ -220,7 +220,7 @@ def _panel_title(number: int, text: str) -> dict[str, Any]:
         "xanchor": "left",
         "yanchor": "bottom",
         "showarrow": False,
-        "font": {"size": 11, "color": "@fg"},
+        "font": {"size": 10, "color": "@fg"},
     }
 
 
@@ -239,7 +239,7 @@ class Overlay:
 def validated_overlays(checks: Sequence[Check]) -> dict[str, list[Overlay]]:
     """Panel title -> curves, one panel for each check."""
     return {
-        check.curves[0].label: [
+        check.curves[0].label.replace(f"-{check.side}", ""): [
             Overlay(curve.channel, curve.x, curve.measured, curve.measured_std, curve.predicted)
             for curve in check.curves
         ]
@@ -264,6 +264,11 @@ def explained_overlays(curves: Sequence[ResidualCurve], measurement: str = "slan
     return panels
 
 
+def _legend(name: str, **look: Any) -> Trace:
+    """An entry of the legend that draws nothing."""
+    return {"type": "scatter", "name": name, "x": [None], "y": [None], "hoverinfo": "skip"} | look
+
+
 def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3) -> Figure | None:
     """Measured MTF (points) over the baseline's prediction (dashed) and, where effects were named, theirs (solid)."""
     if not panels:
@@ -282,22 +287,15 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
     }
     data: list[Trace] = []
     titles = []
-    in_legend: set[str] = set()
+    everything = [overlay for overlays in panels.values() for overlay in overlays]
+    for channel in dict.fromkeys(overlay.channel for overlay in everything):
+        data.append(_legend(f"{channel} measured", mode="markers", marker={"color": CHANNEL.get(channel, "#888888")}))
+    data.append(_legend("baseline", mode="lines", line={"color": "@fg", "width": 1.3, "dash": "dash"}))
+    if any(overlay.explained is not None for overlay in everything):
+        data.append(_legend("with the named effects", mode="lines", line={"color": "@fg", "width": 1.8}))
 
-    def add(overlay: Overlay, name: str, rank: int, on: dict[str, str], **trace: Any) -> None:
-        data.append(
-            {
-                "type": "scatter",
-                "name": name,
-                "x": list(overlay.x),
-                "legendgroup": name,
-                "legendrank": rank,
-                "showlegend": name not in in_legend,
-            }
-            | on
-            | trace
-        )
-        in_legend.add(name)
+    def add(overlay: Overlay, y: Sequence[float], on: dict[str, str], **trace: Any) -> None:
+        data.append({"type": "scatter", "x": list(overlay.x), "y": list(y), "showlegend": False} | on | trace)
 
     for number, (title, overlays) in enumerate(panels.items()):
         suffix = str(number + 1) if number else ""
@@ -306,13 +304,11 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
         for overlay in overlays:
             colour = CHANNEL.get(overlay.channel, "#888888")
             data.append(_band(overlay.x, np.asarray(overlay.measured), np.asarray(overlay.measured_std), colour, **on))
-            marker = {"color": colour, "size": 4}
-            add(overlay, f"{overlay.channel} measured", 1, on, mode="markers", y=list(overlay.measured), marker=marker)
+            add(overlay, overlay.measured, on, mode="markers", marker={"color": colour, "size": 4})
             dashed = {"color": colour, "width": 1.3, "dash": "dash"}
-            add(overlay, "baseline", 2, on, mode="lines", y=list(overlay.baseline), line=dashed)
+            add(overlay, overlay.baseline, on, mode="lines", line=dashed)
             if overlay.explained is not None:
-                solid = {"color": colour, "width": 1.8}
-                add(overlay, "with the named effects", 3, on, mode="lines", y=list(overlay.explained), line=solid)
+                add(overlay, overlay.explained, on, mode="lines", line={"color": colour, "width": 1.8})
         layout |= {
             f"xaxis{suffix}": axis("cy/px" if number >= len(panels) - columns else ""),
             f"yaxis{suffix}": axis("MTF" if number % columns == 0 else "", range=[-0.02, 1.08]),
@@ -447,6 +443,16 @@ def worst_curves(curves: Sequence[ResidualCurve], most: int = 4) -> list[Residua
     return ranked[:most]
 
 
+def _range(curve: ResidualCurve) -> list[float]:
+    """Range of the ordinate: what was measured and explained, and of the baseline only as much as leaves that legible."""
+    seen = np.concatenate([curve.measured, curve.after])
+    low, high = float(seen.min()), float(seen.max())
+    span = max(high - low, 1e-12 * max(abs(high), 1.0))
+    before = np.clip(curve.before, low - span, high + span)
+    low, high = min(low, float(before.min())), max(high, float(before.max()))
+    return [low - 0.06 * (high - low), high + 0.06 * (high - low)]
+
+
 def residual_curve(curve: ResidualCurve) -> Figure:
     """One measurement with the baseline and the named effects, and below it what is left, in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
@@ -493,7 +499,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
         "layout": _layout(
             330,
             xaxis=axis(curve.axis, anchor="y2"),
-            yaxis=axis("measured", domain=[0.42, 1.0]),
+            yaxis=axis("measured", domain=[0.42, 1.0], range=_range(curve)),
             yaxis2=axis("residual, σ", domain=[0.0, 0.32], zeroline=True),
             shapes=[
                 {

@@ -24,6 +24,10 @@ NOISE = {
 }
 
 
+#: Units as they are shown, where names can't spell them.
+SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "percent": "%"}
+
+
 @dataclass(frozen=True)
 class Figure:
     """One number with its standard uncertainty (None: not stated), and what the maker says (None: nothing)."""
@@ -54,7 +58,7 @@ def measured(value: float, std: float | None = None, unit: str = "") -> str:
             power = math.floor(math.log10(max(abs(value), std)))
             digits = max(place + power, 0)
             number = f"({value / 10**power:.{digits}f} ± {std / 10**power:.{digits}f})e{power:+03d}"
-    return number if unit in ("", "1") else f"{number} {unit.replace('um', 'µm')}"
+    return number if unit in ("", "1") else f"{number} {SHOWN_UNITS.get(unit, unit)}"
 
 
 def noise_figures(noise: NoiseFit, camera: Camera | None = None) -> Iterator[Figure]:

@@ -36,10 +36,15 @@ def effect_name(name: str) -> str:
     return name.replace("_", " ")
 
 
+def parameter_name(name: str, value: ParameterValue) -> str:
+    """A parameter's name as words, without the unit at its end: `displacement_x_um` is `displacement x`."""
+    unit = "percent" if value.unit == "%" else value.unit
+    return name.removesuffix(f"_{unit}").replace("_", " ")
+
+
 def parameter_text(name: str, value: ParameterValue) -> str:
-    """`displacement x: 2.10 ± 0.05 um`: the unit at the end of the name goes to the value."""
-    words = name.removesuffix(f"_{value.unit}").replace("_", " ")
-    return f"{words} {measured(value.value, value.std, value.unit)}"
+    """`displacement x 2.10 ± 0.05 µm`."""
+    return f"{parameter_name(name, value)} {measured(value.value, value.std, value.unit)}"
 
 
 def effect_sentence(effect: NamedEffect) -> str:
