@@ -241,19 +241,27 @@ class JobRunner:
 
     def _dask(self) -> Any:
         """The Dask client, started at the first job."""
+        import dask
         from distributed import Client
 
         with self._starting:
             if self._client is None:
                 try:
                     if self.scheduler is None:
-                        self._client = Client(
-                            processes=False,
-                            n_workers=1,
-                            threads_per_worker=self.workers,
-                            dashboard_address=None,
-                            set_as_default=False,
-                        )
+                        # Dask opens its HTTP servers to the whole network, even with no dashboard asked for, the
+                        # scheduler's at one fixed port: here they are on loopback, at any port, and answer nothing.
+                        quiet: dict[str, list[str]] = {
+                            f"distributed.{part}.http.routes": [] for part in ("scheduler", "worker")
+                        }
+                        with dask.config.set(quiet):
+                            self._client = Client(
+                                processes=False,
+                                n_workers=1,
+                                threads_per_worker=self.workers,
+                                dashboard_address="127.0.0.1:0",
+                                worker_dashboard_address="127.0.0.1:0",
+                                set_as_default=False,
+                            )
                     else:
                         self._client = Client(self.scheduler, timeout=self.connect_timeout_s, set_as_default=False)
                 except OSError as error:

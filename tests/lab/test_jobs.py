@@ -167,7 +167,7 @@ def test_what_is_not_there_is_said(store: Store) -> None:
 def test_a_real_fit_on_a_worker_process(store: Store, session: str) -> None:
     # In a process of its own the task has only references: the store's folder and the job's id.
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as cluster,
         JobRunner(store, scheduler=cluster.scheduler_address) as runner,
     ):
         info: JobInfo = runner.wait(runner.submit("fit", session), 120)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -105,6 +106,19 @@ def test_a_report_runs_its_scripts_and_reaches_nothing(shared: Running, with_tas
     # Sandboxed: no cookie of ours, no request to anywhere.
     assert "sandbox allow-scripts" in REPORT_POLICY and "allow-same-origin" not in REPORT_POLICY
     assert "default-src 'none'" in REPORT_POLICY and "connect-src" not in REPORT_POLICY
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="reads Linux's list of sockets")
+def test_jobs_open_no_door_to_the_network(shared: Running, with_tasks: Callable[..., None]) -> None:
+    """Dask has HTTP servers of its own, which by default listen to everyone."""
+    with_tasks(fit=lambda task: FIT)
+    with shared.client("calibrate") as client:
+        path = f"/api/v1/jobs/{submit(client, shared, 'fit')['id']}"
+        until(client, path, lambda now: now["state"] == "done")
+    mine = {str(entry.readlink()) for entry in Path("/proc/self/fd").iterdir() if entry.is_symlink()}
+    rows = [line.split() for file in ("tcp", "tcp6") for line in Path(f"/proc/net/{file}").read_text().splitlines()[1:]]
+    listening = {row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in mine}
+    assert listening == {"0100007F"}  # 127.0.0.1, as Linux writes it on a little-endian machine
 
 
 def test_unknown_work_is_refused(shared: Running) -> None:
