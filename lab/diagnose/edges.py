@@ -56,7 +56,7 @@ def edge_block(study: Study) -> Block:
     for i, e in enumerate(edges):
         sets.setdefault((e.channel, e.part[0].light_radiance), []).append(i)
     f = np.maximum(basis.frequency, 1e-3)
-    angles = np.deg2rad(np.round([e.measured.angle_deg for e in edges], 2))
+    angles = np.deg2rad(np.round([e.measured.angle_deg for e in edges], 1))
 
     def predict(effects: Effects) -> Prediction:
         parts: list[FloatArray] = [np.zeros(0)] * len(edges)

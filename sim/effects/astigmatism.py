@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-import numpy as np
-
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
-from sim.effects.pupil import aberration_ratio
+from sim.effects.pupil import quadratic_ratio
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -45,12 +43,6 @@ class Astigmatism(Effect):
     ) -> FloatArray | None:
         if self.defocus_x_um == 0.0 and self.defocus_y_um == 0.0:
             return None
-        wx = self.defocus_x_um / (8.0 * camera.lens.f_number**2)
-        wy = -self.defocus_y_um / (8.0 * camera.lens.f_number**2)
-
-        def path(u: FloatArray, v: FloatArray, s: FloatArray, angle: FloatArray) -> FloatArray:
-            x = np.cos(angle) * u - np.sin(angle) * v
-            y = np.sin(angle) * u + np.cos(angle) * v
-            return np.asarray(2.0 * s * (wx * np.cos(angle) * x + wy * np.sin(angle) * y))
-
-        return aberration_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path, isotropic=False)
+        scale = 1.0 / (8.0 * camera.lens.f_number**2)
+        path = self.defocus_x_um * scale, -self.defocus_y_um * scale
+        return quadratic_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path)

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
-from sim.effects.pupil import aberration_ratio
+from sim.effects.pupil import quadratic_ratio
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -55,12 +55,4 @@ class Defocus(Effect):
         if self.defocus_um == 0.0:
             return None
         w020 = self.defocus_um / (8.0 * camera.lens.f_number**2)
-        return aberration_ratio(
-            fx_cy_per_um,
-            fy_cy_per_um,
-            wavelength_nm,
-            camera.lens.f_number,
-            lambda u, v, s, a: 2.0 * w020 * s * u,
-            isotropic=True,
-            along_only=True,
-        )
+        return quadratic_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, (w020, w020))

@@ -1,4 +1,10 @@
-"""Diffraction by an aberrated circular pupil: what the aberrations among the effects share."""
+"""Diffraction by an aberrated circular pupil, as a ratio to the perfect one: what the even aberrations among the effects share.
+
+H(s) = (1/pi) integral over the overlap of two unit discs, a distance s = 2 f / cut-off apart, of cos(2 pi dW / lambda), dW the
+difference of the path errors at the two pupil points. Source: J. Goodman, Introduction to Fourier Optics, section 6.4.
+(`sim.optics.pupil` has the OTF of any path error, complex; these two are for the fits of a diagnosis, which call them a hundred
+thousand times: a single integral where dW is linear, a table along the radius where it doesn't depend on direction.)
+"""
 
 from __future__ import annotations
 
@@ -9,9 +15,9 @@ import numpy as np
 
 from sim.spectrum import FloatArray
 
-#: Path difference in um of two pupil points (u + s/2, v) and (u - s/2, v), u along the frequency's direction, at the
-#: angle (rad) of the frequency from x; pupil radius 1, s = 2 f / cut-off.
-PathDifference = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+#: dW in um of the pupil points (u + s/2, v) and (u - s/2, v), u along the frequency; all broadcast.
+PathDifference = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+NODES_LINE, NODES_PLANE = 32, 16
 
 
 @lru_cache(maxsize=8)
@@ -20,76 +26,68 @@ def _nodes(count: int) -> tuple[FloatArray, FloatArray]:
     return 0.5 * (node + 1.0), 0.5 * weight
 
 
-def aberration_ratio(
+def quadratic_ratio(
+    fx_cy_per_um: FloatArray,
+    fy_cy_per_um: FloatArray,
+    wavelength_nm: float,
+    f_number: float,
+    path_um: tuple[float, float],
+) -> FloatArray:
+    """OTF ratio of the path error path_um[0] x^2 + path_um[1] y^2 (x along columns): defocus where both are alike.
+
+    dW is linear over the overlap, so that the integral across is a sinc: what remains is one along the frequency. Shape of the
+    frequencies; 1 beyond the cut-off, where both are 0.
+    """
+    fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
+    shape, radius = fx.shape, np.hypot(fx, fy).ravel()
+    s = 2.0 * radius * (wavelength_nm * 1e-3 * f_number)
+    safe = np.where(radius > 0, radius, 1.0)
+    cos, sin = np.where(radius > 0, fx.ravel() / safe, 1.0), fy.ravel() / safe
+    wave = 2.0 * np.pi / (wavelength_nm * 1e-3) * 2.0 * s
+    along = wave * (path_um[0] * cos**2 + path_um[1] * sin**2)
+    across = wave * (path_um[1] - path_um[0]) * cos * sin
+    node, weight = _nodes(NODES_LINE)
+    half = np.clip(0.5 * s, 0.0, 1.0 - 1e-9)[:, None]
+    # u = (1 - s/2) (1 - t^2) takes the chord's square root at the rim away
+    u = (1.0 - half) * (1.0 - node[None, :] ** 2)
+    chord = np.sqrt(np.maximum(1.0 - (u + half) ** 2, 0.0))
+    area = weight * node * chord
+    wavy = np.cos(along[:, None] * u)
+    if np.any(across):
+        wavy = wavy * np.sinc(across[:, None] * chord / np.pi)
+    ratio = (area * wavy).sum(1) / np.maximum(area.sum(1), 1e-300)
+    return np.where(s < 2.0, ratio, 1.0).reshape(shape)
+
+
+def isotropic_ratio(
     fx_cy_per_um: FloatArray,
     fy_cy_per_um: FloatArray,
     wavelength_nm: float,
     f_number: float,
     path_difference_um: PathDifference,
-    *,
-    isotropic: bool,
-    along_only: bool = False,
-    nodes: int = 16,
 ) -> FloatArray:
-    """OTF of an aberrated circular pupil over that of the perfect one; shape of `fx_cy_per_um`; 1 beyond the cut-off.
-
-    H(s) = (1/pi) integral over the overlap of two unit discs a distance s apart of cos(2 pi dW / lambda), for aberrations
-    whose dW is odd in u (all even ones, such as defocus, spherical aberration and astigmatism). Gauss-Legendre in
-    coordinates that take the square roots at the rim away. `isotropic`: dW doesn't depend on the angle; `along_only`: nor on v.
-    Source: J. Goodman, Introduction to Fourier Optics, section 6.4.
-    """
-    fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
-    radius = np.hypot(fx, fy)
-    cutoff = 1.0 / (wavelength_nm * 1e-3 * f_number)
-    if not isotropic:
-        angle = np.arctan2(fy, fx).ravel()
-        return _ratio(radius.ravel() / cutoff * 2.0, angle, wavelength_nm, path_difference_um, nodes).reshape(
-            radius.shape
-        )
+    """OTF ratio of a path error that depends on the pupil's radius only; shape of the frequencies, 1 beyond the cut-off."""
+    radius = np.hypot(*np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float)))
+    share = radius * (wavelength_nm * 1e-3 * f_number)
     # the same radius comes again at other angles
-    grid, place = np.unique(np.round(radius / cutoff, 9), return_inverse=True)
+    grid, place = np.unique(np.round(share, 9), return_inverse=True)
     if grid.size > 600:
         table = np.linspace(0.0, min(1.0, float(grid[-1])), 301)
-        coarse = aberration_ratio(
-            table * cutoff, np.zeros_like(table), wavelength_nm, f_number, path_difference_um,
-            isotropic=True, along_only=along_only, nodes=nodes,
-        )  # fmt: skip
-        return np.where(radius < cutoff, np.interp(radius / cutoff, table, coarse), 1.0)
-    if along_only:
-        values = _ratio_along(2.0 * grid, wavelength_nm, path_difference_um, 2 * nodes)
-    else:
-        values = _ratio(2.0 * grid, np.zeros_like(grid), wavelength_nm, path_difference_um, nodes)
-    return np.asarray(values[place.reshape(radius.shape)])
+        return np.where(
+            share < 1.0, np.interp(share, table, _plane(2.0 * table, wavelength_nm, path_difference_um)), 1.0
+        )
+    return np.asarray(_plane(2.0 * grid, wavelength_nm, path_difference_um)[place.reshape(radius.shape)])
 
 
-def _ratio_along(s: FloatArray, wavelength_nm: float, path_difference_um: PathDifference, nodes: int) -> FloatArray:
-    """For path errors that don't depend on v: the overlap's chord sqrt(1 - (u + s/2)^2) is the weight, u from 0 to 1 - s/2."""
-    node, weight = _nodes(nodes)
-    inside = np.clip(s, 0.0, 2.0 - 1e-9)[:, None]
-    # u = (1 - s/2) (1 - t^2) takes the chord's square root at the rim away
-    u = (1.0 - 0.5 * inside) * (1.0 - node[None, :] ** 2)
-    area = weight * node * np.sqrt(np.maximum(1.0 - (u + 0.5 * inside) ** 2, 0.0))
-    phase = (
-        2.0 * np.pi / (wavelength_nm * 1e-3) * path_difference_um(u, np.zeros_like(u), inside, np.zeros_like(inside))
-    )
-    return np.where(s < 2.0, (area * np.cos(phase)).sum(1) / np.maximum(area.sum(1), 1e-300), 1.0)
-
-
-def _ratio(
-    s: FloatArray, angle: FloatArray, wavelength_nm: float, path_difference_um: PathDifference, nodes: int
-) -> FloatArray:
-    node, weight = _nodes(nodes)
+def _plane(s: FloatArray, wavelength_nm: float, path_difference_um: PathDifference) -> FloatArray:
+    node, weight = _nodes(NODES_PLANE)
     inside = np.clip(s, 0.0, 2.0 - 1e-9)[:, None, None]
-    # the overlap's half with v > 0: v = v_max sin(t), u = u_max(v) * p with p in -1..1
+    # the overlap's quarter u, v > 0: v = v_max sin(t), u = u_max(v) p
     t = 0.5 * np.pi * node[None, :, None]
     v_max = np.sqrt(1.0 - 0.25 * inside**2)
     v = v_max * np.sin(t)
     u_max = np.sqrt(np.maximum(1.0 - v**2, 0.0)) - 0.5 * inside
-    p = (2.0 * node - 1.0)[None, None, :]
     area = weight[None, :, None] * weight[None, None, :] * v_max * np.cos(t) * u_max
-    phase = 2.0 * np.pi / (wavelength_nm * 1e-3) * path_difference_um(u_max * p, v, inside, angle[:, None, None])
-    # v -> -v is folded in by averaging, for aberrations that mix u and v
-    mirrored = 2.0 * np.pi / (wavelength_nm * 1e-3) * path_difference_um(u_max * p, -v, inside, angle[:, None, None])
-    above = (area * 0.5 * (np.cos(phase) + np.cos(mirrored))).sum((1, 2))
-    below = area.sum((1, 2))
-    return np.where(s < 2.0, above / np.maximum(below, 1e-300), 1.0)
+    phase = 2.0 * np.pi / (wavelength_nm * 1e-3) * path_difference_um(u_max * node[None, None, :], v, inside)
+    ratio = (area * np.cos(phase)).sum((1, 2)) / np.maximum(area.sum((1, 2)), 1e-300)
+    return np.where(s < 2.0, ratio, 1.0)

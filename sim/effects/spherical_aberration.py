@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
-from sim.effects.pupil import aberration_ratio
+from sim.effects.pupil import isotropic_ratio
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -48,7 +48,10 @@ class SphericalAberration(Effect):
         if self.w040_um == 0.0:
             return None
         # rho_+^4 - rho_-^4 = (rho_+^2 - rho_-^2) (rho_+^2 + rho_-^2)
-        return aberration_ratio(
-            fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number,
-            lambda u, v, s, a: self.w040_um * (2.0 * s * u) * (2.0 * (u**2 + v**2) + 0.5 * s**2), isotropic=True,
-        )  # fmt: skip
+        return isotropic_ratio(
+            fx_cy_per_um,
+            fy_cy_per_um,
+            wavelength_nm,
+            camera.lens.f_number,
+            lambda u, v, s: self.w040_um * (2.0 * s * u) * (2.0 * (u**2 + v**2) + 0.5 * s**2),
+        )
