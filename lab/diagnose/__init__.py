@@ -22,6 +22,7 @@ from lab.errors import NotDetermined
 from lab.predict import assumptions, camera_model
 from lab.recording import RecordingSet
 from lab.results import (
+    CameraFit,
     DiagnosisResult,
     FitResult,
     HeldOut,
@@ -104,7 +105,7 @@ def _evidence(recordings: RecordingSet, side: Side, fit: FitResult | None) -> tu
         Skipped(step=f"diagnose {a.quantity}", reason=f"neither stated nor fitted; taken as {a.value}", side=side)
         for a in assumptions(recordings.camera(side))
     ]
-    study = Study(recordings, side, camera)
+    study = Study(recordings, side, camera, _saturation_dn(camera_fit))
     blocks = []
     for make in BLOCKS:
         try:
@@ -113,6 +114,17 @@ def _evidence(recordings: RecordingSet, side: Side, fit: FitResult | None) -> tu
             skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
     blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]
     return (Evidence(tuple(blocks), study.camera) if blocks else None), skipped
+
+
+#: Of the full well: from here on pixels of a noisy level are cut off.
+_NEAR_FULL = 0.985
+
+
+def _saturation_dn(fit: CameraFit | None) -> float | None:
+    noise = fit.noise if fit is not None else None
+    if noise is None or noise.full_well_e is None or noise.conversion_gain_dn_per_e is None:
+        return None
+    return (noise.black_level_dn or 0.0) + _NEAR_FULL * noise.full_well_e * noise.conversion_gain_dn_per_e
 
 
 # --- from verdicts to the result -----------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from lab.diagnose.summaries import SPECTRAL_HOOKS, Effects, Study, overrides
 from sim.effects.base import Effect
@@ -22,7 +23,8 @@ CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
 class CurveSlopes:
     """Electron rates of a list of (light, channel), and their slopes by what is free of the maker's curves.
 
-    Per channel: scale, tilt, bend and a rough part on knots with a squared-exponential prior. The slope by a factor
+    Per channel: scale, tilt, bend, a rough part on knots with a squared-exponential prior, and what the curve does between the
+    samples that the maker gives. The slope by a factor
     (1 + d(w)) on the curve is the rate with the curve times d: exact, as the rate is linear in the curve. The baseline's rates
     are `sim.forward`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
     """
@@ -58,6 +60,8 @@ class CurveSlopes:
         ]
         modes += [vector[:, i] * np.sqrt(size[i]) for i in np.flatnonzero(keep)[::-1]]
         self._modes = np.array([np.interp(self.wavelength, knots, mode) for mode in modes])
+        between = {c: _between_samples(q, self.wavelength) for c, q in camera.quantum_efficiency.items()}
+        self._between = np.array([between[c] for _, c, *_ in items])
 
     @cached_property
     def blind(self) -> FloatArray:
@@ -87,7 +91,8 @@ class CurveSlopes:
                 weight = weight * effect.transmittance(self.wavelength, np.asarray(0.0))
             total = weight.sum(1)
             rate = self._rate * total / np.maximum(self._total, 1e-300)
-            shares = weight @ self._modes.T / np.maximum(total, 1e-300)[:, None]
+            table = np.column_stack([weight @ self._modes.T, (weight * self._between).sum(1)])
+            shares = table / np.maximum(total, 1e-300)[:, None]
             if len(self._kept) > 500:
                 self._kept.clear()
             self._kept[spectral] = rate, rate[:, None] * shares
@@ -104,6 +109,19 @@ class CurveSlopes:
         for channel in self.study.channels:
             mine = np.array([item[1] == channel for item in self.items])
             if mine.any():
-                for i in range(len(self._modes)):
+                for i in range(table.shape[1]):
                     named[f"curve:{channel}:{i}"] = np.where(mine, table[:, i], 0.0)
         return named
+
+
+def _between_samples(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:
+    """Relative difference of a cubic spline through a curve's samples from the straight lines between them.
+
+    A data sheet in steps of 5 nm doesn't say which it is; at a colour filter's foot they differ by some per cent.
+    """
+    if len(curve.wavelength_nm) < 4:
+        return np.zeros_like(wavelength_nm)
+    straight = curve.at(wavelength_nm)
+    spline = CubicSpline(curve.wavelength_nm, curve.value)(wavelength_nm)
+    inside = straight > 1e-4 * max(curve.value)
+    return np.where(inside, np.clip(spline / np.where(inside, straight, 1.0) - 1.0, -0.2, 0.2), 0.0)

@@ -190,7 +190,10 @@ def _crowd(evidence: Evidence, fit: Fit) -> list[int]:
             continue
         fewer = refit(evidence, tuple(e for i, e in enumerate(fit.effects) if i not in members), passes=2)
         bare = evidence.gaussian(fewer.effects)
-        if fewer.weight + discrepancy(evidence, bare, index).gain > fit.weight + discrepancy(evidence, full, index).gain:
+        if (
+            fewer.weight + discrepancy(evidence, bare, index).gain
+            > fit.weight + discrepancy(evidence, full, index).gain
+        ):
             return members
     return []
 

@@ -134,7 +134,7 @@ def patch_levels(study: Study) -> list[Patch]:
             if not part:
                 continue
             frame = steady(study.recordings, part)
-            clipped = study.recordings.frame(part[0]) >= study.camera.white_level_dn
+            clipped = study.recordings.frame(part[0]) >= study.saturation_dn
             for channel in study.channels:
                 spread = _spread(study, frame, channel, part[0].radiance)
                 mean = float(study.pixels_of(frame, channel).mean())

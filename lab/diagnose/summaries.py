@@ -85,8 +85,12 @@ class Levels:
 class Study:
     """One side of a recording set, its frames summarised once; the blocks are made from it."""
 
-    def __init__(self, recordings: RecordingSet, side: Side, camera: CameraModel) -> None:
+    def __init__(
+        self, recordings: RecordingSet, side: Side, camera: CameraModel, saturation_dn: float | None = None
+    ) -> None:
         self.recordings, self.side, self.camera = recordings, side, camera
+        #: Pixels from here on say nothing of the light: the converter's highest code, or the full well where that comes first.
+        self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)
         self.stated: Camera = recordings.camera(side)
         self.channels = camera.channels
         self._levels: dict[str, Levels] = {}
@@ -101,7 +105,7 @@ class Study:
                 "black_level_dn": self.noise.black,
                 "dark_current_e_per_s": self.noise.dark_dn_per_s / self.noise.gain,
                 "read_noise_e": self.noise.read_dn / self.noise.gain,
-                "full_well_e": (camera.white_level_dn - self.noise.black) / self.noise.gain,
+                "full_well_e": (self.saturation_dn - self.noise.black) / self.noise.gain,
             }
         )
 
@@ -133,7 +137,7 @@ class Study:
             pixels = {}
             for channel in self.channels:
                 values = self.pixels_of(frame, channel)
-                clipped = float(np.mean(values >= self.camera.white_level_dn))
+                clipped = float(np.mean(values >= self.saturation_dn))
                 mean[channel] = float(values.mean()) if clipped < CLIPPED_SHARE else None
                 pixels[channel] = values.size
             self._levels[capture.id] = Levels(mean, pixels)
@@ -202,7 +206,7 @@ def noise_guess(study: Study) -> NoiseGuess:
         frames = [recordings.frame(c) for c in group]
         for channel in study.channels:
             planes = [study.pixels_of(f, channel) for f in frames]
-            if any(np.mean(p >= study.camera.white_level_dn) >= CLIPPED_SHARE for p in planes):
+            if any(np.mean(p >= study.saturation_dn) >= CLIPPED_SHARE for p in planes):
                 continue
             means = np.array([p.mean() for p in planes])
             signal.append(means.mean() - black)
@@ -210,7 +214,7 @@ def noise_guess(study: Study) -> NoiseGuess:
             scatter.append(
                 np.var(means / (means.mean() - black), ddof=1) - variance[-1] / planes[0].size / signal[-1] ** 2
             )
-            if 0.3 < signal[-1] / (study.camera.white_level_dn - black) < 0.8:
+            if 0.3 < signal[-1] / (study.saturation_dn - black) < 0.8:
                 first_plane = np.mean(frames, axis=0)[mosaic.phases(study.camera.cfa)[channel][0][0] :: mosaic.step(study.camera.cfa),
                                                       mosaic.phases(study.camera.cfa)[channel][0][1] :: mosaic.step(study.camera.cfa)]  # fmt: skip
                 rough = first_plane - ndimage.uniform_filter(first_plane, 9)
@@ -220,7 +224,7 @@ def noise_guess(study: Study) -> NoiseGuess:
     if len(signal) > 1:
         s, v = np.array(signal), np.array(variance)
         weight = 1.0 / np.maximum(v, 1e-9)
-        low = s < 0.5 * (study.camera.white_level_dn - black)
+        low = s < 0.5 * (study.saturation_dn - black)
         use = low if low.sum() > 2 else np.ones_like(low)
         gain = float(np.sum(weight[use] * s[use] * (v[use] - read**2)) / np.sum(weight[use] * s[use] ** 2))
         lamp = float(np.sqrt(max(np.mean(scatter), 0.0)))

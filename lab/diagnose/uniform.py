@@ -81,7 +81,7 @@ def linearity_block(study: Study) -> Block:
     rate = {}
     for pair in sorted(set(key)):
         mine = np.array([k == pair for k in key])
-        low = mine & (signal < 0.6 * (study.camera.white_level_dn - noise.black))
+        low = mine & (signal < 0.6 * (study.saturation_dn - noise.black))
         use = low if low.sum() > 1 else mine
         rate[pair] = float(np.sum(signal[use]) / np.sum(exposures[use])) / noise.gain / float(study.field.light.mean())
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
