@@ -364,7 +364,7 @@ def run(
     resume: Resume = "",
 ) -> None:
     """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench."""
-    from lab.report import provenance_of, write_report
+    from lab.report import provenance_of, words, write_report
 
     store = _store(out_folder)
     session_id = _captured(store, station, quick, name, resume)
@@ -381,9 +381,13 @@ def run(
     provenance = provenance_of(recordings, runs[-1].instruments if runs else {})
     page = write_report(folder / "report.html", recordings, fitted, validation, diagnosis, provenance)
     _print_fit(recordings, fitted)
-    _print_validation(validation)
-    _print_diagnosis(diagnosis)
-    out.print(f"session: {session_id}")
+    badge, _, headline = words.headline(diagnosis)
+    out.print(f"\n[bold]{badge}[/]: {headline}")
+    for sentence in words.summary(fitted, validation, diagnosis):
+        out.print(escape(sentence))
+    if diagnosis.next_capture:
+        out.print(f"Next: {escape(diagnosis.next_capture)}")
+    out.print(f"\nsession: {session_id}")
     out.print(f"report: {page}")
 
 

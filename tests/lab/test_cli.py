@@ -14,7 +14,7 @@ import pytest
 from lab import cli, recording
 from lab.errors import DeviceError
 from lab.recording import Manifest, RecordingSet
-from lab.results import Check, DiagnosisResult, FitResult, Skipped, ValidationResult
+from lab.results import CameraFit, Check, DiagnosisResult, FitResult, NoiseFit, Skipped, ValidationResult
 
 
 @pytest.fixture(autouse=True)
@@ -244,6 +244,56 @@ def test_device_failures_interruptions_and_defects(
         shown = capsys.readouterr().err
         assert words in shown
         assert len(shown.splitlines()) == 1
+
+
+def test_the_main_job_says_where_the_report_is_and_what_it_says(
+    small_set: Callable[..., RecordingSet],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The order of the main job, on a session that was captured, with results that cost nothing."""
+    recordings = small_set()
+
+    class Shelf:
+        """What `run` needs of a store."""
+
+        def __init__(self) -> None:
+            self.kept: list[str] = []
+
+        def folder(self, session_id: str) -> Path:
+            return tmp_path
+
+        def recording_set(self, session_id: str) -> RecordingSet:
+            return recordings
+
+        def add_result(self, kind: str, source: str, document: dict[str, Any]) -> None:
+            self.kept.append(kind)
+
+        def runs(self, session_id: str) -> list[Any]:
+            return []
+
+    shelf = Shelf()
+    fit = FitResult(source="s", cameras={"left": CameraFit(noise=NoiseFit(conversion_gain_dn_per_e=0.4))})
+    diagnosis = DiagnosisResult(source="s", verdict="no_mismatch")
+    monkeypatch.setattr(cli, "_store", lambda folder=None: shelf)
+    monkeypatch.setattr(cli, "_captured", lambda *_: "session-1")
+    monkeypatch.setattr(cli, "_fitted", lambda *_: fit)
+    monkeypatch.setattr(cli, "_validated", lambda *_: ValidationResult(source="s", checks=()))
+    monkeypatch.setattr(cli, "_diagnosed", lambda *_: diagnosis)
+    assert cli.main(["run"]) == 0
+    shown = capsys.readouterr().out
+    for words in (
+        "conversion gain",
+        "0.4 DN/e",
+        "The baseline model explains",
+        "session: session-1",
+        f"{tmp_path}/report.html",
+    ):
+        assert words in shown
+    assert shelf.kept == ["fit", "validate", "diagnose"]
+    assert DiagnosisResult.model_validate_json((tmp_path / "diagnose.json").read_text()) == diagnosis
+    assert (tmp_path / "report.html").stat().st_size > 1e6
 
 
 def test_import_writes_a_set_or_nothing(tmp_path: Path, flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
