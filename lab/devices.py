@@ -8,6 +8,7 @@ shutter closes and the screen goes dark: on pause and stop through bluesky, and 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -91,7 +92,8 @@ class Status:
             callbacks, self._callbacks = self._callbacks, []
         self._watch.cancel()
         for callback in callbacks:
-            callback(self)
+            with contextlib.suppress(RuntimeError):  # the run was aborted meanwhile: its loop is closed, nobody waits
+                callback(self)
 
     def add_callback(self, callback: Callable[[Any], None]) -> None:
         with self._lock:

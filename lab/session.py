@@ -19,7 +19,7 @@ from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import bluesky.preprocessors as bpp
 import bluesky.run_engine
@@ -37,6 +37,7 @@ from lab.station import Drivers, Station, drivers_of
 from lab.store import JournalEntry, Run, SessionInfo, Store, now
 from sim.parameters import Frozen
 
+T = TypeVar("T")
 log = logging.getLogger(__name__)
 # A library's place: whoever wants bluesky's log configures it; its last resort would write tracebacks over progress bars.
 logging.getLogger("bluesky").addHandler(logging.NullHandler())
@@ -79,6 +80,27 @@ class _Pace:
         )
 
 
+class _Writes:
+    """Lets a run write until it is over. An abort doesn't end the threads that wait for instruments: one that comes back
+    late must not touch the files and steps of the run after."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._over = False
+
+    def do(self, write: Callable[[], T]) -> T:
+        """Write now. Raises InstrumentError after `close`."""
+        with self._lock:
+            if self._over:
+                raise InstrumentError("came back after the run had ended; what it brought is dropped")
+            return write()
+
+    def close(self) -> None:
+        """Wait for what is being written, and let nothing more through."""
+        with self._lock:
+            self._over = True
+
+
 class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
@@ -107,6 +129,7 @@ class CaptureSession:
         self._pace = _Pace()
         self._entries: list[JournalEntry] = []
         self._done = 0
+        self._writes = _Writes()
 
     @classmethod
     def start(
@@ -212,11 +235,16 @@ class CaptureSession:
     def _capture(self) -> None:
         """Connect, run the plan, and leave everything safe."""
         self._tell("connecting", "connecting to the instruments")
+        self._writes = _Writes()
         instruments = Instruments(
             self.station,
             self._connect(self.station),
-            write_frame=lambda path, side, frame: self.store.write_frame(self.id, path, side, frame),
-            write_spectrum=lambda path, spectrum: self.store.write_spectrum(self.id, path, spectrum),
+            write_frame=lambda path, side, frame: self._writes.do(
+                lambda: self.store.write_frame(self.id, path, side, frame)
+            ),
+            write_spectrum=lambda path, spectrum: self._writes.do(
+                lambda: self.store.write_spectrum(self.id, path, spectrum)
+            ),
             cells=self.store.recording_set(self.id).target,
         )
         failure: BaseException | None = None
@@ -227,6 +255,7 @@ class CaptureSession:
             self._drive(instruments)
         except BaseException as error:
             failure = error
+        self._writes.close()
         complaints = instruments.make_safe()
         instruments.close()
         if failure is not None:
@@ -318,7 +347,9 @@ class CaptureSession:
         yield from bpp.finalize_wrapper(steps(), leave)
 
     def _keep(self, step: Step, taken: Taken, started: Any) -> None:
-        self.store.finish_step(self.id, step.id, started, taken.result, taken.files, taken.captures)
+        self._writes.do(
+            lambda: self.store.finish_step(self.id, step.id, started, taken.result, taken.files, taken.captures)
+        )
 
     def _tell(
         self,

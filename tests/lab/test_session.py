@@ -270,6 +270,33 @@ def test_abort_drops_the_step_under_way_and_keeps_the_rest(store: Store, paused:
     assert_whole(store, session.id)
 
 
+def test_a_camera_that_comes_back_after_an_abort_touches_nothing(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, waits, go_on = Bench(), threading.Event(), threading.Event()
+    fire = fake_bench.FakeCamera.fire
+
+    def slow(camera: fake_bench.FakeCamera) -> None:
+        fire(camera)
+        if camera.bench is bench and bench.shots == 4:
+            waits.set()
+            assert go_on.wait(30)
+
+    monkeypatch.setattr(fake_bench.FakeCamera, "fire", slow)
+    session = begin(store, bench, DARKS)
+    worker = threading.Thread(target=session.run)
+    worker.start()
+    assert waits.wait(20)
+    session.abort("enough")
+    worker.join(30)
+    assert CaptureSession(store, session.id, connect=Bench().drivers).run().state == "finished"
+    late = [thread for thread in threading.enumerate() if thread.name == "instrument"]
+    assert late
+    go_on.set()
+    for thread in late:
+        thread.join(10)
+    assert_whole(store, session.id)
+    assert not list((store.folder(session.id) / "frames").glob("*"))
+
+
 def _until(reached: Callable[[], bool], patience_s: float = 20.0) -> None:
     until = time.monotonic() + patience_s
     while not reached():
@@ -384,7 +411,7 @@ def test_kill_9_loses_nothing_and_repeats_nothing(store: Store) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_in_good_order(store: Store, number: signal.Signals) -> None:
     session = store.create_session(STATION, DARKS.steps(STATION))
-    process = _spawn(store, session, 0.05)
+    process = _spawn(store, session, 0.2)
     assert process.stdout is not None
     for line in process.stdout:
         if int(line) == 4:
