@@ -166,12 +166,17 @@ def _edges(
     captures = recordings.captures(SlantedEdge, side)
     if not captures:
         raise NotDetermined("mtf", "no slanted-edge captures")
+    settings: dict[object, list[SlantedEdge]] = {}
+    for found in captures:
+        key = (found.region, found.angle_deg, found.exposure_s, found.gain_db, found.light_radiance)
+        settings.setdefault(key, []).append(found)
     checks, reason = [], ""
-    for capture in captures:
+    for repeats in settings.values():
+        capture = repeats[0]
         curves, residuals, blocks, reference = [], [], [], []
         for channel in model.channels:
             try:
-                measured = measure_edge(recordings, [capture], channel, fit.noise, MTF_FREQUENCIES)
+                measured = measure_edge(recordings, repeats, channel, fit.noise, MTF_FREQUENCIES)
             except NotDetermined as refused:
                 reason = refused.reason
                 continue

@@ -1,0 +1,47 @@
+"""Validation on recordings of a second image former: a healthy camera passes, a concealed filter is caught, and the filter's
+model mends it."""
+
+from __future__ import annotations
+
+from lab.fit import fit_recording_set
+from lab.recording import RecordingSet
+from lab.results import FitResult, ValidationResult
+from lab.validate import validate
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from tests.proof.foreign import Body
+
+DISPLACEMENT_UM = 1.6
+
+
+def _fitted(concealed: dict[str, float]) -> tuple[RecordingSet, FitResult]:
+    recordings = Body(930, concealed, cfa="MONO").record()
+    return recordings, fit_recording_set(recordings)
+
+
+def _passed(result: ValidationResult) -> dict[str, bool]:
+    return {name: all(c.passed for c in result.checks if c.name == name) for name in {c.name for c in result.checks}}
+
+
+def test_a_healthy_camera_is_predicted_within_its_uncertainty() -> None:
+    result = validate(*_fitted({}))
+    assert _passed(result) == {"colorchecker": True, "mtf": True, "psf": True}
+    assert not result.skipped
+    assert all(check.n > 0 and check.chi2 > 0 for check in result.checks)
+
+
+def test_a_concealed_filter_shows_in_edges_and_kernels_and_its_model_mends_it() -> None:
+    recordings, fit = _fitted({"optical_low_pass_filter": DISPLACEMENT_UM})
+    assert _passed(validate(recordings, fit)) == {"colorchecker": True, "mtf": False, "psf": False}
+    known = OpticalLowPassFilter(displacement_x_um=DISPLACEMENT_UM, displacement_y_um=DISPLACEMENT_UM)
+    mended = validate(recordings, fit, {"left": (known,)})
+    before = {c.capture: c.chi2 for c in validate(recordings, fit).checks if c.name == "mtf"}
+    for check in mended.checks:
+        if check.name == "mtf":
+            assert check.chi2 < 0.1 * before[check.capture]
+
+
+def test_what_isn_t_there_is_skipped_with_its_reason() -> None:
+    result = validate(Body(930, {}, cfa="MONO").record(("dark",)), FitResult(source="", cameras={}))
+    assert not result.checks
+    assert {s.step for s in result.skipped} == {"validate colorchecker", "validate mtf", "validate psf"}
+    assert all(s.reason for s in result.skipped)
