@@ -368,7 +368,7 @@ def _next_capture(found: list[_SideResult], effects: list[NamedEffect]) -> str |
 
 def _curves(result: _SideResult) -> list[ResidualCurve]:
     evidence, verdict = result.verdict.evidence, result.verdict
-    before, after = evidence.mean(), evidence.mean(verdict.effects)
+    before, after = evidence.levelled(), evidence.levelled(verdict.effects)
     found = []
     for block, at in zip(evidence.blocks, evidence.slices, strict=True):
         std = np.sqrt(np.diag(block.covariance))

@@ -22,6 +22,8 @@ SCREENED = 8  # candidates that are refitted in a step
 NAMED_FROM = 0.6
 #: Nats by which the unknown has to lag: an effect's law is sharper than a process that fits anything smooth.
 UNKNOWN_HANDICAP = 0.0
+#: A declared rival beside an effect has to gain this share of what that gains: less may be an error of the effect's law.
+COMPANION_SHARE = 0.03
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,9 @@ def decide(evidence: Evidence, rng: np.random.Generator, report: Callable[[str],
 
     named, abstained = _believed(evidence, current, known, threshold, report)
     effects = tuple(c.effect for c in named)
+    if top > threshold and not named and not before and not abstained:
+        # something is off that no effect fits any better than nothing does
+        abstained.append(Candidate(first.scores()[0].start, {}, 0.0, (("unknown", 1.0),), 0.5 * top))
     model = evidence.gaussian(effects)
     after = tuple(s for s in look(evidence, model) if s.significant)
     unexplained = {id(s.block): evidence.blocks.index(s.block) for s in after}
@@ -165,14 +170,24 @@ def _believed(
         if crowd:
             lost = [members[i] for i in crowd]
         else:
-            worst = min(members, key=lambda c: c.probability)
-            lost = [worst] if worst.probability < NAMED_FROM or 2.0 * worst.gain < threshold else []
+            worst = min(members, key=lambda c: (not _companion(c, members), c.probability))
+            weak = worst.probability < NAMED_FROM or 2.0 * worst.gain < threshold or _companion(worst, members)
+            lost = [worst] if weak else []
         if not lost:
             return members, given_up
         given_up += lost
         left = tuple(c.effect for c in members if c not in lost)
         current = refit(evidence, left, passes=2)
     return [], given_up
+
+
+def _companion(candidate: Candidate, members: list[Candidate]) -> bool:
+    """Whether an effect may be no more than the error of a stronger one's law."""
+    return any(
+        candidate.effect.name in type(other.effect).rivals and candidate.gain < COMPANION_SHARE * other.gain
+        for other in members
+        if other is not candidate
+    )
 
 
 def _crowd(evidence: Evidence, fit: Fit) -> list[int]:

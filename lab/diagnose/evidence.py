@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from lab.diagnose.summaries import Block, Effects, Prediction
 from sim.camera import CameraModel
@@ -89,7 +89,7 @@ class Evidence:
         """How alike the error of a law is at two points: smooth along the axis, less so between channels and conditions."""
         kin = np.zeros((len(self.value), len(self.value)))
         for block, at in zip(self.blocks, self.slices, strict=True):
-            x = np.array([label.x for label in block.labels])
+            x = block.position
             channel = np.array([label.channel for label in block.labels])
             condition = np.array([label.condition for label in block.labels])
             near = np.exp(-0.5 * ((x[:, None] - x) / block.reach) ** 2)
@@ -108,6 +108,14 @@ class Evidence:
             change = mean - self.mean((*effects[:i], *effects[i + 1 :]))
             covariance += effect.form_tolerance**2 * np.outer(change, change) * self._kinship
         return Gaussian(mean, covariance)
+
+    def levelled(self, effects: Effects = ()) -> FloatArray:
+        """Prediction of everything with the free quantities where the seen numbers put them, (n,)."""
+        model = self.gaussian(effects)
+        inside = cho_factor(model.covariance[np.ix_(self.seen, self.seen)], lower=True)
+        free = self._free(effects)
+        quantities = free[self.seen].T @ cho_solve(inside, (self.value - model.mean)[self.seen])
+        return np.asarray(model.mean + free @ quantities)
 
     def touched(self, effect: type[Effect]) -> np.ndarray:
         """Numbers that an effect may change."""

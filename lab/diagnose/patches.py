@@ -12,6 +12,7 @@ from scipy import ndimage
 from lab.diagnose.curves import CurveSlopes
 from lab.diagnose.summaries import (
     CLIPPED_SHARE,
+    LEVEL_REACH,
     SPECTRAL_HOOKS,
     TAIL_STD,
     UNIFORM_HOOKS,
@@ -111,7 +112,8 @@ def chart_block(study: Study) -> Block:
         measurement="chart",
         axis="level",
         unit="DN",
-        reach=0.3 * float(signal.max()),
+        reach=LEVEL_REACH,
+        along=np.log(np.maximum(signal, 1.0)),
         value=value,
         covariance=patch_covariance(study, points, signal),
         labels=tuple(

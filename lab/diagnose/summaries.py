@@ -29,6 +29,7 @@ BLACK_FLOOR_DN = 0.01  # of a frame's mean: rounding of a quiet camera
 NARROWBAND_FLOOR = 5e-4  # of a level, each channel by itself
 TAIL_STD = 0.1  # of the light that the baseline's point spread itself sends into dark squares
 CLIPPED_SHARE = 2e-4
+LEVEL_REACH = 0.8  # of a level's logarithm: over a factor of 2 a smooth departure from a line may change
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,19 @@ class Block:
     measurement: str
     axis: str
     unit: str
-    reach: float  # along the axis over which a smooth discrepancy may change
+    reach: float  # along `position`, over which a smooth discrepancy may change
     value: FloatArray
     covariance: FloatArray
     labels: tuple[Label, ...]
     hooks: frozenset[str]  # hooks of an effect that can change the prediction
     predict: Callable[[Effects], Prediction]
     scale: FloatArray  # size of a discrepancy of 1, (n,)
+    along: FloatArray | None = None  # where smoothness isn't along x: logarithms of levels, (n,)
+
+    @property
+    def position(self) -> FloatArray:
+        """Along which errors of laws and unknown discrepancies are smooth, (n,)."""
+        return np.array([label.x for label in self.labels]) if self.along is None else self.along
 
     def touched_by(self, effect: type[Effect]) -> bool:
         """Whether the effect acts on anything that this measurement sees."""

@@ -7,6 +7,7 @@ import numpy as np
 from lab.diagnose.curves import CurveSlopes
 from lab.diagnose.summaries import (
     BLACK_FLOOR_DN,
+    LEVEL_REACH,
     NARROWBAND_FLOOR,
     SPECTRAL_HOOKS,
     UNIFORM_HOOKS,
@@ -113,7 +114,7 @@ def linearity_block(study: Study) -> Block:
         return Prediction(mean, slopes)
 
     return Block(
-        measurement="photon_transfer", axis="level", unit="DN", reach=0.3 * float(np.ptp(value)), value=value, covariance=covariance,
+        measurement="photon_transfer", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
         hooks=UNIFORM_HOOKS, predict=predict, scale=signal,
     )  # fmt: skip
@@ -172,7 +173,7 @@ def variance_block(study: Study) -> Block:
         )
 
     return Block(
-        measurement="noise", axis="level", unit="DN", reach=0.3 * float(np.ptp(signal)), value=value, covariance=covariance,
+        measurement="noise", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(float(p[2]), p[1], f"{p[0][0].exposure_s:.4g} s", tuple(c.id for c in p[0]), p[5]) for p in points),
         hooks=frozenset({"response", "noise_e2"}), predict=predict, scale=value,
     )  # fmt: skip

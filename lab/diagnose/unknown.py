@@ -33,7 +33,7 @@ def discrepancy(evidence: Evidence, model: Gaussian, index: int) -> Discrepancy:
     seen = evidence.seen[at]
     residual = (evidence.value - model.mean)[at][seen]
     covariance = model.covariance[at, at][np.ix_(seen, seen)]
-    x = np.array([label.x for label in block.labels])
+    x = block.position
     channel = np.array([label.channel for label in block.labels])
     condition = np.array([label.condition for label in block.labels])
     by_channel = (channel[:, None] == channel).astype(float)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
+import numpy as np
+
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
+#: Share of full well over which the toe fades.
+TOE = 0.1
+
 
 class Nonlinearity(Effect):
-    """electrons (1 + a x + b x^2) with x = electrons / full well; a, b in percent at full well."""
+    """electrons (1 + a x + b x^2 + c exp(-x / 0.1)) with x = electrons / full well; a, b in percent at full well, c at none."""
 
     name: ClassVar[str] = "nonlinearity"
     stage: ClassVar[Stage] = Stage.ELECTRONICS
@@ -49,8 +54,21 @@ class Nonlinearity(Effect):
         ),
     ] = 0.0
 
+    toe_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "departure of small signals, below a tenth of full well",
+            lower=-50.0,
+            upper=50.0,
+            prior=(0.0, 3.0),
+            absent=0.0,
+        ),
+    ] = 0.0
+
     def response(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
-        if self.quadratic_percent == 0.0 and self.cubic_percent == 0.0:
+        if self.quadratic_percent == 0.0 and self.cubic_percent == 0.0 and self.toe_percent == 0.0:
             return electrons
         x = electrons / camera.full_well_e
-        return electrons * (1.0 + (self.quadratic_percent * x + self.cubic_percent * x * x) / 100.0)
+        bend = self.quadratic_percent * x + self.cubic_percent * x * x + self.toe_percent * np.exp(-np.abs(x) / TOE)
+        return electrons * (1.0 + bend / 100.0)
