@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +44,7 @@ from sim.effects.library import effects as library
 Progress = Callable[[str, float], None]
 SEED = 1288  # of the bootstrap behind the threshold: the same recordings give the same diagnosis
 SMALLEST_RIVAL = 0.005
+WORKERS = 2  # sides at the same time; each needs about half a GB
 
 #: What is looked at; a block that a recording set doesn't allow is left out with a reason.
 BLOCKS: tuple[Callable[[Study], Block], ...] = (
@@ -74,28 +77,31 @@ def diagnose(
     Noise and levels are taken from the recordings anew, as free quantities of the same model. What the recordings don't
     determine is not judged, and stands in `skipped`.
     """
-    found: list[_SideResult] = []
-    skipped: list[Skipped] = []
     sides = recordings.sides
-    for number, side in enumerate(sides):
-        done = 0
+    shares = dict.fromkeys(sides, 0.0)
+    lock = threading.Lock()
 
-        def report(text: str, side: Side = side, number: int = number) -> None:
-            nonlocal done
-            done += 1
-            if progress is not None:
-                progress(f"{text} ({side})", (number + 1.0 - 0.8**done) / len(sides))
+    def work(side: Side) -> tuple[_SideResult | None, list[Skipped]]:
+        def report(text: str) -> None:
+            with lock:
+                shares[side] = 1.0 - 0.8 * (1.0 - shares[side])
+                if progress is not None:
+                    progress(f"{text} ({side})", sum(shares.values()) / len(sides))
 
         report("summarising the recordings")
-        evidence, left_out = _evidence(recordings, side, fit)
-        skipped += left_out
+        evidence, skipped = _evidence(recordings, side, fit)
         if evidence is None:
-            continue
+            return None, skipped
         report("scoring the effects")
-        found.append(_SideResult(side, decide(evidence, np.random.default_rng(SEED), report)))
+        return _SideResult(side, decide(evidence, np.random.default_rng(SEED), report)), skipped
+
+    with ThreadPoolExecutor(WORKERS, thread_name_prefix="diagnose") as pool:
+        done = list(pool.map(work, sides))
+    found = [result for result, _ in done if result is not None]
+    skipped = tuple(item for _, items in done for item in items)
     if progress is not None:
         progress("done", 1.0)
-    return _merged(recordings.source, found, tuple(skipped))
+    return _merged(recordings.source, found, skipped)
 
 
 def _evidence(recordings: RecordingSet, side: Side, fit: FitResult | None) -> tuple[Evidence | None, list[Skipped]]:
