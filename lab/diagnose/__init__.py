@@ -51,6 +51,9 @@ BLOCKS: tuple[Callable[[Study], Block], ...] = (
     dark_block, linearity_block, variance_block, shading_block, narrowband_block, chart_block, edge_block, screen_block,
 )  # fmt: skip
 
+#: Measurements whose points are numbered, not placed on their axis.
+NUMBERED = {"chart": "patch, 0 dark skin .. 23 black", "screen": "number of the pattern and channel"}
+
 #: The capture that tells two effects apart where one depends on a thing and the other doesn't.
 SETTLING = {
     "f_number": "the slanted edges again at twice the f-number",
@@ -390,7 +393,7 @@ def _curves(result: _SideResult) -> list[ResidualCurve]:
                     measurement=block.measurement,
                     label=condition or block.measurement,
                     channel=channel,
-                    axis=f"{block.axis.replace('_', ' ')}, {block.unit}",
+                    axis=NUMBERED.get(block.measurement, f"{block.axis.replace('_', ' ')}, {block.unit}"),
                     x=tuple(block.labels[i].x for i in order),
                     measured=tuple(float(block.value[i]) for i in order),
                     measured_std=tuple(float(std[i]) for i in order),

@@ -106,7 +106,10 @@ class Evidence:
         covariance = self._noise + free @ free.T
         for i, effect in enumerate(effects):
             change = mean - self.mean((*effects[:i], *effects[i + 1 :]))
-            covariance += effect.form_tolerance**2 * np.outer(change, change) * self._kinship
+            for at in self.slices:
+                if change[at].any():
+                    error = effect.form_tolerance * change[at]
+                    covariance[at, at] += error[:, None] * self._kinship[at, at] * error
         return Gaussian(mean, covariance)
 
     def levelled(self, effects: Effects = ()) -> FloatArray:
