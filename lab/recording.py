@@ -935,7 +935,7 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
         progress(f"looking through {len(manifest.captures)} captures")
     problems, warnings = inspect(recordings)
     if problems:
-        raise RecordingError(problems)
+        raise RecordingError([*skipped, *problems])  # whoever mends the folder wants to hear of all of it
     recordings.warnings = (*skipped, *warnings)
     return recordings
 
