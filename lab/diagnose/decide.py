@@ -22,6 +22,8 @@ SCREENED = 8  # candidates that are refitted in a step
 NAMED_FROM = 0.6
 #: Nats by which the unknown has to lag: an effect's law is sharper than a process that fits anything smooth.
 UNKNOWN_HANDICAP = 0.0
+#: A score that no slice and no refit bears out has to exceed the threshold by so much, for what a covariance doesn't hold.
+LONE_SCORE = 10.0
 #: A declared rival beside an effect has to gain this share of what that gains: less may be an error of the effect's law.
 COMPANION_SHARE = 0.03
 
@@ -78,7 +80,7 @@ def decide(evidence: Evidence, rng: np.random.Generator, report: Callable[[str],
 
     named, abstained = _believed(evidence, current, known, threshold, report)
     effects = tuple(c.effect for c in named)
-    if top > threshold and not named and not before and not abstained:
+    if top > threshold + LONE_SCORE and not named and not before and not abstained:
         # something is off that no effect fits any better than nothing does
         abstained.append(Candidate(first.scores()[0].start, {}, 0.0, (("unknown", 1.0),), 0.5 * top))
     model = evidence.gaussian(effects)

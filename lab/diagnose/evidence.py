@@ -101,16 +101,38 @@ class Evidence:
 
     def gaussian(self, effects: Effects = ()) -> Gaussian:
         """Mean and covariance of everything under these effects."""
+        return self._gaussian(effects, np.ones(len(self.value), bool))
+
+    def seen_gaussian(self, effects: Effects = ()) -> Gaussian:
+        """The same of the seen numbers only."""
+        return self._gaussian(effects, self.seen)
+
+    @property
+    def seen_value(self) -> FloatArray:
+        return self.value[self.seen]
+
+    @cached_property
+    def _parts(self) -> dict[bytes, tuple[FloatArray, FloatArray]]:
+        return {}
+
+    def _gaussian(self, effects: Effects, where: np.ndarray) -> Gaussian:
+        key = where.tobytes()
+        if key not in self._parts:
+            only = np.ix_(where, where)
+            self._parts[key] = self._noise[only], self._kinship[only]
+        noise, kinship = self._parts[key]
         mean = self.mean(effects)
-        free = self._free(effects)
-        covariance = self._noise + free @ free.T
+        free = self._free(effects)[where]
+        covariance = noise + free @ free.T
+        ends = np.cumsum([int(where[at].sum()) for at in self.slices])
         for i, effect in enumerate(effects):
             change = mean - self.mean((*effects[:i], *effects[i + 1 :]))
-            for at in self.slices:
-                if change[at].any():
-                    error = effect.form_tolerance * change[at]
-                    covariance[at, at] += error[:, None] * self._kinship[at, at] * error
-        return Gaussian(mean, covariance)
+            for at, end in zip(self.slices, ends, strict=True):
+                error = effect.form_tolerance * change[at][where[at]]
+                if error.any():
+                    here = slice(int(end) - len(error), int(end))
+                    covariance[here, here] += error[:, None] * kinship[here, here] * error
+        return Gaussian(mean[where], covariance)
 
     def levelled(self, effects: Effects = ()) -> FloatArray:
         """Prediction of everything with the free quantities where the seen numbers put them, (n,)."""

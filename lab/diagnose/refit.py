@@ -84,9 +84,8 @@ def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tupl
 
 def likelihood(evidence: Evidence, effects: Effects) -> float:
     """Of the seen numbers under the effects as they stand."""
-    model = evidence.gaussian(effects)
-    seen = evidence.seen
-    return log_likelihood((evidence.value - model.mean)[seen], model.covariance[np.ix_(seen, seen)])
+    model = evidence.seen_gaussian(effects)
+    return log_likelihood(evidence.seen_value - model.mean, model.covariance)
 
 
 def refit(evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluations: int = 12) -> Fit:
@@ -109,7 +108,7 @@ def refit(evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluatio
     prior_std = np.array([s**c.quantity.slope_power for s, c in zip(prior_std, coords, strict=True)])
     jacobian = np.zeros((int(seen.sum()), len(coords)))
     for turn in range(passes):
-        lower = cholesky(evidence.gaussian(moved(effects, coords, u)).covariance[np.ix_(seen, seen)], lower=True)
+        lower = cholesky(evidence.seen_gaussian(moved(effects, coords, u)).covariance, lower=True)
 
         def residual(at: FloatArray, lower: FloatArray = lower) -> FloatArray:
             white = solve_triangular(

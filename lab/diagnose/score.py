@@ -73,9 +73,10 @@ def signatures(
 ) -> Signatures:
     """About a model with `current` effects; `tangents` (n, p): slopes by the parameters of these, projected out."""
     seen = evidence.seen
-    model = evidence.gaussian(current)
-    lower = cholesky(model.covariance[np.ix_(seen, seen)], lower=True)
-    white = solve_triangular(lower, (evidence.value - model.mean)[seen], lower=True)
+    model = evidence.seen_gaussian(current)
+    base = evidence.mean(current)
+    lower = cholesky(model.covariance, lower=True)
+    white = solve_triangular(lower, evidence.seen_value - model.mean, lower=True)
     out = np.zeros((len(white), 0))
     if tangents is not None and tangents.size:
         out = _span(solve_triangular(lower, tangents[seen], lower=True))
@@ -85,7 +86,7 @@ def signatures(
         if not evidence.touched(effect).any():
             continue
         for prototypes in effect.prototypes(camera):
-            raw = np.stack([evidence.mean((*current, p)) - model.mean for p in prototypes], axis=1)[seen]
+            raw = np.stack([evidence.mean((*current, p)) - base for p in prototypes], axis=1)[seen]
             if not np.any(np.abs(raw) > 0):
                 continue
             table = solve_triangular(lower, raw, lower=True)

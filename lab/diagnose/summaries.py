@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,8 @@ class Study:
         times = [c.time for c in recordings.captures(side=side) if c.time is not None]
         self._start = min(times) if times else None
         self.field = Field.of(camera)
+        if saturation_dn is None:
+            self.saturation_dn = _saturation(self)
         self.noise: NoiseGuess = noise_guess(self)
         self.camera = camera.model_copy(
             update={
@@ -150,6 +153,34 @@ class Study:
             self._levels[capture.id] = Levels(mean, pixels)
         return self._levels[capture.id]
 
+    @cached_property
+    def lamps(self) -> dict[str, int]:
+        """Which lamp the flats' radiance files are readings of: one lamp where they differ by less than 1 % in shape and 5 % in
+        level, for a radiometer reads a lamp anew before every pass."""
+        found: list[tuple[FloatArray, FloatArray]] = []
+        lamps: dict[str, int] = {}
+        for capture in self.recordings.captures("flat", self.side):
+            if capture.radiance is None or capture.radiance in lamps:
+                continue
+            wavelength, value = self.spectrum(capture.radiance).arrays
+            for k, (where, level) in enumerate(found):
+                if len(where) != len(wavelength) or np.any(where != wavelength):
+                    continue
+                ratio = float(value.sum() / level.sum())
+                if abs(ratio - 1.0) < 0.05 and np.abs(value / ratio - level).sum() < 0.01 * np.abs(level).sum():
+                    lamps[capture.radiance] = k
+                    break
+            else:
+                lamps[capture.radiance] = len(found)
+                found.append((wavelength, value))
+        return lamps
+
+    def flat_levels(self) -> list[list[Any]]:
+        """Flat captures by what makes their level: exposure, lamp, gain."""
+        return self.groups(
+            "flat", lambda c: (c.exposure_s, self.lamps.get(c.radiance, -1), c.gain_db, c.photons_per_pixel)
+        )
+
     def groups(self, kind: Any, key: Callable[[Any], object]) -> list[list[Any]]:
         """Captures of a kind by their settings, in the manifest's order."""
         found: dict[object, list[Any]] = {}
@@ -184,6 +215,43 @@ class NoiseGuess:
     jitter_lamp: float  # of a flat frame's mean, relative
 
 
+def _saturation(study: Study) -> float:
+    """DN from which on a pixel counts as clipped: the converter's highest code, or less where full wells pile up below it.
+
+    Wells that are full carry no shot noise: among the captures, planes whose highest quantiles lie closer together than a
+    third of what shot noise makes them do pile up, at full well.
+    """
+    white = study.camera.white_level_dn
+    gain = study.stated.conversion_gain_dn_per_e
+    black = study.stated.black_level_dn or 0.0
+    piles = []
+    for kind in ("flat", "narrowband", "white"):
+        for capture in study.recordings.captures(kind, study.side):
+            frame = study.recordings.frame(capture)
+            for channel in study.channels:
+                row, col = mosaic.phases(study.camera.cfa)[channel][0]
+                step = mosaic.step(study.camera.cfa)
+                values = np.asarray(frame[row::step, col::step])
+                if values.max() < 0.25 * white:
+                    continue
+                middle, high, top = np.quantile(values, [0.97, 0.99, 0.999])
+                if gain is None:
+                    # a tenth of the usual noise of a well of 1e5 e: what no unclipped plane falls below
+                    least = 0.1 * np.sqrt(max(top - black, 1.0) * white / 1e5)
+                else:
+                    least = np.sqrt(gain * max(top - black, 1.0)) / 3.0
+                if (
+                    top - high < 0.76 * least and high - middle < 0.45 * least
+                ):  # a normal distribution's quantiles, in sigmas
+                    piles.append((float(top), float(top - middle)))
+    below = [(top, width) for top, width in piles if top < white - 1.0]
+    if not below:
+        return white
+    top = float(np.median([t for t, _ in below]))
+    # a margin of the read noise under the pile
+    return min(white, top - 3.0 * max(float(np.median([w for _, w in below])), 2.0))
+
+
 def noise_guess(study: Study) -> NoiseGuess:
     recordings, stated = study.recordings, study.stated
     black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
@@ -207,7 +275,7 @@ def noise_guess(study: Study) -> NoiseGuess:
     prnu, lamp = 0.008, 3e-4
     signal, variance = [], []
     scatter = []
-    for group in study.groups("flat", lambda c: (c.exposure_s, c.radiance, c.gain_db)):
+    for group in study.flat_levels():
         if len(group) < 2:
             continue
         frames = [recordings.frame(c) for c in group]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from lab.diagnose.curves import CurveSlopes
@@ -32,6 +34,7 @@ LEVEL_FLOOR = 1.0e-4  # of a level: non-linearity below what a linear camera may
 VARIANCE_FLOOR = 0.003  # of a variance
 RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels
 SHADING_FLOOR = 5e-4
+AXIS_STD, AXIS_STD_KNOWN = 0.01, 0.004  # of the frame's diagonal: the optical axis without and with a fitted geometry
 
 
 def dark_block(study: Study) -> Block:
@@ -58,33 +61,31 @@ def dark_block(study: Study) -> Block:
 
 def linearity_block(study: Study) -> Block:
     """Mean of every flat frame by channel against the exposure; each channel's rate is free, the line's straightness isn't."""
-    groups = study.groups("flat", lambda c: (c.exposure_s, c.radiance, c.gain_db, c.photons_per_pixel))
+    groups = study.flat_levels()
     if len({(g[0].exposure_s, g[0].photons_per_pixel) for g in groups}) < 3:
         raise NotDetermined("photon_transfer", "fewer than three levels of flat captures")
     if any(g[0].radiance is None for g in groups):
         raise NotDetermined("photon_transfer", "flat captures without a radiance file: their levels aren't comparable")
-    points = []
-    for i, group in enumerate(groups):
-        out = held_out_of(group, i, 0)
-        for capture in group:
-            for channel in study.channels:
-                mean = study.levels(capture).mean[channel]
-                if mean is not None:
-                    points.append((capture, channel, mean, capture.id in out))
+    points = _flat_points(study, groups)
     if len(points) < 4:
         raise NotDetermined("photon_transfer", "almost all flat captures are clipped: expose them shorter")
     exposures = np.array([c.exposure_s for c, *_ in points])
     value = np.array([mean for _, _, mean, _ in points])
     noise = study.noise
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 1e-3)
-    paths = sorted({c.radiance for c, *_ in points})
-    key = [(c.radiance, channel) for c, channel, *_ in points]
+    lights = list(dict.fromkeys(c.radiance for c, *_ in points))
+    # one reading of a lamp against its first, by channel: what the radiometer says changed between passes
+    first = {study.lamps[path]: path for path in reversed(lights)}
+    read = {(path, c): electron_rate(study.camera, c, study.spectrum(path)) for path in lights for c in study.channels}
+    relative = {(path, c): rate / max(read[first[study.lamps[path]], c], 1e-300) for (path, c), rate in read.items()}
+    key = [(study.lamps[c.radiance], channel) for c, channel, *_ in points]
+    scaled = exposures * np.array([relative[c.radiance, channel] for c, channel, *_ in points])
     rate = {}
     for pair in sorted(set(key)):
         mine = np.array([k == pair for k in key])
         low = mine & (signal < 0.6 * (study.saturation_dn - noise.black))
         use = low if low.sum() > 1 else mine
-        rate[pair] = float(np.sum(signal[use]) / np.sum(exposures[use])) / noise.gain / float(study.field.light.mean())
+        rate[pair] = float(np.sum(signal[use]) / np.sum(scaled[use])) / noise.gain / float(study.field.light.mean())
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
     covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels + (LEVEL_FLOOR * signal) ** 2)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])
@@ -92,25 +93,33 @@ def linearity_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         camera = study.camera
-        relative = dict.fromkeys(rate, 1.0)
+        changed = relative
         if any(overrides(e, SPECTRAL_HOOKS) for e in effects):
-            for path, channel in relative:
-                light = study.spectrum(path)
-                below = electron_rate(camera, channel, light)
-                relative[path, channel] = electron_rate(camera, channel, light, effects) / below if below > 0 else 1.0
+            changed = {}
+            for (path, channel), share in relative.items():
+                below = electron_rate(camera, channel, study.spectrum(path))
+                above = electron_rate(camera, channel, study.spectrum(path), effects)
+                changed[path, channel] = share * (above / below if below > 0 else 1.0)
         mean, lit = np.empty(len(points)), np.empty(len(points))
-        done: dict[tuple[str, str], dict[str, float]] = {}
+        done: dict[str, dict[str, float]] = {}
         for i, (capture, channel, _, _) in enumerate(points):
-            k = (capture.id, capture.radiance)
-            if k not in done:
-                rates = {c: rate[k[1], c] for c in study.channels if (k[1], c) in rate}
-                done[k] = mean_dn(camera, collected_electrons(camera, rates, capture.exposure_s, effects, field=study.field,
-                                                              elapsed_s=study.elapsed_s(capture)), effects)  # fmt: skip
-            lit[i] = done[k][channel] - noise.dark_dn_per_s * capture.exposure_s
-            mean[i] = noise.black + done[k][channel] + study.offset(capture, effects)
+            if capture.id not in done:
+                lamp, elapsed = study.lamps[capture.radiance], study.elapsed_s(capture)
+                rates = {c: rate[lamp, c] * changed[capture.radiance, c] for c in study.channels if (lamp, c) in rate}
+                collected = collected_electrons(
+                    camera, rates, capture.exposure_s, effects, field=study.field, elapsed_s=elapsed
+                )
+                done[capture.id] = mean_dn(camera, collected, effects)
+            lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
+            mean[i] = noise.black + done[capture.id][channel] + study.offset(capture, effects)
         slopes = study.free_offsets(exposures)
-        for pair in rate:
-            slopes[f"rate:{paths.index(pair[0])}:{pair[1]}"] = np.where([k == pair for k in key], 0.05 * lit, 0.0)
+        for lamp, channel in rate:
+            slopes[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
+        if len(lights) > len(set(study.lamps.values())):
+            for path in lights:
+                slopes[f"reading:{path}"] = np.where(
+                    [c.radiance == path for c, *_ in points], RADIOMETER_STD * lit, 0.0
+                )
         return Prediction(mean, slopes)
 
     return Block(
@@ -120,13 +129,22 @@ def linearity_block(study: Study) -> Block:
     )  # fmt: skip
 
 
+def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:
+    """(capture, channel, mean DN, held out) of every flat frame's unclipped channels."""
+    points = []
+    for i, group in enumerate(groups):
+        out = held_out_of(group, i, 0)
+        for capture in group:
+            for channel in study.channels:
+                mean = study.levels(capture).mean[channel]
+                if mean is not None:
+                    points.append((capture, channel, mean, capture.id in out))
+    return points
+
+
 def variance_block(study: Study) -> Block:
     """Temporal variance of flats by channel against their mean: gain and read noise are free, the line isn't."""
-    groups = [
-        g
-        for g in study.groups("flat", lambda c: (c.exposure_s, c.radiance, c.gain_db, c.photons_per_pixel))
-        if len(g) > 1
-    ]
+    groups = [g for g in study.flat_levels() if len(g) > 1]
     points = []
     for i, group in enumerate(groups):
         for channel in study.channels:
@@ -287,24 +305,20 @@ def shading_block(study: Study) -> Block:
     col = (np.arange(cols) + 0.5) / cols * camera.cols - 0.5
     grid_row, grid_col = np.meshgrid(row, col, indexing="ij")
     place = Field.at(camera, grid_row.ravel(), grid_col.ravel())
+    # where the optical axis meets the sensor is known to a share of the frame's diagonal: the fall-off may be centred there
+    off_px = (AXIS_STD_KNOWN if camera.geometry is not None else AXIS_STD) * float(np.hypot(camera.rows, camera.cols))
+    moved = {
+        "axis:row": Field.at(camera, grid_row.ravel() - off_px, grid_col.ravel()),
+        "axis:col": Field.at(camera, grid_row.ravel(), grid_col.ravel() - off_px),
+    }
     value = np.concatenate([p[2].ravel() for p in points])
     n = rows * cols
     std = np.concatenate([np.full(n, np.sqrt((noise.gain / p[4] / len(p[0]) + noise.prnu**2) / p[3])) for p in points])
 
     def predict(effects: Effects) -> Prediction:
-        light = place.light
-        for effect in effects:
-            light = light * effect.illumination(place.x_um, place.y_um, camera)
-        # a veil evens out what the lens's fall-off leaves
-        contrast = wide_contrast(effects)
-        light = contrast * light + (1.0 - contrast) * light.mean()
-        means = []
-        for p in points:
-            electrons = light / light.mean() * p[4] / noise.gain
-            for effect in effects:
-                electrons = effect.response(electrons, camera)
-            means.append(electrons / electrons.mean())
-        return Prediction(np.concatenate(means), {})
+        base = _shaded(points, place, effects, study)
+        slopes = {name: _shaded(points, off, effects, study) - base for name, off in moved.items()}
+        return Prediction(base, slopes)
 
     radius = np.hypot(place.x_um, place.y_um) * 1e-3
     return Block(
@@ -313,6 +327,23 @@ def shading_block(study: Study) -> Block:
         labels=tuple(Label(float(r), p[1], f"cell {k // cols},{k % cols}", tuple(c.id for c in p[0]), p[5]) for p in points for k, r in enumerate(radius)),
         hooks=frozenset({"illumination", "response", "veil"}), predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
+
+
+def _shaded(points: list[Any], place: Field, effects: Effects, study: Study) -> FloatArray:
+    """Cells of every (captures, channel) relative to their mean, (cells x points,)."""
+    light = place.light
+    for effect in effects:
+        light = light * effect.illumination(place.x_um, place.y_um, study.camera)
+    # a veil evens out what the lens's fall-off leaves
+    contrast = wide_contrast(effects)
+    light = contrast * light + (1.0 - contrast) * light.mean()
+    means = []
+    for p in points:
+        electrons = light / light.mean() * p[4] / study.noise.gain
+        for effect in effects:
+            electrons = effect.response(electrons, study.camera)
+        means.append(electrons / electrons.mean())
+    return np.concatenate(means)
 
 
 def _cells(plane: FloatArray, rows: int, cols: int) -> FloatArray:
