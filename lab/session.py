@@ -44,6 +44,9 @@ logging.getLogger("bluesky").addHandler(logging.NullHandler())
 # The RunEngine announces pauses and aborts on stdout, which belongs to the command line.
 bluesky.run_engine.__dict__["print"] = lambda *words, **_: log.debug(" ".join(map(str, words)))
 
+#: How often (s) a waiting main thread wakes to let Python run signal handlers.
+WAKE_S = 0.1
+
 PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
 
 
@@ -276,7 +279,7 @@ class CaptureSession:
 
     def _drive(self, instruments: Instruments) -> None:
         """Run the plan on a RunEngine of its own, through pauses, to its end."""
-        engine = RunEngine({}, context_managers=[], during_task=DuringTask())
+        engine = RunEngine({}, context_managers=[], during_task=_Wakeful())
         documents = self.store.folder(self.id) / "documents.jsonl"
         engine.subscribe(lambda name, document: _append(documents, name, document))
 
@@ -296,7 +299,8 @@ class CaptureSession:
                 self.store.set_state(self.id, "paused")
                 self._tell("paused", "paused: the shutter is closed")
                 with self._control:
-                    self._control.wait_for(lambda: self._resume_asked or self._ended_by is not None)
+                    while not self._control.wait_for(lambda: self._resume_asked or self._ended_by is not None, WAKE_S):
+                        pass
                     self._resume_asked = False
                     ended = self._ended_by is not None
                 if ended:
@@ -398,6 +402,15 @@ class CaptureSession:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
+    """Waits for a plan's end, waking now and then: Python runs signal handlers in the main thread alone, and a signal that
+    the kernel hands to another thread doesn't wake this one from a wait without an end."""
+
+    def block(self, blocking_event: threading.Event) -> None:
+        while not blocking_event.wait(WAKE_S):
+            pass
 
 
 async def _awaited(call: Callable[[], Any]) -> Any:

@@ -107,3 +107,13 @@ def test_spectra_refuse_disorder_in_words() -> None:
         Spectrum.of([600.0, 500.0], [1.0, 1.0])
     with pytest.raises(ValueError, match="ascending"):
         Spectrum.of([400.0, 500.0], [1.0, 1.0]).resampled([500.0, 450.0])
+
+
+def test_equality_asks_for_the_fields_alone() -> None:
+    """Arrays that were computed and kept on the way are neither compared nor needed."""
+    one, other = Spectrum.of([400.0, 500.0], [1.0, 2.0]), Spectrum.of([400.0, 500.0], [1.0, 2.0])
+    assert one.arrays[0] is not other.arrays[0]
+    assert one == other
+    assert hash(one) == hash(other)
+    assert one != one.scaled(2.0)
+    assert one != "a spectrum"
