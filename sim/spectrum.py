@@ -111,6 +111,11 @@ def photons_from_energy(wavelength_nm: ArrayLike, energy: ArrayLike) -> FloatArr
     return np.asarray(energy, float) * np.asarray(wavelength_nm, float) / PHOTON_ENERGY_J_NM
 
 
+def energy_from_photons(wavelength_nm: ArrayLike, photons: ArrayLike) -> FloatArray:
+    """W per (nm ...) of a quantity in photons per (s nm ...): value x h c / w, the inverse of `photons_from_energy`."""
+    return np.asarray(photons, float) * PHOTON_ENERGY_J_NM / np.asarray(wavelength_nm, float)
+
+
 def blackbody_radiance(temperature_k: float, wavelength_nm: ArrayLike) -> Spectrum:
     """Planck's law: radiance W sr^-1 m^-2 nm^-1 of a black body, 2 h c^2 / w^5 / (exp(h c / (w k T)) - 1)."""
     if not temperature_k > 0:

@@ -8,6 +8,7 @@ from sim.scene.scenes import (
     ReflectanceChart,
     Scene,
     ScreenPattern,
+    SpectralImage,
     UniformField,
 )
 from sim.scene.warp import Warp
@@ -20,6 +21,7 @@ __all__ = [
     "ReflectanceChart",
     "Scene",
     "ScreenPattern",
+    "SpectralImage",
     "UniformField",
     "Warp",
 ]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.scene import colorchecker
-from sim.scene.scenes import PlanarTarget, ReflectanceChart, Scene, ScreenPattern
+from sim.scene.scenes import PlanarTarget, ReflectanceChart, Scene, ScreenPattern, SpectralImage
 from sim.scene.warp import Warp
 from sim.spectrum import FloatArray, Spectrum
 
@@ -45,7 +45,8 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One light and where it is: `coverage` 0..1 on the part `window` of a grid, 0 elsewhere."""
+    """One light and where it is: `coverage` on the part `window` of a grid, 0 elsewhere. It's a share 0..1 over a ground that
+    shines; over a ground of no light it's any factor >= 0."""
 
     light: Light
     window: Window
@@ -64,6 +65,8 @@ def draw(scene: Scene, grid: Grid) -> Drawing:
     """A chart, a screen or a printed target drawn on a grid. Raises TypeError for a scene that needs no drawing."""
     if isinstance(scene, ReflectanceChart):
         return _chart(scene, grid)
+    if isinstance(scene, SpectralImage):
+        return _bands(scene, grid)
     if isinstance(scene, ScreenPattern):
         lit = cells(np.asarray(scene.pattern, float), scene.to_camera, grid, 0.0)
     elif isinstance(scene, PlanarTarget):
@@ -109,6 +112,11 @@ def cells(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> Float
     if not (np.min(pattern) >= 0 and np.max(pattern) <= 1):
         bad = pattern[~((pattern >= 0) & (pattern <= 1))].flat[0]
         raise ValueError(f"a pattern's cell is {bad}, outside the limits 0..1: scale it, 0 dark and 1 lit")
+    return _means(pattern, warp, grid, surround)
+
+
+def _means(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> FloatArray:
+    """`cells` for cells of any finite value."""
     divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / 0.999)))
     if divide > MOST_DIVISIONS:
         raise ValueError(
@@ -172,6 +180,19 @@ def _cells_on(framed: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
     under += (flat[width + 1 :][at] - under) * right
     above += (under - above) * below
     return above
+
+
+#: No light: the ground of scenes whose layers just add up.
+NO_LIGHT = Spectrum(wavelength_nm=(300.0, 1100.0), value=(0.0, 0.0))
+
+
+def _bands(scene: SpectralImage, grid: Grid) -> Drawing:
+    """One layer a band on a dark ground: the light is the band's triangle over wavelength, the "coverage" its radiance."""
+    drawn = tuple(
+        Layer((light, None), EVERYWHERE, _means(plane, scene.warp(), grid, 0.0))
+        for light, plane in zip(scene.bands(), np.moveaxis(scene.radiance, 2, 0), strict=True)
+    )
+    return Drawing((NO_LIGHT, None), drawn)
 
 
 def _chart(scene: ReflectanceChart, grid: Grid) -> Drawing:

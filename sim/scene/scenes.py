@@ -7,14 +7,14 @@ capture's kind as the recording-set format names it: effects on the rig may depe
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.camera import Geometry
 from sim.scene.warp import Warp
-from sim.spectrum import FloatArray, Spectrum
+from sim.spectrum import FloatArray, Spectrum, energy_from_photons
 
 Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
@@ -131,3 +131,66 @@ class PlanarTarget:
             [rotation[:, 0] * self.texel_mm, rotation[:, 1] * self.texel_mm, np.asarray(self.translation_mm, float)]
         )
         return Warp.of(np.asarray(self.geometry.camera_matrix, float) @ pose, self.geometry)
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralImage:
+    """A picture with a spectrum in every sample: a multispectral cube.
+
+    `radiance` (rows, cols, bands), W sr^-1 m^-2 nm^-1, float32 or float64, finite and >= 0, at `wavelength_nm` (nm,
+    ascending, two or more); between the bands it's linear, beyond them zero, as a `Spectrum` is. Sample [i, j] is an even
+    square that covers u = j..j+1, v = i..i+1 of `to_camera`; None: sample [i, j] fills the camera's pixel [i, j]. Around
+    the picture it's dark. Raises ValueError that names the quantity, the value and the remedy.
+    """
+
+    wavelength_nm: tuple[float, ...]
+    radiance: NDArray[np.floating]
+    to_camera: Warp | None = None
+    kind: str = "image"
+
+    def __post_init__(self) -> None:
+        step = np.diff(self.wavelength_nm)
+        if len(self.wavelength_nm) < 2 or not np.all(np.isfinite(self.wavelength_nm)):
+            raise ValueError(
+                f"a spectral image of {len(self.wavelength_nm)} wavelengths needs two or more, all finite: give the bands' centres in nm"
+            )
+        if not np.all(step > 0):
+            at = int(np.argmax(step <= 0))
+            raise ValueError(
+                f"wavelengths must ascend: {self.wavelength_nm[at + 1]:g} nm follows {self.wavelength_nm[at]:g} nm; sort the bands"
+            )
+        if self.radiance.ndim != 3 or not self.radiance.size or self.radiance.shape[2] != len(self.wavelength_nm):
+            raise ValueError(
+                f"radiance of shape {self.radiance.shape} has to be (rows, cols, {len(self.wavelength_nm)} bands): move the bands to the last axis"
+            )
+        if self.radiance.dtype not in (np.float32, np.float64):
+            raise ValueError(
+                f"radiance is {self.radiance.dtype}, and has to be float32 or float64: scale codes to W sr^-1 m^-2 nm^-1"
+            )
+        # One pass for all three faults: a NaN makes the minimum a NaN.
+        if not (np.min(self.radiance) >= 0 and np.max(self.radiance) < np.inf):
+            i, j, k = (int(n) for n in np.argwhere(~((self.radiance >= 0) & (self.radiance < np.inf)))[0])
+            raise ValueError(
+                f"radiance is {self.radiance[i, j, k]:g} W sr^-1 m^-2 nm^-1 at row {i}, column {j}, {self.wavelength_nm[k]:g} nm, below the limit of 0 or not finite: correct the cube, or set what noise left below 0 to 0"
+            )
+
+    @classmethod
+    def from_photons(
+        cls, wavelength_nm: tuple[float, ...], photons: NDArray[np.floating], to_camera: Warp | None = None
+    ) -> Self:
+        """The same from `photons`, s^-1 sr^-1 m^-2 nm^-1: radiance = photons x h c / wavelength at every band."""
+        photons = np.asarray(photons)
+        if photons.ndim != 3 or photons.shape[2] != len(wavelength_nm):
+            raise ValueError(
+                f"photons of shape {photons.shape} have to be (rows, cols, {len(wavelength_nm)} bands): move the bands to the last axis"
+            )
+        return cls(wavelength_nm, np.asarray(energy_from_photons(wavelength_nm, photons), float), to_camera)
+
+    def warp(self) -> Warp:
+        """From samples (u, v) to camera px; without `to_camera`, sample [i, j] has its centre at pixel [i, j]."""
+        return self.to_camera or Warp(((1.0, 0.0, -0.5), (0.0, 1.0, -0.5), (0.0, 0.0, 1.0)))
+
+    def bands(self) -> tuple[Spectrum, ...]:
+        """One curve a band, 1 at its wavelength and 0 at its neighbours: radiance = sum of plane x curve, exactly."""
+        rows = np.eye(len(self.wavelength_nm))
+        return tuple(Spectrum.of(self.wavelength_nm, row) for row in rows)
