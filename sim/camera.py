@@ -50,12 +50,25 @@ class CameraModel(Frozen):
     conversion_gain_dn_per_e: Annotated[float, Quantity("DN/e", "codes an electron at 0 dB", lower=1e-6)]
     full_well_e: Annotated[float, Quantity("e", "electrons at which the pixel saturates", lower=1.0)]
     read_noise_e: Annotated[float, Quantity("e", "temporal noise of a dark pixel without quantisation", lower=0.0)]
-    dark_current_e_per_s: Annotated[float, Quantity("e/s", "mean dark current at the stated temperature", lower=0.0)]
+    dark_current_e_per_s: Annotated[float, Quantity("e/s", "mean dark current at the reference temperature", lower=0.0)]
     dsnu_e: Annotated[float, Quantity("e", "spatial standard deviation of the dark signal", lower=0.0)]
     prnu_percent: Annotated[float, Quantity("%", "spatial standard deviation of the response", lower=0.0)]
     quantum_efficiency: dict[str, Spectrum]
     lens: Lens
     geometry: Geometry | None = None
+    dark_current_reference_c: Annotated[
+        float, Quantity("C", "sensor temperature at which the dark current is stated", lower=-273.0, upper=200.0)
+    ] = 25.0
+    dark_current_doubling_c: Annotated[
+        float | None,
+        Quantity("C", "rise in temperature that doubles the dark current; not known: it stays", lower=0.5, upper=100.0),
+    ] = None
+    row_noise_e: Annotated[
+        float, Quantity("e", "temporal noise that all pixels of a row share, new in every frame", lower=0.0)
+    ] = 0.0
+    column_noise_e: Annotated[
+        float, Quantity("e", "spatial standard deviation of the columns' fixed offsets", lower=0.0)
+    ] = 0.0
     std: dict[str, float] = {}
     quantum_efficiency_std: dict[str, Spectrum] = {}
 
