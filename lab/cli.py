@@ -431,8 +431,12 @@ def _captured(store: Store, station_file: Path | None, quick: bool, name: str, r
         left = TextColumn("{task.fields[left]}")
         bar = stack.enter_context(Progress(*columns, left, console=err, transient=True, disable=not err.is_terminal))
         task = bar.add_task("capture", total=None, left="")
+        begun: set[str] = set()
 
         def tell(standing: Standing) -> None:
+            if not err.is_terminal and standing.sequence and standing.sequence not in begun:
+                begun.add(standing.sequence)  # a log gets a line a sequence, where a person sees a bar
+                out.print(f"{standing.sequence}: from step {standing.done + 1} of {standing.total}")
             left_s = "" if standing.left_s is None else f"about {standing.left_s:.0f} s left"
             what = escape(f"{standing.sequence} {standing.what}".strip())
             bar.update(task, description=what, total=standing.total, completed=standing.done, left=left_s)
