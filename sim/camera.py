@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
+from pydantic import model_validator
+
+from sim.optics.imaging import DiffractionLimited, Imaging, TracedLens
 from sim.parameters import Frozen, Quantity
 from sim.spectrum import Spectrum
 
@@ -11,14 +14,35 @@ Cfa = Literal["RGGB", "BGGR", "GRBG", "GBRG", "MONO"]
 Side = Literal["left", "right"]
 
 
+#: By how much a lens's stated f-number and focal length may differ from those that its traced table has.
+TABLE_AGREEMENT = 0.02
+
+
 class Lens(Frozen):
-    """The optics: diffraction limited at `f_number`, with cos^4 illumination at `focal_length_mm`."""
+    """The optics. `imaging` says how a point is imaged (default: diffraction limited at `f_number`); the light falls off as
+    cos^4 at `focal_length_mm`, or as a traced lens's table says. Raises where a traced lens is of another f-number or focal length.
+    """
 
     f_number: Annotated[float, Quantity("1", "working f-number", lower=0.5, upper=64.0)]
     focal_length_mm: Annotated[float, Quantity("mm", "focal length", lower=0.1, upper=5000.0)]
     transmittance: Annotated[
         float, Quantity("1", "share of the light on axis that the lens lets through", lower=0.0, upper=1.0)
     ] = 1.0
+    imaging: Imaging = DiffractionLimited()
+
+    @model_validator(mode="after")
+    def _agrees_with_its_table(self) -> Self:
+        if isinstance(self.imaging, TracedLens):
+            table = self.imaging.table
+            for name, stated, traced in (
+                ("f-number", self.f_number, table.f_number),
+                ("focal length in mm", self.focal_length_mm, table.focal_length_mm),
+            ):
+                if abs(stated / traced - 1.0) > TABLE_AGREEMENT:
+                    raise ValueError(
+                        f"the lens's {name} is {stated:g}, beyond the limit of {100 * TABLE_AGREEMENT:g} % from the traced {traced:g}: state the traced value, or trace the prescription at the aperture you mean"
+                    )
+        return self
 
 
 class Geometry(Frozen):

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
-from sim.optics.diffraction import aperture_otf, diffraction_cutoff_cy_per_um, diffraction_otf
+from sim.optics.diffraction import aperture_otf
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.optics.illumination import sin_theta as sin_theta_at
 from sim.scene.render import Grid, Light, draw
@@ -111,7 +111,7 @@ def optical_transfer(
 ) -> ComplexArray:
     """Optical transfer function of one channel, 1 at zero frequency; complex, of the broadcast shape of fx and fy (cy/px).
 
-    The average of diffraction x the effects' transfer, weighted by the detected electrons (light x responsivity) over
+    The average of the lens's transfer (`Lens.imaging`) x the effects', weighted by the detected electrons (light x responsivity) over
     wavelength, times the pixel's aperture. `radiance` None: light of equal energy at every wavelength.
     """
     fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_px, float), np.asarray(fy_cy_per_px, float))
@@ -374,19 +374,19 @@ def _otf_wavelengths(
 def _highest_cy_per_px(
     camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Effect], kind: str
 ) -> float:
-    """The diffraction's cutoff at the shortest wavelength that counts."""
+    """The lens's cutoff at the shortest wavelength that counts."""
     wavelength_nm, weight = _detected(camera, channel, [(radiance, None)], effects, kind)
     nodes, _ = _otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
-    cutoff = camera.pixel_pitch_um * diffraction_cutoff_cy_per_um(float(np.min(nodes)), camera.lens.f_number)
+    cutoff = camera.pixel_pitch_um * camera.lens.imaging.cutoff_cy_per_um(float(np.min(nodes)), camera.lens.f_number)
     return min(cutoff, HIGHEST_CY_PER_PX)
 
 
 def _transfer_at(
     camera: CameraModel, wavelength_nm: float, fx: FloatArray, fy: FloatArray, effects: Sequence[Effect]
 ) -> FloatArray | ComplexArray:
-    """Diffraction x the effects' transfer at one wavelength; fx, fy in cy/px, which broadcast."""
+    """The lens's transfer x the effects' at one wavelength; fx, fy in cy/px, which broadcast."""
     fx_um, fy_um = fx / camera.pixel_pitch_um, fy / camera.pixel_pitch_um
-    value: FloatArray | ComplexArray = diffraction_otf(np.hypot(fx_um, fy_um), wavelength_nm, camera.lens.f_number)
+    value = camera.lens.imaging.transfer(fx_um, fy_um, wavelength_nm, camera.lens.f_number)
     for effect in effects:
         factor = effect.transfer(fx_um, fy_um, wavelength_nm, camera)
         if factor is not None:
