@@ -10,7 +10,7 @@ result is the baseline bit for bit. Frequencies are cy/px, fx along columns (to 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +44,7 @@ HIGHEST_CY_PER_PX = 64.0
 @dataclass(frozen=True)
 class Exposure:
     """One exposure of a scene. `gain_db` is the analogue gain; `elapsed_s` the time after the session's first capture. Effects
-    may depend on it and on `temperature_c`; the camera's dark current is taken to be stated for the temperature there is."""
+    may depend on it and on the sensor's `temperature_c`, with which the dark current doubles as the camera model says."""
 
     scene: Scene
     exposure_s: float
@@ -210,15 +210,18 @@ def expected_electrons(
         collected_s = effect.exposure(collected_s)
         source *= effect.drift(exposure.elapsed_s)
     light = _light_electron_rate(camera, exposure.scene, effects, source, oversample, margin_px) * collected_s
-    electrons = light + dark_electrons(camera, exposure)
+    electrons = light + dark_electrons(camera, exposure, effects)
     for effect in effects:
         electrons = effect.charge(electrons, exposure.exposure_s, camera)
     return electrons
 
 
-def dark_electrons(camera: CameraModel, exposure: Exposure) -> float:
-    """Mean electrons of the dark current in one exposure."""
-    return camera.dark_current_e_per_s * exposure.exposure_s
+def dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = ()) -> float:
+    """Mean electrons of the dark current in one exposure, at its temperature."""
+    rate = sensor.dark_current_e_per_s(camera, exposure.temperature_c)
+    for effect in effects:
+        rate = effect.dark_current(rate, exposure.temperature_c, camera)
+    return rate * exposure.exposure_s
 
 
 def moments(
@@ -232,14 +235,14 @@ def moments(
 def expected(
     camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> FloatArray:
-    """Mean frame (rows, cols) in DN, not rounded, of a camera whose pixels are all alike; clipping is averaged over noise."""
+    """Mean frame (rows, cols) in DN of a camera whose pixels are all alike; clipping and rounding are averaged over noise."""
     return moments(camera, exposure, effects, oversample=oversample, margin_px=margin_px)[0]
 
 
 def variance(
     camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
 ) -> FloatArray:
-    """Temporal variance (rows, cols) in DN^2: shot and read noise, clipping, and 1/12 for rounding."""
+    """Temporal variance (rows, cols) in DN^2: shot, read and row noise, the effects' own, clipping, and rounding."""
     return moments(camera, exposure, effects, oversample=oversample, margin_px=margin_px)[1]
 
 
@@ -262,10 +265,64 @@ def sample(
         camera,
         rng,
         fixed_pattern,
-        dark_electrons=dark_electrons(camera, exposure),
+        dark_electrons=dark_electrons(camera, exposure, effects),
         gain_db=exposure.gain_db,
         read_out=read_out(camera, exposure, effects),
     )
+
+
+def expected_sequence(
+    camera: CameraModel,
+    exposures: Iterable[Exposure],
+    effects: Sequence[Effect] = (),
+    *,
+    oversample: int = 3,
+    margin_px: int = 32,
+) -> Iterator[FloatArray]:
+    """Mean electrons (rows, cols) that are read in each exposure of a sequence, one after the other: what a frame leaves
+    behind (`Effect.left_behind`) is read with the next. The first follows empty pixels; an exposure that is the same object
+    as the one before is drawn once.
+
+    Drawing every frame's electrons from these means on their own is exact: of Poisson electrons that are told apart one by
+    one, those read and those left behind are independent Poisson variables.
+    """
+    before: Exposure | None = None
+    new: FloatArray = np.zeros(())
+    left: FloatArray | float = 0.0
+    for exposure in exposures:
+        if exposure is not before:
+            new = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
+            before = exposure
+        collected = new + left
+        left = 0.0
+        for effect in effects:
+            left = left + effect.left_behind(np.minimum(collected, camera.full_well_e), camera)
+        yield collected - left
+
+
+def sample_sequence(
+    camera: CameraModel,
+    exposures: Iterable[Exposure],
+    rng: np.random.Generator,
+    effects: Sequence[Effect] = (),
+    fixed_pattern: FixedPattern | None = None,
+    *,
+    oversample: int = 3,
+    margin_px: int = 32,
+) -> Iterator[NDArray[np.uint16]]:
+    """Raw frames (rows, cols) of exposures taken one after the other, drawn as `sample` does from `expected_sequence`."""
+    every = list(exposures)
+    means = expected_sequence(camera, every, effects, oversample=oversample, margin_px=margin_px)
+    for exposure, electrons in zip(every, means, strict=True):
+        yield sensor.sample_from(
+            electrons,
+            camera,
+            rng,
+            fixed_pattern,
+            dark_electrons=dark_electrons(camera, exposure, effects),
+            gain_db=exposure.gain_db,
+            read_out=read_out(camera, exposure, effects),
+        )
 
 
 def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect]) -> ReadOut:
@@ -283,13 +340,28 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
             noise = effect.noise_e2(electrons, noise, camera)
         return noise
 
+    def added(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+        drawn = (effect.added(shape, rng, camera) for effect in effects)
+        return sum((more for more in drawn if more is not None), np.zeros((1, 1)))
+
+    def codes(dn: FloatArray) -> FloatArray:
+        for effect in effects:
+            dn = effect.codes(dn, camera)
+        return dn
+
+    def overridden(hook: str) -> bool:
+        return any(getattr(type(effect), hook) is not getattr(Effect, hook) for effect in effects)
+
     # Only what is overridden acts, so that effects elsewhere leave the read-out the baseline's to the last bit.
-    bends = any(type(effect).response is not Effect.response for effect in effects)
-    stirs = any(type(effect).noise_e2 is not Effect.noise_e2 for effect in effects)
+    shape = camera.rows, camera.cols
     return ReadOut(
-        response if bends else None,
-        noise_e2 if stirs else None,
+        response if overridden("response") else None,
+        noise_e2 if overridden("noise_e2") else None,
         sum(effect.offset_dn(exposure.elapsed_s, exposure.temperature_c, camera) for effect in effects),
+        added if overridden("added") else None,
+        sum((effect.added_e(shape, camera) for effect in effects), 0.0),
+        sum((effect.added_e2(shape, camera) for effect in effects), 0.0),
+        codes if overridden("codes") else None,
     )
 
 

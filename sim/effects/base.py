@@ -122,9 +122,17 @@ class Effect(Frozen):
         """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""
         return 0.0
 
+    def dark_current(self, e_per_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+        """CHARGE: mean dark current of a pixel, given what the camera model says for that temperature of the sensor."""
+        return e_per_s
+
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
         """CHARGE: mean electrons of a whole frame (rows, cols), after light and dark current were added."""
         return electrons
+
+    def left_behind(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
+        """CHARGE: how many of a frame's mean electrons aren't read but stay in the pixels for the next frame."""
+        return 0.0
 
     def response(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
         """ELECTRONICS: what the read-out makes of a mean signal in electrons, point by point (linear: the same)."""
@@ -137,3 +145,20 @@ class Effect(Frozen):
     def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
         """CHARGE or ELECTRONICS: temporal variance of a pixel in e^2 at a mean signal in electrons."""
         return noise_e2
+
+    def added(self, shape: tuple[int, ...], rng: np.random.Generator, camera: CameraModel) -> FloatArray | None:
+        """ELECTRONICS: electrons that one frame's read-out adds to the pixels, drawn anew in each, or None for none; they
+        broadcast to the frame's `shape`. Of mean `added_e` and variance `added_e2`."""
+        return None
+
+    def added_e(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
+        """ELECTRONICS: mean of what `added` draws, pixel by pixel."""
+        return 0.0
+
+    def added_e2(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
+        """ELECTRONICS: temporal variance (e^2) of what `added` draws, pixel by pixel."""
+        return 0.0
+
+    def codes(self, dn: FloatArray, camera: CameraModel) -> FloatArray:
+        """ELECTRONICS: what the converter makes of a level in DN before it rounds (ideal: the same)."""
+        return dn

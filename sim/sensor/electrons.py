@@ -1,8 +1,11 @@
 """From electrons to codes: fixed patterns, shot noise, full well, read-out, conversion, quantisation.
 
 The order, for one exposure: mean electrons (light + dark current) -> x (1 + PRNU) on the light -> shot noise (Poisson) -> full
-well -> the read-out's response -> + DSNU and read noise -> x conversion gain, + black level -> round, clip to
-[0, white_level_dn].
+well -> the read-out's response -> + DSNU, the columns' offsets, read noise and the rows' noise -> x conversion gain, + black
+level -> round, clip to [0, white_level_dn].
+
+Shot noise is exact at every mean. The other noises are normal, in single precision: the least step of a variable of standard
+deviation 1 is 1e-7, its tail ends at 6e-8 a side.
 """
 
 from __future__ import annotations
@@ -18,19 +21,23 @@ from scipy.special import ndtr
 from sim.camera import CameraModel
 from sim.spectrum import FloatArray
 
-#: From this mean on, a Poisson variable is drawn as m + sqrt(m) z + (z^2 - 1) / 6 with a normal z: its mean, variance and
-#: skewness are right, and its distribution function is within 1e-3 (half the Poisson's own steps are 0.05).
-MANY_ELECTRONS = 64.0
+Float32Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class ReadOut:
     """What effects make of the read-out. `response`: mean or noisy electrons -> electrons, point by point; `noise_e2`: (mean
-    electrons, their shot noise's variance) -> variance; `offset_dn` is added to the black level. Defaults: a linear one."""
+    electrons, their shot noise's variance) -> variance; `added`: (frame's shape, generator) -> electrons that one frame's
+    read-out adds, which broadcast to that shape, of mean `added_e` and variance `added_e2`; `codes`: DN before rounding -> DN;
+    `offset_dn` is added to the black level. Defaults: a linear one."""
 
     response: Callable[[FloatArray], FloatArray] | None = None
     noise_e2: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     offset_dn: float = 0.0
+    added: Callable[[tuple[int, ...], np.random.Generator], FloatArray] | None = None
+    added_e: FloatArray | float = 0.0
+    added_e2: FloatArray | float = 0.0
+    codes: Callable[[FloatArray], FloatArray] | None = None
 
 
 LINEAR = ReadOut()
@@ -38,20 +45,33 @@ LINEAR = ReadOut()
 
 @dataclass(frozen=True, eq=False)
 class FixedPattern:
-    """What one camera's pixels keep from frame to frame: relative deviation of the response `prnu`, and deviation of the dark
-    signal `dsnu_e` (electrons, the same at every exposure), both (rows, cols) and of mean 0."""
+    """What one camera's pixels keep from frame to frame: relative deviation of the response `prnu`, deviation of the dark
+    signal `dsnu_e` (electrons, the same at every exposure), both (rows, cols), and offsets of the columns `column_e` (cols,)
+    or None, all of mean 0."""
 
     prnu: FloatArray
     dsnu_e: FloatArray
+    column_e: FloatArray | None = None
 
     @classmethod
     def draw(cls, camera: CameraModel, rng: np.random.Generator) -> Self:
-        """One camera's pattern: normal, with the camera's `prnu_percent` and `dsnu_e` as standard deviations."""
+        """One camera's pattern: normal, with the camera's `prnu_percent`, `dsnu_e` and `column_noise_e` as standard
+        deviations."""
         shape = camera.rows, camera.cols
         return cls(
             prnu=rng.standard_normal(shape) * (camera.prnu_percent / 100.0),
             dsnu_e=rng.standard_normal(shape) * camera.dsnu_e,
+            column_e=rng.standard_normal(camera.cols) * camera.column_noise_e if camera.column_noise_e > 0 else None,
         )
+
+
+def dark_current_e_per_s(camera: CameraModel, temperature_c: float | None = None) -> float:
+    """Mean dark current at a sensor temperature: D 2^((T - T_reference) / T_doubling). Where the temperature or the doubling
+    isn't known, the stated current."""
+    if temperature_c is None or camera.dark_current_doubling_c is None:
+        return camera.dark_current_e_per_s
+    doublings = (temperature_c - camera.dark_current_reference_c) / camera.dark_current_doubling_c
+    return float(camera.dark_current_e_per_s * 2.0**doublings)
 
 
 def gain_dn_per_e(camera: CameraModel, gain_db: float) -> float:
@@ -88,15 +108,54 @@ def clipped_moments(
     return out_mean, out_variance
 
 
-def dn_moments(
-    electrons: FloatArray, camera: CameraModel, gain_db: float = 0.0, read_out: ReadOut = LINEAR
-) -> tuple[FloatArray, FloatArray]:
-    """Mean (DN, not rounded) and temporal variance (DN^2, with 1/12 for rounding) of pixels with mean `electrons`.
+def rounded_moments(mean: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of a normal variable after rounding to whole numbers.
 
-    Shot noise is Poisson; clipping at full well and by the converter is averaged over the noise with normal laws. The
-    variance goes through the response by its slope.
+    With r(y) = (1 / pi) sum_k (-1)^k sin(2 pi k y) / k what rounding adds and d_k = exp(-2 pi^2 k^2 variance): E r = (1 / pi)
+    sum (-1)^k d_k sin(2 pi k mean) / k and variance + 2 variance E r' + E r^2 - (E r)^2 with E r' = 2 sum (-1)^k d_k cos(2 pi k
+    mean), E r^2 = 1 / 12 + (1 / pi^2) sum (-1)^k d_k cos(2 pi k mean) / k^2. From a standard deviation of 0.9 on that is mean
+    and variance + 1 / 12 to 1e-6, and taken as that.
+    """
+    mean, variance = np.broadcast_arrays(np.asarray(mean, float), np.asarray(variance, float))
+    out_mean, out_variance = mean.copy(), variance + 1.0 / 12.0
+    narrow = variance < 0.81
+    if not np.any(narrow):
+        return out_mean, out_variance
+    m, v = mean[narrow], variance[narrow]
+    shift, slope, square = np.zeros_like(m), np.zeros_like(m), np.full_like(m, 1.0 / 12.0)
+    still = v < 1e-4  # the sum would need many terms: the variable itself is rounded
+    for k in range(1, 60):
+        weight = (-1.0) ** k * np.exp(-2.0 * np.pi**2 * k**2 * v)
+        if np.max(np.abs(weight[~still]), initial=0.0) < 1e-9:
+            break
+        wave = 2.0 * np.pi * k * m
+        shift += weight * np.sin(wave) / (np.pi * k)
+        slope += 2.0 * weight * np.cos(wave)
+        square += weight * np.cos(wave) / (np.pi * k) ** 2
+    out_mean[narrow] = np.where(still, np.rint(m), m + shift)
+    out_variance[narrow] = np.where(still, 0.0, np.maximum(v + 2.0 * v * slope + square - shift**2, 0.0))
+    return out_mean, out_variance
+
+
+def dn_moments(
+    electrons: FloatArray,
+    camera: CameraModel,
+    gain_db: float = 0.0,
+    read_out: ReadOut = LINEAR,
+    fixed_pattern: FixedPattern | None = None,
+    *,
+    dark_electrons: float = 0.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (DN, that of the rounded codes) and temporal variance (DN^2) of pixels with mean `electrons`.
+
+    Shot noise is Poisson; clipping at full well and by the converter and rounding are averaged over the noise with normal laws
+    (rounding: 1/12 DN^2 where the noise is wider than a code, see `rounded_moments`). The variance goes through the response by
+    its slope. `fixed_pattern`: the moments of those pixels, in place of pixels that are all alike; then `dark_electrons` of
+    `electrons` are dark current.
     """
     check_electrons(electrons)
+    if fixed_pattern is not None:
+        electrons = np.maximum(electrons + (electrons - dark_electrons) * fixed_pattern.prnu, 0.0)
     noise = electrons if read_out.noise_e2 is None else np.maximum(read_out.noise_e2(electrons, electrons), 0.0)
     mean, variance = clipped_moments(electrons, noise, -np.inf, camera.full_well_e)
     if read_out.response is not None:
@@ -104,13 +163,19 @@ def dn_moments(
         bent = read_out.response(mean)
         variance = variance * ((read_out.response(mean + step) - bent) / step) ** 2
         mean = bent
+    mean = mean + read_out.added_e
+    if fixed_pattern is not None:
+        mean = mean + fixed_pattern.dsnu_e
+        if fixed_pattern.column_e is not None:
+            mean = mean + fixed_pattern.column_e
     gain = gain_dn_per_e(camera, gain_db)
-    return clipped_moments(
-        camera.black_level_dn + read_out.offset_dn + gain * mean,
-        gain**2 * (variance + camera.read_noise_e**2) + 1.0 / 12.0,
-        0.0,
-        camera.white_level_dn,
-    )
+    dn = camera.black_level_dn + read_out.offset_dn + gain * mean
+    dn2 = gain**2 * (variance + camera.read_noise_e**2 + camera.row_noise_e**2 + read_out.added_e2)
+    if read_out.codes is not None:
+        bent = read_out.codes(dn)
+        dn2 = dn2 * (read_out.codes(dn + 0.5) - read_out.codes(dn - 0.5)) ** 2
+        dn = bent
+    return clipped_moments(*rounded_moments(dn, dn2), 0.0, camera.white_level_dn)
 
 
 def sample_from(
@@ -135,6 +200,8 @@ def sample_from(
     electrons = np.asarray(expected_electrons, float)
     check_electrons(electrons)
     frame = np.empty(electrons.shape, np.uint16)
+    added = _added_electrons(electrons.shape, camera, rng, read_out)
+    gain = np.float32(gain_dn_per_e(camera, gain_db))
     rows = max(1, 32_768 // max(1, electrons.shape[-1]))  # strips that stay in the processor's cache
     for start in range(0, len(electrons), rows):
         strip = slice(start, start + rows)
@@ -145,24 +212,35 @@ def sample_from(
         charge = _read_charge(mean, camera, rng, read_out)
         if fixed_pattern is not None:
             charge += fixed_pattern.dsnu_e[strip].astype(np.float32)
-        charge *= np.float32(gain_dn_per_e(camera, gain_db))
+            if fixed_pattern.column_e is not None:
+                charge += fixed_pattern.column_e.astype(np.float32)
+        if added is not None:
+            charge += added[strip]
+        charge *= gain
         charge += np.float32(camera.black_level_dn + read_out.offset_dn)
+        if read_out.codes is not None:
+            charge = read_out.codes(charge.astype(float)).astype(np.float32)
         np.rint(charge, out=charge)
         np.clip(charge, np.float32(0.0), np.float32(camera.white_level_dn), out=charge)
         frame[strip] = charge
     return frame
 
 
-Float32Array = NDArray[np.float32]
+def _added_electrons(
+    shape: tuple[int, ...], camera: CameraModel, rng: np.random.Generator, read_out: ReadOut
+) -> Float32Array | None:
+    """What one frame's read-out adds beside every pixel's own read noise: the rows' noise and the effects' own."""
+    total: FloatArray | None = None
+    if camera.row_noise_e > 0:
+        total = rng.standard_normal((*shape[:-1], 1)) * camera.row_noise_e
+    if read_out.added is not None:
+        more = read_out.added(shape, rng)
+        total = more if total is None else total + more
+    return None if total is None else np.broadcast_to(total.astype(np.float32), shape)
 
 
 def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generator, read_out: ReadOut) -> Float32Array:
     """Electrons as they are read: shot noise, full well, response and read noise."""
-    highest = float(np.max(mean, initial=0.0))
-    plain = read_out.response is None and read_out.noise_e2 is None
-    if plain and np.min(mean) >= MANY_ELECTRONS and highest + 8.0 * np.sqrt(highest) < camera.full_well_e:
-        # Nothing comes between shot and read noise: one normal variable for both, with the skewness of the sum.
-        return _normal_stand_in(mean, np.float32(camera.read_noise_e) ** 2, rng)
     charge = draw_electrons(mean, rng)
     if read_out.noise_e2 is not None:
         wanted = np.maximum(read_out.noise_e2(mean.astype(float), mean.astype(float)), 0.0)
@@ -171,36 +249,17 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
     if read_out.response is not None:
         charge = read_out.response(charge.astype(float)).astype(np.float32)
     if camera.read_noise_e > 0:
-        charge += rng.standard_normal(mean.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
+        noise = rng.standard_normal(mean.shape, dtype=np.float32)
+        noise *= np.float32(camera.read_noise_e)
+        charge += noise
     return charge
 
 
 def draw_electrons(mean: Float32Array, rng: np.random.Generator) -> Float32Array:
-    """Poisson electrons around `mean` (>= 0); see `MANY_ELECTRONS` for how large means are drawn."""
-    mean = np.asarray(mean, np.float32)
-    few = mean < MANY_ELECTRONS
-    if np.all(few):
-        return rng.poisson(mean).astype(np.float32)
-    charge = _normal_stand_in(mean, np.float32(0.0), rng)
-    if np.any(few):
-        charge[few] = rng.poisson(mean[few])
-    return charge
+    """Poisson electrons around `mean` (>= 0), exact at every mean."""
+    from sim.sensor.shot import draw_poisson  # here, as numba takes a second to import
 
-
-def _normal_stand_in(mean: Float32Array, read_e2: np.float32, rng: np.random.Generator) -> Float32Array:
-    """mean + s z + (mean / s^2) (z^2 - 1) / 6 with s^2 = mean + read noise squared: the third cumulant is the Poisson's."""
-    z = rng.standard_normal(mean.shape, dtype=np.float32)
-    variance = mean + read_e2
-    charge = np.sqrt(variance)
-    charge *= z
-    charge += mean
-    z *= z
-    z -= np.float32(1.0)
-    if read_e2 > 0:
-        z *= mean / variance
-    z *= np.float32(1.0 / 6.0)
-    charge += z
-    return charge
+    return draw_poisson(mean, rng)
 
 
 def check_electrons(electrons: FloatArray) -> None:
