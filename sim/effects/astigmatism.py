@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
+import numpy as np
+
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
-from sim.effects.pupil import quadratic_ratio
+from sim.optics.pupil import Wavefront, pupil_ratio
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -44,5 +46,5 @@ class Astigmatism(Effect):
         if self.defocus_x_um == 0.0 and self.defocus_y_um == 0.0:
             return None
         scale = 1.0 / (8.0 * camera.lens.f_number**2)
-        path = self.defocus_x_um * scale, -self.defocus_y_um * scale
-        return quadratic_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path)
+        path = Wavefront.of({(2, 0): self.defocus_x_um * scale, (0, 2): -self.defocus_y_um * scale})
+        return np.real(pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path))

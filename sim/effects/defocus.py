@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
+import numpy as np
+
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
-from sim.effects.pupil import quadratic_ratio
+from sim.optics.pupil import pupil_ratio, seidel
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -55,4 +57,6 @@ class Defocus(Effect):
         if self.defocus_um == 0.0:
             return None
         w020 = self.defocus_um / (8.0 * camera.lens.f_number**2)
-        return quadratic_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, (w020, w020))
+        return np.real(
+            pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, seidel(defocus_um=w020))
+        )

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
+import numpy as np
+
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
-from sim.effects.pupil import isotropic_ratio
+from sim.optics.pupil import pupil_ratio, seidel
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
@@ -47,11 +49,5 @@ class SphericalAberration(Effect):
     ) -> FloatArray | None:
         if self.w040_um == 0.0:
             return None
-        # rho_+^4 - rho_-^4 = (rho_+^2 - rho_-^2) (rho_+^2 + rho_-^2)
-        return isotropic_ratio(
-            fx_cy_per_um,
-            fy_cy_per_um,
-            wavelength_nm,
-            camera.lens.f_number,
-            lambda u, v, s: self.w040_um * (2.0 * s * u) * (2.0 * (u**2 + v**2) + 0.5 * s**2),
-        )
+        path = seidel(spherical_um=self.w040_um)
+        return np.real(pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path))
