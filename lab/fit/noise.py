@@ -16,7 +16,7 @@ Definitions: EMVA Standard 1288, release 4.0 (linear). Where this departs from t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from lab.errors import NotDetermined
+from lab.fit.levels import DEFECT_SIGMA, Level, Stack, defective_pixels, level_statistics
+from lab.fit.lines import DarkLine, Linearity, dark_line, inflation, least_squares, linearity
 from lab.recording import Camera, Capture, Dark, Flat, RecordingSet
 from lab.results import NoiseFit, PhotonTransfer
-from sim.camera import Cfa, Side
-from sim.sensor.mosaic import planes
+from sim.camera import Side
 from sim.spectrum import FloatArray, Spectrum
 
 QUANTISATION_DN2 = 1.0 / 12.0
@@ -41,281 +42,8 @@ CURVATURE_PRIOR = (
 TRUSTED_SCATTER = 3.0  # chi2 per degree of freedom above which the curve isn't what the camera does
 CLIPPED_LIMIT = 1e-4  # share of clipped pixels from which a level's variance is too small
 PILED_LIMIT = 2e-3  # share of pixels on the plane's own highest code that says that it saturates there
-DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
-SHADING_DEGREE = 6
 MIN_LEVELS = 3
 MIN_SIZE_PX = 16
-
-
-F = TypeVar("F", bound=np.floating[Any])
-
-# --- one level ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class PlaneStatistics:
-    """One plane of the mosaic over the repeats of one level; DN and DN^2, of pixels that aren't defects.
-
-    `temporal_variance` is NaN with a single repeat. `spatial_variance` is that of the mean frame less the temporal share,
-    `pattern_variance` the same after shading has been taken out.
-    """
-
-    pixels: int
-    mean: float
-    frame_means: tuple[float, ...]
-    temporal_variance: float
-    temporal_variance_std: float
-    spatial_variance: float
-    spatial_variance_std: float
-    pattern_variance: float
-    pattern_variance_std: float
-    defects: int
-    clipped_share: float
-    piled_share: float
-    zero_share: float
-    highest: float
-
-    @property
-    def repeats(self) -> int:
-        return len(self.frame_means)
-
-    @property
-    def mean_std(self) -> float:
-        """Standard uncertainty of `mean` from the pixels' temporal noise."""
-        return float(np.sqrt(self.temporal_variance / (self.pixels * self.repeats)))
-
-
-@dataclass(frozen=True)
-class Level:
-    """One level of light (0: dark): its setting and the statistics of its planes. `light` is proportional to the photons
-    among the levels with the same `lamp`."""
-
-    exposure_s: float
-    light: float
-    lamp: Hashable
-    plane: dict[str, PlaneStatistics]
-    temperature_c: float | None = None
-
-    @property
-    def repeats(self) -> int:
-        return next(iter(self.plane.values())).repeats
-
-
-def shading(image: NDArray[F], degree: int = SHADING_DEGREE) -> NDArray[F]:
-    """Smooth surface of an image (rows, cols): the polynomial of `degree` in rows and in columns nearest to its block means."""
-    rows, cols = image.shape
-    # Blocks as small as leaves the separable least squares cheap; a degree needs a few blocks to stand on.
-    counts = [int(np.clip(size // 8, 1, 32)) for size in (rows, cols)]
-    block = rows // counts[0], cols // counts[1]
-    inner = image[: counts[0] * block[0], : counts[1] * block[1]]
-    means = inner.reshape(counts[0], block[0], counts[1], block[1]).mean(axis=(1, 3), dtype=float)
-    full, small = [], []
-    for size, count, width in zip((rows, cols), counts, block, strict=True):
-        order = min(degree, max(count // 3, 0))
-        at = 2.0 * (np.arange(size) + 0.5) / size - 1.0
-        basis = np.polynomial.legendre.legvander(at, order)
-        full.append(basis)
-        small.append(basis[: count * width].reshape(count, width, -1).mean(axis=1))
-    coefficients = np.linalg.pinv(small[0]) @ means @ np.linalg.pinv(small[1]).T
-    # In the image's own precision: the surface's error is then the image's.
-    return (full[0] @ coefficients).astype(image.dtype) @ full[1].T.astype(image.dtype)
-
-
-def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> NDArray[np.bool_]:
-    """Pixels of a mean frame that stand out of their plane by more than 8 (robust) standard deviations."""
-    bad = np.zeros(image.shape, bool)
-    for name, plane in planes(image, cfa).items():
-        rest = plane - np.median(plane)
-        for _ in range(2):  # glow widens the first scale, and hot pixels bend the first surface
-            # A quantised plane can have most pixels on one value; a tenth of a DN is the least scale.
-            limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), 0.1)
-            rest = rest - shading(np.clip(rest, -limit, limit))
-        limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), 0.1)
-        planes(bad, cfa)[name][...] = np.abs(rest) > limit
-    return bad
-
-
-class _Stack:
-    """Mean and temporal scatter of repeats, frame by frame (Welford's recursion on frames without their planes' means)."""
-
-    def __init__(self, cfa: Cfa, white_dn: float, bad: NDArray[np.bool_] | None) -> None:
-        self.cfa, self.white_dn = cfa, white_dn
-        self.bad = bad if bad is not None and bad.any() else None
-        self.mean: NDArray[np.float32] | None = None
-        self.scatter: NDArray[np.float32] | None = None
-        self.frame_means: dict[str, list[float]] = {}
-        self.shares: dict[str, list[tuple[float, float, float, float]]] = {}
-
-    def _mean_of(self, values: NDArray[Any], name: str) -> float:
-        good = self._good(name)
-        return float(values.mean(dtype=np.float64) if good is None else values[good].mean(dtype=np.float64))
-
-    def _good(self, name: str) -> NDArray[np.bool_] | None:
-        return None if self.bad is None else ~planes(self.bad, self.cfa)[name]
-
-    def add(self, frame: NDArray[np.integer[Any]]) -> None:
-        values = frame.astype(np.float32)
-        for name, plane in planes(frame, self.cfa).items():
-            self.frame_means.setdefault(name, []).append(self._mean_of(plane, name))
-            highest = plane.max()
-            top = np.count_nonzero(plane == highest) / plane.size
-            zero = np.count_nonzero(plane == 0) / plane.size if self.frame_means[name][-1] < 50 else 0.0
-            self.shares.setdefault(name, []).append(
-                (top if highest >= self.white_dn else 0.0, top, zero, float(highest))
-            )
-        if self.mean is None:
-            self.mean = values
-            return
-        count = len(next(iter(self.frame_means.values())))
-        values -= self.mean
-        for name, delta in planes(values, self.cfa).items():
-            np.subtract(delta, np.float32(self._mean_of(delta, name)), out=delta)
-        if self.scatter is None:
-            self.scatter = np.zeros_like(values)
-        self.mean += values / np.float32(count)
-        values *= values
-        values *= np.float32((count - 1) / count)
-        self.scatter += values
-
-    def statistics(self) -> dict[str, PlaneStatistics]:
-        if self.mean is None:
-            raise ValueError("a level has no frames: give one at least")
-        return {name: self._plane(name) for name in self.frame_means}
-
-    def _plane(self, name: str) -> PlaneStatistics:
-        assert self.mean is not None
-        good, repeats = self._good(name), len(self.frame_means[name])
-        image = planes(self.mean, self.cfa)[name]
-        pixels = image.size if good is None else int(np.count_nonzero(good))
-        variance, variance_std = np.nan, np.nan
-        if self.scatter is not None:
-            scatter = planes(self.scatter, self.cfa)[name] / np.float32(repeats - 1)
-            if good is not None:
-                scatter[~good] = 0.0
-            # One degree of freedom of the plane goes with each frame's mean.
-            variance = float(scatter.sum(dtype=np.float64)) / (pixels - 1)
-            variance_std = _variance_std(scatter, variance, pixels, repeats)
-        spatial, spatial_std, _ = _spatial(image - image.mean(), good, variance, variance_std, repeats, clip=False)
-        pattern, pattern_std, outliers = _spatial(
-            image - shading(image), good, variance, variance_std, repeats, clip=True
-        )
-        clipped, piled, zero, _ = np.mean(self.shares[name], axis=0)
-        return PlaneStatistics(
-            pixels=pixels,
-            mean=float(np.mean(self.frame_means[name])),
-            frame_means=tuple(self.frame_means[name]),
-            temporal_variance=variance,
-            temporal_variance_std=variance_std,
-            spatial_variance=spatial,
-            spatial_variance_std=spatial_std,
-            pattern_variance=pattern,
-            pattern_variance_std=pattern_std,
-            defects=image.size - pixels + outliers,
-            clipped_share=float(clipped),
-            piled_share=float(piled),
-            zero_share=float(zero),
-            highest=max(share[3] for share in self.shares[name]),
-        )
-
-
-def _variance_std(scatter: NDArray[np.floating[Any]], variance: float, pixels: int, repeats: int) -> float:
-    """Standard uncertainty of a mean temporal variance: that of normal noise, or what its rows say where they scatter more
-    (row noise makes the pixels of a row go together)."""
-    normal = variance * np.sqrt(2.0 / (pixels * (repeats - 1)))
-    rows = scatter.shape[0]
-    if rows < 32:
-        return float(normal)
-    # Neighbouring rows see the same shading, so their differences are noise alone.
-    from_rows = float(np.sqrt(np.mean(np.diff(scatter.mean(axis=1, dtype=np.float64)) ** 2) / 2.0 / rows))
-    # That estimate is itself uncertain by sqrt(3 / rows) / 2: believe it where it is clearly larger.
-    return from_rows if from_rows > normal * (1.0 + 2.0 * np.sqrt(3.0 / rows)) else float(normal)
-
-
-def _spatial(
-    rest: NDArray[np.floating[Any]],
-    good: NDArray[np.bool_] | None,
-    temporal: float,
-    temporal_std: float,
-    repeats: int,
-    *,
-    clip: bool,
-) -> tuple[float, float, int]:
-    """Spatial variance of a mean frame less the temporal share var / L, its standard uncertainty, and how many pixels were
-    left out because they stand out."""
-    values = rest if good is None else rest[good]
-    outliers = 0
-    total = float(np.var(values, dtype=np.float64))
-    if clip and total > 0:
-        limit = DEFECT_SIGMA * np.sqrt(total)
-        # The largest of some 10^5 normal pixels are at 5 standard deviations; only then is a closer look worth its time.
-        if max(float(values.max()), -float(values.min())) > limit:
-            scale = 1.4826 * float(np.median(np.abs(values)))
-            inside = np.abs(values) <= DEFECT_SIGMA * scale
-            outliers = int(values.size - np.count_nonzero(inside))
-            total = float(np.var(values[inside], dtype=np.float64))
-    count = values.size - outliers
-    total *= count / (count - 1)
-    return (
-        total - temporal / repeats,
-        float(np.hypot(total * np.sqrt(2.0 / count), temporal_std / repeats)),
-        outliers,
-    )
-
-
-def level_statistics(
-    frames: Iterable[NDArray[np.integer[Any]]], cfa: Cfa, white_dn: float, bad: NDArray[np.bool_] | None = None
-) -> dict[str, PlaneStatistics]:
-    """Statistics of the repeats of one level, by plane (`R`, `G1`, `G2`, `B` or `Y`).
-
-    `frames`: (rows, cols) DN, taken one after the other and not kept. `bad`: pixels to leave out. Temporal variance: the mean
-    over pixels of the variance over repeats after each frame's mean has been taken out.
-    """
-    stack = _Stack(cfa, white_dn, bad)
-    for frame in frames:
-        stack.add(frame)
-    return stack.statistics()
-
-
-# --- darks -------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class DarkLine:
-    """Mean of a dark frame against exposure: black + rate t (DN, DN/s), with covariance; `rate` None with one exposure."""
-
-    black: float
-    rate: float | None
-    covariance: FloatArray
-
-    def at(self, exposure_s: float) -> float:
-        return self.black + (self.rate or 0.0) * exposure_s
-
-
-def dark_line(exposure_s: FloatArray, mean: FloatArray, std: FloatArray) -> DarkLine:
-    """Weighted straight line through dark means; its covariance is scaled up where the means scatter beyond `std`."""
-    if np.ptp(exposure_s) <= 1e-6 * np.max(exposure_s, initial=1e-12):
-        weight = 1.0 / std**2
-        value = float(np.sum(weight * mean) / np.sum(weight))
-        return DarkLine(value, None, np.array([[1.0 / np.sum(weight), 0.0], [0.0, 0.0]]))
-    basis = np.stack([np.ones_like(exposure_s), exposure_s], axis=1)
-    solution, covariance, chi2 = _least_squares(basis, mean, std)
-    return DarkLine(float(solution[0]), float(solution[1]), covariance * _inflation(chi2, len(mean) - 2))
-
-
-def _least_squares(basis: FloatArray, values: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Weighted least squares: solution, covariance, chi2."""
-    scale = np.linalg.norm(basis / std[:, None], axis=0)
-    design = basis / std[:, None] / scale
-    solution, *_ = np.linalg.lstsq(design, values / std, rcond=None)
-    covariance = np.linalg.pinv(design.T @ design) / np.outer(scale, scale)
-    return solution / scale, covariance, float(np.sum((values / std - design @ solution) ** 2))
-
-
-def _inflation(chi2: float, freedom: int, p: float = 0.01) -> float:
-    """Factor on a covariance: chi2 per degree of freedom where chance explains it with less than `p`, else 1."""
-    if freedom < 1 or stats.chi2.sf(chi2, freedom) > p:
-        return 1.0
-    return max(1.0, chi2 / freedom)
 
 
 # --- photon transfer ---------------------------------------------------------------------------------------------------
@@ -391,7 +119,7 @@ def fit_transfer(
     else:
         by_line = False
         gain, curvature = float(solution[0]), float(solution[1])
-        covariance = covariance * _inflation(chi2, freedom)
+        covariance = covariance * inflation(chi2, freedom)
     return TransferFit(
         gain=gain,
         curvature=curvature,
@@ -424,53 +152,13 @@ def _curve(
     gain = max(float(np.median(np.diff(np.sort(v)) / np.maximum(np.diff(np.sort(x)), 1e-9))), 1e-6)
     for _ in range(4):
         prior_std = np.array([CURVATURE_PRIOR * gain / saturation])
-        solution, covariance, chi2 = _least_squares(
+        solution, covariance, chi2 = least_squares(
             np.concatenate([basis, prior]), np.append(v, 0.0), np.append(std, prior_std)
         )
         gain = max(float(solution[0]), 1e-6)
         # Weights from the fitted, not the measured variances: low ones would otherwise pull.
         std = relative[used] * np.maximum(basis @ solution, 0.1 * v)
     return solution, covariance, chi2, int(used.sum()) - 2 - count + 1  # the prior counts as one value
-
-
-# --- linearity ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Linearity:
-    """EMVA's linearity line: offset + slope light, deviations in percent of the line, and their mean modulus."""
-
-    offset: float
-    slope: float
-    slope_std: float
-    deviation_percent: FloatArray
-    error_percent: float
-    error_percent_std: float
-
-
-def linearity(light: FloatArray, signal: FloatArray, signal_std: FloatArray) -> Linearity:
-    """The line through (light, signal) that minimises the relative deviations, and the linearity error: the mean modulus of
-    the relative deviations in percent (EMVA 1288 release 4.0). All points are used: give those within 5..95 % of saturation.
-
-    The uncertainty holds the points' noise and, since a modulus of noise isn't zero, what that adds on average.
-    """
-    basis = np.stack([np.ones_like(light), light], axis=1)
-    solution, covariance, chi2 = _least_squares(basis, signal, signal)
-    model = basis @ solution
-    deviation = 100.0 * (signal - model) / model
-    std = 100.0 * signal_std / model
-    error = np.abs(deviation)
-    z = error / np.maximum(std, 1e-12)
-    folded = std * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z**2) + error * (1.0 - 2.0 * stats.norm.cdf(-z))
-    scatter = chi2 / max(len(light) - 2, 1)
-    return Linearity(
-        float(solution[0]),
-        float(solution[1]),
-        float(np.sqrt(covariance[1, 1] * scatter)),
-        deviation,
-        float(error.mean()),
-        float(np.hypot(np.sqrt(np.sum(std**2)) / len(std), np.mean(folded - error))),
-    )
 
 
 # --- a recording set ---------------------------------------------------------------------------------------------------
@@ -555,7 +243,7 @@ def _dark_levels(
     levels = []
     groups = _groups(darks, lambda dark: (dark.exposure_s, _rounded(dark.temperature_c)))
     for group in sorted(groups, key=lambda group: -group[0].exposure_s):
-        stack = _Stack(camera.cfa, camera.saturation_dn, bad)
+        stack = Stack(camera.cfa, camera.saturation_dn, bad)
         for dark in group:
             stack.add(recordings.frame(dark))
         if bad is None and stack.mean is not None:
@@ -632,7 +320,7 @@ class _Evaluation:
         known = np.array(stds)
         if np.isnan(known).any():
             known = np.where(np.isnan(known), np.nanmax(known) if np.isfinite(known).any() else 1.0, known)
-        frame_std = known * np.sqrt(_inflation(excess, freedom))
+        frame_std = known * np.sqrt(inflation(excess, freedom))
         return np.array(means), frame_std / np.sqrt([level.repeats for level in levels])
 
     def _dark_lines(self) -> dict[str | None, DarkLine]:
@@ -789,7 +477,7 @@ class _Evaluation:
         gradient[0] = -noise / t.gain**2
         gradient[2:] = weight / (2.0 * noise * t.gain)
         inflated = t.covariance.copy()
-        inflated[2:, 2:] *= _inflation(between, count - 1)
+        inflated[2:, 2:] *= inflation(between, count - 1)
         return noise / t.gain, float(np.sqrt(gradient @ inflated @ gradient))
 
     def _quotient(self, value: float, std: float) -> tuple[float, float]:
@@ -882,7 +570,7 @@ class _Evaluation:
         weight = 1.0 / np.maximum(np.array(stds), 1e-9) ** 2
         value = float(np.sum(weight * values) / weight.sum())
         chi2 = float(np.sum(weight * (np.array(values) - value) ** 2))
-        return value, float(np.sqrt(_inflation(chi2, len(values) - 1) / weight.sum()))
+        return value, float(np.sqrt(inflation(chi2, len(values) - 1) / weight.sum()))
 
     def _full_well(self) -> tuple[float | None, float | None]:
         seen = [(value, name) for name, value in self.saturation_seen.items() if value is not None]
@@ -995,7 +683,7 @@ class _Evaluation:
                 continue
             light, signal, std = self._response(name, levels)
             basis = np.polynomial.legendre.legvander(2.0 * (light - light.min()) / np.ptp(light) - 1.0, 3)
-            solution, _, _ = _least_squares(basis, signal, std)
+            solution, _, _ = least_squares(basis, signal, std)
             rests.append(np.sqrt(np.sum((signal - basis @ solution) ** 2) / (len(levels) - 4)))
             noises.append(np.sqrt(np.mean(std**2)))
         if rests and np.mean(rests) > 4.0 * np.mean(noises):

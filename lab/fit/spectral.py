@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg, optimize
 
 from lab.errors import NotDetermined
-from lab.fit.noise import DarkLine, dark_line
+from lab.fit.lines import DarkLine, dark_line
 from lab.recording import Capture, Flat, RecordingSet
 from lab.results import NoiseFit, SpectralFit
 from sim.camera import Side

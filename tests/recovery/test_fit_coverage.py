@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.fit.noise import Level, level_statistics, noise_fit
+from lab.fit.levels import Level, level_statistics
+from lab.fit.noise import noise_fit
 from lab.fit.spectral import estimate_sensitivity
 from lab.recording import Camera
 from lab.results import NoiseFit

@@ -10,17 +10,9 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.noise import (
-    Level,
-    dark_line,
-    defective_pixels,
-    fit_noise,
-    fit_transfer,
-    level_statistics,
-    linearity,
-    noise_fit,
-    shading,
-)
+from lab.fit.levels import Level, defective_pixels, level_statistics, shading
+from lab.fit.lines import dark_line, linearity
+from lab.fit.noise import fit_noise, fit_transfer, noise_fit
 from lab.importers.emva1288 import read_emva1288
 from lab.recording import Camera, Manifest, RecordingSet, read
 from lab.results import NoiseFit

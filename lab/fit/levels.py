@@ -1,0 +1,489 @@
+"""What the noise fits need of the repeats of one level: means, temporal and spatial variances, neighbours' covariances.
+
+Repeats are taken one after the other and not kept. Each frame is compared with the mean of those before it, plane by plane,
+after the difference of the two planes' means has been taken out (Welford's recursion): a lamp that drifts between repeats is no
+temporal noise then. That costs one degree of freedom of a plane's N for each frame, as EMVA 1288 does it with two frames.
+"""
+
+# mypy: disallow-untyped-decorators=False
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.camera import Cfa
+from sim.sensor.mosaic import planes, step
+from sim.spectrum import FloatArray
+
+DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
+SHADING_DEGREE = 6
+
+F = TypeVar("F", bound=np.floating[Any])
+Float32Array = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+
+# --- results -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SpatialVariance:
+    """Variance over the pixels of a mean frame (rows x cols; EMVA: M x N), split; DN^2, less the temporal share.
+
+    `rows`, `columns`, `pixels`: of what a row has in common, a column, and what is the pixel's own; they sum to `total`.
+    """
+
+    total: float
+    total_std: float
+    rows: float
+    rows_std: float
+    columns: float
+    columns_std: float
+    pixels: float
+    pixels_std: float
+
+    @classmethod
+    def split(
+        cls, total: float, rows_mean: float, columns_mean: float, shape: tuple[int, int], share: float, share_std: float
+    ) -> SpatialVariance:
+        """EMVA 1288 release 4.0: from the variances of the mean frame (`total`), of its rows' averages (`rows_mean`, s^2_rav) and
+        of its columns' (`columns_mean`, s^2_cav), all as measured; `share`: the temporal variance over L that is in `total`.
+
+        s^2 = s_row^2 + s_col^2 + s_pixel^2, s_rav^2 = s_row^2 + s_pixel^2 / N, s_cav^2 = s_col^2 + s_pixel^2 / M, so
+        s_pixel^2 = M N / (M N - M - N) (s^2 - s_cav^2 - s_rav^2). Uncertainties: of normal patterns.
+        """
+        m, n = shape
+        pixels = m * n / (m * n - m - n) * (total - columns_mean - rows_mean)
+        rows, columns = rows_mean - pixels / n, columns_mean - pixels / m
+        pixels_std = max(pixels, 0.0) * np.sqrt(2.0 / (m * n))
+        rows_std, columns_std = rows_mean * np.sqrt(2.0 / (m - 1)), columns_mean * np.sqrt(2.0 / (n - 1))
+        # The average over the pixels has no uncertainty of its own here: it is of these pixels. What is uncertain is how
+        # far this draw of rows, columns and pixels stands for the camera.
+        return cls(
+            total=total - share,
+            total_std=float(np.sqrt(pixels_std**2 + rows_std**2 + columns_std**2 + share_std**2)),
+            rows=rows,
+            rows_std=float(rows_std),
+            columns=columns,
+            columns_std=float(columns_std),
+            pixels=pixels - share,
+            pixels_std=float(np.hypot(pixels_std, share_std)),
+        )
+
+
+@dataclass(frozen=True)
+class PlaneStatistics:
+    """One plane of the mosaic over the repeats of one level; DN and DN^2, of pixels that aren't defects.
+
+    `temporal_variance` is NaN with a single repeat. `spatial_variance` is that of the mean frame less the temporal share,
+    `pattern_variance` the same after shading has been taken out. `every_pixel` and `temporal_variance_of_all` count defects,
+    too, as EMVA 1288 does; `pattern` is the split after shading. `adjacent_covariance` and `diagonal_covariance`: temporal, of a
+    pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of whatever plane).
+    """
+
+    pixels: int
+    mean: float
+    frame_means: tuple[float, ...]
+    temporal_variance: float
+    temporal_variance_std: float
+    spatial_variance: float
+    spatial_variance_std: float
+    pattern_variance: float
+    pattern_variance_std: float
+    defects: int
+    clipped_share: float
+    piled_share: float
+    zero_share: float
+    highest: float
+    shape: tuple[int, int] = (0, 0)
+    mean_of_all: float = np.nan
+    temporal_variance_of_all: float = np.nan
+    every_pixel: SpatialVariance | None = None
+    pattern: SpatialVariance | None = None
+    adjacent_covariance: float = np.nan
+    diagonal_covariance: float = np.nan
+    covariance_std: float = np.nan
+
+    @property
+    def repeats(self) -> int:
+        return len(self.frame_means)
+
+    @property
+    def mean_std(self) -> float:
+        """Standard uncertainty of `mean` from the pixels' temporal noise."""
+        return float(np.sqrt(self.temporal_variance / (self.pixels * self.repeats)))
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of light (0: dark): its setting and the statistics of its planes. `light` is proportional to the photons
+    among the levels with the same `lamp`."""
+
+    exposure_s: float
+    light: float
+    lamp: Hashable
+    plane: dict[str, PlaneStatistics]
+    temperature_c: float | None = None
+
+    @property
+    def repeats(self) -> int:
+        return next(iter(self.plane.values())).repeats
+
+
+# --- smooth parts and defects ------------------------------------------------------------------------------------------
+
+
+def _shading_factors(image: NDArray[F], degree: int) -> tuple[NDArray[F], NDArray[F]]:
+    """The smooth surface as a product (rows, k) @ (k, cols), in the image's own precision."""
+    rows, cols = image.shape
+    # Blocks as small as leaves the separable least squares cheap; a degree needs a few blocks to stand on.
+    counts = [int(np.clip(size // 8, 1, 32)) for size in (rows, cols)]
+    block = rows // counts[0], cols // counts[1]
+    inner = image[: counts[0] * block[0], : counts[1] * block[1]]
+    means = inner.reshape(counts[0], block[0], counts[1], block[1]).mean(axis=(1, 3), dtype=float)
+    full, small = [], []
+    for size, count, width in zip((rows, cols), counts, block, strict=True):
+        order = min(degree, max(count // 3, 0))
+        at = 2.0 * (np.arange(size) + 0.5) / size - 1.0
+        basis = np.polynomial.legendre.legvander(at, order)
+        full.append(basis)
+        small.append(basis[: count * width].reshape(count, width, -1).mean(axis=1))
+    coefficients = np.linalg.pinv(small[0]) @ means @ np.linalg.pinv(small[1]).T
+    # In the image's own precision: the surface's error is then the image's.
+    return (full[0] @ coefficients).astype(image.dtype), np.ascontiguousarray(full[1].T.astype(image.dtype))
+
+
+def shading(image: NDArray[F], degree: int = SHADING_DEGREE) -> NDArray[F]:
+    """Smooth surface of an image (rows, cols): the polynomial of `degree` in rows and in columns nearest to its block means."""
+    down, across = _shading_factors(image, degree)
+    return down @ across
+
+
+def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> BoolArray:
+    """Pixels of a mean frame that stand out of their plane by more than 8 (robust) standard deviations."""
+    bad = np.zeros(image.shape, bool)
+    for name, plane in planes(image, cfa).items():
+        rest = plane - np.median(plane)
+        for _ in range(2):  # glow widens the first scale, and hot pixels bend the first surface
+            # A quantised plane can have most pixels on one value; a tenth of a DN is the least scale.
+            limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), 0.1)
+            rest = rest - shading(np.clip(rest, -limit, limit))
+        limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), 0.1)
+        planes(bad, cfa)[name][...] = np.abs(rest) > limit
+    return bad
+
+
+# --- repeats -----------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def _take(
+    frame: NDArray[np.uint16], bad: BoolArray, period: int, white: float
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """By phase of the mosaic: sums of a frame over all pixels and over the good ones (2, phases); the highest code, how often it
+    and 0 come, how many pixels are good (4, phases)."""
+    phases = period * period
+    sums = np.zeros((2, phases))
+    counts = np.zeros((4, phases), np.int64)
+    every = np.zeros(phases, np.int64)
+    some_bad = bad.size > 0
+    for i in range(frame.shape[0]):
+        for j in range(frame.shape[1]):
+            p = (i % period) * period + j % period
+            value = np.int64(frame[i, j])
+            every[p] += value
+            if value > counts[0, p]:
+                counts[0, p] = value
+                counts[1, p] = 1
+            elif value == counts[0, p]:
+                counts[1, p] += 1
+            if value == 0:
+                counts[2, p] += 1
+            if some_bad and bad[i, j]:
+                sums[1, p] -= value
+                counts[3, p] -= 1
+    for p in range(phases):
+        sums[0, p] = every[p]
+        sums[1, p] += every[p]
+    return sums, counts, every
+
+
+@njit(cache=True)
+def _compare(
+    frame: NDArray[np.uint16],
+    mean: Float32Array,
+    scatter: Float32Array,
+    shift: FloatArray,
+    bad: BoolArray,
+    period: int,
+    count: int,
+    products: FloatArray,
+    pairs: NDArray[np.int64],
+) -> None:
+    """Take frame number `count` (from 2) into mean and scatter. `shift`: by how much each phase's mean lies above that of `mean`.
+    `products` and `pairs` (2, phases): sums of neighbours' products, adjacent and diagonal, and how many."""
+    rows, cols = frame.shape
+    share, inverse = np.float32((count - 1) / count), np.float32(1.0 / count)
+    above, row = np.zeros(cols, np.float32), np.zeros(cols, np.float32)
+    some_bad = bad.size > 0
+    for i in range(rows):
+        first = (i % period) * period
+        for j in range(cols):
+            delta = np.float32(frame[i, j]) - mean[i, j] - np.float32(shift[first + j % period])
+            mean[i, j] += delta * inverse
+            scatter[i, j] += delta * delta * share
+            row[j] = np.float32(0.0) if some_bad and bad[i, j] else delta
+        # Sums of one row in the pixels' own precision, of the frame in double: fast, and exact enough (1e-6).
+        for offset in range(period):
+            here, there = first + offset, first + (offset + 1) % period
+            beside = np.float32(0.0)
+            for j in range(offset, cols - 1, period):
+                beside += row[j] * row[j + 1]
+            number = len(range(offset, cols - 1, period))
+            for p in (here, there):
+                products[0, p] += share * beside
+                pairs[0, p] += number
+            if i == 0:
+                continue
+            upper = ((i - 1) % period) * period
+            straight = np.float32(0.0)
+            for j in range(offset, cols, period):
+                straight += row[j] * above[j]
+            for p in (here, upper + offset):
+                products[0, p] += share * straight
+                pairs[0, p] += len(range(offset, cols, period))
+            left, right = np.float32(0.0), np.float32(0.0)
+            for j in range(offset, cols - 1, period):
+                right += row[j] * above[j + 1]
+                left += row[j + 1] * above[j]
+            other = upper + (offset + 1) % period
+            for p in (here, other):
+                products[1, p] += share * right
+                pairs[1, p] += number
+            for p in (there, upper + offset):
+                products[1, p] += share * left
+                pairs[1, p] += number
+        above, row = row, above
+
+
+@njit(cache=True)
+def _pattern_sums(
+    image: Float32Array, surface: Float32Array, bad: BoolArray, mean: float, good_mean: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of image - mean over all pixels: sum of squares, rows' and columns' sums; of image - good_mean over good pixels: sum, sum of
+    squares; of image - surface over good pixels: sum, sum of squares, largest modulus, and rows' and columns' sums."""
+    rows, cols = image.shape
+    sums = np.zeros(6)
+    row_sums, col_sums, row_rest, col_rest = np.zeros(rows), np.zeros(cols), np.zeros(rows), np.zeros(cols)
+    some_bad = bad.size > 0
+    for i in range(rows):
+        for j in range(cols):
+            value = float(image[i, j])
+            from_mean = value - mean
+            sums[0] += from_mean * from_mean
+            row_sums[i] += from_mean
+            col_sums[j] += from_mean
+            if some_bad and bad[i, j]:
+                continue
+            good = value - good_mean
+            sums[1] += good
+            sums[2] += good * good
+            rest = value - surface[i, j]
+            sums[3] += rest
+            sums[4] += rest * rest
+            sums[5] = max(sums[5], abs(rest))
+            row_rest[i] += rest
+            col_rest[j] += rest
+    return sums, row_sums, col_sums, row_rest, col_rest
+
+
+_NONE = np.zeros((0, 0), bool)
+
+
+class Stack:
+    """Repeats of one level, taken one after the other: `mean` and `scatter` (sum of squares over the repeats) by pixel, and what
+    `statistics` makes of them. `bad`: pixels to leave out (rows, cols)."""
+
+    def __init__(self, cfa: Cfa, white_dn: float, bad: BoolArray | None) -> None:
+        self.cfa, self.white_dn = cfa, white_dn
+        self.period = step(cfa)
+        self.bad = bad if bad is not None and bad.any() else None
+        self.count = 0
+        self.mean: Float32Array | None = None
+        self.scatter: Float32Array | None = None
+        self._phases: dict[str, int] = {}
+        self._frame_means: list[FloatArray] = []
+        self._means_of_all: list[FloatArray] = []
+        self._shares: list[FloatArray] = []
+
+    def add(self, frame: NDArray[np.integer[Any]]) -> None:
+        frame = np.ascontiguousarray(frame, np.uint16)
+        bad = _NONE if self.bad is None else self.bad
+        sums, counts, _ = _take(frame, bad, self.period, self.white_dn)
+        if self.mean is None:
+            rows, cols = frame.shape
+            labels = np.arange(self.period**2).reshape(self.period, self.period)
+            tiled = np.tile(labels, (rows // self.period + 1, cols // self.period + 1))[:rows, :cols]
+            self._phases = {name: int(plane[0, 0]) for name, plane in planes(tiled, self.cfa).items()}
+            self._sizes = np.array(
+                [tiled[p // self.period :: self.period, p % self.period :: self.period].size for p in labels.ravel()]
+            )
+            self._good = self._sizes + counts[3]
+            self.products = np.zeros((2, self.period**2))
+            self.pairs = np.zeros((2, self.period**2), np.int64)
+        means = sums[1] / np.maximum(self._good, 1)
+        highest, top, zero = counts[0].astype(float), counts[1] / self._sizes, counts[2] / self._sizes
+        self._shares.append(
+            np.stack([np.where(highest >= self.white_dn, top, 0.0), top, np.where(means < 50, zero, 0.0), highest])
+        )
+        self._frame_means.append(means)
+        self._means_of_all.append(sums[0] / self._sizes)
+        self.count += 1
+        if self.mean is None:
+            self.mean = frame.astype(np.float32)
+            return
+        if self.scatter is None:
+            self.scatter = np.zeros_like(self.mean)
+        # The mean frame keeps the first one's plane means: only its pattern is used.
+        shift = means - self._frame_means[0]
+        _compare(frame, self.mean, self.scatter, shift, bad, self.period, self.count, self.products, self.pairs)
+
+    def statistics(self) -> dict[str, PlaneStatistics]:
+        if self.mean is None:
+            raise ValueError("a level has no frames: give one at least")
+        scatter = None if self.scatter is None else self._temporal()
+        return {name: self._plane(name, scatter) for name in self._phases}
+
+    def _temporal(self) -> dict[str, tuple[float, float, float]]:
+        """Plane -> temporal variance of the good pixels, its standard uncertainty, and the variance of all."""
+        assert self.scatter is not None
+        freedom, found = self.count - 1, {}
+        for name, plane in planes(self.scatter, self.cfa).items():
+            by_row = plane.sum(axis=1, dtype=np.float64) / freedom
+            every = float(by_row.sum())
+            good = np.full(len(by_row), float(plane.shape[1]))
+            if self.bad is not None:
+                bad = planes(self.bad, self.cfa)[name]
+                good -= bad.sum(axis=1)
+                by_row = by_row - np.where(bad, plane, np.float32(0)).sum(axis=1, dtype=np.float64) / freedom
+            pixels = int(good.sum())
+            # One degree of freedom of the plane goes with each frame's mean.
+            variance = float(by_row.sum()) / max(pixels - 1, 1)
+            found[name] = (
+                variance,
+                _variance_std(by_row / np.maximum(good, 1.0), variance, pixels, self.count),
+                every / max(plane.size - 1, 1),
+            )
+        return found
+
+    def _plane(self, name: str, temporal: dict[str, tuple[float, float, float]] | None) -> PlaneStatistics:
+        assert self.mean is not None
+        phase, repeats = self._phases[name], self.count
+        image = planes(self.mean, self.cfa)[name]
+        bad = _NONE if self.bad is None else planes(self.bad, self.cfa)[name]
+        pixels, rows, cols = int(self._good[phase]), *image.shape
+        variance, variance_std, of_all = temporal[name] if temporal is not None else (np.nan, np.nan, np.nan)
+        down, across = _shading_factors(image, SHADING_DEGREE)
+        surface = down @ across
+        first = self._frame_means[0][phase], self._means_of_all[0][phase]
+        sums, row_sums, col_sums, row_rest, col_rest = _pattern_sums(
+            image, surface, bad, float(first[1]), float(first[0])
+        )
+        share, share_std = variance / repeats, variance_std / repeats
+        every = SpatialVariance.split(
+            (sums[0] - row_sums.sum() ** 2 / image.size) / (image.size - 1),
+            float(np.var(row_sums / cols)),
+            float(np.var(col_sums / rows)),
+            (rows, cols),
+            of_all / repeats,
+            share_std,
+        )
+        spatial = (sums[2] - sums[1] ** 2 / pixels) / (pixels - 1)
+        pattern, outliers = (sums[4] - sums[3] ** 2 / pixels) / (pixels - 1), 0
+        good = (cols, rows) if bad.size == 0 else (cols - bad.sum(axis=1), rows - bad.sum(axis=0))
+        rows_mean, cols_mean = (
+            float(np.var(rest / np.maximum(number, 1))) for rest, number in zip((row_rest, col_rest), good, strict=True)
+        )
+        # The largest of some 10^5 normal pixels are at 5 standard deviations; only then is a closer look worth its time.
+        if pattern > 0 and sums[5] > DEFECT_SIGMA * np.sqrt(pattern):
+            rest = image - surface
+            values = rest[~bad] if bad.size else rest.ravel()
+            limit = DEFECT_SIGMA * 1.4826 * float(np.median(np.abs(values)))
+            inside = np.abs(rest) <= limit
+            if bad.size:
+                inside &= ~bad
+            outliers = pixels - int(np.count_nonzero(inside))
+            pattern = float(np.var(rest[inside], dtype=np.float64, ddof=1))
+            clean = np.where(inside, rest, np.float32(0))
+            rows_mean = float(np.var(clean.sum(axis=1, dtype=float) / np.maximum(inside.sum(axis=1), 1)))
+            cols_mean = float(np.var(clean.sum(axis=0, dtype=float) / np.maximum(inside.sum(axis=0), 1)))
+        split = SpatialVariance.split(pattern, rows_mean, cols_mean, (rows, cols), share, share_std)
+        shares = np.mean([share[:3, phase] for share in self._shares], axis=0)
+        adjacent, diagonal, covariance_std = self._covariances(phase, variance)
+        return PlaneStatistics(
+            pixels=pixels,
+            mean=float(np.mean([means[phase] for means in self._frame_means])),
+            frame_means=tuple(float(means[phase]) for means in self._frame_means),
+            temporal_variance=variance,
+            temporal_variance_std=variance_std,
+            spatial_variance=spatial - share,
+            spatial_variance_std=float(np.hypot(spatial * np.sqrt(2.0 / pixels), share_std)),
+            pattern_variance=pattern - share,
+            pattern_variance_std=split.total_std,
+            defects=image.size - pixels + outliers,
+            clipped_share=float(shares[0]),
+            piled_share=float(shares[1]),
+            zero_share=float(shares[2]),
+            highest=max(float(share[3, phase]) for share in self._shares),
+            shape=(rows, cols),
+            mean_of_all=float(np.mean([means[phase] for means in self._means_of_all])),
+            temporal_variance_of_all=of_all,
+            every_pixel=every,
+            pattern=split,
+            adjacent_covariance=adjacent,
+            diagonal_covariance=diagonal,
+            covariance_std=covariance_std,
+        )
+
+    def _covariances(self, phase: int, variance: float) -> tuple[float, float, float]:
+        """Adjacent and diagonal covariance of a phase's pixels with a neighbour, and the standard uncertainty of either."""
+        freedom = self.count - 1
+        if freedom < 1:
+            return np.nan, np.nan, np.nan
+        # `pairs` counts each once a frame, in a MONO sensor from both its ends, which see the same noise.
+        pairs = self.pairs[:, phase] / freedom
+        adjacent, diagonal = self.products[:, phase] / freedom / np.maximum(pairs, 1)
+        independent = pairs[0] / (2.0 if self.period == 1 else 1.0)
+        return float(adjacent), float(diagonal), float(variance / np.sqrt(max(independent, 1.0) * freedom))
+
+
+def _variance_std(by_row: FloatArray, variance: float, pixels: int, repeats: int) -> float:
+    """Standard uncertainty of a mean temporal variance: that of normal noise, or what its rows' means (`by_row`) say where they
+    scatter more (row noise makes the pixels of a row go together)."""
+    normal = variance * np.sqrt(2.0 / (pixels * (repeats - 1)))
+    rows = len(by_row)
+    if rows < 32:
+        return float(normal)
+    # Neighbouring rows see the same shading, so their differences are noise alone.
+    from_rows = float(np.sqrt(np.mean(np.diff(by_row) ** 2) / 2.0 / rows))
+    # That estimate is itself uncertain by sqrt(3 / rows) / 2: believe it where it is clearly larger.
+    return from_rows if from_rows > normal * (1.0 + 2.0 * np.sqrt(3.0 / rows)) else float(normal)
+
+
+def level_statistics(
+    frames: Iterable[NDArray[np.integer[Any]]], cfa: Cfa, white_dn: float, bad: BoolArray | None = None
+) -> dict[str, PlaneStatistics]:
+    """Statistics of the repeats of one level, by plane (`R`, `G1`, `G2`, `B` or `Y`).
+
+    `frames`: (rows, cols) DN, taken one after the other and not kept. `bad`: pixels to leave out. Temporal variance: the mean
+    over pixels of the variance over repeats after each frame's mean has been taken out.
+    """
+    stack = Stack(cfa, white_dn, bad)
+    for frame in frames:
+        stack.add(frame)
+    return stack.statistics()
