@@ -42,9 +42,188 @@ class NoiseFit(Frozen):
     quantum_efficiency: float | None = None
     quantum_efficiency_std: float | None = None
     quantum_efficiency_wavelength_nm: float | None = None
+    #: Slope of the variance at zero signal, of the curve. `conversion_gain_dn_per_e` is this, or EMVA's line where the curve's
+    #: bend isn't established against the scatter of the levels.
+    conversion_gain_at_zero_dn_per_e: float | None = None
+    conversion_gain_at_zero_dn_per_e_std: float | None = None
+    #: Scatter of the temporal variances about their curve beyond sampling, percent of the variance; 0: none is seen.
+    variance_model_error_percent: float | None = None
+    #: At saturation, in percent: departure of the response from its slope at zero (from means); of the variance from its line at
+    #: zero; the variance that is missing beyond what the response takes (brighter-fatter); the share of the shot noise's variance
+    #: that a pixel has in common with its eight neighbours (where brighter-fatter puts what is missing).
+    response_bend_percent: float | None = None
+    response_bend_percent_std: float | None = None
+    variance_bend_percent: float | None = None
+    variance_bend_percent_std: float | None = None
+    brighter_fatter_percent: float | None = None
+    brighter_fatter_percent_std: float | None = None
+    neighbour_covariance_percent: float | None = None
+    neighbour_covariance_percent_std: float | None = None
+    #: From the growth of the dark variance with exposure.
+    dark_current_from_variance_e_per_s: float | None = None
+    dark_current_from_variance_e_per_s_std: float | None = None
+    dark_current_temperature: DarkCurrentTemperature | None = None
+    read_noise_distribution: ReadNoiseDistribution | None = None
+    defects: PixelDefects | None = None
+    channels: dict[str, ChannelNoise] = {}
+    #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
+    emva1288: dict[str, Emva1288] = {}
     photon_transfer: PhotonTransfer | None = None
     #: What the recordings show of the rig, in sentences ("the lamp drifted by ...").
     remarks: tuple[str, ...] = ()
+
+
+class ChannelNoise(Frozen):
+    """What `NoiseFit` says of the sensor, of one colour channel alone."""
+
+    conversion_gain_dn_per_e: float | None = None
+    conversion_gain_dn_per_e_std: float | None = None
+    read_noise_e: float | None = None
+    read_noise_e_std: float | None = None
+    black_level_dn: float | None = None
+    black_level_dn_std: float | None = None
+    dark_current_e_per_s: float | None = None
+    dark_current_e_per_s_std: float | None = None
+    dsnu_e: float | None = None
+    dsnu_e_std: float | None = None
+    prnu_percent: float | None = None
+    prnu_percent_std: float | None = None
+    full_well_e: float | None = None
+    full_well_e_std: float | None = None
+    linearity_error_percent: float | None = None
+    linearity_error_percent_std: float | None = None
+
+
+class DarkCurrentTemperature(Frozen):
+    """Dark current at each temperature, and the laws through them: I = I_ref exp(-E / k (1/T - 1/T_ref)) (Arrhenius), and
+    EMVA's I = I_ref 2^((T - T_ref) / T_d)."""
+
+    temperature_c: tuple[float, ...]
+    dark_current_e_per_s: tuple[float, ...]
+    dark_current_e_per_s_std: tuple[float, ...]
+    doubling_temperature_c: float | None = None
+    doubling_temperature_c_std: float | None = None
+    activation_energy_ev: float | None = None
+    activation_energy_ev_std: float | None = None
+    reference_temperature_c: float | None = None
+    reference_current_e_per_s: float | None = None
+    reference_current_e_per_s_std: float | None = None
+
+
+class ReadNoiseDistribution(Frozen):
+    """Temporal noise of single pixels in the dark, over `degrees_of_freedom` a pixel. `spread_percent`: standard deviation of
+    the pixels' true variances over their mean, what the few repeats scatter taken out. `noisy_pixels`: beyond what chance gives
+    any of them with 1 %."""
+
+    degrees_of_freedom: int
+    rms_e: float
+    median_e: float
+    percentile_95_e: float
+    percentile_99_e: float
+    spread_percent: float
+    spread_percent_std: float
+    noisy_pixels: int
+    noise_e: tuple[float, ...]  # edges of the histogram's bins
+    pixels: tuple[int, ...]
+
+
+class Defect(Frozen):
+    row: int
+    col: int
+    dark_dn: float  # above its plane, in the longest dark
+    dark_current_e_per_s: float | None = None  # above its plane
+
+
+class PixelDefects(Frozen):
+    """Pixels that stand out of their plane by more than 8 standard deviations: `hot` in the longest dark (above), `cold` (below).
+    They are left out of everything but EMVA's own figures. `listed`: the strongest."""
+
+    exposure_s: float
+    hot: int
+    cold: int
+    listed: tuple[Defect, ...] = ()
+
+
+class Emva1288(Frozen):
+    """EMVA Standard 1288, release 4.0 (linear), of one plane: by its definitions, all pixels counted, no shading taken out."""
+
+    #: Slope of the signal against photons, through the origin, to 70 % of saturation.
+    responsivity_dn_per_photon: float | None = None
+    responsivity_dn_per_photon_std: float | None = None
+    quantum_efficiency: float | None = None
+    quantum_efficiency_std: float | None = None
+    wavelength_nm: float | None = None
+    #: Slope of the temporal variance against the signal, both less dark, through the origin, to 70 % of saturation.
+    system_gain_dn_per_e: float
+    system_gain_dn_per_e_std: float
+    #: At zero exposure; `None` below 0.24 DN^2, where rounding hides it: then the limit 0.40 / K stands in `_limit_e`.
+    temporal_dark_noise_dn: float | None = None
+    temporal_dark_noise_dn_std: float | None = None
+    temporal_dark_noise_e: float | None = None
+    temporal_dark_noise_e_std: float | None = None
+    temporal_dark_noise_limit_e: float | None = None
+    #: Signal at which SNR is 1: sqrt(sigma_y.dark^2 / K^2 + 1/4) + 1/2.
+    sensitivity_threshold_e: float | None = None
+    sensitivity_threshold_e_std: float | None = None
+    sensitivity_threshold_photons: float | None = None
+    sensitivity_threshold_photons_std: float | None = None
+    #: At the level of the largest temporal variance.
+    saturation_capacity_e: float | None = None
+    saturation_capacity_e_std: float | None = None
+    saturation_capacity_photons: float | None = None
+    saturation_capacity_photons_std: float | None = None
+    snr_max: float | None = None
+    snr_max_std: float | None = None
+    dynamic_range: float | None = None
+    dynamic_range_std: float | None = None
+    linearity_error_percent: float | None = None
+    linearity_error_percent_std: float | None = None
+    dsnu_e: float | None = None
+    dsnu_e_std: float | None = None
+    dsnu_row_e: float | None = None
+    dsnu_row_e_std: float | None = None
+    dsnu_column_e: float | None = None
+    dsnu_column_e_std: float | None = None
+    dsnu_pixel_e: float | None = None
+    dsnu_pixel_e_std: float | None = None
+    prnu_percent: float | None = None
+    prnu_percent_std: float | None = None
+    prnu_row_percent: float | None = None
+    prnu_row_percent_std: float | None = None
+    prnu_column_percent: float | None = None
+    prnu_column_percent_std: float | None = None
+    prnu_pixel_percent: float | None = None
+    prnu_pixel_percent_std: float | None = None
+    dark_current_from_mean_e_per_s: float | None = None
+    dark_current_from_mean_e_per_s_std: float | None = None
+    dark_current_from_variance_e_per_s: float | None = None
+    dark_current_from_variance_e_per_s_std: float | None = None
+    points: Emva1288Points
+    #: What isn't given, and why; where the recordings aren't what the standard asks for.
+    remarks: tuple[str, ...] = ()
+
+
+class Emva1288Points(Frozen):
+    """One entry a level; dark values at the level's exposure. `light`: photons a pixel, or exposure (s) where the flats don't
+    state photons (`light_unit`)."""
+
+    light_unit: Literal["photons", "s"]
+    light: tuple[float, ...]
+    exposure_s: tuple[float, ...]
+    mean_dn: tuple[float, ...]
+    variance_dn2: tuple[float, ...]
+    dark_mean_dn: tuple[float, ...]
+    dark_variance_dn2: tuple[float, ...]
+    linearity_deviation_percent: tuple[float | None, ...]
+    dark_exposure_s: tuple[float, ...] = ()
+    dark_exposure_mean_dn: tuple[float, ...] = ()
+    dark_exposure_variance_dn2: tuple[float, ...] = ()
+    #: The pair of stacks that the spatial figures come from, and how many images each has.
+    stack_dark_exposure_s: float | None = None
+    stack_dark_images: int | None = None
+    stack_light: float | None = None
+    stack_exposure_s: float | None = None
+    stack_images: int | None = None
 
 
 class PhotonTransfer(Frozen):
