@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, eigh, solve_triangular
 
 from lab.diagnose.evidence import Evidence, Gaussian
 from sim.spectrum import FloatArray
@@ -36,32 +37,50 @@ def discrepancy(evidence: Evidence, model: Gaussian, index: int) -> Discrepancy:
     x = block.position
     channel = np.array([label.channel for label in block.labels])
     condition = np.array([label.condition for label in block.labels])
-    by_channel = (channel[:, None] == channel).astype(float)
-    by_condition = (condition[:, None] == condition).astype(float)
-    kinds = {"shared": np.ones_like(by_channel)}
+    by_channel = np.unique(channel, return_inverse=True)[1]
+    by_condition = np.unique(condition, return_inverse=True)[1]
+    by_both = np.unique(by_condition * len(channel) + by_channel, return_inverse=True)[1]
+    kinds = {"shared": np.zeros_like(by_channel)}
     if len(set(channel)) > 1:
         kinds["by channel"] = by_channel
     if block.measurement == "slanted_edge" and len(set(condition)) > 1:
         kinds["by orientation"] = by_condition
-        kinds["by channel and orientation"] = by_channel * by_condition
+        kinds["by channel and orientation"] = by_both
     if block.measurement in {"chart", "screen"}:
-        kinds = {"by patch": by_condition, "by patch and channel": by_condition * by_channel}
+        kinds = {"by patch": by_condition, "by patch and channel": by_both}
         x = np.zeros_like(x)
-    scale = np.outer(block.scale, block.scale)
-    best = Discrepancy(index, 0.0, 0.0, block.reach, "none", np.zeros_like(scale))
+    lower = cholesky(covariance, lower=True)
+    white = solve_triangular(lower, residual, lower=True)
+    best = Discrepancy(index, 0.0, 0.0, block.reach, "none", np.zeros((len(x), len(x))))
     for reach in (0.5 * block.reach, 1.0 * block.reach, 2.0 * block.reach) if np.ptp(x) > 0 else (block.reach,):
-        smooth = np.exp(-0.5 * ((x[:, None] - x) / reach) ** 2) * scale
+        smooth = _smooth(x, reach) * block.scale[:, None]
         for kind, kin in kinds.items():
-            kernel = smooth * kin
-            # one generalised eigenproblem serves all amplitudes
-            size, vectors = eigh(kernel[np.ix_(seen, seen)], covariance)
-            projected = np.square(vectors.T @ residual)
+            factor = _by_group(smooth, kin)
+            # One eigenproblem of the factor's size, much smaller than the block, serves all amplitudes.
+            table = solve_triangular(lower, factor[seen], lower=True)
+            size, vectors = eigh(table.T @ table)
+            kept = size > 1e-12 * max(float(size[-1]), 1e-300)
+            size = size[kept]
+            projected = np.square(vectors[:, kept].T @ (table.T @ white)) / size
             for amplitude in AMPLITUDES:
-                grown = 1.0 + amplitude**2 * np.maximum(size, 0.0)
+                grown = 1.0 + amplitude**2 * size
                 gain = 0.5 * float(np.sum(projected * (1.0 - 1.0 / grown)) - np.sum(np.log(grown))) - PROCESS_NATS
                 if gain > best.gain:
-                    best = Discrepancy(index, gain, float(amplitude), reach, kind, amplitude**2 * kernel)
+                    best = Discrepancy(index, gain, float(amplitude), reach, kind, amplitude**2 * factor @ factor.T)
     return best
+
+
+def _smooth(x: FloatArray, reach: float) -> FloatArray:
+    """Factor B of the squared-exponential kernel, exp(-(x_i - x_j)^2 / (2 reach^2)) = B B' to 1e-9: few columns, as it is smooth."""
+    place, which = np.unique(x, return_inverse=True)
+    size, vectors = eigh(np.exp(-0.5 * ((place[:, None] - place) / reach) ** 2))
+    kept = size > 1e-10 * size[-1]
+    return np.asarray((vectors[:, kept] * np.sqrt(size[kept]))[which])
+
+
+def _by_group(factor: FloatArray, group: NDArray[np.intp]) -> FloatArray:
+    """The factor's columns once for every group, nil outside it: the process is drawn for each group by itself."""
+    return np.concatenate([np.where((group == g)[:, None], factor, 0.0) for g in range(int(group.max()) + 1)], axis=1)
 
 
 def with_discrepancy(evidence: Evidence, model: Gaussian, found: Discrepancy) -> Gaussian:
