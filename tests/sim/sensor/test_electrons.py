@@ -6,12 +6,12 @@ from scipy import stats
 
 from sim.camera import CameraModel
 from sim.sensor.electrons import (
-    MANY_ELECTRONS,
     FixedPattern,
     ReadOut,
     clipped_moments,
+    coded_moments,
+    dark_current_e_per_s,
     dn_moments,
-    draw_electrons,
     gain_dn_per_e,
     sample_from,
 )
@@ -33,25 +33,30 @@ def test_far_from_the_limits_nothing_changes_to_the_last_bit() -> None:
     assert (mean[0], variance[0]) == (500.1, 33.3)
 
 
-@pytest.mark.parametrize("mean", [0.0, 0.4, 7.0, MANY_ELECTRONS - 0.1, MANY_ELECTRONS, 900.0])
-def test_electrons_are_poisson(mean: float) -> None:
-    drawn = draw_electrons(np.full(400_000, mean), np.random.default_rng(5))
-    n = drawn.size
-    # Standard errors: mean sqrt(m / n); variance sqrt((2 m^2 + m) / n) for Poisson; 4.5 of them.
-    assert drawn.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(mean / n) + 1e-9)
-    assert drawn.var() == pytest.approx(mean, abs=4.5 * np.sqrt((2 * mean**2 + mean) / n) + 1e-9)
-    if mean > 1:
-        # Skewness 1/sqrt(m), its standard error sqrt(6 / n) = 0.004.
-        assert stats.skew(drawn) == pytest.approx(mean**-0.5, abs=0.02)
+@pytest.mark.parametrize("sigma", [0.05, 0.3, 0.9, 1.1, 3.0])
+@pytest.mark.parametrize("mean", [-0.7, 0.0, 0.4, 2.3, 7.5, 19.8, 20.6])
+def test_moments_of_codes(mean: float, sigma: float) -> None:
+    """Against the sum over all codes 0..20 of a normal variable's probabilities."""
+    codes = np.arange(21)
+    up_to = stats.norm(mean, sigma).cdf(codes + 0.5)
+    up_to[-1] = 1.0
+    share = np.diff(up_to, prepend=0.0)
+    found_mean, found_variance = coded_moments(np.array([mean]), np.array([sigma**2]), 20.0)
+    # 1e-3 DN at a limit is what the two terms of Euler and Maclaurin leave.
+    assert found_mean[0] == pytest.approx(share @ codes, abs=1e-3)
+    assert found_variance[0] == pytest.approx(share @ codes**2 - (share @ codes) ** 2, abs=2e-3)
 
 
-def test_the_normal_stand_in_has_poissons_distribution() -> None:
-    """Rounded to whole electrons it has to agree to 1e-3: with 1e6 draws the empirical distribution errs by 1e-3 itself."""
-    mean = MANY_ELECTRONS
-    drawn = np.rint(draw_electrons(np.full(1_000_000, mean), np.random.default_rng(6)))
-    counts = np.arange(30, 110)
-    empirical = np.searchsorted(np.sort(drawn), counts, side="right") / drawn.size
-    assert np.max(np.abs(empirical - stats.poisson(mean).cdf(counts))) < 3e-3
+def test_wide_noise_is_rounded_for_a_twelfth() -> None:
+    mean, variance = coded_moments(np.array([100.3]), np.array([2.0]), 4095.0)
+    assert (mean[0], variance[0]) == (100.3, 2.0 + 1.0 / 12.0)
+
+
+def test_dark_current_doubles(colour_camera: CameraModel) -> None:
+    camera = colour_camera.model_copy(update={"dark_current_doubling_c": 7.0, "dark_current_reference_c": 30.0})
+    assert dark_current_e_per_s(camera) == dark_current_e_per_s(camera, 30.0) == 3.0
+    assert dark_current_e_per_s(camera, 44.0) == pytest.approx(12.0)
+    assert dark_current_e_per_s(colour_camera, 60.0) == 3.0  # no doubling is known
 
 
 @pytest.mark.parametrize("level_e", [0.0, 2.0, 50.0, 3000.0, 10_480.0, 11_500.0])
