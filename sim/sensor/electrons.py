@@ -188,9 +188,9 @@ def dn_moments(
         skewness = electrons / np.maximum(noise, 1e-12) ** 1.5
         mean, variance = clipped_moments(electrons, noise, -np.inf, camera.full_well_e, np.minimum(skewness, 1.0))
     if read_out.response is not None:
-        step = 1e-3 * mean + 1e-3
+        beyond = mean + (1e-3 * mean + 1e-3)
         bent = read_out.response(mean)
-        variance = variance * ((read_out.response(mean + step) - bent) / step) ** 2
+        variance = variance * ((read_out.response(beyond) - bent) / (beyond - mean)) ** 2  # exactly 1 of a straight one
         mean = bent
     mean = mean + read_out.added_e
     if fixed_pattern is not None:
