@@ -8,13 +8,17 @@ go to JSON or TOML and back.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_serializer, model_validator
+from scipy.interpolate import RegularGridInterpolator
+from scipy.special import itj0y0, j0, j1
 
 from sim.optics.diffraction import diffraction_cutoff_cy_per_um, diffraction_otf
+from sim.optics.pupil import Wavefront, noll_order, osa_order, pupil_otf, seidel, zernike
 from sim.optics.table import LensTable
 from sim.parameters import Frozen, Quantity
 from sim.spectrum import FloatArray
@@ -43,11 +47,14 @@ class DiffractionLimited(Frozen):
 
 
 class ZernikePupil(Frozen):
-    """A lens whose circular pupil has a path error (OPD) given by Zernike coefficients, the same in um at all wavelengths.
+    """A lens whose circular pupil has a path error (OPD) given by Zernike coefficients, in um the same at all wavelengths.
 
-    Path error W(rho, phi) = sum_j c_j Z_j, Z_j normalised to an rms of 1 over the pupil, phi from the columns' direction towards
-    the rows'; the phase is 2 pi W / wavelength. `coefficients` begin with the index scheme's first (`noll`: j = 1, piston;
-    `osa`, that is ANSI Z80.28: j = 0, piston), in um, or in waves at `reference_wavelength_nm`.
+    W(rho, phi) = sum_j c_j Z_j(rho, phi), Z_j of rms 1 over the pupil, phi from the columns' direction towards the rows'; the
+    phase is 2 pi W / wavelength. `coefficients` begin with the index scheme's first (`noll`: j = 1; `osa`, that is ANSI Z80.28:
+    j = 0; both piston) and are in um, or in waves at `reference_wavelength_nm`. A W that rises along x moves the image along +x.
+
+    Colours may differ: at `colour_wavelength_nm` (linear between, held beyond) the sensor lies `focus_shift_um` dz from the
+    focus (axial colour, W = dz / (8 N^2) rho^2 on top), and the image is moved by `image_shift_um` (x, y) (lateral colour).
     """
 
     shift_variant: ClassVar[bool] = False
@@ -58,12 +65,50 @@ class ZernikePupil(Frozen):
     reference_wavelength_nm: Annotated[
         float | None, Quantity("nm", "wavelength of the waves that coefficients are in", lower=100.0, upper=20000.0)
     ] = None
+    colour_wavelength_nm: tuple[float, ...] = ()
+    focus_shift_um: tuple[float, ...] = ()
+    image_shift_um: tuple[tuple[float, float], ...] = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.unit == "waves") != (self.reference_wavelength_nm is not None):
+            raise ValueError(
+                f"coefficients in {self.unit} with a reference wavelength of {self.reference_wavelength_nm} nm: waves need one, um none"
+            )
+        _check_wavelengths(self.colour_wavelength_nm, empty=True)
+        for name, given in (("focus_shift_um", self.focus_shift_um), ("image_shift_um", self.image_shift_um)):
+            if given and len(given) != len(self.colour_wavelength_nm):
+                raise ValueError(
+                    f"{name} has {len(given)} entries for {len(self.colour_wavelength_nm)} of colour_wavelength_nm: give one a wavelength"
+                )
+        return self
+
+    @cached_property
+    def _base(self) -> Wavefront:
+        order, first = (noll_order, 1) if self.index == "noll" else (osa_order, 0)
+        scale = 1.0 if self.reference_wavelength_nm is None else self.reference_wavelength_nm * 1e-3
+        total = Wavefront(())
+        for j, coefficient in enumerate(self.coefficients, first):
+            if coefficient != 0.0:
+                total += zernike(*order(j)).scaled(coefficient * scale)
+        return total
+
+    def wavefront(self, wavelength_nm: float, f_number: float) -> Wavefront:
+        """Path error over the pupil at one wavelength, colours' focus and place with it."""
+        total = self._base
+        if self.focus_shift_um:
+            shift = float(np.interp(wavelength_nm, self.colour_wavelength_nm, self.focus_shift_um))
+            total += seidel(defocus_um=shift / (8.0 * f_number**2))
+        if self.image_shift_um:
+            x, y = (float(np.interp(wavelength_nm, self.colour_wavelength_nm, along)) for along in zip(*self.image_shift_um, strict=True))  # fmt: skip
+            total = total.plus({(1, 0): x / (2.0 * f_number), (0, 1): y / (2.0 * f_number)})
+        return total
 
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
     ) -> FloatArray | ComplexArray:
-        """OTF by exact autocorrelation of the pupil; complex, of the broadcast shape of the frequencies."""
-        raise NotImplementedError
+        """OTF by autocorrelation of the pupil (`sim.optics.pupil`), of the broadcast shape of the frequencies."""
+        return pupil_otf(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, self.wavefront(wavelength_nm, f_number))
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """Frequency beyond which nothing is passed: 1 / (wavelength f_number)."""
@@ -73,10 +118,10 @@ class ZernikePupil(Frozen):
 class MeasuredPsf(Frozen):
     """A point spread function of the lens alone (without the pixel's aperture), by samples of a band-limited curve.
 
-    `psf` is (wavelengths, rows, columns), or (1, rows, columns) for one that stands for all wavelengths; light a sample, sum 1
-    within 1e-3. Rows run down, columns to the right; the light stands in the middle of the window (of sample n/2 - 1/2 each way).
-    Linear between wavelengths, held beyond them. Beyond half a cycle a sample, the transfer is 0: take the pitch no
-    wider than wavelength x f_number / 2, or detail is lost.
+    `psf` is (wavelengths, rows, columns): light a sample, >= 0, sum 1 within 1e-3 at each wavelength. One wavelength stands for
+    all; else linear between, held beyond. Rows run down, columns to the right; the light stands in the middle of the window
+    (at sample (n - 1) / 2 each way). Beyond half a cycle a sample the transfer is 0: a pitch wider than wavelength x f_number / 2
+    loses detail.
     """
 
     shift_variant: ClassVar[bool] = False
@@ -85,15 +130,112 @@ class MeasuredPsf(Frozen):
     psf: tuple[tuple[tuple[float, ...], ...], ...]
     sample_pitch_um: Annotated[float, Quantity("um", "distance of neighbouring samples", lower=1e-3, upper=100.0)]
 
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_wavelengths(self.wavelength_nm)
+        _check_cube("psf", self.psf, len(self.wavelength_nm))
+        for wavelength_nm, samples in zip(self.wavelength_nm, np.array(self.psf), strict=True):
+            if samples.min() < 0:
+                raise ValueError(
+                    f"psf is {samples.min():g} at {wavelength_nm:g} nm, below the limit of 0: subtract no more than the background"
+                )
+            if abs(samples.sum() - 1.0) > SUM_TOLERANCE:
+                raise ValueError(
+                    f"psf adds up to {samples.sum():.6g} at {wavelength_nm:g} nm, which isn't 1 within {SUM_TOLERANCE:g}: divide it by its sum"
+                )
+        return self
+
+    @cached_property
+    def _samples(self) -> FloatArray:
+        cube = np.array(self.psf)
+        cube /= cube.sum(axis=(1, 2), keepdims=True)
+        cube.flags.writeable = False
+        return cube
+
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
     ) -> FloatArray | ComplexArray:
         """Fourier sum of the samples, 1 at f = 0, of the broadcast shape of the frequencies. `f_number` doesn't matter."""
-        raise NotImplementedError
+        samples = np.tensordot(_shares(self.wavelength_nm, wavelength_nm), self._samples, 1)
+        return _fourier_sum(samples, self.sample_pitch_um, fx_cy_per_um, fy_cy_per_um)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """The highest frequency of the samples: half a cycle a sample each way, along the diagonal."""
         return float(np.sqrt(0.5)) / self.sample_pitch_um
+
+
+class MeasuredOtf(Frozen):
+    """An optical transfer function of the lens alone, by samples: linear between frequencies, 0 beyond the highest.
+
+    `modulus` is (wavelengths, fy, fx), 1 at zero frequency within 1e-3; `phase_rad` alike, or empty for none (light moved by d um
+    has the phase -2 pi f d). `frequency_x_cy_per_um` ascends from 0; `frequency_y_cy_per_um` ascends from 0 (alike in all four
+    quadrants, no phase) or through it; where it is empty, the transfer is alike in all directions, `modulus` (wavelengths, 1, f).
+    One wavelength stands for all; else linear between, held beyond.
+    """
+
+    shift_variant: ClassVar[bool] = False
+    kind: Literal["measured_otf"] = "measured_otf"
+    wavelength_nm: tuple[float, ...]
+    frequency_x_cy_per_um: tuple[float, ...]
+    frequency_y_cy_per_um: tuple[float, ...] = ()
+    modulus: tuple[tuple[tuple[float, ...], ...], ...]
+    phase_rad: tuple[tuple[tuple[float, ...], ...], ...] = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_wavelengths(self.wavelength_nm)
+        x, y = np.array(self.frequency_x_cy_per_um), np.array(self.frequency_y_cy_per_um)
+        if x.size < 2 or x[0] != 0.0 or np.any(np.diff(x) <= 0) or np.any(np.diff(y) <= 0) or 0.0 not in [*y, *([0.0] if not y.size else [])]:  # fmt: skip
+            raise ValueError(
+                f"frequencies {x[:3].tolist()}... and {y[:3].tolist()}... cy/um have to ascend, from 0 along x and from or through 0 along y: sort them, and give the transfer at 0"
+            )
+        shape = max(y.size, 1), x.size
+        _check_cube("modulus", self.modulus, len(self.wavelength_nm), shape)
+        if self.phase_rad:
+            _check_cube("phase_rad", self.phase_rad, len(self.wavelength_nm), shape)
+            if not y.size or y[0] == 0.0:
+                raise ValueError(
+                    "phase_rad is given with frequencies of one quadrant, where it has no sense: let frequency_y_cy_per_um run through 0"
+                )
+        values = np.array(self.modulus)
+        if values.min() < 0 or values.max() > 1 + SUM_TOLERANCE:
+            raise ValueError(
+                f"modulus runs from {values.min():g} to {values.max():g}, beyond the limits of 0 and 1: divide it by its value at zero frequency"
+            )
+        zero = values[:, self.frequency_y_cy_per_um.index(0.0) if y.size else 0, 0]
+        if np.any(np.abs(zero - 1.0) > SUM_TOLERANCE):
+            worst = zero[np.argmax(np.abs(zero - 1.0))]
+            raise ValueError(
+                f"modulus is {worst:.6g} at zero frequency, which isn't 1 within {SUM_TOLERANCE:g}: divide it by that"
+            )
+        return self
+
+    @cached_property
+    def _samples(self) -> ComplexArray:
+        value = np.array(self.modulus) * np.exp(1j * np.array(self.phase_rad or 0.0))
+        zero = self.frequency_y_cy_per_um.index(0.0) if self.frequency_y_cy_per_um else 0
+        value = value / value[:, zero : zero + 1, :1]
+        value.flags.writeable = False
+        return value
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
+    ) -> FloatArray | ComplexArray:
+        """The samples looked up, of the broadcast shape of the frequencies; the conjugate at -f. `f_number` doesn't matter."""
+        value = np.tensordot(_shares(self.wavelength_nm, wavelength_nm), self._samples, 1)
+        fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
+        x, y = self.frequency_x_cy_per_um, self.frequency_y_cy_per_um
+        if not y:
+            return np.asarray(np.interp(np.hypot(fx, fy), x, np.real(value[0]), right=0.0))
+        turned = np.where(fx < 0, -1.0, 1.0)
+        across = np.abs(fy) if y[0] == 0.0 else fy * turned
+        table = RegularGridInterpolator((y, x), value if self.phase_rad else np.real(value), bounds_error=False, fill_value=0.0)  # fmt: skip
+        found = table(np.stack([across, np.abs(fx)], axis=-1))
+        return np.asarray(np.where(turned < 0, np.conj(found), found) if self.phase_rad else found)
+
+    def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
+        """The highest frequency of the samples."""
+        return float(np.hypot(self.frequency_x_cy_per_um[-1], max(np.abs(self.frequency_y_cy_per_um), default=0.0)))
 
 
 class TracedLens(Frozen):
@@ -116,7 +258,7 @@ class TracedLens(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _needs_its_table(cls, data: Any) -> Any:
-        if isinstance(data, dict) and not isinstance(data.get("table"), LensTable):
+        if isinstance(data, dict) and "table" not in data:
             raise ValueError(
                 f"a traced lens (content hash {data.get('content_hash', 'not given')}) is made of its table alone: trace its prescription or load the table, and give that as `table`"
             )
@@ -126,8 +268,20 @@ class TracedLens(Frozen):
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
     ) -> FloatArray | ComplexArray:
         """OTF of the field point next to the axis, about its chief ray; 1 at f = 0, linear in wavelength between the table's,
-        held beyond them. `f_number` doesn't matter: the table has its own."""
-        raise NotImplementedError
+        held beyond them. `f_number` doesn't matter: the table has its own.
+
+        What the table's window doesn't hold, 1 - `encircled_share`, is taken to lie around it as an aperture's rim scatters
+        it, falling with 1/r^3: a veil that contrast is lower by, except at the lowest frequencies.
+        """
+        table = self.table
+        axis = int(np.argmin(np.sum(table.field_deg**2, axis=1)))
+        shares = _shares(table.wavelength_nm, wavelength_nm)
+        samples, inside = np.tensordot(shares, table.psf[:, axis], 1), float(shares @ table.encircled_share[:, axis])
+        fx, fy = np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float)
+        x, y = table.window_um[axis]
+        value = _fourier_sum(samples, table.sample_pitch_um, fx, fy) * np.exp(-2j * np.pi * (fx * x + fy * y))
+        radius_um = np.sqrt(samples.size / np.pi) * table.sample_pitch_um
+        return value + (1.0 - inside) * _beyond(np.hypot(fx, fy) * radius_um)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """The table's highest frequency: half a cycle a sample each way, along the diagonal."""
@@ -135,4 +289,65 @@ class TracedLens(Frozen):
 
 
 #: What `Lens.imaging` holds.
-Imaging = Annotated[DiffractionLimited | ZernikePupil | MeasuredPsf | TracedLens, Field(discriminator="kind")]
+Imaging = Annotated[
+    DiffractionLimited | ZernikePupil | MeasuredPsf | MeasuredOtf | TracedLens, Field(discriminator="kind")
+]
+
+
+# --- samples ---------------------------------------------------------------------------------------------------------
+
+
+def _check_wavelengths(wavelength_nm: tuple[float, ...], *, empty: bool = False) -> None:
+    if not wavelength_nm and not empty:
+        raise ValueError("no wavelength is given: give at least one, in nm")
+    if np.any(np.diff(wavelength_nm) <= 0) or (wavelength_nm and wavelength_nm[0] <= 0):
+        raise ValueError(f"wavelengths {list(wavelength_nm)[:6]} nm have to be above 0 and ascend: sort them")
+
+
+def _check_cube(
+    name: str, cube: tuple[tuple[tuple[float, ...], ...], ...], planes: int, shape: tuple[int, int] | None = None
+) -> None:
+    """`planes` planes of rows of one length, as many as `shape` says."""
+    shapes = {(len(plane), len(row)) for plane in cube for row in plane}
+    if len(cube) != planes or len(shapes) != 1 or (0 in next(iter(shapes))):
+        raise ValueError(
+            f"{name} holds {len(cube)} planes of the shapes {sorted(shapes)}: give {planes}, one a wavelength, with rows of one length"
+        )
+    if shape is not None and shapes != {shape}:
+        raise ValueError(f"{name} has planes of {next(iter(shapes))}: {shape} (fy, fx) fits the frequencies")
+
+
+def _shares(wavelength_nm: FloatArray | tuple[float, ...], at_nm: float) -> FloatArray:
+    """How much each given wavelength counts at one: linear between, held beyond them."""
+    place = float(np.interp(at_nm, wavelength_nm, np.arange(len(wavelength_nm))))
+    return np.maximum(0.0, 1.0 - np.abs(np.arange(len(wavelength_nm)) - place))
+
+
+def _fourier_sum(samples: FloatArray, pitch_um: float, fx: FloatArray, fy: FloatArray) -> ComplexArray:
+    """sum_ij samples_ij exp(-2 pi i (fx x_j + fy y_i)) about the window's middle; 0 beyond half a cycle a sample."""
+    fx, fy = np.asarray(fx, float), np.asarray(fy, float)
+    y, x = ((np.arange(n) - 0.5 * (n - 1)) * pitch_um for n in samples.shape)
+    shape, limit = np.broadcast_shapes(fx.shape, fy.shape), 0.5 / pitch_um * (1 + 1e-9)
+    passed = (np.abs(fx) <= limit) & (np.abs(fy) <= limit)
+    if len(shape) == 2 and np.all(fx == fx[:1]) and np.all(fy == fy[:, :1]):
+        # a grid: one product of matrices
+        across, down = np.broadcast_to(fx, shape)[0], np.broadcast_to(fy, shape)[:, 0]
+        value = np.exp(-2j * np.pi * np.outer(down, y)) @ samples @ np.exp(-2j * np.pi * np.outer(x, across))
+        return np.where(passed, value, 0.0)
+    across, down = np.broadcast_to(fx, shape).ravel(), np.broadcast_to(fy, shape).ravel()
+    total = np.empty(across.size, complex)
+    block = max(1, 500_000 // max(samples.shape))
+    for start in range(0, across.size, block):
+        at = slice(start, start + block)
+        rows = np.exp(-2j * np.pi * np.outer(down[at], y)) @ samples
+        total[at] = np.sum(rows * np.exp(-2j * np.pi * np.outer(across[at], x)), axis=1)
+    return np.where(passed, total.reshape(shape), 0.0)
+
+
+def _beyond(f_radius: FloatArray) -> FloatArray:
+    """Transfer of light laid out as 1/r^3 outside a circle of radius R, as an aperture's rim diffracts it; argument f R.
+
+    integral_1^inf J0(a u) / u^2 du = J0(a) - a [1 - integral_0^a J0 + J1(a)], a = 2 pi f R; 1 at f = 0.
+    """
+    a = 2.0 * np.pi * f_radius
+    return np.asarray(j0(a) - a * (1.0 - itj0y0(a)[0] + j1(a)))
