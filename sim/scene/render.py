@@ -8,9 +8,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import fresnel
 
 from sim.scene import colorchecker
-from sim.scene.scenes import PlanarTarget, ReflectanceChart, Scene, ScreenPattern, SpectralImage
+from sim.scene.scenes import (
+    KnifeEdge,
+    PlanarTarget,
+    PointArray,
+    Ramp,
+    ReflectanceChart,
+    Scene,
+    ScreenImage,
+    ScreenPattern,
+    SiemensStar,
+    SpectralImage,
+    UniformField,
+    ZonePlate,
+)
 from sim.scene.warp import Warp
 from sim.spectrum import FloatArray, Spectrum
 
@@ -62,18 +76,32 @@ class Drawing:
 
 
 def draw(scene: Scene, grid: Grid) -> Drawing:
-    """A chart, a screen or a printed target drawn on a grid. Raises TypeError for a scene that needs no drawing."""
+    """A scene drawn on a grid. Raises TypeError for one that can't be drawn: darkness, or one of another module."""
+    if isinstance(scene, UniformField):
+        return Drawing((scene.radiance, None), ())
     if isinstance(scene, ReflectanceChart):
         return _chart(scene, grid)
     if isinstance(scene, SpectralImage):
         return _bands(scene, grid)
+    if isinstance(scene, ScreenImage):
+        return _screen(scene, grid)
     if isinstance(scene, ScreenPattern):
         lit = cells(np.asarray(scene.pattern, float), scene.to_camera, grid, 0.0)
     elif isinstance(scene, PlanarTarget):
         lit = cells(np.asarray(scene.texture, float), scene.warp(), grid, scene.surround)
+    elif isinstance(scene, KnifeEdge):
+        lit = _edges(scene, grid)
+    elif isinstance(scene, ZonePlate):
+        lit = _zone_plate(scene, grid)
+    elif isinstance(scene, SiemensStar):
+        lit = _star(scene, grid)
+    elif isinstance(scene, Ramp):
+        lit = _ramp(scene, grid)
+    elif isinstance(scene, PointArray):
+        lit = _points(scene, grid)
     else:
         raise TypeError(
-            f"a scene of type {type(scene).__name__} can't be drawn: use a chart, a screen or a planar target"
+            f"a scene of type {type(scene).__name__} can't be drawn: use one of `sim.scene` that sheds light"
         )
     return Drawing((scene.dark_radiance, None), (Layer((scene.light_radiance, None), EVERYWHERE, lit),))
 
@@ -115,26 +143,43 @@ def cells(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> Float
     return _means(pattern, warp, grid, surround)
 
 
-def _means(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> FloatArray:
-    """`cells` for cells of any finite value."""
-    divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / 0.999)))
+def _means(
+    pattern: FloatArray, warp: Warp, grid: Grid, surround: float, lit: tuple[float, float, float, float] | None = None
+) -> FloatArray:
+    """`cells` for cells of any finite value. `lit` (u0, u1, v0, v1): the part of every cell that holds its value, the rest
+    of it holding `surround`; None: all of it."""
+    from sim.scene.area import mapped_means, project_means  # here: the compiler's library takes a while to load
+
+    finest = 1.0 if lit is None else min(lit[1] - lit[0], lit[3] - lit[2])
+    if lit is not None:
+        gap = min(1.0 - (lit[1] - lit[0]), 1.0 - (lit[3] - lit[2]))
+        finest = min(finest, gap) if gap > 0 else finest
+    divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / finest / 0.999)))
     if divide > MOST_DIVISIONS:
         raise ValueError(
             f"the pattern's cells are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of {1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
         )
+    pattern = np.ascontiguousarray(pattern, float)
     row, col = grid.axes_px()
     step = 1.0 / grid.oversample
-    offset = ((np.arange(divide) + 0.5) / divide - 0.5) * step
-    fine_col = (col[:, None] + offset).ravel()
-    mapper = warp.mapper((row[0] - step, row[-1] + step), (col[0] - step, col[-1] + step))
-    # A frame around the pattern, wide enough that no neighbour of a border falls off it.
-    framed = np.pad(pattern, 2, constant_values=surround)
+    edges, gaps = (0.0, 1.0, 0.0, 1.0) if lit is None else lit, lit is not None
     out = np.empty(grid.shape)
-    strips = max(1, (row.size * divide * fine_col.size) // 100_000)  # strips that stay in the processor's cache
-    for part in np.array_split(np.arange(row.size), min(strips, row.size // 2)):
-        fine_row = (row[part, None] + offset).ravel()
-        fine = _cells_on(framed, *mapper(fine_row, fine_col))
-        out[part] = fine if divide == 1 else fine.reshape(part.size, divide, col.size, divide).mean(axis=(1, 3))
+    if warp.straight:
+        back = np.linalg.inv(np.asarray(warp.homography))
+        project_means(pattern, back, row, col, step, divide, edges, gaps, surround, out)
+        return out
+    # Through a distorting lens pattern points are splines' values, with one more all round for the squares' sides.
+    fine = step / divide
+    mapper = warp.mapper((row[0] - step, row[-1] + step), (col[0] - step, col[-1] + step))
+    offset = (np.arange(divide) + 0.5) * fine - 0.5 * step
+    across = (col[:, None] + offset).ravel()
+    across = np.concatenate([[across[0] - fine], across, [across[-1] + fine]])
+    strips = max(1, (row.size * divide * across.size) // 100_000)  # strips that stay in the processor's cache
+    for part in np.array_split(np.arange(row.size), min(strips, row.size)):
+        down = (row[part, None] + offset).ravel()
+        down = np.concatenate([[down[0] - fine], down, [down[-1] + fine]])
+        u, v = mapper(down, across)
+        mapped_means(pattern, u, v, divide, edges, gaps, surround, out[part[0] : part[-1] + 1])
     return out
 
 
@@ -160,43 +205,151 @@ def _footprint(shape: tuple[int, ...], warp: Warp, grid: Grid) -> float:
     return float(np.max(extent))
 
 
-def _cells_on(framed: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """`cells` for samples no larger than a cell, at pattern points (u, v); `framed` has two cells more on each side."""
-    rows, cols = framed.shape[0] - 4, framed.shape[1] - 4
-    u_down, u_across = np.gradient(u)
-    v_down, v_across = np.gradient(v)
-    near_u, near_v = np.rint(u), np.rint(v)
-    right = half_plane(u - near_u, u_across, u_down)
-    below = half_plane(v - near_v, v_across, v_down)
-    # Left of the border u = j is cell j - 1, which is column j + 1 of the framed pattern.
-    left = np.clip(near_u, -1, cols + 1, out=near_u)
-    top = np.clip(near_v, -1, rows + 1, out=near_v)
-    width = framed.shape[1]
-    at = ((top + 1) * width + (left + 1)).astype(np.intp)
-    flat = framed.ravel()
-    above = flat[at]
-    above += (flat[1:][at] - above) * right
-    under = flat[width:][at]
-    under += (flat[width + 1 :][at] - under) * right
-    above += (under - above) * below
-    return above
-
-
 #: No light: the ground of scenes whose layers just add up.
 NO_LIGHT = Spectrum(wavelength_nm=(300.0, 1100.0), value=(0.0, 0.0))
 
 
 def _bands(scene: SpectralImage, grid: Grid) -> Drawing:
     """One layer a band on a dark ground: the light is the band's triangle over wavelength, the "coverage" its radiance."""
-    drawn = tuple(
-        Layer((light, None), EVERYWHERE, _means(plane, scene.warp(), grid, 0.0))
-        for light, plane in zip(scene.bands(), np.moveaxis(scene.radiance, 2, 0), strict=True)
+    planes = np.moveaxis(scene.radiance, 2, 0)
+    lights = [(light, None) for light in scene.bands()]
+    if scene.to_camera is not None or planes[0].shape != (grid.rows, grid.cols):
+        warp = scene.warp()
+        return Drawing(
+            (NO_LIGHT, None),
+            tuple(
+                Layer(light, EVERYWHERE, _means(plane, warp, grid, 0.0))
+                for light, plane in zip(lights, planes, strict=True)
+            ),
+        )
+    # Sample and pixel are the same square: nothing is cut.
+    s, m = grid.oversample, grid.margin_px * grid.oversample
+    window = slice(m, m + grid.rows * s), slice(m, m + grid.cols * s)
+    return Drawing(
+        (NO_LIGHT, None),
+        tuple(
+            Layer(light, window, np.repeat(np.repeat(plane, s, axis=0), s, axis=1) if s > 1 else plane)
+            for light, plane in zip(lights, planes, strict=True)
+        ),
     )
-    return Drawing((NO_LIGHT, None), drawn)
+
+
+def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
+    """Black's leakage and one layer a primary on a dark ground; all fall off with the angle of view."""
+    warp = scene.warp()
+    screen = scene.screen
+    seen = 1.0 if screen.falloff_exponent == 0 else scene.cosine(*grid.axes_px()) ** screen.falloff_exponent
+    drawn = []
+    if any(screen.black_radiance.value):
+        leak = _means(np.ones(scene.codes.shape[:2]), warp, grid, 0.0) * seen
+        drawn.append(Layer((screen.black_radiance, None), EVERYWHERE, leak))
+    drives = screen.drives(scene.codes)
+    for channel, primary in enumerate(screen.primaries):
+        if screen.sub_pixels is None:
+            picture = _means(drives[:, :, channel], warp, grid, 0.0) * seen
+        else:
+            lit = screen.sub_pixels.lit(channel)
+            picture = _means(drives[:, :, channel] / screen.sub_pixels.share, warp, grid, 0.0, lit) * seen
+        drawn.append(Layer((primary, None), EVERYWHERE, picture))
+    return Drawing((NO_LIGHT, None), tuple(drawn))
+
+
+def _edges(scene: KnifeEdge, grid: Grid) -> FloatArray:
+    """Every sample belongs to the nearest region's edge, whose line cuts it by exact area."""
+    row, col = grid.axes_px()
+    row, col = row[:, None], col[None, :]
+    owner = scene.owner(row, col)
+    lit = np.empty(grid.shape)
+    step = 1.0 / grid.oversample
+    for index, edge in enumerate(scene.regions):
+        angle = np.deg2rad(edge.angle_deg)
+        share = half_plane(edge.distance_px(row, col), np.cos(angle) * step, np.sin(angle) * step)
+        if len(scene.regions) == 1:
+            return share
+        mine = owner == index
+        lit[mine] = share[mine]
+    return lit
+
+
+def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
+    """cos(pi k (x^2 + y^2)) = Re exp(i pi k x^2) exp(i pi k y^2): its mean over a square is a product of two Fresnel integrals,
+    exactly; the taper near the rim, which is smooth, is taken at the square's centre."""
+    if scene.highest_cy_per_px > 0.5 * grid.oversample:
+        raise ValueError(
+            f"the zone plate rises to {scene.highest_cy_per_px:g} cy/px, above the limit of {0.5 * grid.oversample:g} cy/px of {grid.oversample} samples a pixel: draw with more samples, or lower highest_cy_per_px"
+        )
+    k = scene.highest_cy_per_px / scene.radius_px
+    step = 1.0 / grid.oversample
+    parts, squares = [], []
+    for axis, centre in zip(grid.axes_px(), scene.centre, strict=True):
+        edges = np.append(axis - 0.5 * step, axis[-1] + 0.5 * step) - centre
+        sine, cosine = fresnel(np.sqrt(2.0 * k) * edges)
+        parts.append((np.diff(cosine) + 1j * np.diff(sine)) / (np.sqrt(2.0 * k) * step))
+        squares.append((axis - centre) ** 2)
+    (down, across), (down2, across2) = parts, squares
+    lit = np.outer(down.real, across.real) - np.outer(down.imag, across.imag)
+    radius = np.sqrt(np.add.outer(down2, across2))
+    start = (1.0 - scene.taper) * scene.radius_px
+    ring = radius > start
+    past = np.minimum((radius[ring] - start) / (scene.radius_px - start), 1.0)
+    lit[ring] *= 0.5 + 0.5 * np.cos(np.pi * past)
+    return 0.5 + 0.5 * lit
+
+
+def _star(scene: SiemensStar, grid: Grid) -> FloatArray:
+    """Triangles from the centre, each cut exactly."""
+    from sim.scene.area import add_polygon
+
+    lit = np.zeros(grid.shape)
+    row, col = grid.axes_px()
+    for corners in scene.triangles():
+        add_polygon(corners, row[0], col[0], 1.0 / grid.oversample, 1.0, lit)
+    # Shares of up to a spoke's number of triangles were added up in the squares at the centre.
+    return np.minimum(lit, 1.0)
+
+
+def _ramp(scene: Ramp, grid: Grid) -> FloatArray:
+    row, col = grid.axes_px()
+    angle = np.deg2rad(scene.angle_deg)
+    across, down = np.cos(angle), np.sin(angle)
+    # 0 at the start of the ramp, 1 at its end
+    place = (
+        ((col - scene.centre[1]) * across)[None, :] + ((row - scene.centre[0]) * down)[:, None]
+    ) / scene.length_px + 0.5
+    if scene.steps == 0:
+        return np.clip(place, 0.0, 1.0)
+    slope = 1.0 / (grid.oversample * scene.length_px)
+    lit = np.zeros(grid.shape)
+    for n in range(1, scene.steps):
+        lit += half_plane(place - n / scene.steps, across * slope, down * slope)
+    return lit / (scene.steps - 1)
+
+
+def _points(scene: PointArray, grid: Grid) -> FloatArray:
+    """Square holes; one narrower than a sample is spread over a sample's width, with its own energy and middle."""
+    step = 1.0 / grid.oversample
+    wide = max(scene.side_px, step)
+    lit = np.zeros(grid.shape)
+    for point in scene.points:
+        shares = []
+        windows = []
+        for axis, centre in zip(grid.axes_px(), point, strict=True):
+            low, high = np.searchsorted(axis, [centre - 0.5 * (wide + step), centre + 0.5 * (wide + step)])
+            near = axis[low:high]
+            overlap = np.minimum(near + 0.5 * step, centre + 0.5 * wide) - np.maximum(
+                near - 0.5 * step, centre - 0.5 * wide
+            )
+            shares.append(np.maximum(overlap, 0.0) / step * (scene.side_px / wide))
+            windows.append(slice(int(low), int(high)))
+        lit[windows[0], windows[1]] += np.outer(*shares)
+    if np.max(lit, initial=0.0) > 1.0 + 1e-9:
+        raise ValueError(f"points of {scene.side_px:g} px overlap: put them farther apart than their side")
+    return lit
 
 
 def _chart(scene: ReflectanceChart, grid: Grid) -> Drawing:
-    rows, cols = colorchecker.GRID
+    patches = colorchecker.reflectances(scene.name)
+    rows, cols = colorchecker.grid(scene.name)
     if not 0.0 <= scene.gap < 1.0:
         raise ValueError(
             f"the gap between patches is {scene.gap} of their distance, outside 0..1: a ColorChecker has 0.13"
@@ -206,7 +359,7 @@ def _chart(scene: ReflectanceChart, grid: Grid) -> Drawing:
     warp = Warp.from_corners(cols - scene.gap, rows - scene.gap, scene.corners)
     row, col = grid.axes_px()
     drawn = []
-    for index, reflectance in enumerate(colorchecker.reflectances(scene.name).values()):
+    for index, reflectance in enumerate(patches.values()):
         u, v = float(index % cols), float(index // cols)
         corner_row, corner_col = warp.to_camera([u, u + size, u + size, u], [v, v, v + size, v + size])
         window = _window(row, corner_row), _window(col, corner_col)
@@ -225,52 +378,10 @@ def _window(axis: FloatArray, corners: FloatArray) -> slice:
 def quadrilateral(
     row: FloatArray, col: FloatArray, side: float, corner_row: FloatArray, corner_col: FloatArray
 ) -> FloatArray:
-    """Share of each sample's square (`side` px wide, centred at `row` x `col`) inside a convex polygon, exactly.
+    """Share of each sample's square (`side` px wide, centred at the even axes `row` x `col`) inside a convex polygon, exactly."""
+    from sim.scene.area import polygon_share
 
-    Along the polygon's sides by `half_plane`; the few squares that hold a corner are clipped by the polygon.
-    """
-    if _area(np.column_stack([corner_row, corner_col])) < 0:
-        corner_row, corner_col = corner_row[::-1], corner_col[::-1]
-    inside = np.ones((row.size, col.size))
-    if not inside.size:
-        return inside
-    crossed = np.zeros(inside.shape, int)
-    for k in range(len(corner_row)):
-        slope_row, slope_col = _inward(corner_row, corner_col, k)
-        g = slope_row * (row[:, None] - corner_row[k]) + slope_col * (col[None, :] - corner_col[k])
-        share = half_plane(g, slope_col * side, slope_row * side)
-        crossed += (share > 0.0) & (share < 1.0)
-        inside = np.minimum(inside, share)
-    for i, j in np.argwhere((crossed > 1) & (inside > 0.0)):
-        inside[i, j] = _clipped_area(row[i], col[j], side, corner_row, corner_col) / side**2
-    return inside
-
-
-def _inward(corner_row: FloatArray, corner_col: FloatArray, k: int) -> tuple[float, float]:
-    """(row, col) part of the normal into the polygon of the side that ends in corner k."""
-    return -(corner_col[k] - corner_col[k - 1]), corner_row[k] - corner_row[k - 1]
-
-
-def _area(points: FloatArray) -> float:
-    """Signed area of a polygon of (row, col) points."""
-    row, col = points[:, 0], points[:, 1]
-    return 0.5 * float(np.sum(row * np.roll(col, -1) - np.roll(row, -1) * col))
-
-
-def _clipped_area(row: float, col: float, side: float, corner_row: FloatArray, corner_col: FloatArray) -> float:
-    """Area of a square inside a convex polygon: the square cut by one side after the other (Sutherland and Hodgman)."""
-    h = 0.5 * side
-    points = np.array([(row - h, col - h), (row - h, col + h), (row + h, col + h), (row + h, col - h)])
-    for k in range(len(corner_row)):
-        slope = np.array(_inward(corner_row, corner_col, k))
-        g = (points - np.array([corner_row[k], corner_col[k]])) @ slope
-        kept = []
-        for n in range(len(points)):
-            if (g[n - 1] > 0) != (g[n] > 0):
-                kept.append(points[n - 1] + (points[n] - points[n - 1]) * (g[n - 1] / (g[n - 1] - g[n])))
-            if g[n] > 0:
-                kept.append(points[n])
-        if len(kept) < 3:
-            return 0.0
-        points = np.array(kept)
-    return abs(_area(points))
+    if not (row.size and col.size):
+        return np.ones((row.size, col.size))
+    corners = np.column_stack([corner_row, corner_col])
+    return polygon_share(corners, float(row[0]), float(col[0]), side, (row.size, col.size))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.camera import Geometry
+from sim.scene.screen import Screen
 from sim.scene.warp import Warp
 from sim.spectrum import FloatArray, Spectrum, energy_from_photons
 
@@ -44,10 +45,10 @@ class UniformField:
 
 @dataclass(frozen=True)
 class ReflectanceChart:
-    """A flat chart of diffuse patches on a frame of 3 % reflectance, lit evenly.
+    """A flat chart of diffuse patches on a frame of 3 % reflectance, lit evenly: ColorChecker24 or ColorCheckerSG.
 
-    `corners`: outer corners [row, col] of the patch grid, in the order dark skin, bluish green, black, white (for an upright
-    chart: top left, top right, bottom right, bottom left). `illuminant_radiance`: of a perfect white diffuser in the chart's
+    `corners`: outer corners [row, col] of the patch grid, in the order dark skin, bluish green, black, white (SG: A1, N1, N10,
+    A10; for an upright chart: top left, top right, bottom right, bottom left). `illuminant_radiance`: of a perfect white diffuser in the chart's
     place. `gap`: share of the distance of neighbouring patches that the frame between them takes.
     """
 
@@ -90,6 +91,18 @@ class KnifeEdge:
     light_radiance: Spectrum
     kind: str = "slanted_edge"
 
+    def owner(self, row: FloatArray, col: FloatArray) -> NDArray[np.intp]:
+        """Index of the region that rules each point, the nearest one."""
+        if not self.regions:
+            raise ValueError("a knife edge with no region shows nothing: give at least one edge region")
+        away = []
+        for edge in self.regions:
+            row0, col0, row1, col1 = edge.region
+            down = np.maximum(np.maximum(row0 - row, row - (row1 - 1)), 0.0)
+            across = np.maximum(np.maximum(col0 - col, col - (col1 - 1)), 0.0)
+            away.append(np.hypot(down, across))
+        return np.argmin(np.stack(away), axis=0)
+
 
 @dataclass(frozen=True, eq=False)
 class ScreenPattern:
@@ -126,11 +139,142 @@ class PlanarTarget:
 
     def warp(self) -> Warp:
         """From texels to camera px: camera_matrix [r1 r2 t] texel_mm, then the lens's distortion."""
-        rotation = np.asarray(self.rotation, float)
-        pose = np.column_stack(
-            [rotation[:, 0] * self.texel_mm, rotation[:, 1] * self.texel_mm, np.asarray(self.translation_mm, float)]
-        )
-        return Warp.of(np.asarray(self.geometry.camera_matrix, float) @ pose, self.geometry)
+        return planar_warp(self.texel_mm, self.rotation, self.translation_mm, self.geometry)
+
+
+def planar_warp(
+    unit_mm: float,
+    rotation: tuple[tuple[float, float, float], ...],
+    translation_mm: tuple[float, float, float],
+    geometry: Geometry,
+) -> Warp:
+    """From a plane's coordinates in units of `unit_mm` to camera px: camera_matrix [r1 r2 t] unit_mm, then the distortion."""
+    turn = np.asarray(rotation, float)
+    pose = np.column_stack([turn[:, 0] * unit_mm, turn[:, 1] * unit_mm, np.asarray(translation_mm, float)])
+    return Warp.of(np.asarray(geometry.camera_matrix, float) @ pose, geometry)
+
+
+@dataclass(frozen=True)
+class ZonePlate:
+    """Rings of ever finer pitch: level 1/2 + 1/2 cos(pi k r^2), k = highest_cy_per_px / radius_px, so that the local frequency
+    is k r: it rises in proportion to the distance r from `centre` [row, col], to `highest_cy_per_px` at `radius_px`.
+
+    Level 0 is `dark_radiance`, 1 `light_radiance`; outside the radius it's 1/2. Over the outermost share `taper` of the radius
+    the contrast goes to 0 as a raised cosine, so that the rim has no edge.
+    """
+
+    centre: tuple[float, float]
+    radius_px: float
+    highest_cy_per_px: float
+    dark_radiance: Spectrum
+    light_radiance: Spectrum
+    taper: float = 0.05
+    kind: str = "zone_plate"
+
+    def __post_init__(self) -> None:
+        _above_zero("the zone plate's radius", self.radius_px, "px")
+        _above_zero("the zone plate's highest frequency", self.highest_cy_per_px, "cy/px")
+        if not 0.0 < self.taper <= 1.0:
+            raise ValueError(f"the zone plate's taper is {self.taper}, outside the limits 0..1: 0.05 is usual")
+
+
+@dataclass(frozen=True)
+class SiemensStar:
+    """`spokes` light triangles on dark, all from `centre` [row, col], their outer corners on the circle of `radius_px`. Between
+    them the dark is as wide: half of every circle within is light, at spokes / (2 pi r) cy/px at a distance of r px.
+    The first spoke begins `turn_deg` from the right, clockwise."""
+
+    centre: tuple[float, float]
+    radius_px: float
+    spokes: int
+    dark_radiance: Spectrum
+    light_radiance: Spectrum
+    turn_deg: float = 0.0
+    kind: str = "siemens_star"
+
+    def __post_init__(self) -> None:
+        _above_zero("the star's radius", self.radius_px, "px")
+        if self.spokes < 2:
+            raise ValueError(f"a star of {self.spokes} spokes is below the limit of 2: 36 or 72 are usual")
+
+    def triangles(self) -> FloatArray:
+        """Corners [row, col] of the light triangles, (spokes, 3, 2)."""
+        angle = np.deg2rad(self.turn_deg) + np.pi * np.arange(2 * self.spokes) / self.spokes
+        rim = np.stack([np.sin(angle), np.cos(angle)], axis=-1) * self.radius_px + self.centre
+        return np.stack([np.broadcast_to(self.centre, rim[::2].shape), rim[::2], rim[1::2]], axis=1)
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Level 0 (`dark_radiance`) to 1 (`light_radiance`) over `length_px` about `centre` [row, col], rising towards `angle_deg` (0:
+    to the right, 90: down). Linear with `steps` 0; else so many equal bands of levels 0, 1 / (steps - 1), ..., 1."""
+
+    centre: tuple[float, float]
+    length_px: float
+    dark_radiance: Spectrum
+    light_radiance: Spectrum
+    angle_deg: float = 0.0
+    steps: int = 0
+    kind: str = "ramp"
+
+    def __post_init__(self) -> None:
+        _above_zero("the ramp's length", self.length_px, "px")
+        if self.steps == 1 or self.steps < 0:
+            raise ValueError(f"a ramp of {self.steps} steps has no slope: give 0 for a linear one, or 2 or more")
+
+
+@dataclass(frozen=True)
+class PointArray:
+    """Square holes of `side_px` at `points` ([row, col] of their middles), `light_radiance` in `dark_radiance`. The light of a
+    hole, radiance x side_px^2, is drawn exactly, however small the hole."""
+
+    points: tuple[tuple[float, float], ...]
+    side_px: float
+    dark_radiance: Spectrum
+    light_radiance: Spectrum
+    kind: str = "points"
+
+    def __post_init__(self) -> None:
+        _above_zero("the points' side", self.side_px, "px")
+        if not np.all(np.isfinite(self.points)):
+            raise ValueError("a point's place isn't finite: give [row, col] in px")
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenImage:
+    """A picture of digital codes on a screen at a pose: what any `Screen` shows of any image.
+
+    `codes` (rows, cols, 3) uint8, red, green, blue; a code fills one pixel of the screen, `pixel_mm` wide. Plane, pose and
+    `geometry` are those of `PlanarTarget`. Around the picture it's dark: a screen ends where its picture ends.
+    """
+
+    screen: Screen
+    codes: NDArray[np.uint8]
+    pixel_mm: float
+    rotation: tuple[tuple[float, float, float], ...]
+    translation_mm: tuple[float, float, float]
+    geometry: Geometry
+    kind: str = "screen"
+
+    def __post_init__(self) -> None:
+        if self.codes.ndim != 3 or self.codes.shape[2] != 3 or not self.codes.size or self.codes.dtype != np.uint8:
+            raise ValueError(
+                f"codes of shape {self.codes.shape} and type {self.codes.dtype} have to be (rows, cols, 3) uint8: convert the picture to 8-bit RGB"
+            )
+        _above_zero("the screen's pixel", self.pixel_mm, "mm")
+
+    def warp(self) -> Warp:
+        """From the screen's pixels to camera px."""
+        return planar_warp(self.pixel_mm, self.rotation, self.translation_mm, self.geometry)
+
+    def cosine(self, row: FloatArray, col: FloatArray) -> FloatArray:
+        """Cosine of the angle between the screen's normal and the ray to the camera, (row.size, col.size), at the screen's points
+        seen at ascending camera `row` x `col` (px)."""
+        turn = np.asarray(self.rotation, float)
+        eye = -turn.T @ np.asarray(self.translation_mm, float)  # the camera in the screen's frame
+        u, v = self.warp().grid_to_pattern(row, col)
+        away2 = (u * self.pixel_mm - eye[0]) ** 2 + (v * self.pixel_mm - eye[1]) ** 2
+        return np.abs(eye[2]) / np.sqrt(away2 + eye[2] ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,3 +338,8 @@ class SpectralImage:
         """One curve a band, 1 at its wavelength and 0 at its neighbours: radiance = sum of plane x curve, exactly."""
         rows = np.eye(len(self.wavelength_nm))
         return tuple(Spectrum.of(self.wavelength_nm, row) for row in rows)
+
+
+def _above_zero(what: str, value: float, unit: str) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{what} is {value} {unit}, below the limit of 0 {unit} or not finite: give a number above 0")

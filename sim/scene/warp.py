@@ -51,6 +51,11 @@ class Warp:
             right[2 * i : 2 * i + 2] = x, y
         return cls.of(np.append(np.linalg.solve(system, right), 1.0).reshape(3, 3), geometry)
 
+    @property
+    def straight(self) -> bool:
+        """Whether the homography is all there is."""
+        return self.geometry is None or not any(self.geometry.distortion)
+
     def to_camera(self, u: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Camera (row, col) in px of pattern points."""
         col, row = _project(np.asarray(self.homography), np.asarray(u, float), np.asarray(v, float))
@@ -77,8 +82,9 @@ class Warp:
         The lens's distortion is smooth: it's undone on nodes some 8 px apart and interpolated by cubic splines (1e-5 px).
         """
         back = np.linalg.inv(np.asarray(self.homography))
-        if self.geometry is None or not any(self.geometry.distortion):
+        if self.straight:
             return lambda row, col: _project(back, col[None, :], row[:, None])
+        assert self.geometry is not None
         y0, x0 = (np.linspace(low, high, max(8, int((high - low) / 8) + 2)) for low, high in (rows, cols))
         straight_x, straight_y = undistort(*np.meshgrid(x0, y0), self.geometry)
         x, y = RectBivariateSpline(y0, x0, straight_x), RectBivariateSpline(y0, x0, straight_y)

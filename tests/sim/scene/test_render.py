@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim.camera import Geometry
@@ -28,6 +28,7 @@ def test_half_plane_of_a_line_along_an_axis_is_linear() -> None:
     np.testing.assert_allclose(half_plane(d, 1.0, 1.0) + half_plane(-d, 1.0, 1.0), 1.0)
 
 
+@settings(deadline=None)  # the first one loads or compiles the loops
 @given(
     st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=4, max_size=4),
     st.floats(0, 6.28),

@@ -1,0 +1,216 @@
+"""Compiled loops of drawing by area: means of cells, and convex polygons, over the squares of a grid.
+
+Import it where it's used, not at the top of a module: the compiler's library takes a while to load.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from sim.spectrum import FloatArray
+
+
+@njit(cache=True)
+def _share(distance, slope_x, slope_y):  # type: ignore[no-untyped-def]
+    """`sim.scene.render.half_plane` of one square."""
+    a, b = abs(slope_x), abs(slope_y)
+    far = 0.5 * (a + b)
+    if distance >= far:
+        return 1.0
+    if distance <= -far:
+        return 0.0
+    wide = max(a, b)
+    narrow = max(min(a, b), 1e-9 * wide)
+    d = abs(distance)
+    ramp = min(far - d, narrow)
+    beyond = (0.5 * ramp * ramp / narrow if ramp < narrow else 0.5 * wide - d) / wide
+    return 1.0 - beyond if distance > 0 else beyond
+
+
+@njit(cache=True)
+def _border(position, first, second, gaps):  # type: ignore[no-untyped-def]
+    """Number and place of the border nearest to a position. Without gaps, cell j begins at border j, at j. With gaps, it's
+    lit from border 2 j at j + first to border 2 j + 1 at j + second."""
+    if not gaps:
+        near = np.rint(position)
+        return int(near), near
+    whole = np.floor(position)
+    within = position - whole
+    number, place = 2 * int(whole), first
+    if within > 0.5 * (first + second):
+        number, place = number + 1, second
+        if within > 0.5 * (second + 1.0 + first):
+            number, place = number + 1, 1.0 + first
+    elif within < 0.5 * (second - 1.0 + first):
+        number, place = number - 1, second - 1.0
+    return number, whole + place
+
+
+@njit(cache=True)
+def _value(pattern, row, col, gaps, surround):  # type: ignore[no-untyped-def]
+    """What the cell after border `row` and border `col` holds."""
+    if gaps:
+        if (row & 1) or (col & 1):
+            return surround
+        row, col = row >> 1, col >> 1
+    if row < 0 or col < 0 or row >= pattern.shape[0] or col >= pattern.shape[1]:
+        return surround
+    return pattern[row, col]
+
+
+@njit(cache=True)
+def _mean(pattern, u, v, u_across, u_down, v_across, v_down, lit, gaps, surround):  # type: ignore[no-untyped-def]
+    """Mean over a square at (u, v) no larger than a cell, whose sides run along (u_across, v_across), (u_down, v_down)."""
+    col, u_border = _border(u, lit[0], lit[1], gaps)
+    row, v_border = _border(v, lit[2], lit[3], gaps)
+    right = _share(u - u_border, u_across, u_down)
+    below = _share(v - v_border, v_across, v_down)
+    if abs(right - 0.5) == 0.5:
+        col += int(right) - 1
+        if abs(below - 0.5) == 0.5:
+            return _value(pattern, row + int(below) - 1, col, gaps, surround)
+        above = _value(pattern, row - 1, col, gaps, surround)
+        return above + (_value(pattern, row, col, gaps, surround) - above) * below
+    above = _value(pattern, row - 1, col - 1, gaps, surround)
+    above += (_value(pattern, row - 1, col, gaps, surround) - above) * right
+    under = _value(pattern, row, col - 1, gaps, surround)
+    under += (_value(pattern, row, col, gaps, surround) - under) * right
+    return above + (under - above) * below
+
+
+@njit(cache=True)
+def project_means(pattern, back, row, col, step, divide, lit, gaps, surround, out):  # type: ignore[no-untyped-def]
+    """Means of a pattern's cells over the squares at `row` x `col` (px, `step` wide), into `out`.
+
+    `back` (3, 3) takes (x = col, y = row, 1) to the pattern's (u, v, w). Every square is divided `divide` times each way.
+    `lit` (u0, u1, v0, v1) is the lit part of every cell where there are `gaps`.
+    """
+    fine = step / divide
+    count = divide * divide
+    for i in range(row.size):
+        for j in range(col.size):
+            total = 0.0
+            for m in range(divide):
+                y = row[i] + (m + 0.5) * fine - 0.5 * step
+                for n in range(divide):
+                    x = col[j] + (n + 0.5) * fine - 0.5 * step
+                    w = 1.0 / (back[2, 0] * x + back[2, 1] * y + back[2, 2])
+                    u = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) * w
+                    v = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) * w
+                    scale = fine * w
+                    total += _mean(
+                        pattern,
+                        u,
+                        v,
+                        (back[0, 0] - u * back[2, 0]) * scale,
+                        (back[0, 1] - u * back[2, 1]) * scale,
+                        (back[1, 0] - v * back[2, 0]) * scale,
+                        (back[1, 1] - v * back[2, 1]) * scale,
+                        lit,
+                        gaps,
+                        surround,
+                    )
+            out[i, j] = total / count
+
+
+@njit(cache=True)
+def mapped_means(pattern, u, v, divide, lit, gaps, surround, out):  # type: ignore[no-untyped-def]
+    """As `project_means`, for squares at given pattern points `u`, `v`, a frame of one square wider than needed all round;
+    (rows x divide + 2, cols x divide + 2) for `out` of (rows, cols)."""
+    count = divide * divide
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = 0.0
+            for m in range(i * divide + 1, (i + 1) * divide + 1):
+                for n in range(j * divide + 1, (j + 1) * divide + 1):
+                    total += _mean(
+                        pattern,
+                        u[m, n],
+                        v[m, n],
+                        0.5 * (u[m, n + 1] - u[m, n - 1]),
+                        0.5 * (u[m + 1, n] - u[m - 1, n]),
+                        0.5 * (v[m, n + 1] - v[m, n - 1]),
+                        0.5 * (v[m + 1, n] - v[m - 1, n]),
+                        lit,
+                        gaps,
+                        surround,
+                    )
+            out[i, j] = total / count
+
+
+@njit(cache=True)
+def _clip(points, count, axis, limit, sign, kept):  # type: ignore[no-untyped-def]
+    """The part of a convex polygon (its first `count` points) where sign x (coordinate - limit) > 0, into `kept`; how many
+    points it has (Sutherland and Hodgman 1974)."""
+    n = 0
+    for k in range(count):
+        p, q = k - 1 if k else count - 1, k
+        gp, gq = sign * (points[p, axis] - limit), sign * (points[q, axis] - limit)
+        if (gp > 0.0) != (gq > 0.0):
+            t = gp / (gp - gq)
+            kept[n, 1 - axis] = points[p, 1 - axis] + (points[q, 1 - axis] - points[p, 1 - axis]) * t
+            kept[n, axis] = limit
+            n += 1
+        if gq > 0.0:
+            kept[n] = points[q]
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def _area(points, count):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(1, count - 1):
+        total += (points[k, 0] - points[0, 0]) * (points[k + 1, 1] - points[0, 1])
+        total -= (points[k + 1, 0] - points[0, 0]) * (points[k, 1] - points[0, 1])
+    return 0.5 * abs(total)
+
+
+@njit(cache=True)
+def add_polygon(corners, row0, col0, step, factor, out):  # type: ignore[no-untyped-def]
+    """Add factor x share of every square inside a convex polygon of `corners` [row, col], exactly, to `out`.
+
+    Square [i, j] is `step` wide with its middle at (row0 + i step, col0 + j step). A row of squares cuts a strip out of the
+    polygon; as its left side is a convex function of the row and its right one a concave one, the squares between both
+    sides' places at the strip's two ends lie inside wholly; the few others are cut one by one.
+    """
+    most = corners.shape[0] + 8
+    strip, other, cut = np.empty((most, 2)), np.empty((most, 2)), np.empty((most, 2))
+    points = np.empty((most, 2))
+    # In units of squares, square [i, j] from i to i + 1 and j to j + 1.
+    for k in range(corners.shape[0]):
+        points[k, 0] = (corners[k, 0] - row0) / step + 0.5
+        points[k, 1] = (corners[k, 1] - col0) / step + 0.5
+    top, bottom = points[: corners.shape[0], 0].min(), points[: corners.shape[0], 0].max()
+    for i in range(max(0, int(np.floor(top))), min(out.shape[0], int(np.ceil(bottom)))):
+        n = _clip(points, corners.shape[0], 0, float(i), 1.0, other)
+        n = _clip(other, n, 0, float(i + 1), -1.0, strip)
+        if n < 3:
+            continue
+        left, right = strip[:n, 1].min(), strip[:n, 1].max()
+        inner_left, inner_right = np.inf, -np.inf
+        if top <= i and bottom >= i + 1:
+            ends = np.array([[np.inf, -np.inf], [np.inf, -np.inf]])
+            for k in range(n):
+                for e in range(2):
+                    if strip[k, 0] == i + e:
+                        ends[e, 0] = min(ends[e, 0], strip[k, 1])
+                        ends[e, 1] = max(ends[e, 1], strip[k, 1])
+            if ends.max() < np.inf and ends.min() > -np.inf:
+                inner_left, inner_right = max(ends[0, 0], ends[1, 0]), min(ends[0, 1], ends[1, 1])
+        for j in range(max(0, int(np.floor(left))), min(out.shape[1], int(np.ceil(right)))):
+            if j >= inner_left and j + 1 <= inner_right:
+                out[i, j] += factor
+            else:
+                m = _clip(strip, n, 1, float(j), 1.0, other)
+                m = _clip(other, m, 1, float(j + 1), -1.0, cut)
+                if m >= 3:
+                    out[i, j] += factor * _area(cut, m)
+
+
+def polygon_share(corners: FloatArray, row0: float, col0: float, step: float, shape: tuple[int, int]) -> FloatArray:
+    """Share of every square inside one convex polygon; see `add_polygon`."""
+    out = np.zeros(shape)
+    add_polygon(np.ascontiguousarray(corners, float), row0, col0, step, 1.0, out)
+    return out
