@@ -23,8 +23,9 @@ from sim.effects.base import Effect
 from sim.optics.diffraction import aperture_otf
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.optics.illumination import sin_theta as sin_theta_at
-from sim.scene.render import Grid, Light, draw
-from sim.scene.scenes import Darkness, KnifeEdge, Scene, UniformField
+from sim.optics.imaging import DiffractionLimited
+from sim.scene.render import Grid, Light, _means, draw
+from sim.scene.scenes import Darkness, KnifeEdge, Scene, SpectralImage, UniformField
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
 from sim.sensor.electrons import FixedPattern, ReadOut
@@ -44,13 +45,15 @@ HIGHEST_CY_PER_PX = 64.0
 @dataclass(frozen=True)
 class Exposure:
     """One exposure of a scene. `gain_db` is the analogue gain; `elapsed_s` the time after the session's first capture. Effects
-    may depend on it and on the sensor's `temperature_c`, with which the dark current doubles as the camera model says."""
+    may depend on it and on the sensor's `temperature_c`, with which the dark current doubles as the camera model says.
+    `magnification` of the scene dims the image as in ISET: pi / (1 + 4 N^2 (1 + |m|)^2); its blur stays that of `Lens.f_number`."""
 
     scene: Scene
     exposure_s: float
     gain_db: float = 0.0
     temperature_c: float | None = None
     elapsed_s: float = 0.0
+    magnification: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.exposure_s) and self.exposure_s >= 0):
@@ -209,6 +212,10 @@ def expected_electrons(
     for effect in effects:
         collected_s = effect.exposure(collected_s)
         source *= effect.drift(exposure.elapsed_s)
+    if exposure.magnification != 0.0:
+        source *= irradiance_factor(camera.lens.f_number, exposure.magnification) / irradiance_factor(
+            camera.lens.f_number
+        )
     light = _light_electron_rate(camera, exposure.scene, effects, source, oversample, margin_px) * collected_s
     electrons = light + dark_electrons(camera, exposure, effects)
     for effect in effects:
@@ -477,6 +484,8 @@ def _light_electron_rate(
         images = {c: _uniform_image(camera, c, scene, effects) for c in camera.channels}
     elif isinstance(scene, KnifeEdge):
         images = {c: _edge_image(camera, c, scene, effects) for c in camera.channels}
+    elif isinstance(scene, SpectralImage):
+        images = _cube_images(camera, scene, effects, oversample, margin_px)
     else:
         images = _blurred_images(camera, scene, effects, Grid(*shape, oversample, margin_px))
     row, col = np.arange(camera.rows, dtype=np.float64)[:, None], np.arange(camera.cols, dtype=np.float64)[None, :]
@@ -545,7 +554,7 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
             dark, light = dark * field[0](square), light * field[1](square)
         distance = edge.distance_px(row[mine], col[mine])
         dim, bright = (
-            edge_profile(camera, channel, radiance, edge.angle_deg, distance, effects, scene.kind)
+            edge_profile(camera, channel, radiance, edge.angle_deg, distance, _blurring(effects), scene.kind)
             for radiance in spectra
         )
         image[mine] = light * bright + dark * (1.0 - dim)
@@ -561,12 +570,9 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
     """
     drawing = draw(scene, grid)
     lights: list[Light] = [drawing.ground, *(layer.light for layer in drawing.layers)]
-    s, m = grid.oversample, grid.margin_px
+    m = grid.margin_px
     ny, nx = grid.shape
-    fy, fx = fft.fftfreq(ny, 1.0 / s)[:, None], fft.rfftfreq(nx, 1.0 / s)[None, :]
-    # The pixel's aperture; a sample is a mean over its square, which is undone; a pixel's centre lies between even samples.
-    shift = 1j * np.pi * (1.0 - 1.0 / s)
-    pixel_x, pixel_y = (aperture_otf(f, 0.0, camera.fill_factor) * np.exp(shift * f) / np.sinc(f / s) for f in (fx, fy))
+    fy, fx, pixel_y, pixel_x = _pixel_on_grid(camera, grid)
     images: dict[str, FloatArray] = {}
     transformed: list[ComplexArray] = []
     for channel in camera.channels:
@@ -589,22 +595,123 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
         spectrum = np.zeros((ny, nx // 2 + 1), complex)
         for k, node in enumerate(nodes):
             over = (shares[1:, k] - shares[0, k]).tolist()
-            transfer = _transfer_at(camera, float(node), fx, fy, effects)
+            transfer = _transfer_at(camera, float(node), fx, fy, _blurring(effects))
             for factor, picture in (
                 zip(over, transformed, strict=True) if few else [(1.0, _transform(grid, windows, pictures, over))]
             ):
                 spectrum += (factor * transfer) * picture
         spectrum *= pixel_x
         spectrum *= pixel_y
-        # Only every s-th row and column is wanted: fold the rows before going back.
-        folded = spectrum.reshape(s, ny // s, -1).sum(axis=0) / s
-        image = fft.irfft(fft.ifft(folded, axis=0), nx, axis=1)[:, ::s]
+        image = _at_pixels(spectrum, grid.oversample, nx)
         image = np.maximum(image[m : m + grid.rows, m : m + grid.cols] + np.sum(weight[0]), 0.0)
         if field is not None:
             row, col = np.arange(camera.rows)[:, None], np.arange(camera.cols)[None, :]
             image *= field[0](sin_theta_at(camera, row, col) ** 2)
         images[channel] = image
     return images
+
+
+def _blurring(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The effects whose `transfer` acts on a whole frame: all but those that do the same by moving its charge."""
+    return tuple(effect for effect in effects if not effect.moves_charge())
+
+
+def _cube_images(
+    camera: CameraModel, scene: SpectralImage, effects: Sequence[Effect], oversample: int, margin_px: int
+) -> dict[str, FloatArray]:
+    """Electrons a second (rows, cols) of every channel, of a cube of spectra, before cos^4.
+
+    As in `_blurred_images`, image = sum_k OTF_k F[sum_b w_bk band_b]: a cube of any number of bands becomes one picture a
+    wavelength of the rule. A cube whose samples are the camera's pixels needs no finer grid: its transfer is folded.
+    """
+    aligned = scene.to_camera is None
+    grid = Grid(camera.rows, camera.cols, 1 if aligned else oversample, margin_px)
+    # An aligned picture starts at pixel [0, 0]; what is left of the grid keeps its two ends apart.
+    shape = tuple(fft.next_fast_len(n, real=True) for n in grid.shape) if aligned else grid.shape
+    ny, nx = shape
+    start = 0 if aligned else margin_px
+    fy, fx, pixel_y, pixel_x = _pixel_on_grid(camera, grid)
+    images: dict[str, FloatArray] = {}
+    for channel in camera.channels:
+        nodes, pictures = _node_pictures(camera, channel, scene, effects)
+        spectrum = np.zeros((ny, nx // 2 + 1), np.complex64)
+        for node, picture in zip(nodes, pictures, strict=True):
+            if aligned:
+                transfer = _folded_transfer(camera, float(node), (ny, nx), _blurring(effects))
+                fine = np.zeros((ny, nx), np.float32)
+                seen = picture[: camera.rows + margin_px, : camera.cols + margin_px]
+                fine[: seen.shape[0], : seen.shape[1]] = seen
+            else:
+                transfer = _transfer_at(camera, float(node), fx, fy, _blurring(effects))
+                fine = _means(picture.astype(float), scene.warp(), grid, 0.0).astype(np.float32)
+            transformed = fft.rfft2(fine)
+            transformed *= transfer.astype(np.complex64 if np.iscomplexobj(transfer) else np.float32)
+            spectrum += transformed
+        if not aligned:
+            spectrum *= (pixel_y * pixel_x).astype(np.complex64)
+        image = _at_pixels(spectrum, grid.oversample, nx)
+        images[channel] = np.maximum(image[start : start + grid.rows, start : start + grid.cols], 0.0).astype(float)
+    return images
+
+
+def _node_pictures(
+    camera: CameraModel, channel: str, scene: SpectralImage, effects: Sequence[Effect]
+) -> tuple[FloatArray, NDArray[np.float32]]:
+    """Wavelengths (nm) of the frame's rule, and the electrons a second that the cube's samples give at each: (nodes, rows, cols)."""
+    lights: list[Light] = [(band, None) for band in scene.bands()]
+    wavelength_nm, weight = _detected(camera, channel, lights, effects, scene.kind)
+    weight = weight * _collection_m2_sr(camera)
+    nodes, _ = _otf_wavelengths(camera, channel, wavelength_nm, np.sum(weight, axis=0), FRAME_WAVELENGTHS)
+    shares = lagrange_shares(wavelength_nm, weight, nodes)
+    field = _field_of_rates(camera, channel, lights, effects, scene.kind)
+    rows, cols, bands = scene.radiance.shape
+    out = np.empty((nodes.size, rows, cols), np.float32)
+    strip = max(1, 4_000_000 // (cols * bands))
+    for top in range(0, rows, strip):
+        part = scene.radiance[top : top + strip].reshape(-1, bands)
+        if field is not None:
+            v, u = np.meshgrid(np.arange(top, min(top + strip, rows)) + 0.5, np.arange(cols) + 0.5, indexing="ij")
+            square = np.minimum(sin_theta_at(camera, *scene.warp().to_camera(u, v)) ** 2, field[0].x[-1]).ravel()
+            part = part * np.stack([spline(square) for spline in field], axis=1)
+        out[:, top : top + strip] = (shares.T.astype(part.dtype) @ part.T).reshape(nodes.size, -1, cols)
+    return nodes, out
+
+
+def _folded_transfer(
+    camera: CameraModel, wavelength_nm: float, shape: tuple[int, int], effects: Sequence[Effect]
+) -> FloatArray | ComplexArray:
+    """`_transfer_at` with the pixel's aperture and a picture's square of one pixel, folded onto samples of one pixel."""
+    from sim.optics.fold import folded, folded_diffraction  # here: the compiler's library takes a while to load
+
+    imaging = camera.lens.imaging
+    cutoff = camera.pixel_pitch_um * imaging.cutoff_cy_per_um(wavelength_nm, camera.lens.f_number)
+    if isinstance(imaging, DiffractionLimited) and all(type(effect).transfer is Effect.transfer for effect in effects):
+        return folded_diffraction(shape, camera.fill_factor, cutoff)
+    return folded(
+        lambda fx, fy: _transfer_at(camera, wavelength_nm, fx, fy, effects),
+        shape,
+        camera.fill_factor,
+        min(cutoff, HIGHEST_CY_PER_PX / 8.0),
+    )
+
+
+def _pixel_on_grid(camera: CameraModel, grid: Grid) -> tuple[FloatArray, FloatArray, ComplexArray, ComplexArray]:
+    """Frequencies fy (n, 1) and fx (1, n), cy/px, of a drawing's transform, and the factors on each that make samples pixels.
+
+    The pixel's aperture; a sample is a mean over its square, which is undone; a pixel's centre lies between even samples.
+    """
+    s = grid.oversample
+    ny, nx = grid.shape
+    fy, fx = fft.fftfreq(ny, 1.0 / s)[:, None], fft.rfftfreq(nx, 1.0 / s)[None, :]
+    shift = 1j * np.pi * (1.0 - 1.0 / s)
+    pixel_x, pixel_y = (aperture_otf(f, 0.0, camera.fill_factor) * np.exp(shift * f) / np.sinc(f / s) for f in (fx, fy))
+    return fy, fx, pixel_y, pixel_x
+
+
+def _at_pixels(spectrum: ComplexArray | NDArray[np.complex64], oversample: int, cols: int) -> FloatArray:
+    """Back from a transform to every `oversample`-th row and column: the rows are folded first."""
+    folded_rows = spectrum.reshape(oversample, len(spectrum) // oversample, -1).sum(axis=0) / oversample
+    return np.asarray(fft.irfft(fft.ifft(folded_rows, axis=0), cols, axis=1)[:, ::oversample])
 
 
 def _relative_to_ground(

@@ -115,8 +115,15 @@ class Effect(Frozen):
 
         fx runs along columns (x, to the right), fy along rows (y, down). May be complex. An effect that replaces a part of
         the baseline's OTF (defocus: diffraction with an aberrated pupil) returns the ratio to the baseline.
+        An effect that has `charge` too acts through that on whole frames; its `transfer` is for edges and kernels of one
+        channel, where there's no mosaic to move charge on (see `moves_charge`).
         """
         return None
+
+    @classmethod
+    def moves_charge(cls) -> bool:
+        """Whether the effect acts on whole frames through `charge`, and so not through `transfer`: never through both."""
+        return cls.charge is not Effect.charge
 
     def veil(self) -> float:
         """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""
@@ -127,7 +134,8 @@ class Effect(Frozen):
         return e_per_s
 
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
-        """CHARGE: mean electrons of a whole frame (rows, cols), after light and dark current were added."""
+        """CHARGE: mean electrons of a whole frame (rows, cols), after light and dark current were added. What it does to
+        them, `transfer` says of one channel alone; in a frame only this acts."""
         return electrons
 
     def left_behind(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:

@@ -61,7 +61,7 @@ class Crosstalk(Effect):
         )
 
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
-        if self.share_percent == 0.0 or camera.cfa == "MONO":
+        if self.share_percent == 0.0:
             return electrons
         c = self.share_percent / 100.0
         kernel = np.array([[0.0, c, 0.0], [c, 1.0 - 4.0 * c, c], [0.0, c, 0.0]])
