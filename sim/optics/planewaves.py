@@ -1,0 +1,191 @@
+"""Point spread function and transfer function of traced rays: every ray is a plane wave at the image.
+
+U(x, y) = sum_j w_j exp(i k [OPL_j + L_j (x - x_j) + M_j (y - y_j)]), w_j = sqrt(J_j K_j) dA_j, with J = d(L, M)/d(pupil) at
+the image and K the light that a unit of the pupil's area takes in; k = 2 pi n / wavelength.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from sim.spectrum import FloatArray
+
+
+@dataclass(frozen=True)
+class PupilRays:
+    """The rays of one field point and wavelength at the image plane, with their shares in the pupil.
+
+    `x_mm`, `y_mm` are where a ray meets the image plane, `cosine_x`, `cosine_y` its direction there, `path_mm` its optical path,
+    `area` the light that the ray stands for (K dA) and `jacobian` J / K, d(L, M) by that light. `mirrored` says that a ray
+    at +x stands for its mirror image too (`area` is that of one of them). `rim_l`, `rim_m` trace the pupil's rim in
+    direction cosines, closed, once around.
+    """
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    cosine_x: FloatArray
+    cosine_y: FloatArray
+    path_mm: FloatArray
+    jacobian: FloatArray
+    area: FloatArray
+    rim_l: FloatArray
+    rim_m: FloatArray
+    mirrored: bool
+    wavelength_nm: float
+    index: float
+
+    @property
+    def energy(self) -> float:
+        """Light that leaves the lens: integral K dA."""
+        return float(np.sum(self.area)) * (2.0 if self.mirrored else 1.0)
+
+    @property
+    def solid_angle(self) -> float:
+        """Integral dL dM over the open pupil."""
+        return float(np.sum(self.area * self.jacobian)) * (2.0 if self.mirrored else 1.0)
+
+    @property
+    def centroid_mm(self) -> tuple[float, float]:
+        """Centroid (x, y) of the light on the image plane: that of the rays, which is that of the wave too."""
+        total = np.sum(self.area)
+        x = 0.0 if self.mirrored else float(np.sum(self.area * self.x_mm) / total)
+        return x, float(np.sum(self.area * self.y_mm) / total)
+
+    @property
+    def wave_number_per_mm(self) -> float:
+        """k = 2 pi n / wavelength."""
+        return 2.0 * np.pi * self.index / (self.wavelength_nm * 1e-6)
+
+    def plane_path_mm(self, x_mm: float, y_mm: float) -> FloatArray:
+        """Path of every ray's plane wave at the image point (x, y): OPL + n (L (x - x_j) + M (y - y_j))."""
+        return self.path_mm + self.index * (self.cosine_x * (x_mm - self.x_mm) + self.cosine_y * (y_mm - self.y_mm))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _waves(phase: Any, step: Any, weight: Any, count: int) -> Any:
+    """(2, count, rays): real and imaginary part of weight exp(i (phase + step m)), m = 0, 1, ..., by recurrence."""
+    out = np.empty((2, count, phase.size))
+    for j in range(phase.size):
+        re, im = weight[j] * np.cos(phase[j]), weight[j] * np.sin(phase[j])
+        cs, sn = np.cos(step[j]), np.sin(step[j])
+        for i in range(count):
+            out[0, i, j], out[1, i, j] = re, im
+            re, im = re * cs - im * sn, re * sn + im * cs
+    return out
+
+
+def point_spread(rays: PupilRays, centre_mm: tuple[float, float], samples: int, pitch_um: float) -> FloatArray:
+    """(samples, samples) intensities on points around `centre_mm`, rows along y, as shares of all that leaves the lens.
+
+    Parseval: sum of |U|^2 dx dy over the whole plane is (wavelength / n)^2 times the light in the pupil.
+    """
+    k, pitch = rays.wave_number_per_mm, pitch_um * 1e-3
+    first = -0.5 * (samples - 1) * pitch
+    weight = np.sqrt(np.abs(rays.jacobian)) * rays.area
+    path = rays.plane_path_mm(*centre_mm) / rays.index
+    path = path - np.mean(path)
+    rows = _waves(k * (path + rays.cosine_y * first), k * rays.cosine_y * pitch, weight, samples)
+    if rays.mirrored and centre_mm[0] == 0.0:
+        # exp(i k L x) + exp(-i k L x) = 2 cos(k L x), and the window is its own mirror image.
+        half = (samples + 1) // 2
+        columns = _waves(k * rays.cosine_x * first, k * rays.cosine_x * pitch, np.full(rays.cosine_x.size, 2.0), half)[
+            0
+        ]
+        intensity = (rows[0] @ columns.T) ** 2 + (rows[1] @ columns.T) ** 2
+        intensity = np.concatenate([intensity, intensity[:, : samples - half][:, ::-1]], axis=1)
+    else:
+        one = np.ones(rays.cosine_x.size)
+        columns = _waves(k * rays.cosine_x * first, k * rays.cosine_x * pitch, one, samples)
+        wave = (rows[0] + 1j * rows[1]) @ (columns[0] + 1j * columns[1]).T
+        intensity = wave.real**2 + wave.imag**2
+    scale = (rays.wavelength_nm * 1e-6 / rays.index) ** 2 * rays.energy
+    return np.asarray(intensity * (pitch * pitch / scale))
+
+
+def _terms(x: FloatArray, y: FloatArray, order: int) -> FloatArray:
+    """(points, terms): products of Chebyshev polynomials T_i(x) T_j(y) with i + j <= order."""
+    tx = np.polynomial.chebyshev.chebvander(x, order)
+    ty = np.polynomial.chebyshev.chebvander(y, order)
+    return np.stack([tx[..., i] * ty[..., j] for i in range(order + 1) for j in range(order + 1 - i)], axis=-1)
+
+
+def _chords(rim_along: FloatArray, rim_across: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where lines at `across` enter and leave the rim's polygon: its lower and upper end along the other axis."""
+    a0, c0 = rim_along, rim_across
+    a1, c1 = np.roll(a0, -1), np.roll(c0, -1)
+    low, high = np.full(across.size, np.inf), np.full(across.size, -np.inf)
+    for i, line in enumerate(across):
+        cut = (c0 <= line) != (c1 <= line)
+        along = a0[cut] + (a1[cut] - a0[cut]) * (line - c0[cut]) / (c1[cut] - c0[cut])
+        if along.size:
+            low[i], high[i] = along.min(), along.max()
+    return low, high
+
+
+def transfer(
+    rays: PupilRays,
+    frequency_lp_per_mm: ArrayLike,
+    tangential: bool,
+    origin_mm: tuple[float, float],
+    order: int = 14,
+    nodes: int = 64,
+) -> np.ndarray[Any, np.dtype[np.complex128]]:
+    """Complex OTF at frequencies along y (tangential) or x (sagittal), of an image about `origin_mm`; 1 at frequency 0.
+
+    Autocorrelation of the pupil in direction cosines: H(f) = integral A(s + a/2) A*(s - a/2) ds / integral |A|^2 ds, |a| =
+    f wavelength / n, A = sqrt(K / J) exp(i k W). W and A are Chebyshev sums fitted to the rays, the overlap of the pupil
+    with its shifted self is laid out by Gauss-Legendre nodes between its chords: no window cuts anything off. Good where
+    lines along the frequency cut the rim twice, which convex pupils grant.
+    """
+    frequency = np.atleast_1d(np.asarray(frequency_lp_per_mm, float))
+    path = rays.plane_path_mm(*origin_mm)
+    amplitude = 1.0 / np.sqrt(np.abs(rays.jacobian))
+    cosine_x, cosine_y = rays.cosine_x, rays.cosine_y
+    if rays.mirrored:
+        cosine_x, cosine_y = np.concatenate([cosine_x, -cosine_x]), np.concatenate([cosine_y, cosine_y])
+        x = origin_mm[0]
+        mirror = rays.path_mm + rays.index * (
+            -rays.cosine_x * (x + rays.x_mm) + rays.cosine_y * (origin_mm[1] - rays.y_mm)
+        )
+        path, amplitude = np.concatenate([path, mirror]), np.concatenate([amplitude, amplitude])
+    centre = np.array([np.mean([rays.rim_l.min(), rays.rim_l.max()]), np.mean([rays.rim_m.min(), rays.rim_m.max()])])
+    half = np.array([np.ptp(rays.rim_l), np.ptp(rays.rim_m)]) * 0.5
+    terms = _terms((cosine_x - centre[0]) / half[0], (cosine_y - centre[1]) / half[1], order)
+    path = path - np.mean(path)
+    fitted = np.linalg.lstsq(terms, np.stack([path, amplitude], axis=1), rcond=1e-13)[0]
+    rim_along, rim_across = (rays.rim_m, rays.rim_l) if tangential else (rays.rim_l, rays.rim_m)
+    t, weight = np.polynomial.legendre.leggauss(nodes)
+    # Gauss-Chebyshev-like lines: square-root ends of the chords cost no accuracy.
+    theta = 0.5 * np.pi * t
+    middle, reach = 0.5 * (rim_across.min() + rim_across.max()), 0.5 * np.ptp(rim_across)
+    across = middle + reach * np.sin(theta)
+    line_weight = weight * 0.5 * np.pi * reach * np.cos(theta)
+    low, high = _chords(rim_along, rim_across, across)
+
+    def function(along: FloatArray) -> tuple[FloatArray, FloatArray]:
+        a, c = along, np.broadcast_to(across[:, None], along.shape)
+        first, second = (c, a) if tangential else (a, c)
+        values = _terms((first - centre[0]) / half[0], (second - centre[1]) / half[1], order) @ fitted
+        return values[..., 0], values[..., 1]
+
+    k = rays.wave_number_per_mm / rays.index
+
+    def overlap(shift: float) -> complex:
+        start, end = low + 0.5 * shift, high - 0.5 * shift
+        length = np.where(end > start, end - start, 0.0)
+        length[~np.isfinite(length)] = 0.0
+        start = np.where(length > 0, start, middle)
+        along = start[:, None] + 0.5 * length[:, None] * (1.0 + t)
+        path_far, amplitude_far = function(along + 0.5 * shift)
+        path_near, amplitude_near = function(along - 0.5 * shift)
+        value = amplitude_far * amplitude_near * np.exp(1j * k * (path_far - path_near))
+        return complex(np.sum(line_weight * 0.5 * length * (value @ weight)))
+
+    whole = overlap(0.0)
+    wavelength_mm = rays.wavelength_nm * 1e-6 / rays.index
+    return np.array([overlap(float(f) * wavelength_mm) / whole for f in frequency])

@@ -1,0 +1,702 @@
+"""A lens prescription traced: first-order quantities, chief rays, pupils, wavefronts, and the lens table."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sim.optics import rays as rt
+from sim.optics.glass import indices, substitutions
+from sim.optics.planewaves import PupilRays, point_spread
+from sim.optics.prescription import Prescription, PrescriptionError
+from sim.optics.table import TABLE_VERSION, LensTable, load_cached, store_cached
+from sim.parameters import Frozen
+from sim.spectrum import FloatArray
+
+REFERENCE_NM = 550.0
+#: Where the table of a lens begins and ends: 33 wavelengths.
+TABLE_WAVELENGTHS_NM = tuple(float(w) for w in range(400, 721, 10))
+_STEEPEST = math.tan(math.radians(60.0))
+
+Focus = Literal["file", "best"]
+Progress = Callable[[str, float], None]
+
+
+class TableSettings(Frozen):
+    """What a lens table is computed at.
+
+    `fields` field points from the centre to the corner, in equal steps of tan(theta) (of theta beyond 60 deg), or
+    `grid` x `grid` of them where the lens isn't centred. `maximum_field_deg` is the corner, None: the file's largest field.
+    `sample_pitch_um` None: as fine as the smallest wavelength's diffraction needs. `focus` says whether the image lies where
+    the file has it or where the wavefront on the axis is best.
+    """
+
+    wavelength_nm: tuple[float, ...] = TABLE_WAVELENGTHS_NM
+    fields: int = 21
+    grid: int = 11
+    maximum_field_deg: float | None = None
+    samples: int = 64
+    sample_pitch_um: float | None = None
+    focus: Focus = "file"
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """Paraxial quantities at one wavelength; lengths in mm.
+
+    Positions: the entrance pupil's from the first surface, the exit pupil's and the back focus from the last one before the
+    image. `working_f_number` is 1 / (2 u') of the marginal ray, which at infinity is `f_number`.
+    """
+
+    wavelength_nm: float
+    focal_length_mm: float
+    back_focus_mm: float
+    f_number: float
+    working_f_number: float
+    entrance_pupil_mm: float
+    entrance_pupil_position_mm: float
+    exit_pupil_mm: float
+    exit_pupil_position_mm: float
+    paraxial_image_mm: float
+    magnification: float
+    stop_semi_diameter_mm: float
+
+
+class OpticalSystem:
+    """A prescription ready to be traced: indices looked up, stop sized, image placed.
+
+    The stop is as large as the real ray on the axis at the primary wavelength through the rim of the paraxial entrance
+    pupil makes it; every other field and wavelength fills that stop (ray aiming).
+    """
+
+    def __init__(self, prescription: Prescription, focus: Focus = "file") -> None:
+        self.prescription = prescription
+        self.primary_nm = prescription.primary_wavelength_nm or REFERENCE_NM
+        known = prescription.wavelength_nm
+        inside = not known or min(known) <= REFERENCE_NM <= max(known)
+        self.reference_nm = REFERENCE_NM if inside else self.primary_nm
+        self._index: dict[float, FloatArray] = {}
+        self.warnings: list[str] = [*prescription.warnings, *substitutions(prescription)]
+        if prescription.surfaces[-1].curvature_per_mm:
+            self.warnings.append("the image surface is curved in the file; images are computed on its vertex plane")
+        pupil_mm = self._entrance_pupil(self.primary_nm)
+        stop_radius = self._stop_radius(pupil_mm)
+        self.pupil_radius_mm = 0.5 * pupil_mm
+        self.surfaces = rt.compiled_surfaces(prescription, stop_radius)
+        self.image_shift_mm = 0.0
+        if focus == "best":
+            self.image_shift_mm = self._best_focus()
+            self.surfaces = rt.compiled_surfaces(prescription, stop_radius, self.image_shift_mm)
+        self.first_order = self._first_order(self.primary_nm)
+        self._compare_with_file()
+
+    # --- indices and paraxial optics ----------------------------------------------------------------------------------
+
+    def index(self, wavelength_nm: float) -> FloatArray:
+        """Index before the first surface and behind each one."""
+        key = float(wavelength_nm)
+        if key not in self._index:
+            self._index[key] = np.ascontiguousarray(indices(self.prescription, [key])[0])
+        return self._index[key]
+
+    def prepare(self, wavelength_nm: ArrayLike) -> None:
+        """Look up the indices at many wavelengths at once."""
+        wavelengths = np.asarray(wavelength_nm, float)
+        for w, row in zip(wavelengths, indices(self.prescription, wavelengths), strict=True):
+            self._index[float(w)] = np.ascontiguousarray(row)
+
+    def _matrices(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
+        """Paraxial matrices on (y, n u): from the first vertex to the stop's plane, and from there behind the last surface."""
+        index = self.index(wavelength_nm)
+        surfaces = self.prescription.surfaces
+        matrix, before = np.eye(2), np.eye(2)
+        for i, surface in enumerate(surfaces[:-1]):
+            if i == self.prescription.stop:
+                before, matrix = matrix, np.eye(2)
+            if surface.kind != "coordinate_break":
+                quadratic = 0.0
+                if surface.kind == "even_asphere" and surface.coefficients_mm:
+                    quadratic = 2.0 * surface.coefficients_mm[0]
+                if surface.kind == "odd_asphere" and len(surface.coefficients_mm) > 1:
+                    quadratic = 2.0 * surface.coefficients_mm[1]
+                power = (index[i + 1] - index[i]) * (surface.curvature_per_mm + quadratic)
+                matrix = np.array([[1.0, 0.0], [-power, 1.0]]) @ matrix
+            if i < len(surfaces) - 2:
+                matrix = np.array([[1.0, surface.thickness_mm / index[i + 1]], [0.0, 1.0]]) @ matrix
+        return before, matrix
+
+    def _entrance_pupil_position(self, wavelength_nm: float) -> float:
+        before, _ = self._matrices(wavelength_nm)
+        if abs(before[0, 0]) < 1e-9:
+            raise PrescriptionError(
+                "the entrance pupil lies at infinity (telecentric in object space), which isn't traced; move the stop"
+            )
+        return float(before[0, 1] / before[0, 0] * self.index(wavelength_nm)[0])
+
+    def _entrance_pupil(self, wavelength_nm: float) -> float:
+        """The paraxial entrance pupil's diameter, mm, by the file's aperture."""
+        before, after = self._matrices(wavelength_nm)
+        whole = after @ before
+        kind, value = self.prescription.aperture_kind, self.prescription.aperture_value
+        position = self._entrance_pupil_position(wavelength_nm)
+        distance = self.prescription.object_distance_mm
+        if whole[1, 0] == 0.0 and kind in ("f_number", "working_f_number"):
+            raise PrescriptionError("the lens has no focal length, so no f-number either; give the aperture by ENPD")
+        if kind == "entrance_pupil_mm":
+            return value
+        if kind == "f_number":
+            return float(abs(1.0 / whole[1, 0]) / value)
+        if kind == "stop_semi_diameter":
+            if not value > 0:
+                raise PrescriptionError("header: FLOA takes the stop's DIAM, which is 0; give it or ENPD")
+            return float(2.0 * value / abs(before[0, 0]))
+        if kind == "object_numerical_aperture":
+            assert distance is not None
+            if value >= 1.0:
+                raise PrescriptionError(f"header: OBNA {value:g} isn't below the limit of 1; correct it")
+            return 2.0 * (distance + position) * math.tan(math.asin(value))
+        if distance is None:
+            return float(abs(1.0 / whole[1, 0]) / value)
+        # A ray of slope u from the object's axis: y = u d at the first vertex; u' is linear in it.
+        slope = abs((whole @ [distance, 1.0])[1]) / self.index(wavelength_nm)[-2]
+        return float((distance + position) / (value * slope))
+
+    def _stop_radius(self, pupil_mm: float) -> float:
+        """Where the real ray on the axis through the entrance pupil's rim meets the stop."""
+        if self.prescription.aperture_kind == "stop_semi_diameter":
+            return self.prescription.aperture_value
+        surfaces = rt.compiled_surfaces(_centred(self.prescription), 1.0)
+        out, nowhere = np.zeros(rt.ROW), np.zeros((0, 3))
+        rt.trace_ray(surfaces, self.index(self.primary_nm), self._axis(), 0.0, 0.5 * pupil_mm, False, out, nowhere)
+        radius = math.hypot(out[rt.STOP_X], out[rt.STOP_Y])
+        if out[rt.STATUS] != rt.ARRIVED:
+            # The ray may be lost behind the stop: the paraxial size is what is left.
+            before, _ = self._matrices(self.primary_nm)
+            radius = abs(before[0, 0]) * 0.5 * pupil_mm
+            self.warnings.append(
+                f"the marginal ray on the axis {rt.OUTCOMES[int(out[rt.STATUS])]} at surface {int(out[rt.SURFACE]) + 1}; "
+                "the stop has its paraxial size"
+            )
+        return radius
+
+    def _first_order(self, wavelength_nm: float) -> FirstOrder:
+        before, after = self._matrices(wavelength_nm)
+        whole = after @ before
+        power = -whole[1, 0]
+        if power == 0.0:
+            raise PrescriptionError(
+                "the lens has no power: it makes no image of what is far away; check curvatures and glasses"
+            )
+        focal = float(1.0 / power)
+        if focal < 0:
+            raise PrescriptionError(
+                f"the lens's focal length is {focal:g} mm, below the limit of 0: it makes no real image; check curvatures and glasses"
+            )
+        index = self.index(wavelength_nm)
+        position = self._entrance_pupil_position(wavelength_nm)
+        distance = self.prescription.object_distance_mm
+        back = float(-index[-2] * whole[0, 0] / whole[1, 0])
+        pupil = 2.0 * self.pupil_radius_mm
+        if distance is None:
+            image, magnification, working = back, 0.0, focal / pupil
+        else:
+            y, nu = whole @ [distance, 1.0]
+            image = float(-y * index[-2] / nu)
+            magnification = float(index[0] / nu)
+            working = float((distance + position) / pupil * index[-2] / abs(nu))
+        exit_size = abs(2.0 * self.surfaces.stop_radius / after[1, 1]) if after[1, 1] else math.inf
+        exit_position = float(-after[0, 1] / after[1, 1] * index[-2]) if after[1, 1] else math.inf
+        return FirstOrder(
+            wavelength_nm=wavelength_nm,
+            focal_length_mm=focal,
+            back_focus_mm=back,
+            f_number=focal / pupil,
+            working_f_number=working,
+            entrance_pupil_mm=pupil,
+            entrance_pupil_position_mm=position,
+            exit_pupil_mm=exit_size,
+            exit_pupil_position_mm=exit_position,
+            paraxial_image_mm=image,
+            magnification=magnification,
+            stop_semi_diameter_mm=self.surfaces.stop_radius,
+        )
+
+    def _compare_with_file(self) -> None:
+        """A line for each of the file's own values that the traced lens doesn't have."""
+        first, prescription = self.first_order, self.prescription
+        stated = [("focal length", prescription.stated_focal_length_mm, first.focal_length_mm, "mm", 2e-3)]
+        if prescription.aperture_kind == "f_number":
+            stated.append(("f-number", prescription.aperture_value, first.f_number, "", 1e-4))
+        if prescription.aperture_kind == "entrance_pupil_mm":
+            stated.append(("entrance pupil", prescription.aperture_value, first.entrance_pupil_mm, "mm", 1e-4))
+        stop = prescription.surfaces[prescription.stop]
+        stated.append(("stop's semi-diameter", stop.semi_diameter_mm or None, first.stop_semi_diameter_mm, "mm", 0.02))
+        for name, value, computed, unit, tolerance in stated:
+            if value is not None and abs(computed / value - 1.0) > tolerance:
+                self.warnings.append(
+                    f"the file states a {name} of {value:.5g} {unit}".rstrip()
+                    + f", the traced lens has {computed:.5g} {unit}".rstrip()
+                )
+
+    # --- fields and chief rays ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def _pupil_position(self) -> float:
+        return self._entrance_pupil_position(self.primary_nm)
+
+    def _axis(self) -> FloatArray:
+        return self.field((0.0, 0.0))
+
+    def field(self, tangent: tuple[float, float]) -> FloatArray:
+        """What the tracer needs of the field point whose light goes along (tan x, tan y, 1) at the entrance pupil."""
+        tx, ty = tangent
+        distance = self.prescription.object_distance_mm
+        if distance is None:
+            length = math.sqrt(1.0 + tx * tx + ty * ty)
+            return np.array([0.0, tx / length, ty / length, 1.0 / length, self._pupil_position])
+        reach = distance + self._pupil_position
+        return np.array([1.0, -tx * reach, -ty * reach, -distance, self._pupil_position])
+
+    def trace(self, tangent: tuple[float, float], wavelength_nm: float, px: ArrayLike, py: ArrayLike) -> FloatArray:
+        """Rows (`sim.optics.rays`) of the rays of a field point through places (mm) of the entrance pupil's plane."""
+        return np.asarray(
+            rt.trace_rays(
+                self.surfaces,
+                self.index(wavelength_nm),
+                self.field(tangent),
+                np.atleast_1d(np.asarray(px, float)),
+                np.atleast_1d(np.asarray(py, float)),
+            )
+        )
+
+    def aim(
+        self, tangent: tuple[float, float], wavelength_nm: float, start: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[float, float] | None:
+        """Place in the entrance pupil's plane of the ray through the stop's centre, or None where there is none."""
+        x, y, found = rt.aim(self.surfaces, self.index(wavelength_nm), self.field(tangent), start[0], start[1])
+        return (float(x), float(y)) if found else None
+
+    def chief(
+        self, tangent: tuple[float, float], wavelength_nm: float, start: tuple[float, float] = (0.0, 0.0)
+    ) -> FloatArray | None:
+        """The chief ray's row, or None where it doesn't reach the image."""
+        at = self.aim(tangent, wavelength_nm, start)
+        return None if at is None else self.trace(tangent, wavelength_nm, at[0], at[1])[0]
+
+    def _best_focus(self) -> float:
+        """How far behind the file's image the wavefront on the axis at the reference wavelength is flattest, mm.
+
+        Moving the image by d changes the path of a ray of direction cosine N by -n d N: a least-squares fit.
+        """
+        rays = self.pupil((0.0, 0.0), self.reference_nm, span=20.0)
+        if rays is None:
+            raise PrescriptionError("no light reaches the image on the axis; check the apertures and the stop")
+        path = rays.plane_path_mm(0.0, 0.0)
+        lean = np.sqrt(1.0 - rays.cosine_x**2 - rays.cosine_y**2) * rays.index
+        weight = rays.area / np.sum(rays.area)
+        path, lean = path - np.sum(weight * path), lean - np.sum(weight * lean)
+        return float(-np.sum(weight * path * lean) / np.sum(weight * lean * lean))
+
+    # --- pupils -------------------------------------------------------------------------------------------------------
+
+    def pupil(
+        self, tangent: tuple[float, float], wavelength_nm: float, span: float, start: tuple[float, float] | None = None
+    ) -> PupilRays | None:
+        """The open pupil of a field point, laid out in rays, or None where no light comes through.
+
+        Polar about the chief ray (or about an open place, where the chief ray is clipped): Gauss-Legendre nodes out to the
+        rim, which is found for each of equally spaced directions. `span` is the largest difference of phase (rad) between
+        the pupil's centre and its rim that is to be summed: as many nodes are taken as it needs.
+        """
+        index, field = self.index(wavelength_nm), self.field(tangent)
+        at = self.aim(tangent, wavelength_nm, start or (0.0, 0.0))
+        centre = at if at is not None and self._is_open(index, field, at) else self._open_place(index, field, at)
+        if centre is None:
+            return None
+        mirrored = self.prescription.centred and tangent[0] == 0.0
+        radial = math.ceil(0.4 * span) + 10
+        around = 2 * (math.ceil(0.6 * span) + 14)
+        half = around // 2
+        # From +y over +x: the second half is the first one's mirror image.
+        angle = 0.5 * np.pi - 2.0 * np.pi * (np.arange(around) + 0.5) / around
+        if mirrored:
+            angle = angle[:half]
+        reach = rt.rim(self.surfaces, index, field, centre[0], centre[1], angle, 1.1 * self.pupil_radius_mm)
+        if not np.all(reach > 0):
+            return None
+        t, weight = _gauss(radial)
+        s = t[:, None] * reach[None, :]
+        px, py = centre[0] + s * np.cos(angle), centre[1] + s * np.sin(angle)
+        area = (weight * t)[:, None] * (reach * reach)[None, :] * (2.0 * np.pi / around)
+        rows = rt.trace_rays(self.surfaces, index, field, px.ravel(), py.ravel())
+        edge = rt.trace_rays(
+            self.surfaces,
+            index,
+            field,
+            centre[0] + reach * np.cos(angle) * (1 - 1e-9),
+            centre[1] + reach * np.sin(angle) * (1 - 1e-9),
+        )
+        light = area.ravel() * self._light(field, px.ravel(), py.ravel())
+        jacobian = np.abs(rows[:, rt.DL_DX] * rows[:, rt.DM_DY] - rows[:, rt.DL_DY] * rows[:, rt.DM_DX])
+        good = rows[:, rt.STATUS] == rt.ARRIVED
+        rows, light = rows[good], light[good]
+        jacobian = jacobian[good] / self._light(field, px.ravel()[good], py.ravel()[good])
+        edge = edge[edge[:, rt.STATUS] == rt.ARRIVED]
+        rim_l, rim_m = edge[:, rt.L], edge[:, rt.M]
+        if mirrored:
+            rim_l, rim_m = np.concatenate([rim_l, -rim_l[::-1]]), np.concatenate([rim_m, rim_m[::-1]])
+        return PupilRays(
+            x_mm=rows[:, rt.X],
+            y_mm=rows[:, rt.Y],
+            cosine_x=rows[:, rt.L],
+            cosine_y=rows[:, rt.M],
+            path_mm=rows[:, rt.PATH],
+            jacobian=jacobian,
+            area=light,
+            rim_l=rim_l,
+            rim_m=rim_m,
+            mirrored=mirrored,
+            wavelength_nm=wavelength_nm,
+            index=float(index[-2]),
+        )
+
+    def _light(self, field: FloatArray, px: FloatArray, py: FloatArray) -> FloatArray:
+        """What a unit of the entrance pupil's plane takes in: that of a plane wave, or d(L, M) of a Lambertian object point."""
+        if field[0] == 0.0:
+            return np.ones(px.size)
+        reach = field[4] - field[3]
+        square = reach * reach / ((px - field[1]) ** 2 + (py - field[2]) ** 2 + reach * reach)
+        return np.asarray(square * square / (reach * reach))
+
+    def _is_open(self, index: FloatArray, field: FloatArray, at: tuple[float, float]) -> bool:
+        out = np.zeros(rt.ROW)
+        rt.trace_ray(self.surfaces, index, field, at[0], at[1], False, out, np.zeros((0, 3)))
+        return bool(out[rt.STATUS] == rt.ARRIVED and out[rt.CLIP] < -1e-6)
+
+    def _open_place(
+        self, index: FloatArray, field: FloatArray, near: tuple[float, float] | None
+    ) -> tuple[float, float] | None:
+        """The place of the pupil with the most room about it, from a coarse look: where the chief ray is clipped."""
+        x0, y0 = near or (0.0, 0.0)
+        grid = np.linspace(-2.0, 2.0, 61) * self.pupil_radius_mm
+        px, py = (values.ravel() for values in np.meshgrid(x0 + grid, y0 + grid))
+        rows = rt.trace_rays(self.surfaces, index, field, px, py)
+        room = np.where(rows[:, rt.STATUS] == rt.ARRIVED, -rows[:, rt.CLIP], -np.inf)
+        if self.prescription.centred and field[1] == 0.0:
+            room[np.abs(px) > 1e-9 * self.pupil_radius_mm] = -np.inf
+        best = int(np.argmax(room))
+        return (float(px[best]), float(py[best])) if room[best] > 1e-6 else None
+
+    # --- the field of view --------------------------------------------------------------------------------------------
+
+    def file_field_tangent(self) -> float:
+        """tan of the file's largest field angle at the entrance pupil."""
+        prescription, first = self.prescription, self.first_order
+        largest = max(math.hypot(*point) for point in prescription.field_points)
+        distance = prescription.object_distance_mm
+        reach = None if distance is None else distance + self._pupil_position
+        if prescription.field_kind == "angle_deg":
+            return max(
+                math.hypot(math.tan(math.radians(x)), math.tan(math.radians(y))) for x, y in prescription.field_points
+            )
+        if prescription.field_kind == "object_height_mm":
+            assert reach is not None
+            return largest / reach
+        ideal = largest / first.focal_length_mm if reach is None else largest / abs(first.magnification) / reach
+        if prescription.field_kind == "paraxial_image_height_mm":
+            return ideal
+        return self._tangent_of_height(largest, ideal)
+
+    def _tangent_of_height(self, height_mm: float, ideal: float) -> float:
+        """The field tangent whose chief ray meets the image at a height, by secant steps from the paraxial one."""
+        tangent = ideal
+        for _ in range(30):
+            row = self.chief((0.0, tangent), self.primary_nm)
+            if row is None:
+                tangent *= 0.9
+                continue
+            step = height_mm / row[rt.Y]
+            if abs(step - 1.0) < 1e-10:
+                break
+            tangent *= step
+        return tangent
+
+    def starts(self, tangents: Sequence[tuple[float, float]], wavelength_nm: float) -> list[tuple[float, float] | None]:
+        """Places of the chief rays of a row of field points, each found from the one before; None from the first lost one on."""
+        found: list[tuple[float, float] | None] = []
+        start: tuple[float, float] = (0.0, 0.0)
+        previous = (0.0, 0.0)
+        for tangent in tangents:
+            place: tuple[float, float] | None = start
+            # Far steps are taken in parts: the pupil wanders with the field.
+            for share in (0.25, 0.5, 0.75, 1.0):
+                between = (
+                    previous[0] + share * (tangent[0] - previous[0]),
+                    previous[1] + share * (tangent[1] - previous[1]),
+                )
+                if place is not None:
+                    place = self.aim(between, wavelength_nm, place)
+            if place is None:
+                return found + [None] * (len(tangents) - len(found))
+            found.append(place)
+            start, previous = place, tangent
+        return found
+
+    def works(self, tangents: Sequence[tuple[float, float]], wavelengths_nm: Sequence[float]) -> tuple[int, str]:
+        """How many of a row of field points from the centre out work, and what ends them.
+
+        A field point works where the chief ray reaches the image, farther out than the one before, and some light comes
+        through, at every one of the wavelengths.
+        """
+        count, reason = len(tangents), ""
+        for w in wavelengths_nm:
+            height = -1e-12
+            for i, (tangent, place) in enumerate(zip(tangents, self.starts(tangents, w), strict=True)):
+                if i >= count:
+                    break
+                if place is None:
+                    count, reason = i, "the chief ray is lost"
+                    break
+                row = self.trace(tangent, w, place[0], place[1])[0]
+                out = math.hypot(row[rt.X], row[rt.Y])
+                if out <= height:
+                    count, reason = i, "the image turns back"
+                    break
+                height = out
+                field, index = self.field(tangent), self.index(w)
+                if not self._is_open(index, field, place) and self._open_place(index, field, place) is None:
+                    count, reason = i, "no light comes through"
+                    break
+        return count, reason
+
+
+@lru_cache(maxsize=64)
+def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Legendre nodes and weights on 0..1."""
+    t, weight = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (t + 1.0), 0.5 * weight
+
+
+def _centred(prescription: Prescription) -> Prescription:
+    """The lens without its shifts and tilts: what its first-order quantities are those of."""
+    if prescription.centred:
+        return prescription
+    surfaces = tuple(
+        surface.model_copy(update={"decentre_mm": (0.0, 0.0), "tilt_deg": (0.0, 0.0, 0.0), "aperture": None})
+        for surface in prescription.surfaces
+    )
+    return prescription.model_copy(update={"surfaces": surfaces})
+
+
+# --- the table ---------------------------------------------------------------------------------------------------------
+
+
+def content_hash(prescription: Prescription, settings: TableSettings) -> str:
+    """Hash of all that a table depends on: the prescription, the settings and the way of computing."""
+    parts = [prescription.model_dump(mode="json"), settings.model_dump(mode="json"), TABLE_VERSION]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def lens_table(
+    prescription: Prescription, settings: TableSettings | None = None, progress: Progress | None = None
+) -> LensTable:
+    """Trace a lens and lay down what it does: see `LensTable`. PrescriptionError where it makes no image."""
+    settings = settings or TableSettings()
+    return OpticalTable(OpticalSystem(prescription, settings.focus), settings).table(progress)
+
+
+def cached_table(
+    prescription: Prescription, folder: Path, settings: TableSettings | None = None, progress: Progress | None = None
+) -> LensTable:
+    """The table of a lens from the cache folder, or computed and kept there: a damaged file is computed again."""
+    settings = settings or TableSettings()
+    stored = load_cached(folder, content_hash(prescription, settings))
+    if stored is not None:
+        return stored
+    table = lens_table(prescription, settings, progress)
+    store_cached(folder, table)
+    return table
+
+
+class OpticalTable:
+    """The field points and the sampling of a lens table, and its computation."""
+
+    def __init__(self, system: OpticalSystem, settings: TableSettings) -> None:
+        self.system, self.settings = system, settings
+        self.warnings: list[str] = []
+        self.wavelengths = np.array(settings.wavelength_nm, float)
+        if self.wavelengths.size == 0 or np.any(np.diff(self.wavelengths) <= 0):
+            raise PrescriptionError(f"wavelengths {settings.wavelength_nm[:4]} don't ascend; sort them")
+        system.prepare(self.wavelengths)
+        self.symmetric = system.prescription.centred
+        self.tangents = self._field_points()
+        self.pitch_um = settings.sample_pitch_um or self._pitch()
+
+    def _outermost(self) -> float:
+        stated = self.settings.maximum_field_deg
+        if stated is None:
+            return self.system.file_field_tangent()
+        if not 0 < stated < 90:
+            raise PrescriptionError(
+                f"maximum field {stated:g} deg isn't between the limits of 0 and 90 deg; correct it"
+            )
+        return math.tan(math.radians(stated))
+
+    def _line(self, outermost: float, count: int) -> list[float]:
+        if outermost <= _STEEPEST:
+            return [outermost * i / (count - 1) for i in range(count)]
+        return [math.tan(math.atan(outermost) * i / (count - 1)) for i in range(count)]
+
+    def _spokes(self) -> list[tuple[float, float]]:
+        """Directions in which the field has to work out to its edge."""
+        if self.symmetric:
+            return [(0.0, 1.0)]
+        corner = math.sqrt(0.5)
+        return [(corner * a, corner * b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+
+    def _field_points(self) -> list[tuple[float, float]]:
+        """The table's field points, limited to where the lens works."""
+        settings, outermost = self.settings, self._outermost()
+        if min(settings.fields, settings.grid) < 2 and outermost > 0:
+            raise PrescriptionError("a table needs two field points at least; ask for more")
+        checked = sorted({self.wavelengths[0], self.wavelengths[-1], self.system.reference_nm})
+        for spoke in self._spokes():
+            outermost = self._limited(outermost, spoke, checked)
+        if self.symmetric:
+            return [(0.0, t) for t in self._line(outermost, settings.fields)]
+        half = self._line(outermost * math.sqrt(0.5), (settings.grid + 1) // 2)
+        line = [-t for t in reversed(half[1:])] + half
+        return [(tx, ty) for ty in line for tx in line]
+
+    def _limited(self, outermost: float, spoke: tuple[float, float], wavelengths_nm: list[float]) -> float:
+        """How far out along a direction the lens works, `outermost` at most; found by halving."""
+
+        def points(end: float) -> list[tuple[float, float]]:
+            return [(spoke[0] * t, spoke[1] * t) for t in self._line(end, self.settings.fields)]
+
+        count, reason = self.system.works(points(outermost), wavelengths_nm)
+        if count == self.settings.fields:
+            return outermost
+        if count == 0:
+            raise PrescriptionError(f"on the axis {reason}: the lens makes no image; check the apertures and the stop")
+        line = self._line(outermost, self.settings.fields)
+        low, high = line[max(count - 1, 0)], line[count]
+        while high - low > 1e-4 * high:
+            middle = 0.5 * (low + high)
+            if self.system.works(points(middle), wavelengths_nm)[0] == self.settings.fields:
+                low = middle
+            else:
+                high = middle
+        if low <= 0:
+            raise PrescriptionError(f"off the axis {reason}: the lens has no field; check the apertures and the stop")
+        stated, reached = (math.degrees(math.atan(t)) for t in (outermost, low))
+        self.warnings.append(f"the table ends at {reached:.2f} deg, not at {stated:.2f} deg: beyond, {reason}")
+        return low
+
+    def _pitch(self) -> float:
+        """Samples as fine as the image of the shortest wavelength can be, wavelength N / 2, in steps of 0.05 um."""
+        finest = 0.5e-3 * self.wavelengths[0] * self.system.first_order.working_f_number
+        return max(0.05 * math.floor(finest / 0.05), 0.05)
+
+    def table(self, progress: Progress | None = None) -> LensTable:
+        """Compute it."""
+        system, settings = self.system, self.settings
+        w_count, f_count, n = self.wavelengths.size, len(self.tangents), settings.samples
+        chief, window = np.zeros((f_count, 2)), np.zeros((f_count, 2))
+        solid, energy = np.zeros((w_count, f_count)), np.zeros((w_count, f_count))
+        psf = np.zeros((w_count, f_count, n, n))
+        centroid = np.zeros((w_count, f_count, 2))
+        half_window_mm = 0.5e-3 * n * self.pitch_um
+        half_diagonal = half_window_mm * math.sqrt(2.0)
+        starts = self._starts()
+        for f, tangent in enumerate(self.tangents):
+            row = system.chief(tangent, system.reference_nm, starts[f])
+            assert row is not None
+            chief[f] = row[rt.X], row[rt.Y]
+            pupils = [self._pupil(tangent, w, starts[f], half_diagonal, chief[f]) for w in self.wavelengths]
+            for i, pupil in enumerate(pupils):
+                solid[i, f], energy[i, f] = pupil.solid_angle, pupil.energy
+                centroid[i, f] = (np.array(pupil.centroid_mm) - chief[f]) * 1e3
+            window[f] = 0.5 * (centroid[:, f].min(axis=0) + centroid[:, f].max(axis=0))
+            at = chief[f] + 1e-3 * window[f]
+            if self.symmetric:
+                at[0] = 0.0
+            for i, pupil in enumerate(pupils):
+                psf[i, f] = point_spread(pupil, (float(at[0]), float(at[1])), n, self.pitch_um)
+            if progress is not None:
+                progress(f"field {f + 1} of {f_count}", (f + 1) / f_count)
+        axis = self._axis_index()
+        # Everything is seen through the same unit of the entrance pupil; the image's own solid angle is what lights it.
+        relative = solid / solid[:, axis : axis + 1]
+        return LensTable(
+            wavelength_nm=self.wavelengths,
+            field_deg=np.degrees(np.arctan(np.array(self.tangents))),
+            grid_shape=(f_count,) if self.symmetric else (settings.grid, settings.grid),
+            symmetric=self.symmetric,
+            reference_wavelength_nm=system.reference_nm,
+            focal_length_mm=system.first_order.focal_length_mm,
+            f_number=system.first_order.f_number,
+            entrance_pupil_mm=system.first_order.entrance_pupil_mm,
+            chief_mm=chief,
+            relative_illumination=relative,
+            psf=psf,
+            window_um=window,
+            sample_pitch_um=self.pitch_um,
+            encircled_share=psf.sum(axis=(2, 3)),
+            centroid_um=centroid,
+            warnings=tuple(dict.fromkeys([*system.warnings, *self.warnings])),
+            content_hash=content_hash(system.prescription, settings),
+        )
+
+    def _axis_index(self) -> int:
+        return int(np.argmin([math.hypot(*tangent) for tangent in self.tangents]))
+
+    def _starts(self) -> list[tuple[float, float]]:
+        """Where the chief rays of the field points pass the entrance pupil's plane, found from the centre outwards."""
+        system = self.system
+        if self.symmetric:
+            found = system.starts(self.tangents, system.reference_nm)
+        else:
+            found = []
+            for tx, ty in self.tangents:
+                spoke = [(tx * share, ty * share) for share in (0.0, 0.5, 1.0)]
+                found.append(system.starts(spoke, system.reference_nm)[-1])
+        lost = [tangent for tangent, place in zip(self.tangents, found, strict=True) if place is None]
+        if lost:
+            raise PrescriptionError(f"the chief ray at {_angles(lost[0])} is lost; ask for a smaller field")
+        return [place for place in found if place is not None]
+
+    def _pupil(
+        self,
+        tangent: tuple[float, float],
+        wavelength_nm: float,
+        start: tuple[float, float],
+        half_diagonal_mm: float,
+        chief_mm: FloatArray,
+    ) -> PupilRays:
+        """The pupil with as many rays as the window and the aberrations ask for."""
+        k = 2e6 * math.pi / wavelength_nm * self.system.index(wavelength_nm)[-2]
+        aperture = 0.5 / self.system.first_order.working_f_number
+        first = self.system.pupil(tangent, wavelength_nm, 0.0, start)
+        if first is None:
+            raise PrescriptionError(
+                f"no light comes through at {_angles(tangent)}, {wavelength_nm:g} nm; ask for a smaller field"
+            )
+        blur = float(np.max(np.hypot(first.x_mm - chief_mm[0], first.y_mm - chief_mm[1])))
+        rays = self.system.pupil(tangent, wavelength_nm, k * aperture * (half_diagonal_mm + blur), start)
+        assert rays is not None
+        return rays
+
+
+def _angles(tangent: tuple[float, float]) -> str:
+    x, y = (math.degrees(math.atan(t)) for t in tangent)
+    return f"({x:.2f}, {y:.2f}) deg"
