@@ -140,6 +140,22 @@ def mapped_means(pattern, u, v, divide, lit, gaps, surround, out):  # type: igno
 
 
 @njit(cache=True)
+def tapered_rings(down, across, down2, across2, start, end, out):  # type: ignore[no-untyped-def]
+    """1/2 + 1/2 Re(down across) out of the complex factors by row and column, fading to 1/2 from distance `start` to `end`;
+    `down2`, `across2` are the squares of row's and column's distances from the centre."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            distance2 = down2[i] + across2[j]
+            if distance2 >= end * end:
+                out[i, j] = 0.5
+                continue
+            level = down[i].real * across[j].real - down[i].imag * across[j].imag
+            if distance2 > start * start:
+                level *= 0.5 + 0.5 * np.cos(np.pi * (np.sqrt(distance2) - start) / (end - start))
+            out[i, j] = 0.5 + 0.5 * level
+
+
+@njit(cache=True)
 def _clip(points, count, axis, limit, sign, kept):  # type: ignore[no-untyped-def]
     """The part of a convex polygon (its first `count` points) where sign x (coordinate - limit) > 0, into `kept`; how many
     points it has (Sutherland and Hodgman 1974)."""

@@ -7,7 +7,7 @@ distortion included, is the lens's.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Self
 
 import cv2
@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from sim.camera import CameraModel, Geometry
 from sim.parameters import Frozen, Quantity, declared
 from sim.scene import colorchecker
+from sim.scene.light import luminance_cd_m2, screen
 from sim.scene.scenes import (
     EdgeRegion,
     KnifeEdge,
@@ -33,9 +34,9 @@ from sim.scene.scenes import (
     UniformField,
     ZonePlate,
 )
-from sim.scene.screen import Screen
+from sim.scene.screen import SubPixels
 from sim.scene.warp import Warp
-from sim.spectrum import FloatArray, Spectrum
+from sim.spectrum import Spectrum
 
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -109,8 +110,8 @@ class View:
         return -0.5 * cols * cell_mm, -0.5 * rows * cell_mm, self.distance_mm
 
 
-class NamedScene(Frozen):
-    """Base of the scenes that have a name; a subclass's fields are its parameters, each declared with its `Quantity`."""
+class Declared(Frozen):
+    """Base of all declarations: a subclass's fields are its parameters, each with its `Quantity`."""
 
     name: ClassVar[str]
     shows: ClassVar[str]
@@ -119,6 +120,25 @@ class NamedScene(Frozen):
     def quantities(cls) -> dict[str, Quantity]:
         """The declared parameters, by field name."""
         return declared(cls)
+
+    @classmethod
+    def chosen(cls, parameters: Mapping[str, object] | None) -> Self:
+        """The declaration with some parameters set. Raises ValueError, in one line, for an unknown one or a value outside its
+        bounds."""
+        try:
+            return cls.model_validate(dict(parameters or {}))
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            where = ".".join(str(part) for part in problem["loc"])
+            if problem["type"] == "extra_forbidden":
+                raise ValueError(
+                    f"scene {cls.name} has no parameter {where!r}: it has {', '.join(cls.model_fields) or 'none'}"
+                ) from None
+            raise ValueError(f"scene {cls.name}: {where}: {problem['msg'].removeprefix('Value error, ')}") from None
+
+
+class NamedScene(Declared):
+    """A scene that a name and its parameters say all of."""
 
     def place(self, view: View, white: Spectrum) -> Scene:
         """The scene before a camera. `white`: radiance of a perfect white diffuser in the scene's place, or of light at full."""
@@ -300,6 +320,55 @@ class Charuco(NamedScene):
         )
 
 
+class PictureOnScreen(Declared):
+    """An 8-bit RGB picture on a screen that faces the camera."""
+
+    name: ClassVar[str] = "picture"
+    shows: ClassVar[str] = "an RGB picture on a liquid-crystal screen"
+    fill: Annotated[
+        float, Quantity("1", "the picture's size over the largest that fits into the frame", lower=0.01, upper=10.0)
+    ] = 1.0
+    gamma: Annotated[float, Quantity("1", "the screen's exponent, all primaries", lower=0.2, upper=5.0)] = 2.2
+    contrast_ratio: Annotated[float, Quantity("1", "the screen's white over its black", lower=1.01)] = 1000.0
+    falloff_exponent: Annotated[
+        float, Quantity("1", "power of the view angle's cosine; 0 is Lambertian", lower=0.0, upper=20.0)
+    ] = 0.0
+    stripes: Annotated[
+        int, Quantity("1", "1: sub-pixels in stripes; 0: pixels that are even squares", lower=0, upper=1)
+    ] = 0
+
+    def show(self, codes: NDArray[np.uint8], view: View, white: Spectrum) -> ScreenImage:
+        """`codes` (rows, cols, 3) on a screen whose white has the luminance of `white`."""
+        rows, cols = codes.shape[:2]
+        cell = self.fill * view.cell_px_to_fill(rows, cols)
+        shown_on = screen(
+            luminance_cd_m2(white),
+            self.contrast_ratio,
+            (self.gamma, self.gamma, self.gamma),
+            self.falloff_exponent,
+            SubPixels() if self.stripes else None,
+        )
+        corner = view.corner_mm(rows, cols, cell)
+        return ScreenImage(shown_on, codes, cell / view.px_per_mm, UPRIGHT, corner, view.geometry)
+
+
+class Cube(Declared):
+    """A picture with a spectrum in every sample, in a plane that faces the camera."""
+
+    name: ClassVar[str] = "cube"
+    shows: ClassVar[str] = "a multispectral image"
+    fill: Annotated[
+        float, Quantity("1", "the image's size over the largest that fits into the frame", lower=0.01, upper=10.0)
+    ] = 1.0
+
+    def show(self, image: SpectralImage, view: View) -> SpectralImage:
+        """The image centred in the view; of the frame's own shape and at a `fill` of 1, sample on pixel."""
+        rows, cols = image.radiance.shape[:2]
+        if self.fill == 1.0 and (rows, cols) == (view.rows, view.cols):
+            return replace(image, to_camera=None)
+        return replace(image, to_camera=view.upright(rows, cols, self.fill * view.cell_px_to_fill(rows, cols)))
+
+
 #: Texels to a square of a board's texture: a multiple of a marker's cells when markers take 3/4 of a square, 7 cells wide.
 TEXELS_PER_SQUARE = 56
 
@@ -359,28 +428,4 @@ def scene_by_name(
     """
     if name not in SCENES:
         raise ValueError(f"scene {name!r} is not known: name one of {', '.join(SCENES)}, or a file")
-    declaration = SCENES[name]
-    try:
-        chosen = declaration.model_validate(dict(parameters or {}))
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in problem["loc"])
-        if problem["type"] == "extra_forbidden":
-            raise ValueError(
-                f"scene {name} has no parameter {where!r}: it has {', '.join(declaration.model_fields) or 'none'}"
-            ) from None
-        raise ValueError(f"scene {name}: {where}: {problem['msg'].removeprefix('Value error, ')}") from None
-    return chosen.place(View.of(camera, distance_mm), illuminant)
-
-
-def picture_on_screen(codes: NDArray[np.uint8], screen: Screen, view: View, fill: float = 1.0) -> ScreenImage:
-    """An 8-bit RGB picture (rows, cols, 3) shown on a screen that faces the camera; `fill`: its size over the largest that fits."""
-    rows, cols = codes.shape[:2]
-    cell = fill * view.cell_px_to_fill(rows, cols)
-    return ScreenImage(screen, codes, cell / view.px_per_mm, UPRIGHT, view.corner_mm(rows, cols, cell), view.geometry)
-
-
-def cube_before(wavelength_nm: tuple[float, ...], radiance: FloatArray, view: View, fill: float = 1.0) -> SpectralImage:
-    """A cube of radiance (rows, cols, bands) in a plane that faces the camera; `fill`: its size over the largest that fits."""
-    rows, cols = radiance.shape[:2]
-    return SpectralImage(wavelength_nm, radiance, view.upright(rows, cols, fill * view.cell_px_to_fill(rows, cols)))
+    return SCENES[name].chosen(parameters).place(View.of(camera, distance_mm), illuminant)

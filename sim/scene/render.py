@@ -12,6 +12,7 @@ from scipy.special import fresnel
 
 from sim.scene import colorchecker
 from sim.scene.scenes import (
+    EdgeRegion,
     KnifeEdge,
     PlanarTarget,
     PointArray,
@@ -257,23 +258,41 @@ def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
 def _edges(scene: KnifeEdge, grid: Grid) -> FloatArray:
     """Every sample belongs to the nearest region's edge, whose line cuts it by exact area."""
     row, col = grid.axes_px()
-    row, col = row[:, None], col[None, :]
-    owner = scene.owner(row, col)
+    if len(scene.regions) == 1:
+        return _light_side(scene.regions[0], grid)
+    owner = scene.owner(row[:, None], col[None, :])
     lit = np.empty(grid.shape)
-    step = 1.0 / grid.oversample
     for index, edge in enumerate(scene.regions):
-        angle = np.deg2rad(edge.angle_deg)
-        share = half_plane(edge.distance_px(row, col), np.cos(angle) * step, np.sin(angle) * step)
-        if len(scene.regions) == 1:
-            return share
         mine = owner == index
-        lit[mine] = share[mine]
+        lit[mine] = _light_side(edge, grid)[mine]
     return lit
+
+
+def _light_side(edge: EdgeRegion, grid: Grid) -> FloatArray:
+    """Share of every sample on an edge's light side: that part of the grid is a polygon."""
+    row, col = grid.axes_px()
+    half = 0.5 / grid.oversample
+    top, bottom, left, right = row[0] - half, row[-1] + half, col[0] - half, col[-1] + half
+    corners = np.array([(top, left), (top, right), (bottom, right), (bottom, left)])
+    distance = edge.distance_px(corners[:, 0], corners[:, 1])
+    kept = []
+    for k in range(4):
+        if (distance[k - 1] > 0) != (distance[k] > 0):
+            share = distance[k - 1] / (distance[k - 1] - distance[k])
+            kept.append(corners[k - 1] + (corners[k] - corners[k - 1]) * share)
+        if distance[k] > 0:
+            kept.append(corners[k])
+    if len(kept) < 3:
+        return np.zeros(grid.shape)
+    points = np.array(kept)
+    return quadrilateral(row, col, 2.0 * half, points[:, 0], points[:, 1])
 
 
 def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
     """cos(pi k (x^2 + y^2)) = Re exp(i pi k x^2) exp(i pi k y^2): its mean over a square is a product of two Fresnel integrals,
     exactly; the taper near the rim, which is smooth, is taken at the square's centre."""
+    from sim.scene.area import tapered_rings
+
     if scene.highest_cy_per_px > 0.5 * grid.oversample:
         raise ValueError(
             f"the zone plate rises to {scene.highest_cy_per_px:g} cy/px, above the limit of {0.5 * grid.oversample:g} cy/px of {grid.oversample} samples a pixel: draw with more samples, or lower highest_cy_per_px"
@@ -286,14 +305,9 @@ def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
         sine, cosine = fresnel(np.sqrt(2.0 * k) * edges)
         parts.append((np.diff(cosine) + 1j * np.diff(sine)) / (np.sqrt(2.0 * k) * step))
         squares.append((axis - centre) ** 2)
-    (down, across), (down2, across2) = parts, squares
-    lit = np.outer(down.real, across.real) - np.outer(down.imag, across.imag)
-    radius = np.sqrt(np.add.outer(down2, across2))
-    start = (1.0 - scene.taper) * scene.radius_px
-    ring = radius > start
-    past = np.minimum((radius[ring] - start) / (scene.radius_px - start), 1.0)
-    lit[ring] *= 0.5 + 0.5 * np.cos(np.pi * past)
-    return 0.5 + 0.5 * lit
+    lit = np.empty(grid.shape)
+    tapered_rings(*parts, *squares, (1.0 - scene.taper) * scene.radius_px, scene.radius_px, lit)
+    return lit
 
 
 def _star(scene: SiemensStar, grid: Grid) -> FloatArray:
