@@ -1,7 +1,7 @@
 """Mock USB devices for pyusb: plugged into a backend in this process, or exported over USB/IP.
 
 `backend("u3v")` is an `IBackend` with a camera plugged in, `"u3v-stereo"` one with two that trigger one another,
-`"cornerstone260b"` one with a monochromator.
+`"cornerstone260b"` one with a monochromator, `"usb2000plus"` one with a spectrometer.
 `serve_usbip(devices, host, port)` exports the same device models by the real USB/IP protocol: to `drivers.usbip`, and to
 Linux's own `usbip attach` alike.
 
@@ -25,6 +25,7 @@ from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
 from mocks.bench import Bench
 from mocks.cornerstone260b import Cornerstone260B
 from mocks.u3v import TriggerLine, U3vDevice
+from mocks.usb2000plus import Usb2000Plus
 from mocks.usb_device import Abandoned, UsbDevice, UsbFault
 
 SERIAL_NUMBERS = {"left": "CB-U3V-0001", "right": "CB-U3V-0002"}
@@ -43,6 +44,7 @@ _INSTRUMENTS: dict[str, Callable[[Bench], Sequence[UsbDevice]]] = {
     "cornerstone260b": lambda bench: (Cornerstone260B(bench),),
     "u3v": lambda bench: stereo_pair(bench)[:1],
     "u3v-stereo": stereo_pair,
+    "usb2000plus": lambda bench: (Usb2000Plus(bench),),
 }
 
 
@@ -54,7 +56,7 @@ def devices(name: str, bench: Bench | None = None) -> tuple[UsbDevice, ...]:
 
 
 def backend(name: str, bench: Bench | None = None) -> InProcessBackend:
-    """A pyusb backend with that instrument plugged in (`u3v`, `u3v-stereo`, `cornerstone260b`); `.plugged_in` are its device models."""
+    """A pyusb backend with that instrument plugged in (`u3v`, `u3v-stereo`, `cornerstone260b`, `usb2000plus`); `.plugged_in` are its device models."""
     return InProcessBackend(devices(name, bench))
 
 
