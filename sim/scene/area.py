@@ -140,6 +140,28 @@ def mapped_means(pattern, u, v, divide, lit, gaps, surround, out):  # type: igno
 
 
 @njit(cache=True)
+def means_down(values, edges, begin, end, surround):  # type: ignore[no-untyped-def]
+    """Means down the rows between neighbouring `edges` (ascending) of what is values[j] from j + begin to j + end and `surround`
+    elsewhere, column by column: (edges - 1, columns)."""
+    count, width = values.shape
+    out = np.empty((edges.size - 1, width))
+    for i in range(edges.size - 1):
+        low, high = edges[i], edges[i + 1]
+        share = 1.0 / (high - low)
+        first, last = max(0, int(np.floor(low))), min(count - 1, int(np.floor(high)))
+        left = 1.0
+        for j in range(first, last + 1):
+            left -= max(0.0, min(high, j + end) - max(low, j + begin)) * share
+        out[i, :] = max(0.0, left) * surround
+        for j in range(first, last + 1):
+            weight = max(0.0, min(high, j + end) - max(low, j + begin)) * share
+            if weight > 0.0:
+                for k in range(width):
+                    out[i, k] += weight * values[j, k]
+    return out
+
+
+@njit(cache=True)
 def tapered_rings(down, across, down2, across2, start, end, out):  # type: ignore[no-untyped-def]
     """1/2 + 1/2 Re(down across) out of the complex factors by row and column, fading to 1/2 from distance `start` to `end`;
     `down2`, `across2` are the squares of row's and column's distances from the centre."""

@@ -149,6 +149,8 @@ def _means(
 ) -> FloatArray:
     """`cells` for cells of any finite value. `lit` (u0, u1, v0, v1): the part of every cell that holds its value, the rest
     of it holding `surround`; None: all of it."""
+    if warp.upright:
+        return _upright_means(pattern, warp, grid, surround, lit)
     from sim.scene.area import mapped_means, project_means  # here: the compiler's library takes a while to load
 
     finest = 1.0 if lit is None else min(lit[1] - lit[0], lit[3] - lit[2])
@@ -182,6 +184,20 @@ def _means(
         u, v = mapper(down, across)
         mapped_means(pattern, u, v, divide, edges, gaps, surround, out[part[0] : part[-1] + 1])
     return out
+
+
+def _upright_means(
+    pattern: FloatArray, warp: Warp, grid: Grid, surround: float, lit: tuple[float, float, float, float] | None
+) -> FloatArray:
+    """`_means` where rows stay rows and columns columns: exact means along columns, then along rows, of cells of any size."""
+    from sim.scene.area import means_down
+
+    h = np.asarray(warp.homography) / warp.homography[2][2]
+    step = 1.0 / grid.oversample
+    u0, u1, v0, v1 = (0.0, 1.0, 0.0, 1.0) if lit is None else lit
+    row, col = (np.append(axis - 0.5 * step, axis[-1] + 0.5 * step) for axis in grid.axes_px())
+    across = means_down(np.ascontiguousarray(pattern.T, float), (col - h[0, 2]) / h[0, 0], u0, u1, surround)
+    return np.asarray(means_down(np.ascontiguousarray(across.T), (row - h[1, 2]) / h[1, 1], v0, v1, surround))
 
 
 #: A sample's square isn't divided more finely than so many times each way.

@@ -56,6 +56,12 @@ class Warp:
         """Whether the homography is all there is."""
         return self.geometry is None or not any(self.geometry.distortion)
 
+    @property
+    def upright(self) -> bool:
+        """Whether the pattern's rows are the camera's rows and its columns the camera's columns, in their order."""
+        (a, b, _), (c, d, _), (e, f, w) = self.homography
+        return self.straight and b == c == e == f == 0.0 and a * w > 0 and d * w > 0
+
     def to_camera(self, u: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Camera (row, col) in px of pattern points."""
         col, row = _project(np.asarray(self.homography), np.asarray(u, float), np.asarray(v, float))
