@@ -98,8 +98,6 @@ def test_a_raw_developer_sees_the_colours(tmp_path: Path, patch: str) -> None:
     xyz /= _product(daylight(), _matching()[1])
     to_srgb = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
     np.testing.assert_allclose(middle, np.clip(to_srgb @ xyz, 0, 1), atol=0.04)
-    if patch == "white":
-        assert np.ptp(middle) < 0.01
 
 
 def test_what_a_dng_says(tmp_path: Path) -> None:
