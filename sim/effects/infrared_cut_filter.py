@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
-import numpy as np
-from scipy.special import expit
+from pydantic import Field
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
+from sim.optics.filters import edge_transmittance
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
 
 class InfraredCutFilter(Effect):
     """Transmittance 1 / (1 + exp((wavelength - cut) / width)): density grows linearly behind the edge, as behind the edge of
-    an interference filter's stop band."""
+    an interference filter's stop band.
+
+    Of a filter that is known to be such a coating, `effective_index` (1.5 to 2.1 are usual) has its edge move to
+    cut sqrt(1 - sin^2 / n^2) at the chief ray's angle; without it the edge stays, as that of glass does.
+    """
 
     name: ClassVar[str] = "infrared_cut_filter"
     stage: ClassVar[Stage] = Stage.OPTICS
@@ -40,6 +44,10 @@ class InfraredCutFilter(Effect):
         Quantity("nm", "wavelength over which the light falls by e behind the edge", lower=0.5, upper=20.0, absent=6.0),
     ] = 6.0
 
+    effective_index: Annotated[
+        float | None, Field(ge=1.0, le=4.0, description="effective refractive index of an interference filter's layers")
+    ] = None
+
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return tuple(
@@ -49,5 +57,4 @@ class InfraredCutFilter(Effect):
         )
 
     def transmittance(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
-        wavelength, _ = np.broadcast_arrays(np.asarray(wavelength_nm, float), sin_theta)
-        return np.asarray(expit(-(wavelength - self.cut_wavelength_nm) / self.width_nm))
+        return edge_transmittance(wavelength_nm, self.cut_wavelength_nm, self.width_nm, sin_theta, self.effective_index)

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-import numpy as np
-
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
+from sim.optics.filters import veil_otf
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
-
-#: The veil is so wide (standard deviation, in um of the sensor) that only a scene's mean gets through: 1e5 um.
-VEIL_UM = 1e5
 
 
 class VeilingGlare(Effect):
@@ -42,9 +38,7 @@ class VeilingGlare(Effect):
     ) -> FloatArray | None:
         if self.share_percent == 0.0:
             return None
-        share = self.share_percent / 100.0
-        veil = np.exp(-2.0 * np.pi**2 * VEIL_UM**2 * (fx_cy_per_um**2 + fy_cy_per_um**2))
-        return np.asarray(1.0 - share + share * veil)
+        return veil_otf(fx_cy_per_um, fy_cy_per_um, self.veil())
 
     def veil(self) -> float:
         return self.share_percent / 100.0

@@ -10,8 +10,9 @@ import pytest
 from scipy.io import loadmat
 
 from sim.camera import CameraModel, Lens
-from sim.effects.base import Effect
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.forward import Exposure, electron_rate, expected_electrons, optical_transfer
+from sim.optics.filters import birefringent_spots
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.scene.scenes import SpectralImage
 from sim.scene.warp import Warp
@@ -154,21 +155,30 @@ def test_noise(row: np.void) -> None:
     assert frames.var() == pytest.approx(row["var_e2"], abs=4 * np.sqrt(2 / n) * spread + 0.0024)
 
 
-class Birefringent(Effect):
-    """Two copies on each axis, 1 um to either side, as ISETCam's filter of d = 1 um makes them."""
-
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray:
-        return np.cos(2 * np.pi * fx_cy_per_um) * np.cos(2 * np.pi * fy_cy_per_um)
-
-
 def test_analytic_contrast_with_and_without_a_birefringent_filter() -> None:
     m = table("mtf.csv")
     model = camera(4.0, 1.0, {"Y": Spectrum.of([300.0, 900.0], [1.0, 1.0])})
     line = Spectrum.of([549.999, 550.0, 550.001], [0.0, 1.0, 0.0])
     f = m["freq_cy_mm"] * 1e-3 * 2.0
     np.testing.assert_allclose(optical_transfer(model, "Y", line, f, 0 * f), m["analytic_noaa"], atol=1e-4)
-    filtered = np.abs(optical_transfer(model, "Y", line, f, 0 * f, (Birefringent(),)))
+    # their d is the distance of a spot from the middle: two spots are 2 um apart
+    filtered_twice = OpticalLowPassFilter(displacement_x_um=2.0, displacement_y_um=2.0)
+    filtered = np.abs(optical_transfer(model, "Y", line, f, 0 * f, (filtered_twice,)))
     column = next(name for name in m.dtype.names if re.match("ana_gauss1_aa", name))
     np.testing.assert_allclose(filtered, m[column], atol=1e-4)
+
+
+def test_birefringent_kernel() -> None:
+    """Four spots at +-1.1 um, a quarter of the light each, which theirs shares out linearly among the nearest samples, of 0.2508 um."""
+    kernel = loadmat(REFERENCE / "birefringent_kernel.mat")["k"]
+    kernel = np.where(np.isfinite(kernel), kernel, 0.0)  # their interpolation has no value at the rim
+    positions, shares = birefringent_spots(2.2, 2.2)
+    row, col = np.indices(kernel.shape) - 64.0
+    # how far out the spots lie in samples, of all their light: the sample's pitch, which is stated to four digits
+    pitch_um = 1.1 / (np.sum(np.abs(col) * kernel) / np.sum(kernel))
+    assert pitch_um == pytest.approx(0.2508, abs=5e-5)
+    hats = [
+        share * np.maximum(1 - np.abs(col - x / pitch_um), 0) * np.maximum(1 - np.abs(row - y / pitch_um), 0)
+        for (x, y), share in zip(positions, shares, strict=True)
+    ]
+    np.testing.assert_allclose(sum(hats), kernel, atol=1e-12)
