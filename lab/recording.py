@@ -305,10 +305,17 @@ def parse_spectrum(text: str) -> Spectrum:
 
     Blank lines and a byte-order mark are let pass. Wavelengths must ascend strictly, every number be finite.
     """
+    return parse_curve(text, ("value",))[1]
+
+
+def parse_curve(text: str, columns: tuple[str, ...]) -> tuple[str, Spectrum]:
+    """As `parse_spectrum`, with any of `columns` as the second column's name; which one it was, and the curve."""
     rows = [row for row in csv.reader(io.StringIO(text.removeprefix("\ufeff"))) if any(cell.strip() for cell in row)]
-    if not rows or [cell.strip() for cell in rows[0]] != ["wavelength_nm", "value"]:
+    names = [cell.strip() for cell in rows[0]] if rows else []
+    if len(names) != 2 or names[0] != "wavelength_nm" or names[1] not in columns:
         head = ",".join(rows[0])[:60] if rows else ""
-        raise InputError(f"its first line is '{head}', not 'wavelength_nm,value'; write that header")
+        wanted = " or ".join(f"'wavelength_nm,{column}'" for column in columns)
+        raise InputError(f"its first line is '{head}', not {wanted}; write that header")
     if len(rows) == 1:
         raise InputError("has no samples; write one row a sample")
     wavelength_nm: list[float] = []
@@ -326,7 +333,7 @@ def parse_spectrum(text: str) -> Spectrum:
             raise InputError(f"row {number}: {at:g} nm follows {wavelength_nm[-1]:g} nm; sort the rows, each nm once")
         wavelength_nm.append(at)
         value.append(height)
-    return Spectrum(wavelength_nm=tuple(wavelength_nm), value=tuple(value))
+    return names[1], Spectrum(wavelength_nm=tuple(wavelength_nm), value=tuple(value))
 
 
 def _load_spectrum(file: Path) -> Spectrum:

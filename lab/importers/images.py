@@ -28,10 +28,11 @@ def read_image(file: Path) -> Frame:
         return load_frame(file)
     if suffix not in IMAGES:
         raise InputError(f"can't be read; give one of {' '.join((*IMAGES, *RAWS, '.npy'))}")
-    return _grey(_decoded(file))
+    return _grey(decoded(file))
 
 
-def _decoded(file: Path) -> NDArray[Any]:
+def decoded(file: Path) -> NDArray[Any]:
+    """An image file's samples as they're stored, channels in OpenCV's order. InputError without the path."""
     data = file.read_bytes()
     if why := _damage(data):
         raise InputError(f"damaged image ({why}); copy it again or recapture")
