@@ -276,6 +276,79 @@ class PsfKernel(Frozen):
     psf_std: tuple[tuple[float, ...], ...]
 
 
+Rows = tuple[tuple[float, ...], ...]
+
+
+class BoardWarp(Frozen):
+    """How far a board is from flat: z = bend_x (x^2 - 1/3) + bend_y (y^2 - 1/3) + twist x y, x and y from -1 to 1 across the
+    board, z away from the camera. None where the views don't determine it: it is in the other uncertainties nevertheless."""
+
+    board: str
+    bend_x_mm: float | None = None
+    bend_x_mm_std: float | None = None
+    bend_y_mm: float | None = None
+    bend_y_mm_std: float | None = None
+    twist_mm: float | None = None
+    twist_mm_std: float | None = None
+
+
+class DistortionModel(Frozen):
+    """One of the models that were tried: how well it predicts views that its fit has not seen."""
+
+    coefficients: tuple[str, ...]
+    held_out_rms_px: float
+    chosen: bool
+    reason: str
+
+
+class CrossValidation(Frozen):
+    """Two halves of the views, each calibrated by itself: by how much they differ over the frame, the implied motion taken
+    out, and by how much the noise of the corners lets them. What exceeds that is the model's error, not the sampling's."""
+
+    difference_px: float
+    expected_px: float
+    significance_sigma: float
+    #: Of one half, beyond the noise; 0 where the halves agree.
+    model_error_px: float
+
+
+class ViewResiduals(Frozen):
+    """Corners of one view, numbered row by row, as they were seen; `dx_px`, `dy_px` are seen less predicted; and their depth."""
+
+    capture: str
+    corner: tuple[int, ...]
+    x_px: tuple[float, ...]
+    y_px: tuple[float, ...]
+    dx_px: tuple[float, ...]
+    dy_px: tuple[float, ...]
+    depth_mm: tuple[float, ...]
+
+
+class ProjectionUncertainty(Frozen):
+    """Standard uncertainty of where a point projects, px, in its worst direction, on a grid over the frame, rows by columns. A
+    motion of the camera that the same corners can't tell from a change of its intrinsics is taken out."""
+
+    distance_mm: float | None  # None: at infinity
+    x_px: tuple[float, ...]
+    y_px: tuple[float, ...]
+    projection_px_std: Rows
+
+
+class ChannelGeometry(Frozen):
+    """The geometry of one colour, and how far it lies outside of green (lateral colour) over the distance to the axis."""
+
+    channel: str
+    camera_matrix: tuple[tuple[float, float, float], ...]
+    distortion: tuple[float, ...]
+    centre_shift_px: tuple[float, float] = (0.0, 0.0)
+    centre_shift_px_std: tuple[float, float] | None = None
+    radius_px: tuple[float, ...] = ()
+    radial_shift_px: tuple[float, ...] = ()
+    radial_shift_px_std: tuple[float, ...] = ()
+    rms_px: float
+    corners: int
+
+
 class GeometryFit(Frozen):
     """OpenCV's pinhole and distortion (`k1 k2 p1 p2 k3`); px."""
 
@@ -286,6 +359,45 @@ class GeometryFit(Frozen):
     rms_px: float
     views: int | None = None
     rejected: tuple[Skipped, ...] = ()
+    #: Single corners that were left out of views that were kept; `step` names the view.
+    rejected_corners: tuple[Skipped, ...] = ()
+    #: Of `covariance`: intrinsics that were fitted ("fx"), then the boards' warps.
+    parameters: tuple[str, ...] = ()
+    covariance: Rows | None = None
+    #: Standard deviation of one coordinate of a corner: by the residuals, and by what the pictures' own noise explains.
+    corner_px_std: float | None = None
+    corner_noise_px: float | None = None
+    board_warp: tuple[BoardWarp, ...] = ()
+    distortion_models: tuple[DistortionModel, ...] = ()
+    cross_validation: CrossValidation | None = None
+    projection: tuple[ProjectionUncertainty, ...] = ()
+    channels: tuple[ChannelGeometry, ...] = ()
+    residuals: tuple[ViewResiduals, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+class DepthUncertainty(Frozen):
+    """Standard uncertainty of a triangulated depth over the left camera's frame, rows by columns; None where the right camera
+    doesn't see the point. `calibration`: by the calibration alone, the same for every picture; `total`: with corners matched
+    as well as the board's were."""
+
+    depth_mm: float
+    x_px: tuple[float, ...]
+    y_px: tuple[float, ...]
+    calibration_mm_std: tuple[tuple[float | None, ...], ...]
+    total_mm_std: tuple[tuple[float | None, ...], ...]
+
+
+class Rectification(Frozen):
+    """OpenCV's rectification of the pair: turns and new projections, from which `lab.fit.stereo.rectification_maps` makes maps.
+    `row_rms_px`: by how much the rows of the same corner differ in the rectified pair."""
+
+    rotation_left: tuple[tuple[float, float, float], ...]
+    rotation_right: tuple[tuple[float, float, float], ...]
+    projection_left: Rows
+    projection_right: Rows
+    disparity_to_depth: Rows
+    row_rms_px: float
 
 
 class StereoFit(Frozen):
@@ -299,6 +411,18 @@ class StereoFit(Frozen):
     baseline_mm_std: float | None = None
     rms_px: float
     pairs: int
+    #: The intrinsics that belong to this rig: fitted jointly with it, over the views of both cameras.
+    camera_matrix_left: tuple[tuple[float, float, float], ...] | None = None
+    distortion_left: tuple[float, ...] | None = None
+    camera_matrix_right: tuple[tuple[float, float, float], ...] | None = None
+    distortion_right: tuple[float, ...] | None = None
+    #: Of `covariance`: "left fx" .., "right fx" .., the turn about the right camera's axes, the translation, the boards' warps.
+    parameters: tuple[str, ...] = ()
+    covariance: Rows | None = None
+    corner_px_std: float | None = None
+    rejected: tuple[Skipped, ...] = ()
+    rectification: Rectification | None = None
+    depth: tuple[DepthUncertainty, ...] = ()
 
 
 class CameraFit(Frozen):

@@ -1,417 +1,575 @@
-"""Intrinsics of a camera from views of a board: OpenCV's pinhole and Brown distortion, with uncertainties.
+"""Intrinsics of a camera from views of a board, with what is known of their errors.
 
-The boards are the `charuco` captures. A plain checkerboard is a `charuco` capture whose `dictionary` is `"none"`: `squares`
-counts its squares `[rows, cols]`, so that it has `rows - 1` x `cols - 1` inner corners; `marker_mm` says nothing then, and
-all inner corners have to be in view. A folder of pictures of a plain checkerboard becomes a recording set that way, each
-picture one capture, the pictures of a pair under one `pose`.
+The boards are the `charuco` captures (see `lab.fit.board`). Solved for are OpenCV's pinhole and distortion, the poses, and the
+boards' own warp, by the bundle adjustment of `lab.fit.bundle`; the full covariance follows from its Jacobian and the scatter of
+the corners. Besides:
 
-Corners are found on the raw mosaic itself: a board is black and white, so that each plane, levelled by itself, shows the same
-picture, and interleaved they are the luminance, sampled at every pixel. No demosaicing moves a corner. Each corner is then
-fitted: the product of two blurred straight edges, by least squares over the pixels that no marker touches.
-
-Points are OpenCV's: (x, y) px, x to the right along columns, (0, 0) the centre of the top-left pixel.
+- single corners and whole views that don't fit are left out, with the reason;
+- the distortion model is chosen by views that its fit has not seen: a richer model is refused where it predicts them worse;
+- two halves of the views are calibrated by themselves: what they differ by beyond the corners' noise is an error of the model;
+- the uncertainty of the projection is mapped over the frame (`lab.fit.projection`);
+- each colour of a mosaic has its corners and its distortion: lateral colour.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.special import erf
 
 from lab.errors import NotDetermined
-from lab.recording import Charuco, RecordingSet
-from lab.results import GeometryFit, Skipped
+from lab.fit.board import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
+from lab.fit.bundle import Bundle, Sight, Solution, board_key, first_intrinsics, first_state, with_boards
+from lab.fit.pinhole import COUNT, NAMES, distortion_of, matrix_of, project_slopes, unproject
+from lab.fit.projection import Difference, difference, grid, grid_points, points_at, projection_std
+from lab.recording import RecordingSet
+from lab.results import (
+    BoardWarp,
+    ChannelGeometry,
+    CrossValidation,
+    DistortionModel,
+    GeometryFit,
+    ProjectionUncertainty,
+    Skipped,
+    ViewResiduals,
+)
 from sim.camera import Side
-from sim.sensor.mosaic import planes
 
 Array = NDArray[np.floating[Any]]
 
-MIN_CORNERS = 8  # of a view: six degrees of freedom of the pose need more than six numbers, with a margin
 MIN_VIEWS = 3
 OUTLYING_VIEW = 3.0  # times the median rms of the views
-WINDOW_PX = 9.0  # largest half-window of a corner's fit
+OUTLYING_VIEW_PX = 0.1  # below this no view is left out
+OUTLYING_CORNER = 5.0  # standard deviations of a coordinate: of 2000 good corners, one in 500 calibrations
+OUTLYING_SHARE = 0.25  # of a view's corners: more, and it is the view that is wrong
+NOT_A_BOARD = 0.005  # rms over the frame's diagonal, above which no camera explains the corners
+FOCAL_KNOWN = 0.05  # relative uncertainty of the focal length, above which it isn't determined
+PARALLEL_DEG = 5.0
+FOLDS = 5
+OVERFITTED = 0.05  # of the squared error of held-out views, by which a richer model has to be worse to be refused
+#: From simple to rich; each model has the coefficients of those before it.
+MODELS = (("k1",), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"))
+WARP_KNOWN = 0.5  # of the prior's standard deviation, above which the views have said nothing about a warp
+DIFFERENT = 2.6  # sigma: two halves of the views that differ by more, at 1 %, don't follow one model
 
 
 @dataclass(frozen=True)
-class BoardView:
-    """Corners of a board in one frame. `board_mm` (n, 3) float32, z = 0; `image_px` (n, 2), (x, y); `index` (n,)
-    names each corner, row by row."""
+class Calibration:
+    """A camera's solution with the views it rests on, and what was left out on the way."""
 
-    capture: Charuco
-    index: NDArray[np.int64]
-    board_mm: Array
-    image_px: Array
+    views: tuple[BoardView, ...]
+    solution: Solution
+    models: tuple[DistortionModel, ...] = ()
+    rejected: tuple[Skipped, ...] = ()
+    rejected_corners: tuple[Skipped, ...] = ()
+
+    @property
+    def intrinsics(self) -> Array:
+        """(12,), see `lab.fit.pinhole`."""
+        return np.asarray(self.solution.state.intrinsics[0])
+
+    @property
+    def covariance(self) -> Array:
+        """(12, 12) of the intrinsics."""
+        return self.solution.of_camera(0)
+
+    @property
+    def points(self) -> Array:
+        """Corners (n, 3) in the camera's frame: what ties an implied motion down."""
+        return placed_points(self.views, self.solution)
+
+    def projection_std(self, image: Array, distance_mm: float | None) -> Array:
+        """Standard uncertainty (n,) of projecting to `image` (n, 2) from a distance, px; NaN where nothing projects."""
+        points = points_at(image, self.intrinsics, distance_mm)
+        return projection_std(self.intrinsics, self.covariance, self.points, points)
 
 
-def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
-    """The mosaic of a black and white scene as one picture, 0 dark .. 1 light: each plane between its 2 % and 98 % quantiles."""
-    picture = np.array(frame, dtype=float)
-    for plane in planes(picture, cfa).values():  # views: what is written to them is written to the picture
-        low, high = np.quantile(plane, [0.02, 0.98])
-        plane[:] = (plane - low) / max(high - low, 1e-12)
-    return picture
+def placed_points(views: Sequence[BoardView], solution: Solution, camera: int = 0) -> Array:
+    """Corners (n, 3) of `views`, one pose each, in the frame of the first camera."""
+    state = solution.state
+    return np.concatenate(
+        [view.board_mm @ state.turns[k].T + state.shifts_mm[k] for k, view in enumerate(views)]
+    ).astype(float)
 
 
-def find_board(picture: Array, capture: Charuco) -> BoardView:
-    """The board's corners in a picture (rows, cols) of 0..1; `NotDetermined` with the reason where it isn't found."""
-    rows, cols = capture.squares
-    grey = np.clip(255.0 * ndimage.gaussian_filter(picture, 0.7), 0, 255).astype(np.uint8)
-    if capture.dictionary == "none":
-        index, points = _plain_corners(grey, rows - 1, cols - 1)
-        marker_mm = 0.0
-    else:
-        index, points = _charuco_corners(grey, capture)
-        marker_mm = float(capture.marker_mm or 0.0)
-    if len(index) < MIN_CORNERS:
-        raise NotDetermined(
-            "geometry", f"only {len(index)} corners found, {MIN_CORNERS} needed: light or place the board better"
-        )
-    if len(index) < (rows - 1) * (cols - 1):
-        index, points = _completed(index, points, rows - 1, cols - 1, picture.shape)
-    board = np.zeros((len(index), 3), dtype=np.float32)
-    board[:, :2] = (_grid(index, cols - 1) + 1.0) * capture.square_mm
-    fitted, trusted = _refine(picture, points, board[:, :2].astype(float), capture.square_mm, marker_mm, rows, cols)
-    if trusted.sum() < MIN_CORNERS:
+def sights_of(views: Sequence[BoardView]) -> list[Sight]:
+    """Views of one camera, each its own pose; views of equal boards share the board."""
+    keys = list(dict.fromkeys(board_key(view) for view in views))
+    return [Sight(view, pose=k, board=keys.index(board_key(view))) for k, view in enumerate(views)]
+
+
+def free_intrinsics(coefficients: Sequence[str]) -> NDArray[np.bool_]:
+    """Mask (12,) of a distortion model: the pinhole and these coefficients."""
+    return np.array([name in ("fx", "fy", "cx", "cy", *coefficients) for name in NAMES])
+
+
+# --- the solve, and what it leaves out -------------------------------------------------------------------------------------
+
+
+def calibrate(views: Sequence[BoardView], shape: tuple[int, int], coefficients: Sequence[str] = MODELS[-1]) -> Solution:
+    """One camera from views in frames of `shape` (rows, cols), with the distortion `coefficients`; all views are used."""
+    sights = sights_of(views)
+    start = first_state(views, first_intrinsics(views, shape))
+    start = with_boards(start, 1 + max(sight.board for sight in sights))
+    # From the pinhole by way of k1: a rich model that starts from poses without distortion can end beside the minimum.
+    rough = Bundle(sights, free_intrinsics(MODELS[0])[None, :], shape).solve(start)
+    return Bundle(sights, free_intrinsics(coefficients)[None, :], shape).solve(rough.state)
+
+
+def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side: Side | None = None) -> Calibration:
+    """`calibrate` without views and corners that don't fit, with the distortion model that predicts unseen views best.
+
+    A corner is left out beyond 5 standard deviations of the others; a view where its rms is beyond 3 times the median, or a
+    quarter of its corners would go. Raises `NotDetermined` where too few views are left, where no camera explains them, or
+    where they don't determine the focal length.
+    """
+    kept = list(views)
+    rejected: list[Skipped] = []
+    stray: dict[str, list[tuple[int, float]]] = {}
+    while True:
+        if len(kept) < MIN_VIEWS:
+            why = f"; {rejected[0].step}: {rejected[0].reason}" if rejected else ""
+            raise NotDetermined("geometry", f"{len(kept)} views of the board can be used, {MIN_VIEWS} are needed{why}")
+        solution = calibrate(kept, shape)
+        outlying = _outlying_view(kept, solution)
+        if outlying is not None:
+            which, reason = outlying
+            rejected.append(Skipped(step=kept[which].capture.id, reason=reason, side=side))
+            stray.pop(kept[which].capture.id, None)
+            del kept[which]
+            continue
+        if not _leave_out_corners(kept, solution, stray):
+            break
+    _check_determined(kept, solution, shape)
+    coefficients, models = choose_model(kept, shape, solution)
+    if coefficients != MODELS[-1]:
+        solution = calibrate(kept, shape, coefficients)
+    corners = tuple(
+        Skipped(step=capture, reason=_corner_reason(numbers, solution.noise_px), side=side)
+        for capture, numbers in stray.items()
+    )
+    return Calibration(tuple(kept), solution, models, tuple(rejected), corners)
+
+
+def _outlying_view(views: Sequence[BoardView], solution: Solution) -> tuple[int, str] | None:
+    """The view that fits worst, and why it goes."""
+    squares = [np.sum(residual**2, axis=1) for residual in solution.residuals]
+    rms = np.array([np.sqrt(np.mean(one)) for one in squares])
+    # by the median of a view's corners: one stray corner is no reason to drop the others
+    typical = np.array([np.sqrt(np.median(one)) for one in squares])
+    limit = max(OUTLYING_VIEW * float(np.median(rms)), OUTLYING_VIEW_PX)
+    worst = int(np.argmax(rms))
+    if rms[worst] <= limit:
+        return None
+    far = squares[worst] > (OUTLYING_CORNER * max(solution_scatter(solution), 1e-3)) ** 2
+    if far.mean() < OUTLYING_SHARE and typical[worst] <= limit and (~far).sum() >= MIN_CORNERS:
+        return None
+    return worst, f"rms {rms[worst]:.2f} px, where the other views have {np.median(rms):.2f} px"
+
+
+def solution_scatter(solution: Solution) -> float:
+    """Standard deviation of one coordinate, px, by the median: strays don't widen it."""
+    return 1.4826 * float(np.median(np.abs(np.concatenate(solution.residuals))))
+
+
+def _leave_out_corners(kept: list[BoardView], solution: Solution, stray: dict[str, list[tuple[int, float]]]) -> bool:
+    """Take the stray corners out of `kept`, note them in `stray`; whether there were any."""
+    scatter = max(solution_scatter(solution), 1e-3)
+    found = False
+    for k, (view, residual) in enumerate(zip(kept, solution.residuals, strict=True)):
+        away = np.linalg.norm(residual, axis=1)
+        far = away > OUTLYING_CORNER * scatter
+        # the worst ones first: they pull others with them
+        far &= away > 0.5 * away.max(initial=0.0)
+        if not far.any() or (~far).sum() < MIN_CORNERS:
+            continue
+        noted = stray.setdefault(view.capture.id, [])
+        noted += [(int(index), float(px)) for index, px in zip(view.index[far], away[far], strict=True)]
+        kept[k] = view.only(~far)
+        found = True
+    return found
+
+
+def _corner_reason(numbers: list[tuple[int, float]], noise_px: float) -> str:
+    which = ", ".join(f"{index} ({px:.2f} px)" for index, px in sorted(numbers))
+    return f"corners {which} lie off, where the others scatter by {noise_px:.3f} px"
+
+
+def _check_determined(views: Sequence[BoardView], solution: Solution, shape: tuple[int, int]) -> None:
+    diagonal = float(np.hypot(*shape))
+    if not solution.rms_px < NOT_A_BOARD * diagonal:
+        capture = views[0].capture
         raise NotDetermined(
             "geometry",
-            f"only {trusted.sum()} corners are clear enough, {MIN_CORNERS} needed: focus or light the board better",
+            f"no camera explains the corners (rms {solution.rms_px:.1f} px): check that the board has {capture.squares[0]} x "
+            f"{capture.squares[1]} squares, that it is flat, and that it didn't move while it was exposed",
         )
-    return BoardView(capture, index[trusted], board[trusted], fitted[trusted])
-
-
-def _charuco_corners(grey: NDArray[np.uint8], capture: Charuco) -> tuple[NDArray[np.int64], Array]:
-    code = getattr(cv2.aruco, capture.dictionary, None)
-    if not isinstance(code, int) or not capture.dictionary.startswith("DICT_"):
-        raise NotDetermined(
-            "geometry", f"OpenCV knows no dictionary '{capture.dictionary}': give one of its names, DICT_..."
-        )
-    rows, cols = capture.squares
-    best: tuple[NDArray[np.int64], Array] = (np.empty(0, np.int64), np.empty((0, 2)))
-    for legacy in (False, True):  # boards of an even number of rows begin otherwise since OpenCV 4.6
-        board = cv2.aruco.CharucoBoard(
-            (cols, rows), capture.square_mm, capture.marker_mm or 0.0, cv2.aruco.getPredefinedDictionary(code)
-        )
-        board.setLegacyPattern(legacy)
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
-        if ids is not None and len(ids) > len(best[0]):
-            best = (ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(float))
-        if len(best[0]) or rows % 2:
-            break
-    return best
-
-
-def _grid(index: NDArray[np.int64], cols: int) -> Array:
-    """(x, y) of corners in squares, from the first inner corner."""
-    return np.column_stack([index % cols, index // cols]).astype(float)
-
-
-def _completed(
-    index: NDArray[np.int64], points: Array, rows: int, cols: int, shape: tuple[int, ...]
-) -> tuple[NDArray[np.int64], Array]:
-    """The corners between markers that couldn't be read, where the board's plane and a smooth bend put them; the fit decides."""
-    homography, _ = cv2.findHomography(_grid(index, cols), points, cv2.RANSAC, 3.0)
-    if homography is None:
-        return index, points
-
-    def plane(of: NDArray[np.int64]) -> Array:
-        return np.asarray(cv2.perspectiveTransform(_grid(of, cols)[:, None, :], homography)[:, 0])
-
-    known = plane(index)
-    centre, scale = known.mean(axis=0), known.std() + 1.0
-
-    def bends(at: Array) -> Array:
-        x, y = ((at - centre) / scale).T
-        terms = [np.ones_like(x), x, y]
-        if len(index) >= 12:
-            terms += [x * x, x * y, y * y]
-        return np.column_stack(terms)
-
-    gap = np.linalg.lstsq(bends(known), points - known, rcond=None)[0]
-    missing = np.setdiff1d(np.arange(rows * cols), index)
-    guess = plane(missing)
-    guess = guess + bends(guess) @ gap
-    inside = np.all((guess > 4) & (guess < np.array([shape[1], shape[0]]) - 5), axis=1)
-    index = np.concatenate([index, missing[inside]])
-    order = np.argsort(index)
-    return index[order], np.concatenate([points, guess[inside]])[order]
-
-
-def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArray[np.int64], Array]:
-    found, corners = cv2.findChessboardCorners(
-        grey, (cols, rows), flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    focal = float(solution.state.intrinsics[0, 0])
+    uncertain = float(solution.std()[0]) / focal if solution.determined and focal > 0 else np.inf
+    if uncertain <= FOCAL_KNOWN:
+        return
+    normals = solution.state.turns[:, :, 2]
+    apart = np.rad2deg(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))).max()
+    why = (
+        f"all views are parallel within {apart:.0f} deg, so that focal length and distance can't be told apart"
+        if apart < PARALLEL_DEG
+        else f"it is open by {100 * min(uncertain, 9.99):.0f} %"
     )
-    if not found:  # slower, and finds more
-        found, corners = cv2.findChessboardCornersSB(grey, (cols, rows), flags=cv2.CALIB_CB_EXHAUSTIVE)
-    if not found:
-        raise NotDetermined(
-            "geometry", f"no checkerboard of {rows} x {cols} inner corners found: all of it has to be in view"
-        )
-    grid = corners.reshape(rows, cols, 2).astype(float)
-    turned = [np.rot90(grid, k) for k in range(4)] if rows == cols else [grid, grid[::-1, ::-1]]
-    turned += [g[:, ::-1] for g in turned]
-    # Seen from the front, along a row and then down is a clockwise turn. Of what is left, the one whose first square is dark,
-    # so that both cameras of a pair number alike; boards that look the same turned by 180 deg begin at the top left.
-    front = [g for g in turned if _turn(g[0, -1] - g[0, 0], g[-1, 0] - g[0, 0]) > 0]
-    if (rows + cols) % 2:
-        front = [g for g in front if _first_square_is_dark(grey, g)] or front
-    first = min(front, key=lambda g: float(g[0, 0].sum()))
-    return np.arange(rows * cols), first.reshape(-1, 2)
+    raise NotDetermined(
+        "geometry", f"the focal length isn't determined: {why}; tilt the board by 20..40 deg in several views"
+    )
 
 
-def _turn(a: Array, b: Array) -> float:
-    return float(a[0] * b[1] - a[1] * b[0])
+# --- the distortion model, by views that its fit has not seen --------------------------------------------------------------
 
 
-def _first_square_is_dark(grey: NDArray[np.uint8], grid: Array) -> bool:
-    """Whether the square between the first four inner corners, which has the first square's colour, is darker than its
-    neighbours."""
-    middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
-    level = ndimage.map_coordinates(grey.astype(float), middles[..., ::-1].reshape(-1, 2).T, order=1, mode="nearest")
-    even = np.indices(middles.shape[:2]).sum(axis=0).ravel() % 2 == 0
-    return bool(level[even].mean() < level[~even].mean())
+def choose_model(
+    views: Sequence[BoardView], shape: tuple[int, int], solution: Solution
+) -> tuple[tuple[str, ...], tuple[DistortionModel, ...]]:
+    """The distortion model, and how each of `MODELS` predicts held-out views: fitted to the others, each held-out view gets a
+    pose and nothing else.
 
-
-def _refine(
-    picture: Array, points: Array, board: Array, square_mm: float, marker_mm: float, rows: int, cols: int
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Corners fitted in the picture, and which of the fits are to be trusted."""
-    homography, _ = cv2.findHomography(board.astype(np.float64), points.astype(np.float64), cv2.RANSAC, 3.0)
-    if homography is None:
-        raise NotDetermined("geometry", "the corners found don't lie on a plane: light or place the board better")
-    inverse = np.linalg.inv(homography)
-
-    def to_image(at: Array) -> Array:
-        return np.asarray(cv2.perspectiveTransform(at[:, None, :].astype(np.float64), homography)[:, 0])
-
-    step = 0.5 * square_mm
-    along = [
-        to_image(board + np.array(d) * step) - to_image(board - np.array(d) * step) for d in ((1.0, 0.0), (0.0, 1.0))
-    ]
-    square_px = np.minimum(np.linalg.norm(along[0], axis=1), np.linalg.norm(along[1], axis=1))
-    half = np.clip(0.42 * square_px, 2.0, WINDOW_PX)
-
-    def clear(at_px: Array) -> NDArray[np.bool_]:
-        """Pixels (n, 2) that no marker blurs into and that are on the board."""
-        mm = cv2.perspectiveTransform(at_px.reshape(-1, 1, 2).astype(np.float64), inverse)[:, 0]
-        inside = np.all((mm > 0) & (mm < np.array([cols, rows]) * square_mm), axis=1)
-        if marker_mm <= 0:
-            return np.asarray(inside)
-        blur_mm = 1.5 * square_mm / float(np.median(square_px))
-        reach = 0.5 * marker_mm + blur_mm
-        # Markers stand in the light squares; the dark ones are of one level, so that leaving them out costs nothing but pixels:
-        # which squares are light is seen in the picture, not assumed.
-        cell = np.floor(mm / square_mm)
-        centre = (cell + 0.5) * square_mm
-        near = np.all(np.abs(mm - centre) < reach, axis=1)
-        light = light_squares[
-            np.clip(cell[:, 1], 0, rows - 1).astype(int), np.clip(cell[:, 0], 0, cols - 1).astype(int)
-        ]
-        return np.asarray(inside & ~(near & light))
-
-    light_squares = _light_squares(picture, to_image, square_mm, marker_mm, rows, cols)
-    return fit_corners(picture, points, along[0], along[1], half, clear)
-
-
-def _light_squares(
-    picture: Array, to_image: Any, square_mm: float, marker_mm: float, rows: int, cols: int
-) -> NDArray[np.bool_]:
-    """Which squares are light: of the two checker patterns, the one that agrees with the picture at the squares' rims."""
-    row, col = np.indices((rows, cols))
-    rim = 0.5 - 0.25 * max(1.0 - marker_mm / square_mm, 0.1)
-    level = np.zeros((rows, cols))
-    for dx, dy in ((rim, 0.0), (-rim, 0.0), (0.0, rim), (0.0, -rim)):
-        at = to_image(np.column_stack([(col.ravel() + 0.5 + dx) * square_mm, (row.ravel() + 0.5 + dy) * square_mm]))
-        level += ndimage.map_coordinates(picture, at[:, ::-1].T, order=1, mode="nearest").reshape(rows, cols)
-    even = (row + col) % 2 == 0
-    return np.asarray(even if level[even].mean() > level[~even].mean() else ~even)
-
-
-def fit_corners(
-    picture: Array, points: Array, across: Array, down: Array, half_px: Array, clear: Any = None
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Checkerboard corners by least squares: I = level + slope . r + contrast E(d1) E(d2), E a blurred edge, -1..1.
-
-    `points` (n, 2), (x, y), are the first guess, good to about 2 px; `across` and `down` (n, 2) the directions of the board's
-    axes there; `half_px` (n,) the window. `clear(points) -> bool` says which pixels may be used. Returns the corners and
-    which are trusted: converged near the guess, sharp enough, explaining what is seen.
+    The richest model is taken unless a simpler one predicts the held-out views better, by more than chance and by enough to matter. A
+    coefficient is thus never dropped for being small: that would claim that it is known to be 0, and its neighbours' uncertainties
+    would be too small.
     """
-    points = np.array(points, dtype=float)
-    count = len(points)
-    size = int(np.ceil(half_px.max()))
-    offset = np.arange(-size, size + 1, dtype=float)
-    dx, dy = (grid.ravel() for grid in np.meshgrid(offset, offset))
-    base = np.round(points)
-    x, y = base[:, :1] + dx, base[:, 1:] + dy  # (n, window)
-    rows, cols = picture.shape
-    used = (x >= 0) & (x < cols) & (y >= 0) & (y < rows)
-    used &= np.hypot(dx, dy)[None, :] <= half_px[:, None] + 0.5
-    if clear is not None:
-        used &= clear(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(used.shape)
-    value = picture[np.clip(y, 0, rows - 1).astype(int), np.clip(x, 0, cols - 1).astype(int)]
-    weight = used.astype(float)
+    folds = [np.arange(start, len(views), min(FOLDS, len(views))) for start in range(min(FOLDS, len(views)))]
+    scores = {model: np.zeros(len(views)) for model in MODELS}
+    for fold in folds:
+        rest = [k for k in range(len(views)) if k not in fold]
+        chosen = [views[k] for k in rest]
+        if len(chosen) < 2:
+            continue
+        start = solution.state
+        start = replace(start, turns=start.turns[rest], shifts_mm=start.shifts_mm[rest])
+        boards = {board_key(view): number for number, view in enumerate(_one_a_board(views))}
+        for model in MODELS:
+            free = free_intrinsics(model)
+            held = replace(start, intrinsics=np.where(free, start.intrinsics, 0.0))
+            sights = [Sight(view, pose=k, board=boards[board_key(view)]) for k, view in enumerate(chosen)]
+            trained = Bundle(sights, free[None, :], shape, boards=len(boards)).solve(held).state
+            for k in map(int, fold):
+                scores[model][k] = _held_out(views[k], trained, boards[board_key(views[k])], solution, k, shape)
+    counts = sum(len(view.index) for view in views)
+    best = MODELS[-1]
+    reasons = dict.fromkeys(MODELS, "")
+    for model in reversed(MODELS[:-1]):
+        worse = scores[best] - scores[model]
+        error = float(np.std(worse, ddof=1) * np.sqrt(len(worse)))
+        if worse.sum() > max(error, OVERFITTED * scores[model].sum()):
+            reasons[best] = "refused: it predicts held-out views worse than a simpler one does"
+            best = model
+    listed = []
+    for model in MODELS:
+        reason = reasons[model]
+        if model == best:
+            reason = "chosen: no simpler model predicts held-out views better"
+        elif not reason:
+            change = 100.0 * (np.sqrt(scores[model].sum() / scores[best].sum()) - 1.0)
+            reason = f"simpler, and no better: held-out views change by {change:+.2g} %"
+        listed.append(
+            DistortionModel(
+                coefficients=model,
+                held_out_rms_px=float(np.sqrt(scores[model].sum() / counts)),
+                chosen=model == best,
+                reason=reason,
+            )
+        )
+    return best, tuple(listed)
 
-    # Edge 1 runs along `across`, edge 2 along `down`. Parameters: place (2), angles of the normals (2), width, level, slope (2),
-    # contrast.
-    p = np.zeros((count, 9))
-    p[:, :2] = points - base
-    p[:, 2] = np.arctan2(across[:, 0], -across[:, 1])
-    p[:, 3] = np.arctan2(down[:, 0], -down[:, 1])
-    p[:, 4] = 1.0
-    p[:, 5:] = _solve(_corner_slopes(p, dx, dy)[1][:, :, 5:], weight, value)[0]
-    damping = np.full(count, 1e-3)
-    cost = _corner_cost(p, dx, dy, value, weight)
-    spread = np.full(count, np.inf)
-    limit = np.array([1.0, 1.0, 0.3, 0.3, 0.5, np.inf, np.inf, np.inf, np.inf])
-    for _ in range(25):
-        model, slopes = _corner_slopes(p, dx, dy)
-        change, covariance = _solve(slopes, weight, value - model, damping)
-        tried = p + np.clip(change, -limit, limit)
-        tried[:, 4] = np.clip(tried[:, 4], 0.2, 4.0)
-        new = _corner_cost(tried, dx, dy, value, weight)
-        better = new <= cost
-        moved = np.abs(np.where(better[:, None], tried - p, 0.0))[:, :2].max()
-        p[better], cost = tried[better], np.where(better, new, cost)
-        damping = np.clip(np.where(better, damping * 0.1, damping * 10.0), 1e-10, 1e6)
-        spread = np.sqrt(np.abs(covariance[:, 0, 0] + covariance[:, 1, 1]))
-        if moved < 1e-4 and np.mean(better | (damping >= 1e3)) > 0.98:
+
+def _one_a_board(views: Sequence[BoardView]) -> list[BoardView]:
+    first: dict[tuple[object, ...], BoardView] = {}
+    for view in views:
+        first.setdefault(board_key(view), view)
+    return list(first.values())
+
+
+def _held_out(
+    view: BoardView, trained: Any, board: int, solution: Solution, pose: int, shape: tuple[int, int]
+) -> float:
+    """Sum of squared residuals (px^2) of a view that the camera `trained` has not seen."""
+    state = replace(
+        trained,
+        warps_mm=trained.warps_mm[board : board + 1],
+        turns=solution.state.turns[pose : pose + 1],
+        shifts_mm=solution.state.shifts_mm[pose : pose + 1],
+    )
+    only = Bundle([Sight(view, pose=0)], np.zeros((1, COUNT), dtype=bool), shape, only_poses=True)
+    return float(np.sum(only.solve(state).residuals[0] ** 2))
+
+
+# --- what the errors are ----------------------------------------------------------------------------------------------------
+
+
+def halves_differ(calibration: Calibration, shape: tuple[int, int]) -> Difference | None:
+    """Two halves of the views, every other one, each calibrated by itself, compared where the corners were seen; None where the
+    halves would be too small."""
+    views, coefficients = calibration.views, _coefficients(calibration.solution)
+    halves = [views[0::2], views[1::2]]
+    if min(len(half) for half in halves) < MIN_VIEWS:
+        return None
+    one, two = (calibrate(half, shape, coefficients) for half in halves)
+    if not (one.determined and two.determined):
+        return None
+    points = calibration.points
+    points = points[:: max(1, len(points) // 300)]
+    return difference(
+        one.state.intrinsics[0], two.state.intrinsics[0], one.of_camera() + two.of_camera(), calibration.points, points
+    )
+
+
+def _coefficients(solution: Solution) -> tuple[str, ...]:
+    return tuple(name for name, free in zip(NAMES[4:], solution.free[0, 4:], strict=True) if free)
+
+
+def cross_validation(calibration: Calibration, shape: tuple[int, int]) -> CrossValidation | None:
+    """`halves_differ` as a result: error of the model apart from error of the sampling."""
+    found = halves_differ(calibration, shape)
+    if found is None:
+        return None
+    beyond = max(found.rms_px**2 - found.expected_px**2, 0.0) / 2.0
+    sigma = found.significance_sigma
+    return CrossValidation(
+        difference_px=found.rms_px,
+        expected_px=found.expected_px,
+        significance_sigma=sigma,
+        model_error_px=float(np.sqrt(beyond)) if sigma > DIFFERENT else 0.0,
+    )
+
+
+def projection_maps(calibration: Calibration, shape: tuple[int, int]) -> tuple[ProjectionUncertainty, ...]:
+    """At the boards' middle distance, and at infinity."""
+    x, y = grid(shape)
+    image = grid_points(x, y)
+    distances = (float(np.median(np.linalg.norm(calibration.points, axis=1))), None)
+    found = []
+    for distance_mm in distances:
+        std = calibration.projection_std(image, distance_mm).reshape(len(y), len(x))
+        if not np.isfinite(std).all():  # outside of where the distortion has an inverse
+            std = np.where(np.isfinite(std), std, np.nanmax(std))
+        found.append(
+            ProjectionUncertainty(
+                distance_mm=distance_mm, x_px=_numbers(x), y_px=_numbers(y), projection_px_std=_rows(std)
+            )
+        )
+    return tuple(found)
+
+
+def board_warps(
+    views: Sequence[BoardView], warps_mm: Array, covariance: Array, prior_std: Array
+) -> tuple[BoardWarp, ...]:
+    """The warps (boards, 3) as results; `covariance` and `prior_std` of them all, in order."""
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(-1, 3)
+    known = std < WARP_KNOWN * prior_std.reshape(-1, 3)
+    found = []
+    for number, view in enumerate(_one_a_board(views)):
+        capture = view.capture
+        name = f"{capture.squares[0]} x {capture.squares[1]} squares of {capture.square_mm:g} mm, {capture.dictionary}"
+        fields: dict[str, float | None] = {}
+        for k, field in enumerate(("bend_x_mm", "bend_y_mm", "twist_mm")):
+            fields[field] = float(warps_mm[number, k]) if known[number, k] else None
+            fields[f"{field}_std"] = float(std[number, k]) if known[number, k] else None
+        found.append(BoardWarp(board=name, **fields))
+    return tuple(found)
+
+
+# --- lateral colour ----------------------------------------------------------------------------------------------------------
+
+
+def channel_geometry(
+    calibration: Calibration, corners: Sequence[dict[str, CornerFits]], shape: tuple[int, int]
+) -> tuple[ChannelGeometry, ...]:
+    """Each colour's camera, from where its corners (one entry for each view) lie beside the luminance's.
+
+    Poses and boards are the same for all colours, so that only differences count: scale, principal point, k1 and k2 of each
+    colour by least squares, dq = J dtheta. A colour's radial shift is its own less green's, over the distance from the principal
+    point, positive outwards.
+    """
+    if not corners or "G" not in corners[0]:
+        return ()
+    intrinsics = calibration.intrinsics
+    seen = np.concatenate([view.image_px for view in calibration.views])
+    rays = unproject(seen, intrinsics)
+    by_camera = project_slopes(rays, intrinsics)[2]
+    directions = _colour_directions(intrinsics)
+    slopes = by_camera @ directions
+    farthest = float(np.linalg.norm(seen - intrinsics[2:4], axis=1).max())
+    radius = np.linspace(0.0, farthest, 16)
+    found = []
+    for channel in corners[0]:
+        trusted = np.concatenate([fits[channel].trusted & fits["G"].trusted for fits in corners])
+        at = np.concatenate([fits[channel].points for fits in corners])
+        green = np.concatenate([fits["G"].points for fits in corners])
+        own = _fit_shift(at - seen, slopes, trusted)
+        beside = _fit_shift(at - green, slopes, trusted) if channel != "G" else None
+        if own is None or (channel != "G" and beside is None):
+            continue
+        theta = intrinsics + directions @ own[0]
+        result = ChannelGeometry(
+            channel=channel,
+            camera_matrix=_matrix_rows(theta),
+            distortion=_numbers(distortion_of(theta)),
+            rms_px=own[2],
+            corners=int(own[3]),
+        )
+        if beside is not None:
+            # along the frame's diagonal: the radial part is the same in all directions but for fx/fy
+            along = np.array([0.8, 0.6])
+            line = unproject(intrinsics[2:4] + radius[:, None] * along, intrinsics)
+            radial = np.einsum("i,nij->nj", along, project_slopes(line, intrinsics)[2] @ directions)
+            radial[:, 1:3] = 0.0  # what is the same over the whole frame isn't radial
+            result = result.model_copy(
+                update={
+                    "centre_shift_px": (float(beside[0][1]), float(beside[0][2])),
+                    "centre_shift_px_std": _pair(np.sqrt(np.diag(beside[1])[1:3])),
+                    "radius_px": _numbers(radius),
+                    "radial_shift_px": _numbers(radial @ beside[0]),
+                    "radial_shift_px_std": _numbers(np.sqrt(np.einsum("ni,ij,nj->n", radial, beside[1], radial))),
+                }
+            )
+        found.append(result)
+    return tuple(found)
+
+
+def _colour_directions(intrinsics: Array) -> Array:
+    """(12, 5): how scale, cx, cy, k1 and k2 move the intrinsics."""
+    directions = np.zeros((COUNT, 5))
+    directions[0, 0], directions[1, 0] = intrinsics[0], intrinsics[1]
+    for column, row in ((1, 2), (2, 3), (3, 4), (4, 5)):
+        directions[row, column] = 1.0
+    return directions
+
+
+def _fit_shift(shift: Array, slopes: Array, trusted: NDArray[np.bool_]) -> tuple[Array, Array, float, int] | None:
+    """Parameters, covariance, rms (px) and number of corners of shift (n, 2) = slopes (n, 2, p) parameters; strays left out."""
+    used = trusted.copy()
+    for _ in range(4):
+        if used.sum() < 4 * MIN_CORNERS:
+            return None
+        design = slopes[used].reshape(-1, slopes.shape[2])
+        scale = np.maximum(np.linalg.norm(design, axis=0), 1e-12)
+        values = np.linalg.lstsq(design / scale, shift[used].ravel(), rcond=1e-12)[0] / scale
+        rest = shift - slopes @ values
+        away = np.linalg.norm(rest, axis=1)
+        scatter = 1.4826 * float(np.median(np.abs(rest[used])))
+        kept = trusted & (away < OUTLYING_CORNER * max(scatter, 1e-6))
+        if np.array_equal(kept, used):
             break
-    pixels = weight.sum(axis=1)
-    residual = np.sqrt(cost / np.maximum(pixels - 9.0, 1.0))
-    found = base + p[:, :2]
-    trusted = (
-        (np.linalg.norm(found - points, axis=1) < 2.5)
-        & (pixels > 16)
-        & (np.abs(p[:, 8]) > 3.0 * residual)
-        & (residual * spread < 0.5)
-    )
-    return found, trusted
+        used = kept
+    variance = float(np.sum(rest[used] ** 2)) / max(2 * used.sum() - len(values), 1)
+    covariance = variance * np.linalg.pinv((design / scale).T @ (design / scale)) / np.outer(scale, scale)
+    return values, covariance, float(np.sqrt(np.mean(away[used] ** 2))), int(used.sum())
 
 
-def _corner_slopes(p: Array, dx: Array, dy: Array) -> tuple[Array, Array]:
-    """Model (n, window) and its derivatives (n, window, 9)."""
-    x, y = dx - p[:, :1], dy - p[:, 1:2]
-    width = p[:, 4:5]
-    edges, steps, turns, lags = [], [], [], []
-    for angle in (p[:, 2:3], p[:, 3:4]):
-        u = np.cos(angle) * x + np.sin(angle) * y
-        edges.append(erf(u / (np.sqrt(2.0) * width)))
-        steps.append(np.sqrt(2.0 / np.pi) / width * np.exp(-0.5 * (u / width) ** 2))
-        turns.append(np.cos(angle) * y - np.sin(angle) * x)
-        lags.append(u)
-    contrast = p[:, 8:9]
-    first, second = steps[0] * edges[1] * contrast, steps[1] * edges[0] * contrast
-    slopes = np.stack(
-        [
-            -first * np.cos(p[:, 2:3]) - second * np.cos(p[:, 3:4]),
-            -first * np.sin(p[:, 2:3]) - second * np.sin(p[:, 3:4]),
-            first * turns[0],
-            second * turns[1],
-            -(first * lags[0] + second * lags[1]) / width,
-            np.ones_like(x),
-            np.broadcast_to(dx, x.shape),
-            np.broadcast_to(dy, x.shape),
-            edges[0] * edges[1],
-        ],
-        axis=-1,
-    )
-    model = p[:, 5:6] + p[:, 6:7] * dx + p[:, 7:8] * dy + contrast * edges[0] * edges[1]
-    return model, slopes
-
-
-def _corner_cost(p: Array, dx: Array, dy: Array, value: Array, weight: Array) -> Array:
-    return np.asarray((weight * (value - _corner_slopes(p, dx, dy)[0]) ** 2).sum(axis=1))
-
-
-def _solve(slopes: Array, weight: Array, residual: Array, damping: Array | None = None) -> tuple[Array, Array]:
-    """Damped least squares of every corner: changes (n, k) and the inverse normal matrices (n, k, k)."""
-    weighted = slopes * weight[:, :, None]
-    normal = np.swapaxes(weighted, 1, 2) @ slopes
-    scale = np.einsum("nkk->nk", normal)
-    ridge = (1e-9 if damping is None else damping[:, None]) * scale + 1e-12
-    normal = normal + ridge[:, :, None] * np.eye(normal.shape[1])
-    inverse = np.linalg.inv(normal)
-    right = np.swapaxes(weighted, 1, 2) @ residual[:, :, None]
-    return (inverse @ right)[:, :, 0], inverse
-
-
-# --- the camera ------------------------------------------------------------------------------------------------------------
-
-
-def find_boards(recordings: RecordingSet, side: Side) -> tuple[list[BoardView], list[Skipped]]:
-    """The boards of all `charuco` captures of `side`, and those that couldn't be found, with the reason."""
-    cfa = recordings.camera(side).cfa
-    views, rejected = [], []
-    for capture in recordings.captures("charuco", side):
-        try:
-            views.append(find_board(luminance(recordings.frame(capture), cfa), capture))
-        except NotDetermined as refused:
-            rejected.append(Skipped(step=capture.id, reason=refused.reason, side=side))
-    return views, rejected
-
-
-def calibrate(views: Sequence[BoardView], shape: tuple[int, int]) -> tuple[Any, ...]:
-    """OpenCV's calibration of views in frames of `shape` (rows, cols): rms, matrix, distortion, standard deviations, rms of
-    the views. `k3` is left at 0 where the views don't tell it from 0 by three standard deviations."""
-    boards = [view.board_mm for view in views]
-    points = [view.image_px.astype(np.float32) for view in views]
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-10)
-
-    def run(flags: int) -> tuple[Any, ...]:
-        found = cv2.calibrateCameraExtended(boards, points, shape[::-1], None, None, flags=flags, criteria=criteria)
-        rms, matrix, distortion, _, _, deviations, _, of_views = found
-        return rms, matrix, distortion.ravel()[:5], deviations.ravel()[:9], of_views.ravel()
-
-    full = run(0)
-    if abs(full[2][4]) < 3.0 * full[3][8] or not np.isfinite(full[3]).all():
-        return run(cv2.CALIB_FIX_K3)
-    return full
+# --- all of it ----------------------------------------------------------------------------------------------------------------
 
 
 def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
-    """Camera matrix and distortion of `side` from its `charuco` captures (plain checkerboards: see the module's docstring).
+    """Camera matrix and distortion of `side` from its `charuco` captures (plain checkerboards: see `lab.fit.board`).
 
-    Uncertainties are OpenCV's: from the Jacobian at the solution and the residuals' scatter. A view whose rms is more than 3
-    times the median of the views is left out, and said so. Raises `NotDetermined` below 3 good views, or where all views
-    are parallel to the sensor (no perspective: focal length and distance can't be told apart).
+    Raises `NotDetermined` below 3 good views, where the board isn't what the captures say, or where all views are parallel to each
+    other (no perspective: focal length and distance can't be told apart).
     """
     if not recordings.captures("charuco", side):
         raise NotDetermined("geometry", "no charuco captures")
-    views, rejected = find_boards(recordings, side)
+    views, missed = find_boards(recordings, side)
     camera = recordings.camera(side)
-    while True:
-        if len(views) < MIN_VIEWS:
-            why = f"; {rejected[0].step}: {rejected[0].reason}" if rejected else ""
-            raise NotDetermined("geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{why}")
-        try:
-            rms, matrix, distortion, deviations, of_views = calibrate(views, (camera.rows, camera.cols))
-        except cv2.error as error:
-            raise NotDetermined(
-                "geometry", f"the views don't determine the camera ({error.err}): tilt the board more"
-            ) from error
-        limit = max(OUTLYING_VIEW * float(np.median(of_views)), 0.1)
-        worst = int(np.argmax(of_views))
-        if of_views[worst] <= limit:
-            break
-        reason = f"rms {of_views[worst]:.2f} px, where the other views have {np.median(of_views):.2f} px"
-        rejected.append(Skipped(step=views[worst].capture.id, reason=reason, side=side))
-        views = [view for k, view in enumerate(views) if k != worst]
-    if not np.isfinite(deviations).all() or deviations[0] > 0.2 * matrix[0, 0]:
-        raise NotDetermined(
-            "geometry", "the focal length isn't determined: tilt the board by 20..40 deg in several views"
-        )
-    fx, fy, cx, cy = (float(v) for v in deviations[:4])
+    shape = (camera.rows, camera.cols)
+    if len(views) < MIN_VIEWS:
+        why = f"; {missed[0].step}: {missed[0].reason}" if missed else ""
+        raise NotDetermined("geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{why}")
+    calibration = calibrate_robustly(views, shape, side)
+    solution = calibration.solution
+    frames = (channel_corners(recordings.frame(view.capture), camera.cfa, view) for view in calibration.views)
+    channels = channel_geometry(calibration, list(frames), shape) if camera.cfa != "MONO" else ()
+    validation = cross_validation(calibration, shape)
+    noises = [view.std_px for view in calibration.views if view.std_px is not None]
+    of_pictures = float(np.sqrt(np.mean(np.concatenate(noises) ** 2))) if noises else None
+    std = solution.std()
+    warps = solution.covariance[int(solution.free.sum()) :, int(solution.free.sum()) :]
+    fx, fy, cx, cy = (float(value) for value in std[:4])
+    intrinsics = calibration.intrinsics
     return GeometryFit(
-        camera_matrix=tuple((float(a), float(b), float(c)) for a, b, c in matrix),
+        camera_matrix=_matrix_rows(intrinsics),
         camera_matrix_std=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 0.0)),
-        distortion=tuple(float(v) for v in distortion),
-        distortion_std=tuple(float(v) for v in deviations[4:9]),
-        rms_px=float(rms),
-        views=len(views),
-        rejected=tuple(rejected),
+        distortion=_numbers(distortion_of(intrinsics)),
+        distortion_std=_numbers(std[4 : 4 + len(distortion_of(intrinsics))]),
+        rms_px=solution.rms_px,
+        views=len(calibration.views),
+        rejected=(*missed, *calibration.rejected),
+        rejected_corners=calibration.rejected_corners,
+        parameters=solution.names,
+        covariance=_rows(solution.covariance),
+        corner_px_std=solution.noise_px,
+        corner_noise_px=of_pictures,
+        board_warp=board_warps(calibration.views, solution.state.warps_mm, warps, _warp_prior(calibration, shape)),
+        distortion_models=calibration.models,
+        cross_validation=validation,
+        projection=projection_maps(calibration, shape),
+        channels=channels,
+        residuals=view_residuals(calibration),
+        remarks=tuple(_remarks(solution, validation, of_pictures)),
     )
+
+
+def _warp_prior(calibration: Calibration, shape: tuple[int, int]) -> Array:
+    problem = Bundle(sights_of(calibration.views), calibration.solution.free, shape)
+    return problem.prior_std[problem.at_warp :]
+
+
+def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
+    """Where each view's corners were seen, and how far from their predictions."""
+    state = calibration.solution.state
+    found = []
+    for k, (view, rest) in enumerate(zip(calibration.views, calibration.solution.residuals, strict=True)):
+        depth = (view.board_mm @ state.turns[k].T + state.shifts_mm[k])[:, 2]
+        found.append(
+            ViewResiduals(
+                capture=view.capture.id,
+                corner=tuple(int(index) for index in view.index),
+                x_px=_numbers(np.round(view.image_px[:, 0], 5)),
+                y_px=_numbers(np.round(view.image_px[:, 1], 5)),
+                dx_px=_numbers(np.round(rest[:, 0], 5)),
+                dy_px=_numbers(np.round(rest[:, 1], 5)),
+                depth_mm=_numbers(np.round(depth, 3)),
+            )
+        )
+    return tuple(found)
+
+
+def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures: float | None) -> list[str]:
+    said = []
+    if of_pictures is not None and solution.noise_px > 2.0 * max(of_pictures, 1e-3):
+        said.append(
+            f"The corners scatter by {solution.noise_px:.3f} px about the model, where the pictures' noise accounts for "
+            f"{of_pictures:.3f} px: the rest is the board's print and shape, motion, or the lens model."
+        )
+    if validation is None:
+        said.append(f"Fewer than {2 * MIN_VIEWS} views: the model's own error can't be told from the sampling's.")
+    elif validation.model_error_px > 0:
+        said.append(
+            f"Two halves of the views differ by {validation.difference_px:.3f} px over the frame, where the corners' noise lets "
+            f"them differ by {validation.expected_px:.3f} px: the model is off by about {validation.model_error_px:.3f} px, which "
+            "the standard uncertainties leave out."
+        )
+    return said
+
+
+def _matrix_rows(intrinsics: Array) -> tuple[tuple[float, float, float], ...]:
+    return tuple((float(a), float(b), float(c)) for a, b, c in matrix_of(intrinsics))
+
+
+def _numbers(values: Array) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def _rows(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(_numbers(row) for row in values)

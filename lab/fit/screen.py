@@ -1,6 +1,6 @@
 """Where a pattern on a screen lies in the camera's frame, to a few thousandths of a pixel.
 
-The checkerboard's corners are found and fitted in the levelled mosaic (see `lab.fit.geometry`), numbered by growing a grid
+The checkerboard's corners are found and fitted in the levelled mosaic (see `lab.fit.board`), numbered by growing a grid
 from one of them, and matched to the target by the Bernoulli pattern, which unlike a checkerboard fits in one place only. The
 map from camera px to target cells is a homography after a smooth displacement, cubic in the position:
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, spatial
 
 from lab.errors import NotDetermined
-from lab.fit.geometry import fit_corners
+from lab.fit.board import fit_corners
 
 Array = NDArray[np.floating[Any]]
 
@@ -76,7 +76,7 @@ def register(
     picture = np.where(seen, checkerboard, 0.0)
     points, grid, across, down = _grown_grid(picture, seen, square_px)
     half = np.full(len(points), float(np.clip(0.4 * square_px, 2.5, 9.0)))
-    fitted, trusted = fit_corners(picture, points, across, down, half)
+    fitted, trusted, _ = fit_corners(picture, points, across, down, half)
     points, grid = fitted[trusted], grid[trusted]
     if len(points) < MIN_CORNERS:
         raise NotDetermined(

@@ -1,8 +1,11 @@
 """Extrinsics of a stereo pair: x_right = rotation x_left + translation_mm, from poses of a board that both cameras saw.
 
-One least-squares problem over everything the pairs say: the rig's rotation and translation, both cameras' intrinsics (from
-where the single cameras' fits ended) and the board's pose in every pair. Solving for the rig alone, with the intrinsics held
+One least-squares problem over everything that both cameras saw: the rig's rotation and translation, both cameras' intrinsics, the
+boards' warp and the pose of the board in every capture (`lab.fit.bundle`). Solving for the rig alone, with the intrinsics held
 where each camera's own views put them, would push their errors into the rig and leave them out of its uncertainty.
+
+From the joint covariance follows what a depth is worth. A point P in the left camera's frame is seen at q(theta, P), (4,) px in
+both frames. With A = dq/dP and B = dq/dtheta, the triangulated point moves by dP = -(A^T A)^-1 A^T (B dtheta - dq).
 """
 
 from __future__ import annotations
@@ -14,26 +17,54 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from lab.errors import NotDetermined
-from lab.fit.geometry import BoardView, find_boards
+from lab.fit.board import BoardView, board_points
+from lab.fit.bundle import RIG, Bundle, Sight, Solution, State, board_key, board_pose, rms_px
+from lab.fit.pinhole import (
+    NAMES,
+    cross_matrices,
+    distortion_of,
+    intrinsics_of,
+    intrinsics_of_fit,
+    matrix_of,
+    project_slopes,
+    unproject,
+)
+from lab.fit.projection import grid, grid_points
 from lab.recording import RecordingSet
-from lab.results import GeometryFit, StereoFit
+from lab.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
+from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]
 
 MIN_PAIRS = 2
-INTRINSICS = 9  # fx fy cx cy k1 k2 p1 p2 k3
 OUTLYING_PAIR = 3.0  # times the median rms of the pairs
+OUTLYING_PAIR_PX = 0.1
+NO_RIG = 5.0  # times the single cameras' rms (and at least 1 px), above which no rig explains the pairs
+DEPTHS_MM = (500.0, 1000.0, 2000.0)
 
 
-def fit_stereo(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> StereoFit:
+@dataclass(frozen=True)
+class Pair:
+    """One pose as both cameras saw it."""
+
+    left: BoardView
+    right: BoardView
+
+
+def fit_stereo(
+    recordings: RecordingSet,
+    left: GeometryFit,
+    right: GeometryFit,
+    depths_mm: Sequence[float] = DEPTHS_MM,
+) -> StereoFit:
     """Rotation and translation between the cameras from the `charuco` captures of equal `pose`, with uncertainties.
 
-    `rms_px` is over all corners of both cameras, of the corner's distance from its prediction. A view that the single camera's
-    fit has rejected isn't used, nor is a pair whose rms is more than 3 times the pairs' median. Raises `NotDetermined`
-    below 2 pairs.
+    `rms_px` is over all corners of both cameras, of the corner's distance from its prediction. Used are the corners that the single
+    cameras' fits rest on; a pair whose rms is more than 3 times the pairs' median is left out. `depths_mm`: where the depth's
+    uncertainty is mapped. Raises `NotDetermined` below 2 pairs, or where no rig explains them.
     """
     pairs = paired_views(recordings, left, right)
     if len(pairs) < MIN_PAIRS:
@@ -42,172 +73,250 @@ def fit_stereo(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) 
             f"{len(pairs)} poses of the board were found by both cameras, {MIN_PAIRS} are needed: capture charuco poses with "
             "both, under the same pose name",
         )
+    shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
+    rejected: list[Skipped] = []
     while True:
-        rig = solve_rig(pairs, left, right)
-        worst = int(np.argmax(rig.rms_of_pairs_px))
-        limit = max(OUTLYING_PAIR * float(np.median(rig.rms_of_pairs_px)), 0.1)
-        if len(pairs) == MIN_PAIRS or rig.rms_of_pairs_px[worst] <= limit:
+        solution = solve_rig(pairs, left, right, shapes[0])
+        of_pairs = [
+            rms_px(np.concatenate(solution.residuals[2 * k : 2 * k + 2])) for k in range(len(pairs))
+        ]  # two sights a pair, left then right
+        worst = int(np.argmax(of_pairs))
+        limit = max(OUTLYING_PAIR * float(np.median(of_pairs)), OUTLYING_PAIR_PX)
+        if len(pairs) == MIN_PAIRS or of_pairs[worst] <= limit:
             break
+        reason = f"rms {of_pairs[worst]:.2f} px, where the other pairs have {np.median(of_pairs):.2f} px"
+        rejected.append(Skipped(step=f"pose {pairs[worst].left.capture.pose}", reason=reason))
         pairs = [pair for k, pair in enumerate(pairs) if k != worst]
-    translation, covariance = rig.translation_mm, rig.covariance
-    rotation, by_turn = cv2.Rodrigues(rig.turn)
-    # The uncertainty as a small rotation about the camera's axes: R(turn + d) R(turn)^T = 1 + [w]x, w linear in d
-    small = [by_turn[k].reshape(3, 3) @ rotation.T for k in range(3)]
-    axes = np.array([[s[2, 1], s[0, 2], s[1, 0]] for s in small]).T
-    turn_covariance = axes @ covariance[:3, :3] @ axes.T
+    alone = max(left.rms_px, right.rms_px)
+    if not solution.rms_px < max(NO_RIG * alone, 1.0) or not solution.determined:
+        raise NotDetermined(
+            "stereo",
+            f"no rig explains the pairs (rms {solution.rms_px:.1f} px, each camera alone {alone:.2f} px): check that equal poses are "
+            "the same pose of the board, that the rig was rigid, and that neither camera's frames are mirrored",
+        )
+    return _result(solution, pairs, shapes, depths_mm, tuple(rejected))
+
+
+def paired_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[Pair]:
+    """Views of both cameras with the same `pose`, the first of each where a pose was repeated, in the left one's order."""
+    of_left, of_right = _views_by_pose(recordings, "left", left), _views_by_pose(recordings, "right", right)
+    return [Pair(view, of_right[pose]) for pose, view in of_left.items() if pose in of_right]
+
+
+def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> dict[str, BoardView]:
+    """The views that a camera's fit rests on, without the corners that it has left out."""
+    captures = {capture.id: capture for capture in recordings.captures("charuco", side)}
+    found: dict[str, BoardView] = {}
+    for view in fit.residuals:
+        capture = captures.get(view.capture)
+        if capture is None:
+            raise NotDetermined(
+                "stereo", f"the {side} geometry rests on '{view.capture}', which isn't here: fit it again"
+            )
+        seen = np.column_stack([view.x_px, view.y_px])
+        index = np.array(view.corner, dtype=np.int64)
+        found.setdefault(capture.pose, BoardView(capture, index, board_points(capture, index), seen))
+    return found
+
+
+def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
+    """Mask (12,) of the intrinsics that a fit has let free."""
+    if fit.parameters:
+        return np.array([name in fit.parameters for name in NAMES])
+    return np.append(np.ones(8, dtype=bool), intrinsics_of_fit(fit)[8:] != 0.0)
+
+
+def solve_rig(pairs: Sequence[Pair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int]) -> Solution:
+    """Joint least squares of the rig, both cameras' intrinsics, the boards' warps and their poses, from where the single cameras'
+    fits ended. Sights stand pair by pair, left then right."""
+    cameras = np.array([intrinsics_of_fit(left), intrinsics_of_fit(right)])
+    keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
+    sights, poses, turns, shifts = [], [], [], []
+    for k, pair in enumerate(pairs):
+        board = keys.index(board_key(pair.left))
+        sights += [Sight(pair.left, k, board, 0), Sight(pair.right, k, board, 1)]
+        (turn_one, shift_one), (turn_two, shift_two) = (
+            board_pose(view, camera) for view, camera in zip((pair.left, pair.right), cameras, strict=True)
+        )
+        rotation = turn_two @ turn_one.T
+        poses.append((turn_one, shift_one))
+        turns.append(Rotation.from_matrix(rotation).as_rotvec())
+        shifts.append(shift_two - rotation @ shift_one)
+    start = State(
+        intrinsics=cameras,
+        rotation=Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(),
+        translation_mm=np.median(shifts, axis=0),
+        warps_mm=np.zeros((len(keys), 3)),
+        turns=np.array([turn for turn, _ in poses]),
+        shifts_mm=np.array([shift for _, shift in poses]),
+    )
+    return Bundle(sights, np.array([free_of(left), free_of(right)]), shape).solve(start)
+
+
+def _result(
+    solution: Solution,
+    pairs: Sequence[Pair],
+    shapes: Sequence[tuple[int, int]],
+    depths_mm: Sequence[float],
+    rejected: tuple[Skipped, ...],
+) -> StereoFit:
+    state = solution.state
+    at = solution.names.index(RIG[0])
+    std = np.sqrt(np.diag(solution.covariance)[at : at + 6])
+    translation = state.translation_mm
     baseline = float(np.linalg.norm(translation))
     along = translation / baseline
+    of_shift = solution.covariance[at + 3 : at + 6, at + 3 : at + 6]
     return StereoFit(
-        rotation=tuple((float(a), float(b), float(c)) for a, b, c in rotation),
-        rotation_std_rad=_three(np.sqrt(np.diag(turn_covariance))),
+        rotation=_rows3(state.rotation),
+        rotation_std_rad=_three(std[:3]),
         translation_mm=_three(translation),
-        translation_mm_std=_three(np.sqrt(np.diag(covariance)[3:6])),
+        translation_mm_std=_three(std[3:]),
         baseline_mm=baseline,
-        baseline_mm_std=float(np.sqrt(along @ covariance[3:6, 3:6] @ along)),
-        rms_px=rig.rms_px,
+        baseline_mm_std=float(np.sqrt(along @ of_shift @ along)),
+        rms_px=solution.rms_px,
         pairs=len(pairs),
+        camera_matrix_left=_rows3(matrix_of(state.intrinsics[0])),
+        distortion_left=_numbers(distortion_of(state.intrinsics[0])),
+        camera_matrix_right=_rows3(matrix_of(state.intrinsics[1])),
+        distortion_right=_numbers(distortion_of(state.intrinsics[1])),
+        parameters=solution.names,
+        covariance=_rows(solution.covariance),
+        corner_px_std=solution.noise_px,
+        rejected=rejected,
+        rectification=rectification(state, pairs, shapes[0]) if shapes[0] == shapes[1] else None,
+        depth=tuple(depth_uncertainty(solution, depth_mm, shapes) for depth_mm in depths_mm),
     )
 
 
-def paired_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[tuple[BoardView, BoardView]]:
-    """Views of both cameras with the same `pose`, the first of each where a pose was repeated, in the left one's order."""
-    of_side: dict[str, dict[str, BoardView]] = {}
-    for side, fit in (("left", left), ("right", right)):
-        refused = {item.step for item in fit.rejected}
-        views, _ = find_boards(recordings, "left" if side == "left" else "right")
-        of_side[side] = {}
-        for view in views:
-            if view.capture.id not in refused:
-                of_side[side].setdefault(view.capture.pose, view)
-    return [(view, of_side["right"][pose]) for pose, view in of_side["left"].items() if pose in of_side["right"]]
+# --- depth -------------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Rig:
-    """Outcome of the joint solve: `turn` (rotation vector) and `translation_mm`, their covariance (6, 6), and what is left, px."""
+def triangulation_slopes(solution: Solution, points: Array) -> tuple[Array, Array]:
+    """Slopes of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by the shared parameters
+    (n, 4, parameters)."""
+    state, free = solution.state, solution.free
+    shared = np.zeros((len(points), 4, len(solution.names)))
+    by_point = np.empty((len(points), 4, 3))
+    _, by_point[:, :2], by_camera = project_slopes(points, state.intrinsics[0])
+    first = int(free[0].sum())
+    shared[:, :2, :first] = by_camera[:, :, free[0]]
+    turned = points @ state.rotation.T
+    _, slope, by_camera = project_slopes(turned + state.translation_mm, state.intrinsics[1])
+    by_point[:, 2:] = slope @ state.rotation
+    at = solution.names.index(RIG[0])
+    shared[:, 2:, first:at] = by_camera[:, :, free[1]]
+    shared[:, 2:, at : at + 3] = -slope @ cross_matrices(turned)
+    shared[:, 2:, at + 3 : at + 6] = slope
+    return by_point, shared
 
-    turn: Array
-    translation_mm: Array
-    covariance: Array
-    rms_px: float
-    rms_of_pairs_px: Array
+
+def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[Array, Array]:
+    """Standard uncertainty (n,) of the triangulated depth of `points`, mm: by the calibration, and with corners in both pictures
+    that scatter by `corner_px_std` a coordinate, too."""
+    by_point, shared = triangulation_slopes(solution, points)
+    inverse = np.linalg.pinv(by_point)[:, 2, :]  # (n, 4): the row of the depth
+    by_parameter = -np.einsum("nk,nkp->np", inverse, shared)
+    calibration = np.einsum("np,pq,nq->n", by_parameter, solution.covariance, by_parameter)
+    matching = corner_px_std**2 * np.sum(inverse**2, axis=1)
+    return np.sqrt(calibration), np.sqrt(calibration + matching)
 
 
-def solve_rig(pairs: Sequence[tuple[BoardView, BoardView]], left: GeometryFit, right: GeometryFit) -> Rig:
-    """Joint least squares of the rig, both cameras' intrinsics and the boards' poses."""
-    problem = _Problem(pairs, (_intrinsics(left), _intrinsics(right)))
-    start = problem.start()
-    scale = np.maximum(np.linalg.norm(problem.evaluate(start)[1], axis=0), 1e-12)
-    found = least_squares(
-        lambda p: problem.evaluate(p)[0],
-        start,
-        jac=lambda p: problem.evaluate(p)[1],
-        x_scale=1.0 / scale,
-        method="lm",
-        max_nfev=200,
+def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tuple[int, int]]) -> DepthUncertainty:
+    """The map of `depth_std` over the left camera's frame at one depth, where the right camera sees the point."""
+    x, y = grid(shapes[0])
+    state = solution.state
+    points = unproject(grid_points(x, y), state.intrinsics[0]) * depth_mm
+    there = np.isfinite(points).all(axis=1)
+    seen = np.full((len(points), 2), np.nan)
+    on_right = points[there] @ state.rotation.T + state.translation_mm
+    front = on_right[:, 2] > 0
+    there[there] = front
+    seen[there] = project_slopes(on_right[front], state.intrinsics[1])[0]
+    rows, cols = shapes[1]
+    there &= (seen[:, 0] >= 0) & (seen[:, 0] <= cols - 1) & (seen[:, 1] >= 0) & (seen[:, 1] <= rows - 1)
+    maps = np.full((2, len(points)), np.nan)
+    if there.any():
+        maps[:, there] = depth_std(solution, points[there], solution.noise_px)
+    calibration, total = maps.reshape(2, len(y), len(x))
+    return DepthUncertainty(
+        depth_mm=float(depth_mm),
+        x_px=_numbers(x),
+        y_px=_numbers(y),
+        calibration_mm_std=_open_rows(calibration),
+        total_mm_std=_open_rows(total),
     )
-    residual, slopes = problem.evaluate(found.x)
-    scale = np.maximum(np.linalg.norm(slopes, axis=0), 1e-12)
-    normal = (slopes / scale).T @ (slopes / scale)
-    variance = float(residual @ residual) / max(len(residual) - len(found.x), 1)
-    covariance = variance * np.linalg.pinv(normal, rcond=1e-13)[:6, :6] / np.outer(scale[:6], scale[:6])
-    ends = np.cumsum([2 * (len(one.index) + len(two.index)) for one, two in pairs])[:-1]
-    return Rig(
-        turn=found.x[:3],
-        translation_mm=found.x[3:6],
-        covariance=covariance,
-        rms_px=float(np.sqrt(2.0 * np.mean(residual**2))),
-        rms_of_pairs_px=np.array([np.sqrt(2.0 * np.mean(part**2)) for part in np.split(residual, ends)]),
+
+
+# --- rectification -----------------------------------------------------------------------------------------------------------
+
+
+def rectification(state: State, pairs: Sequence[Pair], shape: tuple[int, int]) -> Rectification:
+    """OpenCV's rectification, with the rows' disagreement of the corners that both cameras saw."""
+    one, two = (matrix_of(camera) for camera in state.intrinsics)
+    of_one, of_two = (distortion_of(camera) for camera in state.intrinsics)
+    found = cv2.stereoRectify(
+        one, of_one, two, of_two, shape[::-1], state.rotation, state.translation_mm[:, None], alpha=0.0
     )
-
-
-class _Problem:
-    """Parameters: rig (3 + 3), intrinsics of both cameras (those that are fitted), pose of the board in every pair (3 + 3)."""
-
-    def __init__(self, pairs: Sequence[tuple[BoardView, BoardView]], cameras: tuple[Array, Array]) -> None:
-        self.pairs = pairs
-        self.cameras = cameras
-        self.free = [np.append(np.ones(8, dtype=bool), c[8] != 0.0) for c in cameras]  # a k3 that wasn't fitted stays 0
-        edges = np.cumsum([6, *(int(mask.sum()) for mask in self.free)])
-        self.at_camera = [slice(edges[0], edges[1]), slice(edges[1], edges[2])]
-        self.at_poses = int(edges[2])
-
-    def start(self) -> Array:
-        """From the single cameras' intrinsics and the board's pose in each."""
-        poses, rigs = [], []
-        for pair in self.pairs:
-            (turn_one, shift_one), (turn_two, shift_two) = (
-                _pose(view, camera) for view, camera in zip(pair, self.cameras, strict=True)
+    turn_one, turn_two, new_one, new_two, to_depth = found[:5]
+    gaps = []
+    for pair in pairs:
+        _, at_left, at_right = np.intersect1d(pair.left.index, pair.right.index, return_indices=True)
+        rows = [
+            cv2.undistortPoints(view.image_px[at][:, None, :], matrix, distortion, R=turn, P=new)[:, 0, 1]
+            for view, at, matrix, distortion, turn, new in (
+                (pair.left, at_left, one, of_one, turn_one, new_one),
+                (pair.right, at_right, two, of_two, turn_two, new_two),
             )
-            rotation = cv2.Rodrigues(turn_two)[0] @ cv2.Rodrigues(turn_one)[0].T
-            rigs.append(np.concatenate([cv2.Rodrigues(rotation)[0].ravel(), shift_two - rotation @ shift_one]))
-            poses.append(np.concatenate([turn_one, shift_one]))
-        intrinsics = [camera[mask] for camera, mask in zip(self.cameras, self.free, strict=True)]
-        return np.concatenate([np.median(rigs, axis=0), *intrinsics, *poses])
-
-    def camera(self, p: Array, number: int) -> Array:
-        """All nine intrinsics of a camera."""
-        intrinsics = np.zeros(INTRINSICS)
-        intrinsics[self.free[number]] = p[self.at_camera[number]]
-        return intrinsics
-
-    def evaluate(self, p: Array) -> tuple[Array, Array]:
-        """Residuals, and their Jacobian: (x, y) of every corner, left then right, pair by pair."""
-        residuals, rows = [], []
-        for k, (one, two) in enumerate(self.pairs):
-            at = slice(self.at_poses + 6 * k, self.at_poses + 6 * k + 6)
-            turn, shift = p[at][:3], p[at][3:]
-            residual, by_pose, by_camera = _project(one, turn, shift, self.camera(p, 0))
-            row = np.zeros((len(residual), len(p)))
-            row[:, self.at_camera[0]] = by_camera[:, self.free[0]]
-            row[:, at] = by_pose
-            residuals.append(residual)
-            rows.append(row)
-
-            turn, shift, *slopes = cv2.composeRT(turn, shift, p[:3], p[3:6])
-            by_board = np.block([[slopes[0], slopes[1]], [slopes[4], slopes[5]]])
-            by_rig = np.block([[slopes[2], slopes[3]], [slopes[6], slopes[7]]])
-            residual, by_pose, by_camera = _project(two, turn, shift, self.camera(p, 1))
-            row = np.zeros((len(residual), len(p)))
-            row[:, :6] = by_pose @ by_rig
-            row[:, self.at_camera[1]] = by_camera[:, self.free[1]]
-            row[:, at] = by_pose @ by_board
-            residuals.append(residual)
-            rows.append(row)
-        return np.concatenate(residuals), np.concatenate(rows)
-
-
-def _intrinsics(fit: GeometryFit) -> Array:
-    matrix = fit.camera_matrix
-    distortion = (*fit.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    return np.array([matrix[0][0], matrix[1][1], matrix[0][2], matrix[1][2], *distortion])
-
-
-def _matrix(camera: Array) -> Array:
-    return np.array([[camera[0], 0.0, camera[2]], [0.0, camera[1], camera[3]], [0.0, 0.0, 1.0]])
-
-
-def _pose(view: BoardView, camera: Array) -> tuple[Array, Array]:
-    """The board's rotation vector and translation in the camera's frame."""
-    found, turn, shift = cv2.solvePnP(
-        view.board_mm.astype(float), view.image_px.astype(float), _matrix(camera), camera[4:], flags=cv2.SOLVEPNP_IPPE
+            if len(at)
+        ]
+        gaps += [rows[1] - rows[0]] if rows else []
+    return Rectification(
+        rotation_left=_rows3(turn_one),
+        rotation_right=_rows3(turn_two),
+        projection_left=_rows(new_one),
+        projection_right=_rows(new_two),
+        disparity_to_depth=_rows(to_depth),
+        row_rms_px=float(np.sqrt(np.mean(np.concatenate(gaps) ** 2))),
     )
-    if not found:
-        raise NotDetermined(
-            "stereo", f"{view.capture.id}: no pose of the board fits its corners: leave the capture out"
+
+
+def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, tuple[Array, Array]]:
+    """OpenCV's maps (x, y), each of `shape` (rows, cols) float32, for `cv2.remap` of each side's frames into the rectified pair, in
+    which a point stands in the same row of both. Raises `NotDetermined` where the fit has no rectification."""
+    if stereo.rectification is None or stereo.camera_matrix_left is None or stereo.camera_matrix_right is None:
+        raise NotDetermined("rectification", "the stereo fit has none: fit again cameras of equal size")
+    own = stereo.rectification
+    left = intrinsics_of(stereo.camera_matrix_left, stereo.distortion_left or ())
+    right = intrinsics_of(stereo.camera_matrix_right, stereo.distortion_right or ())
+    found: dict[Side, tuple[Array, Array]] = {}
+    sides: tuple[tuple[Side, Array, Any, Any], ...] = (
+        ("left", left, own.rotation_left, own.projection_left),
+        ("right", right, own.rotation_right, own.projection_right),
+    )
+    for side, camera, turn, new in sides:
+        x, y = cv2.initUndistortRectifyMap(
+            matrix_of(camera), distortion_of(camera), np.array(turn), np.array(new)[:, :3], shape[::-1], cv2.CV_32FC1
         )
-    turn, shift = cv2.solvePnPRefineLM(
-        view.board_mm.astype(float), view.image_px.astype(float), _matrix(camera), camera[4:], turn, shift
-    )
-    return turn.ravel(), shift.ravel()
-
-
-def _project(view: BoardView, turn: Array, shift: Array, camera: Array) -> tuple[Array, Array, Array]:
-    """Predicted less seen (2n,), and its derivatives by the pose (2n, 6) and by the intrinsics (2n, 9)."""
-    points, slopes = cv2.projectPoints(view.board_mm.astype(float), turn, shift, _matrix(camera), camera[4:])
-    residual = (points.reshape(-1, 2) - view.image_px).ravel()
-    return residual, slopes[:, :6], slopes[:, 6:15]
+        found[side] = (x, y)
+    return found
 
 
 def _three(values: Array) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
+
+
+def _rows3(values: Array) -> tuple[tuple[float, float, float], ...]:
+    return tuple(_three(row) for row in values)
+
+
+def _numbers(values: Array) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _rows(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(_numbers(row) for row in values)
+
+
+def _open_rows(values: Array) -> tuple[tuple[float | None, ...], ...]:
+    return tuple(tuple(float(value) if np.isfinite(value) else None for value in row) for row in values)

@@ -8,7 +8,8 @@ import pytest
 from scipy.special import erf
 
 from lab.errors import NotDetermined
-from lab.fit.geometry import find_board, fit_corners, fit_geometry, luminance
+from lab.fit.board import find_board, fit_corners, luminance
+from lab.fit.geometry import fit_geometry
 
 
 def test_corner_is_found_where_it_is():
@@ -20,7 +21,7 @@ def test_corner_is_found_where_it_is():
         dx, dy = x - 20 - place[0], y - 20 - place[1]
         edges = [erf((np.cos(a) * dx + np.sin(a) * dy) / (0.8 * np.sqrt(2))) for a in (0.2, 1.9)]
         picture = 0.5 + 0.003 * dx + 0.4 * edges[0] * edges[1] + rng.normal(0, 0.02, dx.shape)
-        points, trusted = fit_corners(
+        points, trusted, _ = fit_corners(
             picture,
             np.array([[20.0, 20.0]]),
             across=np.array([[-np.sin(0.2), np.cos(0.2)]]),
