@@ -21,6 +21,8 @@ from sim.camera import Cfa
 from sim.sensor.mosaic import planes, step
 from sim.spectrum import FloatArray
 
+QUANTISATION_DN2 = 1.0 / 12.0
+HIDDEN_DN2 = 0.30  # a normal variable of less than 0.45 DN may have any variance below this after rounding
 DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
 SHADING_DEGREE = 6
 
@@ -84,6 +86,7 @@ class PlaneStatistics:
     `pattern_variance` the same after shading has been taken out. `every_pixel` and `temporal_variance_of_all` count defects,
     too, as EMVA 1288 does; `pattern` is the split after shading. `adjacent_covariance` and `diagonal_covariance`: temporal, of a
     pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of whatever plane).
+    `shading_rows`, `shading_columns`: the smooth surface's mean over the first and the last row (column), over `mean`, dark included.
     """
 
     pixels: int
@@ -108,6 +111,8 @@ class PlaneStatistics:
     adjacent_covariance: float = np.nan
     diagonal_covariance: float = np.nan
     covariance_std: float = np.nan
+    shading_rows: tuple[float, float] = (1.0, 1.0)
+    shading_columns: tuple[float, float] = (1.0, 1.0)
 
     @property
     def repeats(self) -> int:
@@ -115,8 +120,34 @@ class PlaneStatistics:
 
     @property
     def mean_std(self) -> float:
-        """Standard uncertainty of `mean` from the pixels' temporal noise."""
-        return float(np.sqrt(self.temporal_variance / (self.pixels * self.repeats)))
+        """Standard uncertainty of `mean` from the pixels' temporal noise, and of its rounding."""
+        return float(np.hypot(np.sqrt(self.temporal_variance / (self.pixels * self.repeats)), self.mean_rounding_std))
+
+    @property
+    def spread(self) -> float:
+        """Variance of single values over pixels and repeats, which is what spreads rounding errors out (DN^2)."""
+        spatial = self.spatial_variance if self.spatial_variance > 0 else 0.0
+        return spatial + (self.temporal_variance if np.isfinite(self.temporal_variance) else 0.0)
+
+    @property
+    def mean_rounding_std(self) -> float:
+        """What rounding may leave in `mean` (DN, a standard uncertainty): that of a normal variable of standard deviation s is off
+        by exp(-2 pi^2 s^2) / pi sin(2 pi mean), which no averaging takes out."""
+        return float(np.exp(-2.0 * np.pi**2 * _unrounded(self.spread)) / np.pi / np.sqrt(2.0))
+
+
+def _unrounded(variance: float) -> float:
+    """A variance before rounding added its own (DN^2). Below `HIDDEN_DN2` it may be anything down to 0: a still value half way
+    between two codes has 1/4."""
+    return variance - QUANTISATION_DN2 if variance >= HIDDEN_DN2 else 0.0
+
+
+def variance_rounding_std(temporal: float, spatial: float) -> float:
+    """What rounding may leave in a mean temporal variance (DN^2, a standard uncertainty) beside its 1/12: with temporal and spatial
+    standard deviations s and t of normal laws, (4 s^2 + 1 / pi^2) exp(-2 pi^2 (s^2 + t^2)) cos(2 pi mean)."""
+    true = _unrounded(temporal)
+    size = (4.0 * true + 1.0 / np.pi**2) * np.exp(-2.0 * np.pi**2 * (true + max(spatial, 0.0)))
+    return float(size / np.sqrt(2.0))
 
 
 @dataclass(frozen=True)
@@ -169,11 +200,12 @@ def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> BoolArray:
     bad = np.zeros(image.shape, bool)
     for name, plane in planes(image, cfa).items():
         rest = plane - np.median(plane)
+        # A quantised plane can have most pixels on one value: then the rounding's own is the least scale, else a tenth of a DN.
+        least = np.sqrt(QUANTISATION_DN2) if not np.median(np.abs(rest)) > 0 else 0.1
         for _ in range(2):  # glow widens the first scale, and hot pixels bend the first surface
-            # A quantised plane can have most pixels on one value; a tenth of a DN is the least scale.
-            limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), 0.1)
+            limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
             rest = rest - shading(np.clip(rest, -limit, limit))
-        limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), 0.1)
+        limit = DEFECT_SIGMA * max(1.4826 * float(np.median(np.abs(rest))), least)
         planes(bad, cfa)[name][...] = np.abs(rest) > limit
     return bad
 
@@ -390,7 +422,7 @@ class Stack:
         variance, variance_std, of_all = temporal[name] if temporal is not None else (np.nan, np.nan, np.nan)
         down, across = _shading_factors(image, SHADING_DEGREE)
         surface = down @ across
-        first = self._frame_means[0][phase], self._means_of_all[0][phase]
+        first = max(self._frame_means[0][phase], 1e-9), self._means_of_all[0][phase]
         sums, row_sums, col_sums, row_rest, col_rest = _pattern_sums(
             image, surface, bad, float(first[1]), float(first[0])
         )
@@ -404,6 +436,8 @@ class Stack:
             share_std,
         )
         spatial = (sums[2] - sums[1] ** 2 / pixels) / (pixels - 1)
+        if np.isfinite(variance):
+            variance_std = float(np.hypot(variance_std, variance_rounding_std(variance, spatial - share)))
         pattern, outliers = (sums[4] - sums[3] ** 2 / pixels) / (pixels - 1), 0
         good = (cols, rows) if bad.size == 0 else (cols - bad.sum(axis=1), rows - bad.sum(axis=0))
         rows_mean, cols_mean = (
@@ -448,6 +482,8 @@ class Stack:
             adjacent_covariance=adjacent,
             diagonal_covariance=diagonal,
             covariance_std=covariance_std,
+            shading_rows=(float(surface[0].mean() / first[0]), float(surface[-1].mean() / first[0])),
+            shading_columns=(float(surface[:, 0].mean() / first[0]), float(surface[:, -1].mean() / first[0])),
         )
 
     def _covariances(self, phase: int, variance: float) -> tuple[float, float, float]:

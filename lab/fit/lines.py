@@ -84,3 +84,12 @@ def linearity(light: FloatArray, signal: FloatArray, signal_std: FloatArray) -> 
         float(error.mean()),
         float(np.hypot(np.sqrt(np.sum(std**2)) / len(std), np.mean(folded - error))),
     )
+
+
+def root(square: float, square_std: float) -> tuple[float, float]:
+    """Square root of a variance that noise may have made negative, with a standard uncertainty of which twice reaches the roots of
+    the variance's own two standard uncertainties: far from 0 that is std / (2 value), near 0 it takes 0 in."""
+    above = max(square, 0.0)
+    value = float(np.sqrt(above))
+    upper, lower = np.sqrt(above + 2.0 * square_std), np.sqrt(max(above - 2.0 * square_std, 0.0))
+    return value, float(max(upper - value, value - lower)) / 2.0

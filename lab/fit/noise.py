@@ -5,8 +5,13 @@ Definitions: EMVA Standard 1288, release 4.0 (linear). Where this departs from t
 - The conversion gain K is the slope of the temporal variance against the mean at zero signal, of v = v0 + K x + c x^2
   fitted to all unsaturated levels and planes at once, weighted by what the variances are worth. The curvature c takes up a
   nonlinear response and brighter-fatter, which bias the standard's straight line (to 70 % of saturation) by 1.5 times the
-  curvature. Where the variances scatter about the curve far beyond their noise, the curvature isn't trusted: then K is the
-  standard's straight line, and its uncertainty spans both.
+  curvature. What the variances scatter about the curve beyond their sampling noise is the model's error (of an uneven
+  converter, mostly). Its part that is smooth over the whole range can't be seen, since the curve takes it up: it is assumed to be
+  as large as the part that is. Where the curvature doesn't stand out of that, K is the standard's straight line, and its
+  uncertainty spans both.
+- What bends the variance is told apart by three measurements: the means against the light give the response's bend; what
+  the variances bend beyond three times that is missing noise; and the temporal covariances of neighbouring pixels show
+  whether it went there (brighter-fatter).
 - Frames are compared after their means have been taken out plane by plane, so that a lamp that drifts between repeats
   doesn't count as temporal noise.
 - PRNU is of what is left after a smooth surface (polynomial, degree 6 in rows and in columns, plane by plane) has been taken
@@ -25,24 +30,30 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from lab.errors import NotDetermined
-from lab.fit.levels import DEFECT_SIGMA, Level, Stack, defective_pixels, level_statistics
-from lab.fit.lines import DarkLine, Linearity, dark_line, inflation, least_squares, linearity
+from lab.fit.emva1288 import Recorded
+from lab.fit.emva1288 import figures as emva1288_figures
+from lab.fit.levels import DEFECT_SIGMA, HIDDEN_DN2, QUANTISATION_DN2, Level, defective_pixels
+from lab.fit.lines import DarkLine, Linearity, dark_line, inflation, least_squares, linearity, root
+from lab.fit.pixels import DarkPixels, read_noise_distribution, taken
 from lab.recording import Camera, Capture, Dark, Flat, RecordingSet
-from lab.results import NoiseFit, PhotonTransfer
+from lab.results import ChannelNoise, DarkCurrentTemperature, Emva1288, NoiseFit, PhotonTransfer
 from sim.camera import Side
 from sim.spectrum import FloatArray, Spectrum
 
-QUANTISATION_DN2 = 1.0 / 12.0
 LINE_LIMIT = 0.7  # of saturation: EMVA's range of the photon-transfer line
 CURVE_LIMIT = 0.9  # of saturation: range of the curve, whose top levels fix the curvature
 LINEARITY_RANGE = (0.05, 0.95)  # of saturation: EMVA's range of the linearity line
 CURVATURE_PRIOR = (
     0.1  # standard deviation of c x_saturation / K: keeps three levels solvable, is nothing against twenty
 )
-TRUSTED_SCATTER = 3.0  # chi2 per degree of freedom above which the curve isn't what the camera does
+SCATTER_CHANCE = 1e-3  # below which the scatter of variances isn't taken for sampling noise
+ESTABLISHED_SIGMA = 2.0  # of the model's error, above which a curvature is believed
+SECOND_DIFFERENCE_RMS = 12.0**-0.5  # rms of x about its mean over 0..1
 CLIPPED_LIMIT = 1e-4  # share of clipped pixels from which a level's variance is too small
 PILED_LIMIT = 2e-3  # share of pixels on the plane's own highest code that says that it saturates there
+PILED_PIXELS = 12  # a normal law that spreads over some DN puts one or two pixels of a plane on its highest
 MIN_LEVELS = 3
+ASYMMETRY = 0.002  # difference of opposite edges' light that is worth a remark, of the mean
 MIN_SIZE_PX = 16
 
 
@@ -54,7 +65,9 @@ class TransferFit:
     """Photon transfer: v = floor[plane] + gain x + curvature x^2, x the mean above black (DN), v the temporal variance.
 
     `covariance` is over (gain, curvature, floors...). `gain` in DN/e, `curvature` in 1/e per DN; `line_gain` is EMVA's
-    straight line through the origin to 70 % of saturation; `by_line` says that it was taken for `gain`.
+    straight line through the origin to 70 % of saturation; `by_line` says that it was taken for `gain`. `curve_gain` and
+    `curve_bend` (c x_saturation / K) are the curve's in any case. `model_error`: relative scatter of the flats' variances beyond
+    sampling, `dark_error` of the darks'.
     """
 
     gain: float
@@ -65,7 +78,12 @@ class TransferFit:
     freedom: int
     line_gain: float
     curve_gain: float
+    curve_gain_std: float
+    curve_bend: float
+    curve_bend_std: float
     by_line: bool
+    model_error: float
+    dark_error: float
     used: NDArray[np.bool_]
 
     @property
@@ -83,43 +101,59 @@ def fit_transfer(
 ) -> TransferFit:
     """Conversion gain, curvature and dark variances from points (n,) of all planes.
 
-    `signal`: mean above black, DN; `variance`: temporal, DN^2; `plane`: index 0..; `light`: False for darks; `saturation`: DN
-    above black. All points given are taken as unsaturated; those above 90 % of saturation are left out.
+    `signal`: mean above black, DN; `variance`: temporal, DN^2, with the uncertainty of its sampling; `plane`: index 0..; `light`:
+    False for darks; `saturation`: DN above black. All points given are taken as unsaturated; those above 90 % of saturation are
+    left out.
     """
-    relative = variance_std / variance
+    points = _Points(signal, variance, variance_std / variance, plane, light, saturation)
     for limit in (CURVE_LIMIT, LINE_LIMIT):
         used = ~light | (signal <= limit * saturation)
-        solution, covariance, chi2, freedom = _curve(signal, variance, relative, plane, used, saturation)
+        if not used[light].any():  # all flats stand on the last tenth
+            used = np.ones_like(light)
+        curve = points.curve(used, (0.0, 0.0))
         # Towards saturation some responses bend more than a parabola: then EMVA's range is the range.
-        if (
-            freedom < 1
-            or stats.chi2.sf(chi2, freedom) > 1e-3
-            or np.sum(light & (signal <= LINE_LIMIT * saturation)) < 4
-        ):
+        if curve.likely or np.sum(light & (signal <= LINE_LIMIT * saturation)) < 4:
             break
-    floor = solution[2:]
+    chi2, freedom = curve.chi2, curve.freedom
+    errors = points.model_errors(used, curve)
+    if any(errors):
+        curve = points.curve(used, errors)
+    dark_error, model_error = errors
+    solution, covariance = curve.solution, curve.covariance
+    gain, floor = float(solution[0]), solution[2:]
+    # The part of the model's error that is smooth over the range, a line in the relative variance of the same rms: at zero signal
+    # it is sqrt(3) times its rms, and from zero to the end of the range 1 / SECOND_DIFFERENCE_RMS times.
+    highest = float(np.max(signal[used & light], initial=1e-9))
+    smooth_gain = np.sqrt(3.0) * model_error * gain
+    smooth_bend = model_error / SECOND_DIFFERENCE_RMS * saturation / highest
+    bend = float(solution[1]) * saturation / gain
+    bend_std = float(np.hypot(np.sqrt(covariance[1, 1]) * saturation / gain, smooth_bend))
+    covariance = covariance.copy()
+    covariance[0, 0] += smooth_gain**2
+    covariance[1, 1] += (smooth_bend * gain / saturation) ** 2
+    covariance[0, 1] -= smooth_gain * smooth_bend * gain / saturation
+    covariance[1, 0] = covariance[0, 1]
+    curve_gain_std = float(np.sqrt(covariance[0, 0]))
     on_line = light & (signal <= LINE_LIMIT * saturation)
     if not on_line.any():
         on_line = light & used
-    excess = variance - floor[plane]
-    x, v = signal[on_line], excess[on_line]
+    x, v = signal[on_line], (variance - floor[plane])[on_line]
     line = float(np.sum(x * v) / np.sum(x * x))
-    if freedom >= 3 and chi2 / freedom > TRUSTED_SCATTER and np.unique(plane[~light]).size == floor.size:
-        # The levels scatter for a reason that isn't in the model, and the curvature would amplify it.
-        covariance = covariance * (chi2 / freedom)
-        rest = v - line * x
-        line_std = float(np.sqrt(np.sum((x * rest) ** 2)) / np.sum(x * x))
-        spread = line_std**2 + ((line - solution[0]) / 2.0) ** 2
-        by_line = True
-        by_line_covariance = covariance.copy()
-        by_line_covariance[0, :] = by_line_covariance[:, 0] = 0.0
-        by_line_covariance[0, 0] = spread
-        dark = np.array([np.average(variance[~light & (plane == p)]) for p in range(floor.size)])
-        gain, curvature, floor, covariance = line, 0.0, dark, by_line_covariance
-    else:
-        by_line = False
-        gain, curvature = float(solution[0]), float(solution[1])
-        covariance = covariance * inflation(chi2, freedom)
+    by_line = (
+        model_error > 0 and abs(bend) < ESTABLISHED_SIGMA * bend_std and np.unique(plane[~light]).size == floor.size
+    )
+    curvature = float(solution[1])
+    curve_gain = gain
+    if by_line:
+        floor, floor_std = points.dark_variances(dark_error)
+        v = (variance - floor[plane])[on_line]
+        line = float(np.sum(x * v) / np.sum(x * x))
+        line_std = float(np.sqrt(np.sum((x * (v - line * x)) ** 2)) / np.sum(x * x))
+        # The gain at zero signal may lie anywhere between the line's and the curve's.
+        covariance = np.zeros_like(covariance)
+        covariance[0, 0] = line_std**2 + (line - gain) ** 2 / 3.0
+        covariance[2:, 2:] = np.diag(floor_std**2)
+        gain, curvature = line, 0.0
     return TransferFit(
         gain=gain,
         curvature=curvature,
@@ -128,37 +162,103 @@ def fit_transfer(
         chi2=chi2,
         freedom=freedom,
         line_gain=line,
-        curve_gain=float(solution[0]),
-        by_line=by_line,
+        curve_gain=curve_gain,
+        curve_gain_std=curve_gain_std,
+        curve_bend=bend,
+        curve_bend_std=bend_std,
+        by_line=bool(by_line),
+        model_error=model_error,
+        dark_error=dark_error,
         used=used,
     )
 
 
-def _curve(
-    signal: FloatArray,
-    variance: FloatArray,
-    relative: FloatArray,
-    plane: NDArray[np.integer[Any]],
-    used: NDArray[np.bool_],
-    saturation: float,
-) -> tuple[FloatArray, FloatArray, float, int]:
-    """Weighted least squares of the curve, with a normal prior on its curvature. Returns solution, covariance, chi2, freedom."""
-    count = int(plane.max()) + 1
-    x, v = signal[used], variance[used]
-    basis = np.concatenate([np.stack([x, x**2], axis=1), np.eye(count)[plane[used]]], axis=1)
-    std = relative[used] * v
-    prior = np.zeros((1, 2 + count))
-    prior[0, 1] = 1.0
-    gain = max(float(np.median(np.diff(np.sort(v)) / np.maximum(np.diff(np.sort(x)), 1e-9))), 1e-6)
-    for _ in range(4):
-        prior_std = np.array([CURVATURE_PRIOR * gain / saturation])
-        solution, covariance, chi2 = least_squares(
-            np.concatenate([basis, prior]), np.append(v, 0.0), np.append(std, prior_std)
-        )
-        gain = max(float(solution[0]), 1e-6)
-        # Weights from the fitted, not the measured variances: low ones would otherwise pull.
-        std = relative[used] * np.maximum(basis @ solution, 0.1 * v)
-    return solution, covariance, chi2, int(used.sum()) - 2 - count + 1  # the prior counts as one value
+@dataclass(frozen=True)
+class _Curve:
+    """A solution of the photon-transfer curve; `residual` and `std` (DN^2) and `leverage` of the points used."""
+
+    solution: FloatArray
+    covariance: FloatArray
+    chi2: float
+    freedom: int
+    residual: FloatArray
+    std: FloatArray
+    fitted: FloatArray
+    leverage: FloatArray
+
+    @property
+    def likely(self) -> bool:
+        return self.freedom < 1 or bool(stats.chi2.sf(self.chi2, self.freedom) > SCATTER_CHANCE)
+
+
+@dataclass(frozen=True)
+class _Points:
+    """The points that a photon-transfer curve is fitted to; `relative`: sampling uncertainty of a variance over itself."""
+
+    signal: FloatArray
+    variance: FloatArray
+    relative: FloatArray
+    plane: NDArray[np.integer[Any]]
+    light: NDArray[np.bool_]
+    saturation: float
+
+    def curve(self, used: NDArray[np.bool_], errors: tuple[float, float]) -> _Curve:
+        """Weighted least squares of the curve, with a normal prior on its curvature. `errors`: relative errors of the model in
+        darks and in flats, on top of the sampling's."""
+        count = int(self.plane.max()) + 1
+        x, v = self.signal[used], self.variance[used]
+        basis = np.concatenate([np.stack([x, x**2], axis=1), np.eye(count)[self.plane[used]]], axis=1)
+        relative = np.hypot(self.relative, np.where(self.light, errors[1], errors[0]))[used]
+        std = relative * v
+        prior = np.zeros((1, 2 + count))
+        prior[0, 1] = 1.0
+        gain = max(float(np.median(np.diff(np.sort(v)) / np.maximum(np.diff(np.sort(x)), 1e-9))), 1e-6)
+        for _ in range(4):
+            prior_std = np.array([CURVATURE_PRIOR * gain / self.saturation])
+            solution, covariance, chi2 = least_squares(
+                np.concatenate([basis, prior]), np.append(v, 0.0), np.append(std, prior_std)
+            )
+            gain = max(float(solution[0]), 1e-6)
+            # Weights from the fitted, not the measured variances: low ones would otherwise pull.
+            fitted = np.maximum(basis @ solution, 0.1 * v)
+            std = relative * fitted
+        leverage = np.einsum("ij,jk,ik->i", basis, covariance, basis) / std**2
+        freedom = int(used.sum()) - 2 - count + 1  # the prior counts as one value
+        return _Curve(solution, covariance, chi2, freedom, v - basis @ solution, std, fitted, leverage)
+
+    def model_errors(self, used: NDArray[np.bool_], curve: _Curve) -> tuple[float, float]:
+        """Relative errors of the model in darks and in flats: what makes their chi2 what it should be (Paule and Mandel, J. Res.
+        Natl. Bur. Stand. 87, 377, 1982); 0 where sampling explains the scatter."""
+        light = self.light[used]
+        squares = [0.0, 0.0]
+        active = [False, False]
+        for index, group in enumerate((~light, light)):
+            freedom = float(np.sum(1.0 - curve.leverage[group])) if group.any() else 0.0
+            chi2 = float(np.sum((curve.residual[group] / curve.std[group]) ** 2))
+            active[index] = freedom >= 1.0 and bool(stats.chi2.sf(chi2, freedom) < SCATTER_CHANCE)
+        for _ in range(40):
+            before = list(squares)
+            for index, group in enumerate((~light, light)):
+                if not active[index]:
+                    continue
+                weighted = (curve.residual[group] / curve.std[group]) ** 2
+                excess = float(weighted.sum()) - float(np.sum(1.0 - curve.leverage[group]))
+                slope = float(np.sum(weighted * (curve.fitted[group] / curve.std[group]) ** 2))
+                squares[index] = max(squares[index] + excess / max(slope, 1e-30), 0.0)
+            if np.allclose(squares, before, rtol=1e-3, atol=0.0):
+                break
+            curve = self.curve(used, (np.sqrt(squares[0]), np.sqrt(squares[1])))
+        return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+
+    def dark_variances(self, error: float) -> tuple[FloatArray, FloatArray]:
+        """Weighted mean of the darks' variances by plane, with standard uncertainties."""
+        values, stds = [], []
+        for index in range(int(self.plane.max()) + 1):
+            own = ~self.light & (self.plane == index)
+            weight = 1.0 / (np.hypot(self.relative[own], error) * self.variance[own]) ** 2
+            values.append(float(np.average(self.variance[own], weights=weight)))
+            stds.append(float(weight.sum() ** -0.5))
+        return np.array(values), np.array(stds)
 
 
 # --- a recording set ---------------------------------------------------------------------------------------------------
@@ -185,19 +285,19 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     gain_db = max(sorted(set(gains)), key=gains.count)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in recordings.captures("dark", side) if (dark.gain_db or 0.0) == gain_db]
-    dark_levels, bad = _dark_levels(recordings, darks, camera)
+    dark_levels, pixels = _dark_levels(recordings, darks, camera)
     lamps = _lamps(recordings, flats)
     flat_levels = [
         Level(
             group[0].exposure_s,
             _light(group[0]),
             lamps[group[0].id],
-            level_statistics((recordings.frame(capture) for capture in group), camera.cfa, camera.saturation_dn, bad),
+            taken(recordings, group, pixels.bad).statistics(),
             group[0].temperature_c,
         )
         for group in _groups(flats, lambda flat: (flat.exposure_s, _light(flat), lamps[flat.id]))
     ]
-    return noise_fit(dark_levels, flat_levels, camera, gain_db, 0 if bad is None else int(bad.sum()))
+    return noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
 
 
 def _groups(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C]]:
@@ -235,23 +335,21 @@ def _lamps(recordings: RecordingSet, flats: Sequence[Flat]) -> dict[str, Hashabl
     return {flat.id: (names[flat.radiance], flat.photons_per_pixel is not None, flat.wavelength_nm) for flat in flats}
 
 
-def _dark_levels(
-    recordings: RecordingSet, darks: Sequence[Dark], camera: Camera
-) -> tuple[list[Level], NDArray[np.bool_] | None]:
+def _dark_levels(recordings: RecordingSet, darks: Sequence[Dark], camera: Camera) -> tuple[list[Level], DarkPixels]:
     """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
-    bad: NDArray[np.bool_] | None = None
+    pixels = DarkPixels(camera.cfa)
     levels = []
     groups = _groups(darks, lambda dark: (dark.exposure_s, _rounded(dark.temperature_c)))
     for group in sorted(groups, key=lambda group: -group[0].exposure_s):
-        stack = Stack(camera.cfa, camera.saturation_dn, bad)
-        for dark in group:
-            stack.add(recordings.frame(dark))
-        if bad is None and stack.mean is not None:
-            bad = stack.bad = defective_pixels(stack.mean, camera.cfa)
-            if not bad.any():
-                stack.bad = None
+        stack = taken(recordings, group, pixels.bad)
+        if pixels.longest is None and stack.mean is not None:
+            bad = defective_pixels(stack.mean, camera.cfa)
+            if bad.any():
+                pixels.bad = bad
+                stack = taken(recordings, group, bad)
+        pixels.take(stack, group[0].exposure_s)
         levels.append(Level(group[0].exposure_s, 0.0, "dark", stack.statistics(), _rounded(group[0].temperature_c)))
-    return levels, bad
+    return levels, pixels
 
 
 def _rounded(temperature_c: float | None) -> float | None:
@@ -259,31 +357,45 @@ def _rounded(temperature_c: float | None) -> float | None:
 
 
 def noise_fit(
-    darks: Sequence[Level], flats: Sequence[Level], camera: Camera, gain_db: float = 0.0, defects: int = 0
+    darks: Sequence[Level],
+    flats: Sequence[Level],
+    camera: Camera,
+    gain_db: float = 0.0,
+    defects: int = 0,
+    pixels: DarkPixels | None = None,
 ) -> NoiseFit:
-    """The fit on levels' statistics; see the module for what is computed. `defects`: pixels that were left out of all.
+    """The fit on levels' statistics; see the module for what is computed. `defects`: pixels that were left out of all; `pixels`:
+    what the darks say of single ones.
 
     Raises NotDetermined where fewer than three unsaturated flat levels have repeats.
     """
-    return _Evaluation(darks, flats, camera, gain_db, defects).result()
+    if pixels is not None and pixels.bad is not None:
+        defects = int(np.count_nonzero(pixels.bad))
+    return _Evaluation(darks, flats, camera, gain_db, defects).result(pixels)
 
 
 class _Evaluation:
     """The steps of one fit, in order; each leaves what later ones need."""
 
     def __init__(
-        self, darks: Sequence[Level], flats: Sequence[Level], camera: Camera, gain_db: float, defects: int
+        self,
+        darks: Sequence[Level],
+        flats: Sequence[Level],
+        camera: Camera,
+        gain_db: float,
+        defects: int,
+        names: tuple[str, ...] | None = None,
     ) -> None:
         self.camera, self.gain_db, self.defects = camera, gain_db, defects
         self.remarks: list[str] = []
         self.white = camera.saturation_dn
         self.flats = sorted(flats, key=lambda level: (level.light, level.exposure_s))
-        self.names = tuple(flats[0].plane)
+        self.names = names or tuple(flats[0].plane)
         self.all_darks = sorted(darks, key=lambda level: level.exposure_s)
         self.darks = self._darks_of_one_temperature()
         self.black_clipped = any(level.plane[name].zero_share > 1e-3 for level in self.darks for name in self.names)
         if self.black_clipped:
-            self.remarks.append(
+            self._remark(
                 "dark frames are clipped at 0 DN: black level, read noise, dark current and DSNU aren't determined; raise the black level"
             )
             self.darks = []
@@ -305,10 +417,11 @@ class _Evaluation:
     def _mean_std(self, levels: Sequence[Level], name: str | None) -> tuple[FloatArray, FloatArray]:
         """Mean (over planes for name None) of each level and its standard uncertainty: temporal noise, or the scatter of the
         repeats where that is larger."""
-        means, stds, excess, freedom = [], [], 0.0, 0
+        means, stds, rounding, excess, freedom = [], [], [], 0.0, 0
         for level in levels:
             own = [level.plane[n] for n in (self.names if name is None else (name,))]
             pixels = np.array([plane.pixels for plane in own])
+            rounding.append(max(plane.mean_rounding_std for plane in own))  # planes stand on like values
             frames = np.average([plane.frame_means for plane in own], axis=0, weights=pixels)
             variance = np.average([plane.temporal_variance for plane in own], weights=pixels)
             noise = max(float(variance), QUANTISATION_DN2) if np.isfinite(variance) else float("nan")
@@ -321,7 +434,7 @@ class _Evaluation:
         if np.isnan(known).any():
             known = np.where(np.isnan(known), np.nanmax(known) if np.isfinite(known).any() else 1.0, known)
         frame_std = known * np.sqrt(inflation(excess, freedom))
-        return np.array(means), frame_std / np.sqrt([level.repeats for level in levels])
+        return np.array(means), np.hypot(frame_std / np.sqrt([level.repeats for level in levels]), rounding)
 
     def _dark_lines(self) -> dict[str | None, DarkLine]:
         """Dark mean against exposure, by plane and (None) over all."""
@@ -333,7 +446,7 @@ class _Evaluation:
 
     def _black_without_darks(self) -> float:
         if not self.black_clipped:
-            self.remarks.append(
+            self._remark(
                 "no darks: read noise, dark current and DSNU aren't determined; capture darks at two exposures or more"
             )
         if self.camera.black_level_dn is not None:
@@ -364,7 +477,7 @@ class _Evaluation:
             ratio = excess / signal if signal > 0 else np.nan
             usual = float(np.median(ratios)) if ratios else np.nan
             at_white = plane.clipped_share > CLIPPED_LIMIT
-            piled = plane.piled_share > PILED_LIMIT and plane.temporal_variance > 4.0
+            piled = plane.piled_share > max(PILED_LIMIT, PILED_PIXELS / plane.pixels) and plane.temporal_variance > 4.0
             flat = signal > 0.2 * (self.white - self.lines[name].black) and (
                 ratio < 0.5 * usual or plane.temporal_variance < 0.01
             )
@@ -425,24 +538,22 @@ class _Evaluation:
             np.array(x), np.array(v), np.array(s), compact, np.array(light), max(self.saturation.values())
         )
         self.plane_index = {self.names[p]: i for i, p in enumerate(present)}
+        if transfer.model_error > 0:
+            self._remark(
+                f"the variances of the flats scatter about their curve by {100 * transfer.model_error:.2g} % beyond what sampling explains "
+                "(an uneven converter does that): it is in the uncertainties"
+            )
         if transfer.by_line:
-            self.remarks.append(
-                f"the variances scatter about their curve by {np.sqrt(transfer.chi2 / transfer.freedom):.1f} times what noise "
-                f"explains, so the curvature isn't trusted: the conversion gain is EMVA's straight line to 70 % of saturation; with "
-                f"curvature it would be {transfer.curve_gain:.4g} DN/e at zero signal"
+            self._remark(
+                f"the bend of the variances ({100 * transfer.curve_bend:+.1f} +- {100 * transfer.curve_bend_std:.1f} % at saturation) isn't "
+                "established against that scatter: the conversion gain is EMVA's straight line to 70 % of saturation; at zero signal "
+                f"the curve has {transfer.curve_gain:.4g} +- {transfer.curve_gain_std:.2g} DN/e"
             )
-        elif transfer.chi2 / max(transfer.freedom, 1) > TRUSTED_SCATTER:
-            self.remarks.append(
-                f"the variances scatter about their curve by {np.sqrt(transfer.chi2 / transfer.freedom):.1f} times what noise explains"
+        elif abs(transfer.curve_bend) > 4.0 * transfer.curve_bend_std:
+            self._remark(
+                f"the variance bends by {100 * transfer.curve_bend:+.1f} +- {100 * transfer.curve_bend_std:.1f} % of its line at saturation "
+                "(nonlinear response or brighter-fatter); the conversion gain is that at zero signal"
             )
-        if not transfer.by_line:
-            bend = transfer.curvature * max(self.saturation.values()) / transfer.gain
-            bend_std = float(np.sqrt(transfer.covariance[1, 1])) * max(self.saturation.values()) / transfer.gain
-            if abs(bend) > 4.0 * bend_std:
-                self.remarks.append(
-                    f"the variance bends by {100 * bend:+.1f} +- {100 * bend_std:.1f} % of its line at saturation "
-                    "(nonlinear response or brighter-fatter); the conversion gain is that at zero signal"
-                )
         if transfer.gain <= 0 or transfer.gain < 3.0 * transfer.gain_std:
             raise NotDetermined(
                 "noise",
@@ -456,7 +567,7 @@ class _Evaluation:
         t = self.transfer
         if not any(level.lamp == "dark" for level, _ in self.points):
             if any(level.repeats > 1 for level in self.darks):
-                self.remarks.append(
+                self._remark(
                     f"repeated dark frames are all alike: rounding hides the read noise, which is below {0.4 / t.gain:.2f} e"
                 )
             return None, None
@@ -465,8 +576,8 @@ class _Evaluation:
         weight = 1.0 / np.diag(own)
         weight /= weight.sum()
         floor = float(weight @ t.floor)
-        if floor < 0.24:
-            self.remarks.append(
+        if floor < HIDDEN_DN2:
+            self._remark(
                 f"the temporal noise of dark frames is {np.sqrt(max(floor, 0)):.2f} DN, where rounding hides it: the read noise is below "
                 f"{0.4 / t.gain:.2f} e; a higher gain would show it"
             )
@@ -490,22 +601,64 @@ class _Evaluation:
             return None, None
         line = self.lines[None]
         if line.rate is None:
-            self.remarks.append(
+            self._remark(
                 "all darks have one exposure: the dark current isn't determined; capture darks of a longer one"
             )
             return None, None
-        for temperature in dict.fromkeys(level.temperature_c for level in self.all_darks):
-            others = [level for level in self.all_darks if level.temperature_c == temperature]
-            exposure = np.array([level.exposure_s for level in others])
-            if temperature is None:
-                continue
-            rate = dark_line(exposure, *self._mean_std(others, None)).rate
-            if rate is not None:
-                own = ", the value given" if temperature == self.temperature else ""
-                self.remarks.append(
-                    f"the dark current at {temperature:g} deg C is {rate / self.transfer.gain:.4g} e/s{own}"
-                )
+        if self._hidden():
+            return None, None
         return self._quotient(line.rate, float(np.sqrt(line.covariance[1, 1])))
+
+    def _hidden(self) -> bool:
+        """Does rounding hide the dark signal? Where neither noise nor pattern spreads the values over codes, means stand still."""
+        spread = min(level.plane[name].spread for level in self.darks for name in self.names)
+        if spread >= HIDDEN_DN2:
+            return False
+        self._remark(
+            f"noise and pattern of the darks spread over {np.sqrt(spread):.2f} DN only, so rounding decides their means: dark current "
+            "and DSNU aren't determined, and the black level to its rounding; a higher gain would show them"
+        )
+        return True
+
+    def _remark(self, sentence: str) -> None:
+        if sentence not in self.remarks:
+            self.remarks.append(sentence)
+
+    def _dark_current_from_variance(self) -> tuple[float | None, float | None]:
+        """The dark current's own shot noise: growth of the dark variance with exposure over K^2, planes together."""
+        repeated = [level for level in self.darks if level.repeats > 1]
+        exposure = np.array([level.exposure_s for level in repeated])
+        if np.unique(exposure).size < 3:
+            return None, None
+        rates, weights = [], []
+        for name in self.names:
+            own = [level.plane[name] for level in repeated]
+            std = np.array([plane.temporal_variance_std for plane in own])
+            variance = np.array([plane.temporal_variance for plane in own])
+            if variance.min() < HIDDEN_DN2:
+                return None, None
+            line = dark_line(exposure, variance, std)
+            if line.rate is not None:
+                rates.append(line.rate)
+                weights.append(1.0 / line.covariance[1, 1])
+        rate = float(np.average(rates, weights=weights))
+        gain = self.transfer.gain
+        rate_std = float(np.hypot(np.sum(weights) ** -0.5, 2.0 * rate * self.transfer.gain_std / gain))
+        return rate / gain**2, rate_std / gain**2
+
+    def _temperatures(self) -> DarkCurrentTemperature | None:
+        """Dark current at every temperature with darks of two exposures, and the laws through those that are above 0."""
+        found: list[tuple[float, float, float]] = []
+        temperatures = {level.temperature_c for level in self.all_darks if level.temperature_c is not None}
+        for temperature in sorted(temperatures):
+            own = [level for level in self.all_darks if level.temperature_c == temperature]
+            line = dark_line(np.array([level.exposure_s for level in own]), *self._mean_std(own, None))
+            if line.rate is not None:
+                std = float(np.sqrt(line.covariance[1, 1]))
+                found.append((temperature, line.rate / self.transfer.gain, std / self.transfer.gain))
+                own_value = ", the value given" if temperature == self.temperature else ""
+                self._remark(f"the dark current at {temperature:g} deg C is {found[-1][1]:.4g} e/s{own_value}")
+        return temperature_law(found, self.transfer.gain_std / self.transfer.gain) if found else None
 
     def _black(self) -> tuple[float | None, float | None]:
         if not self.darks:
@@ -530,7 +683,12 @@ class _Evaluation:
 
     def _dsnu(self) -> tuple[float | None, float | None]:
         pattern = self._dark_pattern()
-        return (None, None) if pattern is None else self._quotient(*_root(pattern[1], pattern[2]))
+        if pattern is None or self._hidden():
+            return None, None
+        level, square, std = pattern
+        if min(level.plane[name].temporal_variance for name in self.names) < HIDDEN_DN2:
+            std = float(np.hypot(std, QUANTISATION_DN2))  # each pixel's own mean is rounded
+        return self._quotient(*root(square, std))
 
     def _prnu(self) -> tuple[float | None, float | None]:
         dark = self._dark_pattern()
@@ -548,23 +706,21 @@ class _Evaluation:
             if not candidates:
                 continue
             _, _, distance, signal, plane = max(candidates, key=lambda c: c[:3])
-            root, root_std = _root(plane.pattern_variance - dark_variance, plane.pattern_variance_std)
-            values.append(100.0 * root / signal)
-            stds.append(100.0 * root_std / signal)
+            spread, spread_std = root(plane.pattern_variance - dark_variance, plane.pattern_variance_std)
+            values.append(100.0 * spread / signal)
+            stds.append(100.0 * spread_std / signal)
             levels.append((distance, plane.defects))
         if not values:
-            self.remarks.append(
-                "no unsaturated flats above 10 % of saturation: the PRNU isn't determined; expose longer"
-            )
+            self._remark("no unsaturated flats above 10 % of saturation: the PRNU isn't determined; expose longer")
             return None, None
         farthest = -min(levels)[0]
         if farthest > 0.2:
-            self.remarks.append(
+            self._remark(
                 f"PRNU comes from flats as far as {100 * farthest:.0f} % from half of saturation, where it should be taken"
             )
         outliers = sum(count for _, count in levels) - self.defects
         if outliers > 0:
-            self.remarks.append(
+            self._remark(
                 f"{outliers} pixels respond more than {DEFECT_SIGMA:g} standard deviations off: left out of PRNU"
             )
         weight = 1.0 / np.maximum(np.array(stds), 1e-9) ** 2
@@ -578,14 +734,14 @@ class _Evaluation:
             highest = max(
                 level.plane[name].mean - self.lines[name].black for level in self.flats for name in self.names
             ) / (self.white - self.lines[None].black)
-            self.remarks.append(
+            self._remark(
                 f"no flat saturates (the brightest reaches {100 * highest:.0f} % of the range): the full well isn't determined; expose longer"
             )
             return None, None
         value, name = max(seen)
         limit = self.white - self.lines[name].black
         if value >= limit - 0.5:
-            self.remarks.append(
+            self._remark(
                 f"saturation is the converter's limit ({self.white:g} DN): full_well_e is the signal there, and the pixel may hold more"
             )
         # A plateau is rounded to whole DN where the converter sets it, and known to its noise otherwise.
@@ -611,7 +767,7 @@ class _Evaluation:
             for level, percent in zip(chosen, found[name].deviation_percent, strict=True):
                 deviation[id(level), name] = float(percent)
         if not found:
-            self.remarks.append(
+            self._remark(
                 "fewer than four levels of one lamp between 5 and 95 % of saturation: the linearity error isn't determined"
             )
         return found, deviation
@@ -670,7 +826,7 @@ class _Evaluation:
     def _remark_on_lamp(self) -> None:
         relative, scatter, expected, _ = self._drift()
         if relative > 0:
-            self.remarks.append(
+            self._remark(
                 f"the lamp drifted: the means of repeated flat frames scatter by {scatter:.2g} DN where noise explains "
                 f"{expected:.2g} DN ({100 * relative:.2g} % of the signal)"
             )
@@ -687,7 +843,7 @@ class _Evaluation:
             rests.append(np.sqrt(np.sum((signal - basis @ solution) ** 2) / (len(levels) - 4)))
             noises.append(np.sqrt(np.mean(std**2)))
         if rests and np.mean(rests) > 4.0 * np.mean(noises):
-            self.remarks.append(
+            self._remark(
                 f"the lamp drifted between levels: their means scatter by {np.mean(rests):.2g} DN about a smooth response where noise "
                 f"explains {np.mean(noises):.2g} DN"
             )
@@ -705,6 +861,145 @@ class _Evaluation:
         line = linearity(*self._response("Y", chosen))
         value, std = self._quotient(line.slope, line.slope_std)
         return value, std, lamp[2]
+
+    # --- what bends ---
+
+    def _response_bend(self) -> tuple[float, float] | None:
+        """Departure of the response from its slope at zero, relative, at saturation: from means against light, planes together.
+
+        x = o + S l + q l^2 with an offset for light that the exposure's clock doesn't count; the bend is q x_sat / S^2."""
+        values, weights, highest = [], [], max(self.saturation.values())
+        for name in self.names:
+            levels = self._linear_levels(name, 0.0, CURVE_LIMIT)
+            if len({level.light for level in levels}) < 5:
+                continue
+            light, signal, std = self._response(name, levels)
+            basis = np.stack([np.ones_like(light), light, light**2], axis=1)
+            solution, covariance, chi2 = least_squares(basis, signal, std)
+            covariance *= inflation(chi2, len(levels) - 3)
+            _, slope, square = solution
+            gradient = highest * np.array([0.0, -2.0 * square / slope**3, 1.0 / slope**2])
+            values.append(float(square * highest / slope**2))
+            weights.append(1.0 / float(gradient @ covariance @ gradient))
+        if not values:
+            return None
+        mean = float(np.average(values, weights=weights))
+        chi2 = float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2))
+        return mean, float(np.sqrt(inflation(chi2, len(values) - 1) / np.sum(weights)))
+
+    def _neighbours(self) -> tuple[float, float] | None:
+        """Temporal covariance of a pixel with its eight neighbours, of the share of its shot noise's variance, at saturation:
+        4 (adjacent + diagonal) less the darks' = share K x^2 / x_sat."""
+        highest, gain = max(self.saturation.values()), self.transfer.gain
+        product, norm, chi2, freedom = 0.0, 0.0, 0.0, -1
+        rows: list[tuple[float, float, float]] = []
+        dark: dict[str, tuple[float, float]] = {}
+        for name in self.names:
+            own = [level.plane[name] for level in self.darks if np.isfinite(level.plane[name].covariance_std)]
+            if own:
+                weight = np.array([1.0 / max(plane.covariance_std, 1e-9) ** 2 for plane in own])
+                both = np.array([4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) for plane in own])
+                dark[name] = float(np.average(both, weights=weight)), float(np.sqrt(32.0 / weight.sum()))
+        for level, name in self.points:
+            plane = level.plane[name]
+            signal = plane.mean - self.lines[name].black
+            if (
+                level.lamp == "dark"
+                or not np.isfinite(plane.covariance_std)
+                or signal > CURVE_LIMIT * self.saturation[name]
+            ):
+                continue
+            below, below_std = dark.get(name, (0.0, 0.0))
+            value = 4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) - below
+            rows.append(
+                (gain * signal**2 / highest, value, float(np.hypot(np.sqrt(32.0) * plane.covariance_std, below_std)))
+            )
+        if len(rows) < 3:
+            return None
+        x, y, std = np.array(rows).T
+        norm = float(np.sum((x / std) ** 2))
+        product = float(np.sum(x * y / std**2)) / norm
+        chi2, freedom = float(np.sum(((y - product * x) / std) ** 2)), len(rows) - 1
+        return product, float(np.sqrt(inflation(chi2, freedom) / norm))
+
+    def _bends(self) -> dict[str, float]:
+        """Percent at saturation: the response's bend, the variance's, what the variance lacks beyond the response's, and what
+        neighbours have in common; with standard uncertainties. Says in a remark what bends the variance."""
+        t = self.transfer
+        found = {
+            "variance_bend_percent": 100.0 * t.curve_bend,
+            "variance_bend_percent_std": 100.0 * t.curve_bend_std,
+        }
+        shared = self._neighbours()
+        if shared is not None:
+            found["neighbour_covariance_percent"] = 100.0 * shared[0]
+            found["neighbour_covariance_percent_std"] = 100.0 * shared[1]
+        response = self._response_bend()
+        if response is None:
+            return found
+        found["response_bend_percent"], found["response_bend_percent_std"] = 100.0 * response[0], 100.0 * response[1]
+        # v = K (dy/de)^2 e: a response that bends by b at saturation bends the variance by 3 b.
+        missing = 3.0 * response[0] - t.curve_bend
+        missing_std = float(np.hypot(3.0 * response[1], t.curve_bend_std))
+        found["brighter_fatter_percent"], found["brighter_fatter_percent_std"] = 100.0 * missing, 100.0 * missing_std
+        causes = []
+        if abs(response[0]) > 4.0 * response[1] and abs(3.0 * response[0]) > 2.0 * missing_std:
+            causes.append(f"a response that bends by {100 * response[0]:+.2g} +- {100 * response[1]:.1g} %")
+        if missing > 4.0 * missing_std:
+            seen = shared is not None and shared[0] > 4.0 * shared[1]
+            where = (
+                "and it is seen in the neighbours' covariances"
+                if seen
+                else "which the neighbours' covariances don't show"
+            )
+            causes.append(
+                f"{100 * missing:.2g} +- {100 * missing_std:.1g} % of the noise that is missing beyond that (brighter-fatter, {where})"
+            )
+        if causes and abs(t.curve_bend) > 2.0 * t.curve_bend_std:
+            self._remark(f"at saturation, the variance bends by {' and '.join(causes)}")
+        return found
+
+    # --- the letter of the standard ---
+
+    def _emva1288(self) -> dict[str, Emva1288]:
+        """By plane; what a plane lacks is said in the remarks."""
+        found: dict[str, Emva1288] = {}
+        main = sorted(self._main_lamp(), key=lambda level: level.light)
+        lamp = main[0].lamp
+        photons = isinstance(lamp, tuple) and len(lamp) == 3 and bool(lamp[1])
+        for name in self.names:
+            given = Recorded(
+                plane=name,
+                darks=tuple(self.darks),
+                flats=tuple(level for level in main if level.light > 0),
+                in_photons=photons,
+                wavelength_nm=lamp[2] if photons and isinstance(lamp, tuple) else None,
+                saturation_dn=self.saturation[name],
+                variance_error=self.transfer.model_error,
+                lamp_error=self._drift()[0],
+            )
+            figures = emva1288_figures(given)
+            if isinstance(figures, str):
+                self._remark(f"no EMVA 1288 figures: {figures}")
+            else:
+                found[name] = figures
+        return found
+
+    def _channels(self, principal: dict[str, float | None]) -> dict[str, ChannelNoise]:
+        """Each colour by itself; a channel that its levels don't determine is left out, and said."""
+        found: dict[str, ChannelNoise] = {}
+        for channel in dict.fromkeys(name[0] for name in self.names):
+            own = tuple(name for name in self.names if name[0] == channel)
+            try:
+                part = principal if own == self.names else self._part(own).principal()
+            except NotDetermined as refused:
+                self._remark(f"channel {channel} alone: {refused.reason}")
+                continue
+            found[channel] = ChannelNoise(**part)
+        return found
+
+    def _part(self, names: tuple[str, ...]) -> _Evaluation:
+        return _Evaluation(self.all_darks, self.flats, self.camera, self.gain_db, 0, names)
 
     # --- all ---
 
@@ -749,17 +1044,36 @@ class _Evaluation:
     def _remark_on_levels(self) -> None:
         clipped = sum(any(flags) for flags in zip(*self.clipped.values(), strict=True))
         if clipped:
-            self.remarks.append(f"{clipped} of {len(self.flats)} flat levels saturate in a channel: left out there")
+            self._remark(f"{clipped} of {len(self.flats)} flat levels saturate in a channel: left out there")
         single = sum(level.repeats < 2 for level in self.flats)
         if single:
-            self.remarks.append(f"{single} of {len(self.flats)} flat levels have no repeat: only their means are used")
+            self._remark(f"{single} of {len(self.flats)} flat levels have no repeat: only their means are used")
         if self.defects:
-            self.remarks.append(
-                f"{self.defects} hot or dead pixels stand out of the longest darks: left out of everything"
-            )
+            self._remark(f"{self.defects} hot or dead pixels stand out of the longest darks: left out of everything")
         if self.gain_db:
-            self.remarks.append(f"recorded at a gain of {self.gain_db:g} dB: the conversion gain is given for 0 dB")
+            self._remark(f"recorded at a gain of {self.gain_db:g} dB: the conversion gain is given for 0 dB")
         self._remark_on_planes()
+
+    def _remark_on_shading(self) -> None:
+        """Is the light on opposite edges alike? cos^4 is; a lamp off the axis, or a lens that isn't centred, isn't."""
+        edges: list[tuple[float, ...]] = []
+        for level in self.flats:
+            for name in self.names:
+                plane = level.plane[name]
+                share = (plane.mean - self.lines[name].black) / self.saturation[name]
+                if 0.3 <= share <= 0.7 and not self.clipped[name][self.flats.index(level)]:
+                    lift = plane.mean / (plane.mean - self.lines[name].black)
+                    edges.append(tuple(1.0 + lift * (e - 1.0) for e in (*plane.shading_rows, *plane.shading_columns)))
+        if not edges:
+            return
+        first_row, last_row, first_col, last_col = np.mean(edges, axis=0)
+        found = [
+            f"{axis} from {first:.3f} at the first to {last:.3f} at the last"
+            for axis, first, last in (("rows", first_row, last_row), ("columns", first_col, last_col))
+            if abs(last - first) > ASYMMETRY
+        ]
+        if found:
+            self._remark(f"the flats' shading is asymmetric: {'; '.join(found)}, of the mean")
 
     def _remark_on_planes(self) -> None:
         """Do the planes agree on K? Read-out channels of their own don't."""
@@ -775,7 +1089,9 @@ class _Evaluation:
             signal = np.array([p.mean - self.lines[name].black for p, _ in own])
             excess = np.array([p.temporal_variance for p, _ in own]) - self.transfer.floor[self.plane_index[name]]
             excess -= self.transfer.curvature * signal**2
-            weight = (signal / np.array([p.temporal_variance_std for p, _ in own])) ** 2
+            weight = (
+                signal / np.hypot([p.temporal_variance_std for p, _ in own], self.transfer.model_error * excess)
+            ) ** 2
             values.append(float(np.sum(weight * excess / signal) / weight.sum()))
             weights.append(float(weight.sum()))
         if len(values) < 2:
@@ -783,50 +1099,98 @@ class _Evaluation:
         mean = np.average(values, weights=weights)
         if stats.chi2.sf(float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2)), len(values) - 1) < 1e-4:
             listed = ", ".join(f"{name} {value:.4g}" for name, value in zip(self.names, values, strict=False))
-            self.remarks.append(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")
+            self._remark(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")
 
-    def result(self) -> NoiseFit:
+    def principal(self) -> dict[str, float | None]:
+        """The figures that stand for the sensor and for each channel, with their uncertainties."""
+        scale = 10.0 ** (-self.gain_db / 20.0)
+        errors = list(self._linearity()[0].values())
+        found: dict[str, tuple[float | None, float | None]] = {
+            "conversion_gain_dn_per_e": (self.transfer.gain * scale, self.transfer.gain_std * scale),
+            "read_noise_e": self._read_noise(),
+            "black_level_dn": self._black(),
+            "dark_current_e_per_s": self._dark_current(),
+            "dsnu_e": self._dsnu(),
+            "prnu_percent": self._prnu(),
+            "full_well_e": self._full_well(),
+            "linearity_error_percent": (
+                float(np.mean([e.error_percent for e in errors])) if errors else None,
+                # Planes see the same lamp: their errors go together.
+                float(np.mean([e.error_percent_std for e in errors])) if errors else None,
+            ),
+        }
+        values = {name: value for name, (value, _) in found.items()}
+        return values | {f"{name}_std": std for name, (_, std) in found.items()}
+
+    def result(self, pixels: DarkPixels | None) -> NoiseFit:
         t = self.transfer
         scale = 10.0 ** (-self.gain_db / 20.0)
-        found, deviation = self._linearity()
         self._remark_on_lamp()
         self._remark_on_levels()
-        read_noise, read_noise_std = self._read_noise()
-        black, black_std = self._black()
-        dark_current, dark_current_std = self._dark_current()
-        dsnu, dsnu_std = self._dsnu()
-        prnu, prnu_std = self._prnu()
-        full_well, full_well_std = self._full_well()
+        self._remark_on_shading()
+        principal = self.principal()
         qe, qe_std, qe_at = self._quantum_efficiency()
-        errors = list(found.values())
+        from_variance, from_variance_std = self._dark_current_from_variance()
+        dark = pixels is not None and self.darks
         return NoiseFit(
-            conversion_gain_dn_per_e=t.gain * scale,
-            conversion_gain_dn_per_e_std=t.gain_std * scale,
-            read_noise_e=read_noise,
-            read_noise_e_std=read_noise_std,
-            black_level_dn=black,
-            black_level_dn_std=black_std,
-            dark_current_e_per_s=dark_current,
-            dark_current_e_per_s_std=dark_current_std,
-            dsnu_e=dsnu,
-            dsnu_e_std=dsnu_std,
-            prnu_percent=prnu,
-            prnu_percent_std=prnu_std,
-            full_well_e=full_well,
-            full_well_e_std=full_well_std,
-            linearity_error_percent=float(np.mean([e.error_percent for e in errors])) if errors else None,
-            # Planes see the same lamp: their errors go together.
-            linearity_error_percent_std=float(np.mean([e.error_percent_std for e in errors])) if errors else None,
+            **principal,
             quantum_efficiency=qe,
             quantum_efficiency_std=qe_std,
             quantum_efficiency_wavelength_nm=qe_at,
-            photon_transfer=self._photon_transfer(deviation),
+            conversion_gain_at_zero_dn_per_e=t.curve_gain * scale,
+            conversion_gain_at_zero_dn_per_e_std=t.curve_gain_std * scale,
+            variance_model_error_percent=100.0 * t.model_error,
+            **self._bends(),
+            dark_current_from_variance_e_per_s=from_variance,
+            dark_current_from_variance_e_per_s_std=from_variance_std,
+            dark_current_temperature=self._temperatures(),
+            read_noise_distribution=read_noise_distribution(pixels, t.gain) if dark and pixels is not None else None,
+            defects=pixels.defects(t.gain) if dark and pixels is not None else None,
+            channels=self._channels(principal),
+            emva1288=self._emva1288(),
+            photon_transfer=self._photon_transfer(self._linearity()[1]),
             remarks=tuple(self.remarks),
         )
 
 
-def _root(square: float, square_std: float) -> tuple[float, float]:
-    """Square root of a variance that noise may have made negative, with its standard uncertainty."""
-    value = float(np.sqrt(max(square, 0.0)))
-    # Far from 0 this is std / (2 value); at 0 the root is known to sqrt(std).
-    return value, square_std / (value + float(np.sqrt(max(square, square_std))))
+BOLTZMANN_EV_PER_K = 8.617333262e-5
+ZERO_C_K = 273.15
+
+
+def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentTemperature:
+    """The Arrhenius law and EMVA's doubling temperature through dark currents: `found`: (deg C, e/s, its standard uncertainty).
+
+    ln I = ln I_ref - E / k (1/T - 1/T_ref), weighted, T_ref the coldest; and ln I = a + ln 2 (T - T_ref) / T_d likewise. Only currents
+    above three uncertainties are used; two temperatures are needed. `gain_error`: relative, common to all.
+    """
+    listed = np.array(found, float)
+    plain = DarkCurrentTemperature(
+        temperature_c=tuple(listed[:, 0]),
+        dark_current_e_per_s=tuple(listed[:, 1]),
+        dark_current_e_per_s_std=tuple(float(std) for std in np.hypot(listed[:, 2], gain_error * listed[:, 1])),
+    )
+    temperature, current, std = listed[listed[:, 1] > 3.0 * listed[:, 2]].T
+    if np.unique(temperature).size < 2:
+        return plain
+    reference = float(temperature.min())
+    inverse = 1.0 / (temperature + ZERO_C_K) - 1.0 / (reference + ZERO_C_K)
+    fits = []
+    for axis in (-inverse / BOLTZMANN_EV_PER_K, np.log(2.0) * (temperature - reference)):
+        basis = np.stack([np.ones_like(axis), axis], axis=1)
+        solution, covariance, chi2 = least_squares(basis, np.log(current), std / current)
+        covariance *= inflation(chi2, temperature.size - 2)
+        fits.append((solution, covariance))
+    (arrhenius, arrhenius_covariance), (doubling, doubling_covariance) = fits
+    at_reference = float(np.exp(arrhenius[0]))
+    update: dict[str, float] = {
+        "activation_energy_ev": float(arrhenius[1]),
+        "activation_energy_ev_std": float(np.sqrt(arrhenius_covariance[1, 1])),
+        "reference_temperature_c": reference,
+        "reference_current_e_per_s": at_reference,
+        "reference_current_e_per_s_std": at_reference
+        * float(np.hypot(np.sqrt(arrhenius_covariance[0, 0]), gain_error)),
+    }
+    if doubling[1] > 3.0 * np.sqrt(doubling_covariance[1, 1]):
+        update["doubling_temperature_c"] = 1.0 / float(doubling[1])
+        update["doubling_temperature_c_std"] = float(np.sqrt(doubling_covariance[1, 1]) / doubling[1] ** 2)
+    return plain.model_copy(update=update)

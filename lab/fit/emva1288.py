@@ -1,0 +1,386 @@
+"""EMVA Standard 1288, release 4.0 (linear model): the quantities by their definitions, of one plane of the mosaic.
+
+The letter of the standard: unweighted lines, every pixel counted, no shading taken out, one figure by one formula. Beside it
+stands the physical fit of `lab.fit.noise`, which is less biased where a camera isn't linear. Two things are added to the letter:
+standard uncertainties (of the recordings' noise and of how far these rows, columns and pixels stand for the camera), and
+temporal variances over any number of repeats, of which the standard's pair of images is the smallest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lab.fit.levels import QUANTISATION_DN2, BoolArray, Level, PlaneStatistics, SpatialVariance
+from lab.fit.lines import DarkLine, dark_line, inflation, linearity, root
+from lab.results import Emva1288, Emva1288Points
+from sim.spectrum import FloatArray
+
+HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise
+HIDDEN_DN = 0.40  # and the limit that is stated then
+LINE_LIMIT = 0.7  # of saturation: range of responsivity and system gain
+LINEARITY_RANGE = (0.05, 0.95)  # of saturation
+SPATIAL_IMAGES = 16  # fewer leave the rows' and columns' parts to the temporal noise; the standard asks for more
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What `figures` works on: the darks of one temperature, the flats of one lamp in ascending light (two or more of each), what
+    `light` counts, the signal (DN above dark) that is taken for saturation where the flats don't reach it, and what is known of the
+    errors: `variance_error` (relative, of a temporal variance, beyond sampling) and `lamp_error` (relative, of a mean)."""
+
+    plane: str
+    darks: tuple[Level, ...]
+    flats: tuple[Level, ...]
+    in_photons: bool
+    wavelength_nm: float | None
+    saturation_dn: float
+    variance_error: float = 0.0
+    lamp_error: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Value:
+    """A number with its standard uncertainty."""
+
+    value: float
+    std: float
+
+    def over(self, other: _Value) -> _Value:
+        """Quotient of independent numbers."""
+        quotient = self.value / other.value
+        return _Value(quotient, math.hypot(self.std / other.value, quotient * other.std / other.value))
+
+
+class _Points:
+    """Means and variances less dark, by level."""
+
+    def __init__(self, given: Recorded) -> None:
+        self.given = given
+        self.flats = [level for level in given.flats if level.repeats > 1]
+        own = [level.plane[given.plane] for level in self.flats]
+        self.darks = [level for level in given.darks if level.repeats > 1]
+        dark = [level.plane[given.plane] for level in self.darks]
+        self.dark_exposure = np.array([level.exposure_s for level in self.darks])
+        self.dark_variance = np.array([plane.temporal_variance for plane in dark])
+        self.dark_variance_std = np.array([plane.temporal_variance_std for plane in dark])
+        self.dark_mean = np.array([plane.mean for plane in dark])
+        self.dark_mean_std = mean_std(dark)
+        self.mean_line = dark_line(self.dark_exposure, self.dark_mean, self.dark_mean_std)
+        self.variance_line = dark_line(self.dark_exposure, self.dark_variance, np.maximum(self.dark_variance_std, 1e-9))
+        self.exposure = np.array([level.exposure_s for level in self.flats])
+        self.light = np.array([level.light for level in self.flats])
+        self.mean = np.array([plane.mean for plane in own])
+        self.variance = np.array([plane.temporal_variance for plane in own])
+        self.variance_std = np.hypot(
+            np.array([plane.temporal_variance_std for plane in own]), given.variance_error * self.variance
+        )
+        # The dark at the level's exposure where it was taken, else by the line through all darks.
+        self.source = [self._taken(level.exposure_s) for level in self.flats]
+        self.below_mean = self._below(self.dark_mean, self.mean_line)
+        self.below_variance = self._below(self.dark_variance, self.variance_line)
+        self.signal = self.mean - self.below_mean
+        self.signal_std = np.hypot(
+            [plane.mean_std for plane in own],
+            np.hypot(self._below(self.dark_mean_std, None), given.lamp_error * self.signal),
+        )
+
+    def _taken(self, exposure_s: float) -> int | None:
+        if not self.dark_exposure.size:
+            return None
+        nearest = int(np.argmin(np.abs(self.dark_exposure - exposure_s)))
+        return nearest if abs(self.dark_exposure[nearest] - exposure_s) <= 1e-6 * exposure_s else None
+
+    def _below(self, taken: FloatArray, line: DarkLine | None) -> FloatArray:
+        """Of the dark at each level's exposure; where none was taken, of the line, or (None) the smallest of all."""
+        return np.array(
+            [
+                taken[source]
+                if source is not None
+                else (line.at(float(exposure)) if line is not None else float(taken.min()))
+                for source, exposure in zip(self.source, self.exposure, strict=True)
+            ]
+        )
+
+    def gain(self, used: BoolArray) -> _Value:
+        """Slope through the origin of the variance against the signal; `used`: flags."""
+        x = np.where(used, self.signal, 0.0)
+        norm = float(np.sum(x * x))
+        excess = self.variance - self.below_variance
+        value = float(np.sum(x * excess)) / norm
+        square = float(np.sum((x * self.variance_std) ** 2))
+        # A dark that stands below several levels errs in all of them alike.
+        for number, std in enumerate(self.dark_variance_std):
+            square += (float(np.sum(x[[source == number for source in self.source]])) * std) ** 2
+        on_line = x[[source is None for source in self.source]]
+        if on_line.size:
+            lines = self.variance_line.covariance
+            t = self.exposure[[source is None for source in self.source]]
+            gradient = np.array([on_line.sum(), float(np.sum(on_line * t))])
+            square += float(gradient @ lines @ gradient)
+        return _Value(value, math.sqrt(square) / norm)
+
+
+def mean_std(planes: Sequence[PlaneStatistics]) -> FloatArray:
+    """Standard uncertainties of means over a plane: temporal noise, rounding where it isn't dithered, and the scatter of
+    repeats where that is larger."""
+    noise, excess, freedom = [], 0.0, 0
+    for plane in planes:
+        variance = plane.temporal_variance if np.isfinite(plane.temporal_variance) else QUANTISATION_DN2
+        noise.append(math.sqrt(max(variance, QUANTISATION_DN2) / plane.pixels))
+        if plane.repeats > 1:
+            frames = np.array(plane.frame_means)
+            excess += float(np.sum((frames - frames.mean()) ** 2)) / noise[-1] ** 2
+            freedom += plane.repeats - 1
+    widened = np.array(noise) * math.sqrt(inflation(excess, freedom))
+    repeats = np.sqrt([plane.repeats for plane in planes])
+    return np.hypot(widened / repeats, [plane.mean_rounding_std for plane in planes])
+
+
+Found = dict[str, _Value]
+
+
+def figures(given: Recorded) -> Emva1288 | str:
+    """The figures of one plane, or why there are none."""
+    if not any(level.repeats > 1 for level in given.darks):
+        return "no repeated darks: EMVA 1288 compares bright with dark pairs; capture two darks at each of the flats' exposures"
+    at = _Points(given)
+    remarks: list[str] = []
+    saturation, top = _saturation(at, given, remarks)
+    used = at.signal <= LINE_LIMIT * saturation
+    if np.count_nonzero(used) < 3:
+        return (
+            f"{np.count_nonzero(used)} levels of one lamp with repeats up to 70 % of saturation: EMVA 1288 needs three at least and "
+            "asks for fifty; capture more"
+        )
+    gain = at.gain(used)
+    if not gain.value > 3.0 * gain.std:
+        return "the temporal variance doesn't grow with the signal: no system gain"
+    if at.signal.size < 50:
+        remarks.append(f"{at.signal.size} levels; the standard asks for 50")
+    missing = sum(source is None for source in at.source)
+    if missing:
+        remarks.append(
+            f"{missing} of {at.signal.size} levels have no dark of their exposure: a line through the darks stands for it"
+        )
+    found: Found = {}
+    if given.in_photons:
+        found |= _responsivity(at, used, gain)
+    dark, limit_e = _dark_noise(at, gain, remarks)
+    found |= dark
+    found |= _sensitivity(at, top, gain, found)
+    lines, deviation = _linearity(at, saturation, remarks)
+    found |= lines
+    found |= _dark_current(at, gain, remarks)
+    stacks = _stacks(given, at, saturation, remarks)
+    found |= _spatial(given.plane, stacks, gain)
+    numbers = {name: value.value for name, value in found.items()}
+    numbers |= {f"{name}_std": value.std for name, value in found.items()}
+    return Emva1288(
+        **numbers,
+        system_gain_dn_per_e=gain.value,
+        system_gain_dn_per_e_std=gain.std,
+        temporal_dark_noise_limit_e=limit_e,
+        wavelength_nm=given.wavelength_nm if given.in_photons else None,
+        points=_plotted(at, given, deviation, stacks),
+        remarks=tuple(remarks),
+    )
+
+
+def _saturation(at: _Points, given: Recorded, remarks: list[str]) -> tuple[float, int | None]:
+    """Signal at the level with the largest variance (from the brightest down, the first maximum that two darker levels confirm),
+    and which one that is; None where the flats don't get beyond it."""
+    best, index = -np.inf, 0
+    for number in range(at.variance.size - 1, -1, -1):
+        if at.variance[number] >= best:
+            best, index = float(at.variance[number]), number
+        elif at.variance[max(number - 1, 0)] < best:
+            break
+    beyond = at.variance[index + 1 :]
+    if beyond.size and beyond.min() < at.variance[index] - 3.0 * at.variance_std[index]:
+        return float(at.signal[index]), index
+    remarks.append(
+        "no flat lies beyond the largest temporal variance: the saturation capacity isn't determined, and the ranges are of "
+        f"{given.saturation_dn:.4g} DN above dark"
+    )
+    return given.saturation_dn, None
+
+
+def _responsivity(at: _Points, used: BoolArray, gain: _Value) -> Found:
+    light = np.where(used, at.light, 0.0)
+    norm = float(np.sum(light * light))
+    if norm <= 0:
+        return {}
+    std = math.sqrt(float(np.sum((light * at.signal_std) ** 2))) / norm
+    responsivity = _Value(float(np.sum(light * at.signal)) / norm, std)
+    return {"responsivity_dn_per_photon": responsivity, "quantum_efficiency": responsivity.over(gain)}
+
+
+def _dark_noise(at: _Points, gain: _Value, remarks: list[str]) -> tuple[Found, float | None]:
+    """Temporal dark noise at zero exposure, and the limit (e) that stands for it where rounding hides it."""
+    if np.unique(at.dark_exposure).size >= 3:
+        square = _Value(at.variance_line.black, math.sqrt(float(at.variance_line.covariance[0, 0])))
+    else:
+        shortest = int(np.argmin(at.dark_exposure))
+        square = _Value(float(at.dark_variance[shortest]), float(at.dark_variance_std[shortest]))
+    if square.value < HIDDEN_DN2:
+        limit_e = HIDDEN_DN / gain.value
+        remarks.append(
+            f"the dark variance is {max(square.value, 0.0):.2g} DN^2, below 0.24, where rounding hides it: the temporal dark noise is "
+            f"below {limit_e:.3g} e"
+        )
+        return {}, limit_e
+    noise_dn = math.sqrt(square.value)
+    noise_e = math.sqrt(square.value - QUANTISATION_DN2)
+    return {
+        "temporal_dark_noise_dn": _Value(noise_dn, square.std / (2.0 * noise_dn)),
+        "temporal_dark_noise_e": _Value(noise_e, square.std / (2.0 * noise_e)).over(gain),
+    }, None
+
+
+def _sensitivity(at: _Points, top: int | None, gain: _Value, found: Found) -> Found:
+    """Threshold, saturation capacity, largest SNR and dynamic range; in photons where the quantum efficiency is known."""
+    given: Found = {}
+    efficiency = found.get("quantum_efficiency")
+    dark = found.get("temporal_dark_noise_dn")
+    if dark is not None:
+        dark_e = dark.over(gain)
+        inner = math.sqrt(dark_e.value**2 + 0.25)
+        given["sensitivity_threshold_e"] = _Value(inner + 0.5, dark_e.value * dark_e.std / inner)
+    if top is not None:
+        # The largest variance lies somewhere between this level's neighbours.
+        step = float(np.abs(np.diff(at.signal[max(top - 1, 0) : top + 2])).mean()) if at.signal.size > 1 else 0.0
+        if efficiency is not None:
+            photons = _Value(float(at.light[top]), float(step / at.signal[top] * at.light[top]) / math.sqrt(12.0))
+            given["saturation_capacity_photons"] = photons
+            electrons = photons.value * efficiency.value
+            std = math.hypot(photons.std * efficiency.value, photons.value * efficiency.std)
+            given["saturation_capacity_e"] = _Value(electrons, std)
+        else:
+            given["saturation_capacity_e"] = _Value(float(at.signal[top]), step / math.sqrt(12.0)).over(gain)
+        full = given["saturation_capacity_e"]
+        given["snr_max"] = _Value(math.sqrt(full.value), full.std / (2.0 * math.sqrt(full.value)))
+    if efficiency is not None and "sensitivity_threshold_e" in given:
+        given["sensitivity_threshold_photons"] = given["sensitivity_threshold_e"].over(efficiency)
+    if "saturation_capacity_e" in given and "sensitivity_threshold_e" in given:
+        given["dynamic_range"] = given["saturation_capacity_e"].over(given["sensitivity_threshold_e"])
+    return given
+
+
+def _linearity(at: _Points, saturation: float, remarks: list[str]) -> tuple[Found, FloatArray]:
+    """LE, and each level's deviation from the line (percent; NaN outside its range)."""
+    deviation = np.full(at.signal.size, np.nan)
+    low, high = LINEARITY_RANGE
+    chosen = (at.signal >= low * saturation) & (at.signal <= high * saturation)
+    if np.unique(at.light[chosen]).size < 4:
+        remarks.append("fewer than four levels between 5 and 95 % of saturation: no linearity error")
+        return {}, deviation
+    line = linearity(at.light[chosen], at.signal[chosen], at.signal_std[chosen])
+    deviation[chosen] = line.deviation_percent
+    return {"linearity_error_percent": _Value(line.error_percent, line.error_percent_std)}, deviation
+
+
+def _dark_current(at: _Points, gain: _Value, remarks: list[str]) -> Found:
+    """From the mean and from the variance, against exposure (three exposures or more)."""
+    if np.unique(at.dark_exposure).size < 3:
+        remarks.append("darks of fewer than three exposures: no dark current")
+        return {}
+    found: Found = {}
+    mean, variance = at.mean_line, at.variance_line
+    if mean.rate is not None:
+        rate = _Value(mean.rate, math.sqrt(float(mean.covariance[1, 1])))
+        found["dark_current_from_mean_e_per_s"] = rate.over(gain)
+    if variance.rate is not None and float(at.dark_variance.min()) >= HIDDEN_DN2:
+        rate = _Value(variance.rate, math.sqrt(float(variance.covariance[1, 1])))
+        square = _Value(gain.value**2, 2.0 * gain.value * gain.std)
+        found["dark_current_from_variance_e_per_s"] = rate.over(square)
+    return found
+
+
+@dataclass(frozen=True)
+class _Stacks:
+    """The dark and the bright stack of the spatial figures; None: there isn't one."""
+
+    dark: Level | None
+    bright: Level | None
+
+
+def _stacks(given: Recorded, at: _Points, saturation: float, remarks: list[str]) -> _Stacks:
+    """The level of most images near half of saturation, and the dark of most images nearest to its exposure."""
+
+    def half(number: int) -> tuple[int, float]:
+        return at.flats[number].repeats, -abs(at.signal[number] / saturation - 0.5)
+
+    near = [k for k in range(at.signal.size) if 0.3 <= at.signal[k] / saturation <= 0.7]
+    bright = at.flats[max(near, key=half)] if near else None
+    exposure_s = bright.exposure_s if bright is not None else 0.0
+    dark = max(at.darks, key=lambda level: (level.repeats, -abs(level.exposure_s - exposure_s)), default=None)
+    if bright is None:
+        remarks.append("no level between 30 and 70 % of saturation: no PRNU1288")
+    least = min((level.repeats for level in (dark, bright) if level is not None), default=0)
+    if least < SPATIAL_IMAGES:
+        remarks.append(
+            f"the spatial stacks have {least} images: the rows' and columns' parts carry more temporal noise than the standard means"
+        )
+    if dark is not None and bright is not None and abs(dark.exposure_s - exposure_s) > 1e-3 * exposure_s:
+        remarks.append(
+            f"the dark stack was exposed for {1e3 * dark.exposure_s:.3g} ms, the bright one for {1e3 * exposure_s:.3g} ms; the standard "
+            "asks for the same"
+        )
+    return _Stacks(dark, bright)
+
+
+def _spatial(plane: str, stacks: _Stacks, gain: _Value) -> Found:
+    found: Found = {}
+    dark = stacks.dark.plane[plane].every_pixel if stacks.dark is not None else None
+    if dark is None:
+        return found
+    for name, square in _parts(dark).items():
+        found[f"dsnu{name}_e"] = _Value(*root(square.value, square.std)).over(gain)
+    bright = stacks.bright.plane[plane].every_pixel if stacks.bright is not None else None
+    if bright is None or stacks.bright is None or stacks.dark is None:
+        return found
+    signal = stacks.bright.plane[plane].mean_of_all - stacks.dark.plane[plane].mean_of_all
+    below = _parts(dark)
+    for name, square in _parts(bright).items():
+        # Both stacks hold the same dark pattern: its uncertainty as a draw goes, that of its measurement stays.
+        root_dn = _Value(*root(square.value - below[name].value, math.hypot(square.std, below[name].std)))
+        found[f"prnu{name}_percent"] = _Value(100.0 * root_dn.value / signal, 100.0 * root_dn.std / signal)
+    return found
+
+
+def _parts(split: SpatialVariance) -> dict[str, _Value]:
+    return {
+        "": _Value(split.total, split.total_std),
+        "_row": _Value(split.rows, split.rows_std),
+        "_column": _Value(split.columns, split.columns_std),
+        "_pixel": _Value(split.pixels, split.pixels_std),
+    }
+
+
+def _plotted(at: _Points, given: Recorded, deviation: FloatArray, stacks: _Stacks) -> Emva1288Points:
+    def numbers(values: FloatArray) -> tuple[float, ...]:
+        return tuple(float(value) for value in values)
+
+    dark, bright = stacks.dark, stacks.bright
+    return Emva1288Points(
+        light_unit="photons" if given.in_photons else "s",
+        light=numbers(at.light),
+        exposure_s=numbers(at.exposure),
+        mean_dn=numbers(at.mean),
+        variance_dn2=numbers(at.variance),
+        dark_mean_dn=numbers(at.below_mean),
+        dark_variance_dn2=numbers(at.below_variance),
+        linearity_deviation_percent=tuple(None if np.isnan(value) else float(value) for value in deviation),
+        dark_exposure_s=numbers(at.dark_exposure),
+        dark_exposure_mean_dn=numbers(at.dark_mean),
+        dark_exposure_variance_dn2=numbers(at.dark_variance),
+        stack_dark_exposure_s=dark.exposure_s if dark is not None else None,
+        stack_dark_images=dark.repeats if dark is not None else None,
+        stack_light=bright.light if bright is not None else None,
+        stack_exposure_s=bright.exposure_s if bright is not None else None,
+        stack_images=bright.repeats if bright is not None else None,
+    )
