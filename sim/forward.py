@@ -24,7 +24,7 @@ from sim.optics.diffraction import aperture_otf
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.optics.illumination import sin_theta as sin_theta_at
 from sim.optics.imaging import DiffractionLimited
-from sim.scene.render import Grid, Light, _means, draw
+from sim.scene.render import Grid, Light, cell_means, draw
 from sim.scene.scenes import Darkness, KnifeEdge, Scene, SpectralImage, UniformField
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
@@ -643,7 +643,7 @@ def _cube_images(
                 fine[: seen.shape[0], : seen.shape[1]] = seen
             else:
                 transfer = _transfer_at(camera, float(node), fx, fy, _blurring(effects))
-                fine = _means(picture.astype(float), scene.warp(), grid, 0.0).astype(np.float32)
+                fine = cell_means(picture.astype(float), scene.warp(), grid, 0.0).astype(np.float32)
             transformed = fft.rfft2(fine)
             transformed *= transfer.astype(np.complex64 if np.iscomplexobj(transfer) else np.float32)
             spectrum += transformed

@@ -141,10 +141,10 @@ def cells(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> Float
     if not (np.min(pattern) >= 0 and np.max(pattern) <= 1):
         bad = pattern[~((pattern >= 0) & (pattern <= 1))].flat[0]
         raise ValueError(f"a pattern's cell is {bad}, outside the limits 0..1: scale it, 0 dark and 1 lit")
-    return _means(pattern, warp, grid, surround)
+    return cell_means(pattern, warp, grid, surround)
 
 
-def _means(
+def cell_means(
     pattern: FloatArray, warp: Warp, grid: Grid, surround: float, lit: tuple[float, float, float, float] | None = None
 ) -> FloatArray:
     """`cells` for cells of any finite value. `lit` (u0, u1, v0, v1): the part of every cell that holds its value, the rest
@@ -189,7 +189,7 @@ def _means(
 def _upright_means(
     pattern: FloatArray, warp: Warp, grid: Grid, surround: float, lit: tuple[float, float, float, float] | None
 ) -> FloatArray:
-    """`_means` where rows stay rows and columns columns: exact means along columns, then along rows, of cells of any size."""
+    """`cell_means` where rows stay rows and columns columns: exact means along columns, then along rows, of cells of any size."""
     from sim.scene.area import means_down
 
     h = np.asarray(warp.homography) / warp.homography[2][2]
@@ -235,7 +235,7 @@ def _bands(scene: SpectralImage, grid: Grid) -> Drawing:
         return Drawing(
             (NO_LIGHT, None),
             tuple(
-                Layer(light, EVERYWHERE, _means(plane, warp, grid, 0.0))
+                Layer(light, EVERYWHERE, cell_means(plane, warp, grid, 0.0))
                 for light, plane in zip(lights, planes, strict=True)
             ),
         )
@@ -258,15 +258,15 @@ def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
     seen = 1.0 if screen.falloff_exponent == 0 else scene.cosine(*grid.axes_px()) ** screen.falloff_exponent
     drawn = []
     if any(screen.black_radiance.value):
-        leak = _means(np.ones(scene.codes.shape[:2]), warp, grid, 0.0) * seen
+        leak = cell_means(np.ones(scene.codes.shape[:2]), warp, grid, 0.0) * seen
         drawn.append(Layer((screen.black_radiance, None), EVERYWHERE, leak))
     drives = screen.drives(scene.codes)
     for channel, primary in enumerate(screen.primaries):
         if screen.sub_pixels is None:
-            picture = _means(drives[:, :, channel], warp, grid, 0.0) * seen
+            picture = cell_means(drives[:, :, channel], warp, grid, 0.0) * seen
         else:
             lit = screen.sub_pixels.lit(channel)
-            picture = _means(drives[:, :, channel] / screen.sub_pixels.share, warp, grid, 0.0, lit) * seen
+            picture = cell_means(drives[:, :, channel] / screen.sub_pixels.share, warp, grid, 0.0, lit) * seen
         drawn.append(Layer((primary, None), EVERYWHERE, picture))
     return Drawing((NO_LIGHT, None), tuple(drawn))
 

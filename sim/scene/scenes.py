@@ -6,15 +6,15 @@ capture's kind as the recording-set format names it: effects on the rig may depe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.camera import Geometry
+from sim.camera import Geometry, StereoRig
 from sim.scene.screen import Screen
-from sim.scene.warp import Warp
+from sim.scene.warp import Matrix, Warp
 from sim.spectrum import FloatArray, Spectrum, energy_from_photons
 
 Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -117,19 +117,47 @@ class ScreenPattern:
     kind: str = "bernoulli"
 
 
+class Posed:
+    """A flat thing at a pose: a point X of its plane (x to the right along columns, y down along rows, z away from the camera, mm;
+    OpenCV's frame of a board) goes to `rotation` X + `translation_mm` in the camera's frame and is projected by `geometry`."""
+
+    rotation: Matrix
+    translation_mm: tuple[float, float, float]
+    geometry: Geometry
+
+    def plane_warp(self, unit_mm: float) -> Warp:
+        """From the plane's coordinates in units of `unit_mm` to camera px: camera_matrix [r1 r2 t] unit_mm, then the distortion."""
+        turn = np.asarray(self.rotation, float)
+        pose = np.column_stack([turn[:, 0] * unit_mm, turn[:, 1] * unit_mm, np.asarray(self.translation_mm, float)])
+        return Warp.of(np.asarray(self.geometry.camera_matrix, float) @ pose, self.geometry)
+
+    def seen_by(self, rig: StereoRig) -> tuple[Self, Self]:
+        """The same thing before both cameras of a rig, this pose being that in the left one's frame: what stands at x before the
+        left camera stands at rotation x + translation_mm before the right one. Geometries are the cameras'."""
+        pair = rig.left.geometry, rig.right.geometry
+        if pair[0] is None or pair[1] is None:
+            raise ValueError(
+                f"the {'left' if pair[0] is None else 'right'} camera has no geometry: give its camera matrix"
+            )
+        between = np.asarray(rig.rotation, float)
+        turn = between @ np.asarray(self.rotation, float)
+        x, y, z = (between @ np.asarray(self.translation_mm, float) + np.asarray(rig.translation_mm, float)).tolist()
+        first, second, third = ((float(a), float(b), float(c)) for a, b, c in turn)
+        moved = {"rotation": (first, second, third), "translation_mm": (x, y, z), "geometry": pair[1]}
+        return replace(self, geometry=pair[0]), replace(self, **moved)  # type: ignore[type-var]
+
+
 @dataclass(frozen=True, eq=False)
-class PlanarTarget:
+class PlanarTarget(Posed):
     """A flat printed target at a pose: a ChArUco board.
 
     `texture` (rows, cols), 0..1, is the share of `light_radiance` (1) against `dark_radiance` (0). Its texel [i, j] covers
-    j..j+1 by i..i+1 texels of `texel_mm` in the target's plane, x to the right along columns, y down along rows, z away
-    from the camera: OpenCV's frame of a board. A point X goes to `rotation` X + `translation_mm` in the camera's frame and is
-    projected by `geometry`. Around the texture there's `surround` (0..1).
+    j..j+1 by i..i+1 texels of `texel_mm` in the plane of `Posed`. Around the texture there's `surround` (0..1).
     """
 
     texture: NDArray[np.uint8] | FloatArray
     texel_mm: float
-    rotation: tuple[tuple[float, float, float], ...]
+    rotation: Matrix
     translation_mm: tuple[float, float, float]
     geometry: Geometry
     dark_radiance: Spectrum
@@ -139,19 +167,7 @@ class PlanarTarget:
 
     def warp(self) -> Warp:
         """From texels to camera px: camera_matrix [r1 r2 t] texel_mm, then the lens's distortion."""
-        return planar_warp(self.texel_mm, self.rotation, self.translation_mm, self.geometry)
-
-
-def planar_warp(
-    unit_mm: float,
-    rotation: tuple[tuple[float, float, float], ...],
-    translation_mm: tuple[float, float, float],
-    geometry: Geometry,
-) -> Warp:
-    """From a plane's coordinates in units of `unit_mm` to camera px: camera_matrix [r1 r2 t] unit_mm, then the distortion."""
-    turn = np.asarray(rotation, float)
-    pose = np.column_stack([turn[:, 0] * unit_mm, turn[:, 1] * unit_mm, np.asarray(translation_mm, float)])
-    return Warp.of(np.asarray(geometry.camera_matrix, float) @ pose, geometry)
+        return self.plane_warp(self.texel_mm)
 
 
 @dataclass(frozen=True)
@@ -241,17 +257,17 @@ class PointArray:
 
 
 @dataclass(frozen=True, eq=False)
-class ScreenImage:
+class ScreenImage(Posed):
     """A picture of digital codes on a screen at a pose: what any `Screen` shows of any image.
 
-    `codes` (rows, cols, 3) uint8, red, green, blue; a code fills one pixel of the screen, `pixel_mm` wide. Plane, pose and
-    `geometry` are those of `PlanarTarget`. Around the picture it's dark: a screen ends where its picture ends.
+    `codes` (rows, cols, 3) uint8, red, green, blue; a code fills one pixel of the screen, `pixel_mm` wide, in the plane
+    of `Posed`. Around the picture it's dark: a screen ends where its picture ends.
     """
 
     screen: Screen
     codes: NDArray[np.uint8]
     pixel_mm: float
-    rotation: tuple[tuple[float, float, float], ...]
+    rotation: Matrix
     translation_mm: tuple[float, float, float]
     geometry: Geometry
     kind: str = "screen"
@@ -265,7 +281,7 @@ class ScreenImage:
 
     def warp(self) -> Warp:
         """From the screen's pixels to camera px."""
-        return planar_warp(self.pixel_mm, self.rotation, self.translation_mm, self.geometry)
+        return self.plane_warp(self.pixel_mm)
 
     def cosine(self, row: FloatArray, col: FloatArray) -> FloatArray:
         """Cosine of the angle between the screen's normal and the ray to the camera, (row.size, col.size), at the screen's points
