@@ -106,7 +106,7 @@ def _real_transfer(measured: EdgeMtf) -> tuple[FloatArray, FloatArray]:
     operator[:, 0] += turn * measured.otf
     slopes = np.real(operator)
     size = operator.shape[1]
-    return np.real(turn * measured.otf), slopes @ measured.geometry.normal[:size, :size] @ slopes.T
+    return np.real(turn * measured.otf), slopes @ measured.geometry.scatter[:size, :size] @ slopes.T
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,12 @@
 One Bayer plane is analysed on its own grid; nothing is demosaiced. The edge is a cubic in the frame, found by iterated
 least squares; the edge-spread function (ESF) is a cubic spline of the distance from it, with even knots in the core and ever
 wider ones in the tails, fitted by weighted least squares together with the illumination's gradient; the transfer function is
-the Fourier transform of the spline's derivative. (A hat basis in place of the spline leaves a ripple of h^2 E'' / 12 that an
-uneven spread of the samples turns into a bias of 0.1 % of MTF50.)
+the Fourier transform of the spline's derivative, in closed form. (A hat basis in place of the spline leaves a ripple of
+h^2 E'' / 12 that an uneven spread of the samples turns into a bias of 0.1 % of MTF50.)
+
+What the samples leave open is filled by a Gaussian process of the line spread, chosen by evidence (`_prior_precision`): noise
+that no line spread makes is kept out, the uncertainty is that of the truth given the data, and the tail of diffraction, 1 % of
+the contrast of which lies beyond any region, is followed by its law.
 
 Everything after the edge is found is linear in the pixel values. An `EdgeGeometry` keeps that linear operator, so that a
 *predicted* edge profile goes through the same estimator as the recording (`EdgeMtf.predict`), which takes the estimator's
@@ -24,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage, sparse
+from scipy import linalg, ndimage, sparse
 from scipy.interpolate import BSpline
 
 from lab.errors import NotDetermined
@@ -37,14 +41,26 @@ from sim.sensor.mosaic import step as period
 Array = NDArray[np.floating[Any]]
 
 KNOT_SPACING_PX = 0.25  # in the core; a cubic spline of this spacing passes 1 cy/px with an error of 1e-4
-TAIL_GROWTH = (
-    3.0  # ratio of neighbouring knot spacings outside the core: few knots, little noise, and the tail is smooth
-)
+TAIL_GROWTH = 1.6  # ratio of neighbouring knot spacings outside the core: few knots, and the tail is smooth
 TAIL_REACH_PX = 9.0
-OUTER_ZONE_PX = 20.0  # beyond the last knot: levels and the illumination's gradient
+OUTER_ZONE_PX = 24.0  # beyond: levels, the tail's law and the illumination's gradient
+PRIOR_LENGTHS = (0.5, 1.2, 3.0, 7.0)  # of the line spread's correlation (Matern 3/2), in blur widths
+PRIOR_STRENGTHS = (0.5, 1.0, 2.0, 4.0)  # relative to the envelope
+# Of the line spread's tail, amplitude / distance^2: 4 / (pi^3 cutoff) of a diffracting lens, px
+FAR_AMPLITUDES_PX = (0.003, 0.1, 0.3)
+_PRIOR_GRID = (PRIOR_LENGTHS, PRIOR_STRENGTHS, FAR_AMPLITUDES_PX)
+_PRIOR_STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+ENVELOPE_WIDTHS, ENVELOPE_FLOOR = (
+    1.0,
+    1e-3,
+)  # the line spread's envelope: over how many blur widths, and its least value
+FAR_PX = 150.0  # to where the profile is followed, by its law where there are no samples
+FAR_LENGTH, FAR_ALIKE = 4.0, 0.98  # of the tail's correlation, in the distance's logarithm; between both sides
+MOST_REACH_PX = 60.0
 SMOOTHING = 1e-6  # of a knot's weight: bridges knots that no sample falls on; 1e-4 of the signal at 1 cy/px
 EDGE_ORDER = 3
-CORE_PX, CORE_SIGMAS = 1.5, 3.0  # half-width of the core
+REFINED_PX = 6.0  # the samples within see the edge's place
+CORE_PX, CORE_SIGMAS = 2.5, 3.0  # half-width of the core
 PASSES = 3  # of the least squares: noise levels and gradients need the profile
 NUMERICAL_FLOOR = 1e-6  # of the contrast: noise-free regions have weights too
 DEFAULT_FREQUENCY_CY_PER_PX: Array = np.arange(101) / 100.0
@@ -76,30 +92,52 @@ class Spline:
         outside = (distance_px < self.knot_px[0]) | (distance_px > self.knot_px[-1])
         return np.where(outside, 0.0, value)
 
+    @cached_property
+    def pieces(self) -> Array:
+        """(intervals, 4, 4): powers of t = 0..1 within an interval, lowest first, of the four basis functions there."""
+        t = np.array([0.0, 1.0, 2.0, 3.0]) / 3.0
+        at = self.knot_px[:-1, None] + t * np.diff(self.knot_px)[:, None]
+        values = BSpline(self._all_knots, np.eye(self.size), 3)(np.minimum(at, self.knot_px[-1]).ravel())
+        index = np.arange(len(at))[:, None, None] + np.arange(4)
+        local = values.reshape(len(at), 4, self.size)[np.arange(len(at))[:, None, None], np.arange(4)[:, None], index]
+        return np.asarray(np.linalg.inv(np.vander(t, increasing=True)) @ local)
+
     def roughness(self, strength: float) -> Array:
         """Penalty matrix of third differences, which bridges knots that no sample falls on."""
         differences = np.diff(np.eye(self.size), 3, axis=0)
         return np.asarray(strength * differences.T @ differences)
 
-    @cached_property
-    def _quadrature(self) -> tuple[Array, Array]:
-        """Nodes, and the weighted first derivatives of the basis there, (nodes, size).
-
-        Gauss-Legendre, 6 nodes on pieces of at most 0.5 px: integrates waves up to 2 cy/px to 1e-9.
-        """
-        counts = np.ceil(np.diff(self.knot_px) / 0.5).astype(int)
-        widths = np.repeat(np.diff(self.knot_px) / counts, counts)
-        starts = self.knot_px[0] + np.concatenate([[0.0], np.cumsum(widths)[:-1]])
-        node, share = np.polynomial.legendre.leggauss(6)
-        at = (starts[:, None] + 0.5 * widths[:, None] * (1.0 + node)).ravel()
-        weight = (0.5 * widths[:, None] * share).ravel()
-        slopes = BSpline(self._all_knots, np.eye(self.size), 3)(at, nu=1)
-        return at, slopes * weight[:, None]
-
     def transfer_operator(self, frequency_cy_per_px: Array) -> NDArray[np.complex128]:
-        """(frequencies, size) matrix from the coefficients to the Fourier transform of the derivative."""
-        at, slopes = self._quadrature
-        return np.asarray(np.exp(-2j * np.pi * np.outer(frequency_cy_per_px, at)) @ slopes)
+        """(frequencies, size) matrix from the coefficients to the Fourier transform of the derivative.
+
+        Exact: between knots the derivative is a parabola in t = 0..1, whose transform is a sum of the moments of
+        exp(-2 pi i f width t).
+        """
+        turn = -2j * np.pi * np.asarray(frequency_cy_per_px, dtype=float)[:, None]
+        moments = _exponential_moments(turn * np.diff(self.knot_px)) * np.exp(turn * self.knot_px[:-1])
+        out = np.zeros((len(turn), self.size), dtype=complex)
+        slopes = self.pieces[:, 1:] * np.array([1.0, 2.0, 3.0])[:, None]  # of t, by t
+        for basis in range(4):
+            out[:, basis : basis + len(slopes)] += np.einsum("kfi,ik->fi", moments, slopes[:, :, basis])
+        return out
+
+
+def _exponential_moments(z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """(3, ...): integral over t = 0..1 of t^k exp(z t), k = 0, 1, 2; by series where |z| < 1, else by recursion."""
+    out = np.empty((3, *z.shape), dtype=complex)
+    far = np.abs(z) >= 1.0
+    end = np.exp(z[far])
+    out[0, far] = (end - 1.0) / z[far]
+    out[1, far] = (end - out[0, far]) / z[far]
+    out[2, far] = (end - 2.0 * out[1, far]) / z[far]
+    small = z[~far]
+    for k in range(3):
+        term, total = np.ones_like(small), np.full_like(small, 1.0 / (k + 1))
+        for n in range(1, 16):
+            term = term * small / n
+            total += term / (n + k + 1)
+        out[k, ~far] = total
+    return out
 
 
 @dataclass(frozen=True)
@@ -120,14 +158,19 @@ class EdgeGeometry:
     distance_px: Array
     weight: Array
     spline: Spline
-    basis: sparse.csr_array  # (n, k): the spline at the samples
     gradients: Array  # (g, n): the illumination's gradient along and across, as seen at the samples
-    normal: Array  # (k + g, k + g): inverse of the normal matrix = covariance of the solution
+    normal: Array  # (k + g, k + g): inverse of the normal matrix = covariance of the solution about the truth
+    scatter: Array  # (k + g, k + g): its covariance over repeats, which the prior makes smaller
 
     @property
     def reach_px(self) -> float:
         """Largest distance from the edge of a sample that counts."""
         return float(np.abs(self.distance_px).max())
+
+    @cached_property
+    def basis(self) -> sparse.csr_array:
+        """(n, k): the spline at the samples."""
+        return self.spline.design(self.distance_px)
 
     def coefficients(self, values: Array) -> Array:
         """Least-squares spline coefficients (k,) of the ESF from values at the samples, (n,)."""
@@ -174,6 +217,8 @@ class EdgeMtf:
     otf: NDArray[np.complex128]
     mtf50_cy_per_px: float | None
     mtf50_cy_per_px_std: float | None
+    mtf10_cy_per_px: float | None
+    mtf10_cy_per_px_std: float | None
     angle_deg: float
     angle_deg_std: float
     distance_px: Array
@@ -226,49 +271,15 @@ def planes_mtf(
     frequency = (
         DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else np.asarray(frequency_cy_per_px, dtype=float)
     )
-    samples = _Samples.of(planes)
+    _refuse_unusable(planes)
     edge = _first_line(planes[0])
-    edge = _refined(samples, edge)
-    return _measure(samples, edge, frequency, noise_std)
+    widest = _reach(planes, edge)
+    near = _Samples.near(planes, edge, min(max(16.0, 3.0 * planes[0].step), widest) + 8.0)
+    edge = _refined(near, edge, widest)
+    return _measure(planes, near, edge, _reach(planes, edge), frequency, noise_std)
 
 
 # --- samples and the edge -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Samples:
-    row: Array
-    col: Array
-    value: Array
-    plane: NDArray[np.int64]
-    step: int
-    count: int
-
-    def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> _Samples:
-        return _Samples(self.row[kept], self.col[kept], self.value[kept], self.plane[kept], self.step, self.count)
-
-    @staticmethod
-    def of(planes: Sequence[Plane]) -> _Samples:
-        if not planes or any(min(p.values.shape) * p.step < 16 or min(p.values.shape) < 8 for p in planes):
-            raise NotDetermined("mtf", "the region is too small: at least 16 x 16 px (8 x 8 samples) are needed")
-        rows, cols, values, index = [], [], [], []
-        for k, p in enumerate(planes):
-            if not np.isfinite(p.values).all():
-                raise NotDetermined("mtf", "the region holds values that aren't finite")
-            r = p.row0 + p.step * np.arange(p.values.shape[0], dtype=float)
-            c = p.col0 + p.step * np.arange(p.values.shape[1], dtype=float)
-            rows.append(np.repeat(r, len(c)))
-            cols.append(np.tile(c, len(r)))
-            values.append(p.values.ravel().astype(float))
-            index.append(np.full(p.values.size, k))
-        return _Samples(
-            np.concatenate(rows),
-            np.concatenate(cols),
-            np.concatenate(values),
-            np.concatenate(index),
-            planes[0].step,
-            len(planes),
-        )
 
 
 @dataclass(frozen=True)
@@ -281,10 +292,10 @@ class _Edge:
     poly: Array
     sign: int
 
-    def frame(self, samples: _Samples) -> tuple[Array, Array]:
-        row, col = samples.row - self.centre[0], samples.col - self.centre[1]
-        along, across = (col, row) if self.transposed else (row, col)
-        return along / self.half_length, across
+    @property
+    def tilt(self) -> float:
+        """Of the edge at its middle: px across a px along."""
+        return float(self.poly[1]) / self.half_length
 
     def shifted(self, change: Array) -> _Edge:
         return _Edge(self.transposed, self.centre, self.half_length, self.poly + change, self.sign)
@@ -294,15 +305,135 @@ class _Edge:
         first = polynomial.polyder(self.poly) / self.half_length
         second = polynomial.polyder(first) / self.half_length
         foot = along
+        if not self.poly[2:].any():  # a line: the foot in closed form
+            gap = across - _horner(along, self.poly)
+            slope = np.full_like(along, first[0])
+            return (
+                self.sign * gap / np.sqrt(1.0 + first[0] ** 2),
+                along + gap * first[0] / (1.0 + first[0] ** 2) / self.half_length,
+                slope,
+            )
         for _ in range(2):
-            gap = across - polynomial.polyval(foot, self.poly)
-            slope = polynomial.polyval(foot, first)
-            bend = polynomial.polyval(foot, second)
+            gap = across - _horner(foot, self.poly)
+            slope = _horner(foot, first)
             lag = (foot - along) * self.half_length - gap * slope
-            foot = foot - lag / (1.0 + slope**2 - gap * bend) / self.half_length
-        slope = polynomial.polyval(foot, first)
-        gap = across - polynomial.polyval(foot, self.poly)
-        return self.sign * gap * np.sqrt(1.0 + slope**2), foot, slope
+            foot = foot - lag / (1.0 + slope * slope - gap * _horner(foot, second)) / self.half_length
+        slope = _horner(foot, first)
+        gap = across - _horner(foot, self.poly)
+        return self.sign * gap * np.sqrt(1.0 + slope * slope), foot, slope
+
+
+def _horner(x: Array, coefficients: Array) -> Array:
+    """Polynomial, lowest power first."""
+    value = np.full_like(x, coefficients[-1])
+    for c in coefficients[-2::-1]:
+        value *= x
+        value += c
+    return value
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Pixels of all planes near an edge, in the edge's own frame: `along` in half lengths, `across` in px."""
+
+    along: Array
+    across: Array
+    value: Array
+    plane: NDArray[np.int64]
+    step: int
+    count: int
+
+    def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> _Samples:
+        return _Samples(self.along[kept], self.across[kept], self.value[kept], self.plane[kept], self.step, self.count)
+
+    @staticmethod
+    def near(planes: Sequence[Plane], edge: _Edge, reach_px: float, every: int = 1) -> _Samples:
+        """Those within `reach_px` of the edge; of every so manieth line across it only."""
+        found = []
+        band = reach_px * np.sqrt(1.0 + edge.tilt**2)
+        for k, p in enumerate(planes):
+            r = p.row0 + p.step * np.arange(p.values.shape[0], dtype=float) - edge.centre[0]
+            c = p.col0 + p.step * np.arange(p.values.shape[1], dtype=float) - edge.centre[1]
+            values = p.values
+            if edge.transposed:
+                r, c, values = c, r, values.T
+            r, values = r[::every] / edge.half_length, values[::every]
+            inside = np.abs(c - _horner(r, edge.poly)[:, None]) < band
+            i, j = np.nonzero(inside)
+            found.append((r[i], c[j], values[inside], np.full(len(i), k)))
+        along, across, value, plane = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return _Samples(along, across, value, plane, planes[0].step, len(planes))
+
+
+def _refuse_unusable(planes: Sequence[Plane]) -> None:
+    if not planes or any(min(p.values.shape) * p.step < 16 or min(p.values.shape) < 8 for p in planes):
+        raise NotDetermined("mtf", "the region is too small: at least 16 x 16 px (8 x 8 samples) are needed")
+    bad = sum(int(np.count_nonzero(~np.isfinite(p.values))) for p in planes)
+    if bad:
+        raise NotDetermined("mtf", f"the region holds {bad} values that aren't finite: leave them out of the region")
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Samples in the order of a spline's intervals, so that a sum over all of them is one small product an interval."""
+
+    spline: Spline
+    order: NDArray[np.int64]
+    starts: NDArray[np.int64]  # (intervals + 1,)
+    powers: Array  # (4, n) of the place within the interval, 0..1
+
+    @staticmethod
+    def of(spline: Spline, distance_px: Array) -> _Placed:
+        knots = spline.knot_px
+        inside = np.clip(distance_px, knots[0], knots[-1])
+        interval = np.clip(np.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
+        order = np.argsort(interval.astype(np.int16), kind="stable")
+        counts = np.bincount(interval, minlength=len(knots) - 1)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        t = (inside[order] - np.repeat(knots[:-1], counts)) / np.repeat(np.diff(knots), counts)
+        powers = np.empty((4, len(t)))
+        powers[0] = 1.0
+        for k in (1, 2, 3):
+            np.multiply(powers[k - 1], t, out=powers[k])
+        return _Placed(spline, order, starts, powers)
+
+    def _local(self, coefficients: Array) -> Array:
+        """(4, intervals) powers of t of a spline."""
+        windows = np.lib.stride_tricks.sliding_window_view(coefficients, 4)
+        return np.einsum("ikl,il->ki", self.spline.pieces, windows)
+
+    def values(self, coefficients: Array) -> Array:
+        """A spline at the samples, (n,), in their new order."""
+        counts, t = np.diff(self.starts), self.powers[1]
+        value, *rest = (np.repeat(c, counts) for c in self._local(coefficients)[::-1])
+        for c in rest:
+            value *= t
+            value += c
+        return value
+
+    def slopes(self, coefficients: Array) -> Array:
+        """First derivative, per px."""
+        counts = np.diff(self.starts)
+        _, b, c, d = (np.repeat(k / np.diff(self.spline.knot_px), counts) for k in self._local(coefficients))
+        return np.asarray(b + 2.0 * c * self.powers[1] + 3.0 * d * self.powers[2])
+
+    def gram(self, columns: Array, weight: Array | None = None) -> Array:
+        """A^T W A, A = the spline's columns and then `columns` (g, n): (size + g, size + g)."""
+        size, extra = self.spline.size, len(columns)
+        rows = np.concatenate([self.powers, columns])
+        weighted = rows if weight is None else rows * weight
+        out = np.zeros((size + extra,) * 2)
+        for i, (start, stop) in enumerate(zip(self.starts[:-1], self.starts[1:], strict=True)):
+            if stop == start:
+                continue
+            piece = self.spline.pieces[i]
+            part = weighted[:, start:stop] @ rows[:, start:stop].T
+            cross = piece.T @ part[:4, 4:]
+            out[i : i + 4, i : i + 4] += piece.T @ part[:4, :4] @ piece
+            out[i : i + 4, size:] += cross
+            out[size:, i : i + 4] += cross.T
+            out[size:, size:] += part[4:, 4:]
+        return out
 
 
 def _first_line(plane: Plane) -> _Edge:
@@ -349,7 +480,7 @@ def _levelled(samples: _Samples, distance: Array, inner: float, outer: float) ->
     value = np.empty_like(samples.value)
     dark_sum = light_sum = 0.0
     for k in range(samples.count):
-        here = samples.plane == k
+        here = slice(None) if samples.count == 1 else samples.plane == k
         d = distance[here]
         v = samples.value[here]
         dark, light = v[(d < -inner) & (d > -outer)], v[(d > inner) & (d < outer)]
@@ -363,46 +494,46 @@ def _levelled(samples: _Samples, distance: Array, inner: float, outer: float) ->
     return value, dark_sum / samples.count, light_sum / samples.count
 
 
-def _refined(samples: _Samples, edge: _Edge) -> _Edge:
+def _refined(samples: _Samples, edge: _Edge, widest: float) -> _Edge:
     """The edge's polynomial by Gauss-Newton on the profile: v = E(d), dE/d(edge) = -E'(d); wide and coarse first."""
-    rng = np.random.default_rng(0)
-    widest = _reach(edge, samples)
-    along, across = edge.frame(samples)
-    near = np.abs(across - polynomial.polyval(along, edge.poly)) < 2.0 * (min(16.0, widest) + 4.0)
-    along, across, samples = along[near], across[near], samples.where(near)
+    chance = np.random.default_rng(0).random(len(samples.value))
     for reach, spacing, order in (
         (16.0, 1.0, 1),
         (12.0, 0.75, 2),
         (8.0, 0.5, 3),
-        (6.0, 0.25, 3),
-        (6.0, 0.25, 3),
-        (6.0, 0.25, 3),
+        (REFINED_PX, 0.25, 3),
+        (REFINED_PX, 0.25, 3),
+        (REFINED_PX, 0.25, 3),
     ):
         limit = min(max(reach, 3.0 * samples.step), 0.8 * widest)
-        tilt = np.sqrt(1.0 + (edge.poly[1] / edge.half_length) ** 2)
-        kept = np.flatnonzero(np.abs(across - polynomial.polyval(along, edge.poly)) < limit * tilt)
+        tilt = np.sqrt(1.0 + edge.tilt**2)
+        kept = np.flatnonzero(np.abs(samples.across - _horner(samples.along, edge.poly)) < limit * tilt)
         if order < EDGE_ORDER and len(kept) > 8000:  # coarse steps need few samples
-            kept = rng.choice(kept, 8000, replace=False)
-        distance, foot, slope = edge.distance(along[kept], across[kept])
-        value, _, _ = _levelled(samples.where(kept), distance, 0.6 * limit, 1.5 * limit)
+            kept = kept[chance[kept] < 8000.0 / len(kept)]
+        part = samples.where(kept)
+        distance, foot, slope = edge.distance(part.along, part.across)
+        value, _, _ = _levelled(part, distance, 0.6 * limit, 1.5 * limit)
         count = int(np.ceil(limit / spacing))
         spline = Spline(np.arange(-count, count + 1) * (limit / count))
-        basis = spline.design(distance)
-        normal = (basis.T @ basis).toarray()
-        esf = np.linalg.solve(normal + spline.roughness(1e-4 * np.trace(normal) / spline.size), basis.T @ value)
-        residual = value - basis @ esf
+        placed = _Placed.of(spline, distance)
+        distance, foot, slope, value = (x[placed.order] for x in (distance, foot, slope, value))
+        gram = placed.gram(value[None])
+        normal = gram[:-1, :-1]
+        esf = np.linalg.solve(normal + spline.roughness(1e-4 * np.trace(normal) / spline.size), gram[:-1, -1])
+        profile = placed.values(esf)
+        residual = value - profile
         # d(distance) / d(edge) = -sign / sqrt(1 + slope^2)
-        response = -edge.sign * spline.slope(esf, distance) / np.sqrt(1.0 + slope**2)
+        response = -edge.sign * placed.slopes(esf) / np.sqrt(1.0 + slope * slope)
         columns = np.concatenate(
             [
-                response * foot ** np.arange(order + 1)[:, None],
+                response * _powers(foot, order),
                 # uneven illumination would else pull the edge
-                _gradients(distance, foot * edge.half_length, np.clip(basis @ esf, 0.0, 1.0), room=True),
+                _gradients(distance, foot * edge.half_length, np.clip(profile, 0.0, 1.0), room=True),
             ]
         )
         inlier = np.abs(residual) < 5.0 * np.sqrt(np.mean(residual**2)) + 1e-9
-        gram = (columns * inlier) @ columns.T
-        change = np.linalg.lstsq(gram, (columns * inlier) @ residual, rcond=1e-10)[0][: order + 1]
+        kept_columns = columns * inlier
+        change = np.linalg.lstsq(kept_columns @ columns.T, kept_columns @ residual, rcond=1e-10)[0][: order + 1]
         # A free profile can be shifted against a free edge: the edge is where the profile is half way.
         grid = np.linspace(-limit, limit, 401)
         offset = _crossing(grid, spline.design(grid) @ (esf - esf[0]) / (esf[-1] - esf[0]))
@@ -410,6 +541,15 @@ def _refined(samples: _Samples, edge: _Edge) -> _Edge:
         change = np.clip(change, -0.25 * limit, 0.25 * limit)
         edge = edge.shifted(np.concatenate([change, np.zeros(EDGE_ORDER - order)]))
     return edge
+
+
+def _powers(x: Array, order: int) -> Array:
+    """(order + 1, n): 1, x, x^2, ..."""
+    rows = np.empty((order + 1, len(x)))
+    rows[0] = 1.0
+    for k in range(order):
+        np.multiply(rows[k], x, out=rows[k + 1])
+    return rows
 
 
 def _crossing(distance: Array, rising: Array) -> float:
@@ -421,20 +561,20 @@ def _crossing(distance: Array, rising: Array) -> float:
     return float(at[np.argmin(np.abs(at))])
 
 
-def _reach(edge: _Edge, samples: _Samples) -> float:
-    """Distance from the edge up to which, on both sides, at least half as many samples lie as beside the edge."""
-    some = np.random.default_rng(0).integers(0, len(samples.value), min(len(samples.value), 20000))
-    along, across = (x[some] for x in edge.frame(samples))
-    slope = polynomial.polyval(along, polynomial.polyder(edge.poly)) / edge.half_length
-    distance = (across - polynomial.polyval(along, edge.poly)) / np.sqrt(1.0 + slope**2)
+def _reach(planes: Sequence[Plane], edge: _Edge) -> float:
+    """Distance from the edge, 60 px at most, up to which, on both sides, at least half as many samples lie as beside it."""
+    every = max(1, min(planes[0].values.shape) // 64)
+    samples = _Samples.near(planes, edge, MOST_REACH_PX + 4.0 * planes[0].step, every)
+    slope = _horner(samples.along, polynomial.polyder(edge.poly)) / edge.half_length
+    distance = (samples.across - _horner(samples.along, edge.poly)) / np.sqrt(1.0 + slope**2)
     width = 2.0 * samples.step
-    count, _ = np.histogram(distance, bins=np.arange(-101, 102) * width)
-    middle = len(count) // 2
-    enough = count >= 0.5 * max(float(count[middle - 1 : middle + 2].mean()), 1.0)
-    right = np.flatnonzero(~enough[middle:])
-    left = np.flatnonzero(~enough[: middle + 1][::-1])
-    steps = min(right[0] if len(right) else middle, left[0] if len(left) else middle)
-    reach = (float(steps) - 0.5) * width
+    bins = int(MOST_REACH_PX / width) + 1
+    at = np.floor(distance / width + 0.5).astype(int) + bins
+    count = np.bincount(at[(at >= 0) & (at <= 2 * bins)], minlength=2 * bins + 1)
+    enough = count >= 0.5 * max(float(count[bins - 1 : bins + 2].mean()), 1.0)
+    right, left = np.flatnonzero(~enough[bins:]), np.flatnonzero(~enough[: bins + 1][::-1])
+    steps = min(right[0] if len(right) else bins + 1, left[0] if len(left) else bins + 1)
+    reach = min((float(steps) - 0.5) * width, MOST_REACH_PX)
     if reach < 4.0:
         raise NotDetermined(
             "mtf",
@@ -456,52 +596,58 @@ def _interpolate(grid: Array, values: Array, at: Array) -> Array:
     return np.asarray(b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a))))
 
 
-def _knots(width: float, reach: float, step: int) -> tuple[Array, bool]:
-    """Even knots in the core of half-width `width`, then wider and wider ones; whether there is room for an outer zone."""
-    limit = max(reach - 2.0 * step, 2.0)
-    core = min(width, limit)
+def _knots(width: float, reach: float, step: int) -> Array:
+    """Even knots in the core of half-width `width`, then wider and wider ones, out to where no sample is needed any more."""
+    core = min(width, max(reach - 2.0 * step, 2.0))
     count = max(int(np.ceil(core / KNOT_SPACING_PX)), 6)
     side = list(np.arange(count + 1) * KNOT_SPACING_PX)
     spacing = KNOT_SPACING_PX
-    while side[-1] < count * KNOT_SPACING_PX + TAIL_REACH_PX:
+    while side[-1] < FAR_PX:
         spacing *= TAIL_GROWTH
-        if side[-1] + spacing > limit:
-            break
         side.append(side[-1] + spacing)
     positive = np.array(side)
-    return np.concatenate([-positive[:0:-1], positive]), reach - positive[-1] > 8.0 * step
+    return np.concatenate([-positive[:0:-1], positive])
 
 
-def _measure(samples: _Samples, edge: _Edge, frequency: Array, noise_std: float | None) -> EdgeMtf:
-    reach = min(_reach(edge, samples), 60.0)
-    along, across = edge.frame(samples)
-    slope = polynomial.polyval(along, polynomial.polyder(edge.poly)) / edge.half_length
-    near = np.abs(across - polynomial.polyval(along, edge.poly)) < 1.05 * reach * np.sqrt(1.0 + slope**2) + 2.0
-    samples = samples.where(near)
-    distance, foot, _ = edge.distance(along[near], across[near])
-
-    knots, room = _knots(CORE_PX + CORE_SIGMAS * _blur_width(samples, distance, min(12.0, reach)), reach, samples.step)
-    outer = min(reach, float(knots[-1]) + OUTER_ZONE_PX)
+def _measure(
+    planes: Sequence[Plane], near: _Samples, edge: _Edge, reach: float, frequency: Array, noise_std: float | None
+) -> EdgeMtf:
+    distance, _, _ = edge.distance(near.along, near.across)
+    width = _blur_width(near, distance, min(12.0, reach))
+    core = CORE_PX + CORE_SIGMAS * width
+    outer = min(reach, core + TAIL_REACH_PX + OUTER_ZONE_PX)
+    room = outer > core + TAIL_REACH_PX + 8.0 * near.step
+    samples = _Samples.near(planes, edge, 1.05 * outer + 2.0)
+    distance, foot, _ = edge.distance(samples.along, samples.across)
     kept = np.abs(distance) < outer
     samples, distance, foot = samples.where(kept), distance[kept], foot[kept]
-    inner = min(0.6 * outer, float(knots[-1]))
+    inner = min(0.6 * outer, core + TAIL_REACH_PX)
     value, dark_level, light_level = _levelled(samples, distance, inner, outer)
     contrast = light_level - dark_level
     offset = max(dark_level, 0.0) / contrast  # the illumination's gradient acts on the dark side's light too
 
-    spline = Spline(knots)
+    spline = Spline(_knots(core, reach, near.step))
     size = spline.size
-    basis = spline.design(distance)
+    placed = _Placed.of(spline, distance)
+    distance, foot, value = distance[placed.order], foot[placed.order], value[placed.order]
     dark_tail, light_tail = distance < -0.5 * inner, distance > 0.5 * inner
     variance = np.ones_like(value)
     used = np.ones(len(value), dtype=bool)
     esf = np.clip(0.5 + distance, 0.0, 1.0)
+    solution = np.zeros(0)
     for _ in range(PASSES):
         weight = np.where(used, 1.0 / variance, 0.0)
         gradients = _gradients(distance, foot * edge.half_length, esf + offset, room)
-        normal = _inverse_normal_matrix(basis, gradients, weight, spline)
-        solution = normal @ np.concatenate([basis.T @ (weight * value), gradients @ (weight * value)])
-        esf = basis @ solution[:size]
+        gram = placed.gram(np.concatenate([gradients, value[None]]), weight)
+        matrix, right = gram[:-1, :-1].copy(), gram[:-1, -1]
+        if not len(solution):
+            precision = spline.roughness(SMOOTHING * np.trace(matrix[:size, :size]) / size)
+        else:
+            precision = _prior_precision(spline, solution[:size], matrix, right, width, outer)
+        matrix[:size, :size] += precision
+        normal = np.linalg.inv(matrix)
+        solution = normal @ right
+        esf = placed.values(solution[:size])
         residual = value - esf - solution[size:] @ gradients
         if noise_std is None:
             std_dark, std_light = _robust_std(residual[dark_tail]), _robust_std(residual[light_tail])
@@ -510,11 +656,11 @@ def _measure(samples: _Samples, edge: _Edge, frequency: Array, noise_std: float 
         variance = std_dark**2 + np.clip(esf, 0.0, 1.0) * (std_light**2 - std_dark**2) + NUMERICAL_FLOOR**2
         used = np.abs(residual) < 6.0 * np.sqrt(variance) + 0.02
     _refuse_unless_one_edge(residual, dark_tail | light_tail, max(std_dark, std_light))
+    _refuse_clipped(samples.value[placed.order][light_tail], std_dark * contrast, contrast)
 
-    tilt = float(polynomial.polyval(0.0, polynomial.polyder(edge.poly))) / edge.half_length
     geometry = EdgeGeometry(
-        angle_deg=_angle_deg(tilt, edge.transposed),
-        angle_deg_std=_angle_deg_std(spline.slope(solution[:size], distance), foot, weight, tilt, edge.half_length),
+        angle_deg=_angle_deg(edge.tilt, edge.transposed),
+        angle_deg_std=_angle_deg_std(placed.slopes(solution[:size]), distance, foot, variance, gradients, edge),
         transposed=edge.transposed,
         edge_px=tuple(float(c) for c in edge.poly),
         centre_px=edge.centre,
@@ -522,9 +668,9 @@ def _measure(samples: _Samples, edge: _Edge, frequency: Array, noise_std: float 
         distance_px=distance,
         weight=weight,
         spline=spline,
-        basis=basis,
         gradients=gradients,
         normal=normal,
+        scatter=normal @ gram[:-1, :-1] @ normal,
     )
     freedom = max(np.count_nonzero(used) - len(solution) - len(edge.poly), 1)
     return _described(
@@ -535,6 +681,79 @@ def _measure(samples: _Samples, edge: _Edge, frequency: Array, noise_std: float 
         noise=(std_dark * contrast, std_light * contrast),
         chi2=float((weight * residual**2).sum() / freedom),
     )
+
+
+def _prior_precision(
+    spline: Spline, coefficients: Array, matrix: Array, right: Array, width: float, reach: float
+) -> Array:
+    """Inverse covariance of the ESF's coefficients, (size, size), with nothing said of its levels.
+
+    The line spread's mass between knots is a Gaussian process of two parts. Near the edge: envelope x correlation x envelope,
+    the envelope from the estimate itself, strength and length by evidence given the normal equations, as for kernels
+    (`lab.fit.psf`). Far from it: amplitude / distance^2, as any aperture diffracts, much alike on both sides; it carries what
+    is seen of the tail to beyond the samples (a diffraction-limited profile has 1 % of its contrast there).
+    """
+    size = spline.size
+    knots = np.concatenate([[spline.knot_px[0]] * 2, spline.knot_px, [spline.knot_px[-1]] * 2])
+    place = (knots[:-2] + knots[1:-1] + knots[2:]) / 3.0
+    at, pitch = 0.5 * (place[1:] + place[:-1]), np.diff(place)
+    scale = max(width, KNOT_SPACING_PX)
+    density = np.where(np.abs(at) < reach, np.abs(np.diff(coefficients)) / pitch, 0.0)
+    share = pitch * np.exp(-0.5 * ((at[:, None] - at) / (ENVELOPE_WIDTHS * scale)) ** 2)
+    local = share @ density / share.sum(axis=1)
+    decay = 1.0 / (1.0 + (at / (4.0 * scale)) ** 2)
+    envelope = pitch * np.maximum(local * (np.abs(at) < 0.5 * reach), ENVELOPE_FLOOR * local.max() * decay)
+
+    side = np.where(np.sign(at)[:, None] == np.sign(at), 1.0, FAR_ALIKE)
+    order = np.log(np.maximum(np.abs(at), 1.0))
+    far = pitch * at**2 / (at**2 + (3.0 * scale) ** 2) / np.maximum(at**2, 1e-6)
+    tails = np.outer(far, far) * side * _matern(np.abs(order[:, None] - order) / FAR_LENGTH)
+
+    tried: dict[tuple[int, int, int], tuple[float, Array]] = {}
+
+    def value(at_grid: tuple[int, int, int]) -> float:
+        """Logarithm of the evidence, but for a constant, at a point of the grid of lengths, strengths and amplitudes."""
+        if not all(0 <= i < len(steps) for i, steps in zip(at_grid, _PRIOR_GRID, strict=True)):
+            return -np.inf
+        if at_grid not in tried:
+            length, strength, amplitude = (steps[i] for i, steps in zip(at_grid, _PRIOR_GRID, strict=True))
+            near = np.outer(envelope, envelope) * _matern(np.abs(at[:, None] - at) / (length * scale))
+            inverse, half_log = _inverse(strength**2 * near + amplitude**2 * tails)
+            # differences^T inverse differences
+            wide = np.zeros((size + 1, size + 1))
+            wide[1:-1, 1:-1] = inverse
+            precision = np.diff(np.diff(wide, axis=0), axis=1)
+            full = matrix.copy()
+            full[:size, :size] += precision
+            factor, info = linalg.lapack.dpotrf(full, lower=1)
+            evidence = -np.inf
+            if not info:
+                half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
+                evidence = float(0.5 * half @ half - np.log(np.diag(factor)).sum()) - half_log
+            tried[at_grid] = evidence, precision
+        return tried[at_grid][0]
+
+    best = (1, 1, 1)
+    while True:
+        around = [(best[0] + i, best[1] + j, best[2] + k) for i, j, k in _PRIOR_STEPS]
+        uphill = max(around, key=value)
+        if value(uphill) <= value(best):
+            return tried[best][1]
+        best = uphill
+
+
+def _matern(apart: Array) -> Array:
+    """Correlation at distances in units of its length: once differentiable, so that kinks are no surprise."""
+    return np.asarray((1.0 + np.sqrt(3.0) * apart) * np.exp(-np.sqrt(3.0) * apart))
+
+
+def _inverse(covariance: Array) -> tuple[Array, float]:
+    """Of a covariance; and half the logarithm of its determinant."""
+    scale = np.sqrt(np.diag(covariance))
+    factor, _ = linalg.lapack.dpotrf(covariance / np.outer(scale, scale), lower=1)
+    inverse, _ = linalg.lapack.dpotri(factor, lower=1)
+    inverse = np.tril(inverse) + np.tril(inverse, -1).T
+    return inverse / np.outer(scale, scale), float(np.log(np.diag(factor)).sum() + np.log(scale).sum())
 
 
 def _described(
@@ -555,7 +774,7 @@ def _described(
     turned = slopes * phase.conj()[:, None]
     along_slopes, aside_slopes = turned.real, turned.imag
     covariance = along_slopes @ covariance_of_esf @ along_slopes.T
-    aside = np.einsum("fi,ij,fj->f", aside_slopes, covariance_of_esf, aside_slopes)
+    aside = np.einsum("fi,fi->f", aside_slopes @ covariance_of_esf, aside_slopes)
     along = np.clip(np.diag(covariance), 0.0, None)
     # E|F + n|^2 = |F|^2 + var: what lies across F counts always, what lies along it only where there is no F to speak of
     power = across**2
@@ -563,9 +782,10 @@ def _described(
     # ... and where even that leaves a floor, the last term brings it down; it is of fourth order where F stands out
     mtf = np.sqrt(np.clip(power - excess - excess**2 / np.maximum(power, 1e-300), 0.0, None))
 
-    mtf50, mtf50_std = _mtf50(geometry, esf, covariance_of_esf)
+    (mtf50, mtf50_std), (mtf10, mtf10_std) = _falls_to(geometry, esf, covariance_of_esf, (0.5, 0.1))
     step = esf[-1] - esf[0]
-    distance = np.arange(np.ceil(spline.knot_px[0] / 0.125), np.floor(spline.knot_px[-1] / 0.125) + 1) * 0.125
+    count = int(geometry.reach_px / 0.125)
+    distance = np.arange(-count, count + 1) * 0.125
     return EdgeMtf(
         frequency_cy_per_px=frequency,
         mtf=mtf,
@@ -574,6 +794,8 @@ def _described(
         otf=otf,
         mtf50_cy_per_px=mtf50,
         mtf50_cy_per_px_std=mtf50_std,
+        mtf10_cy_per_px=mtf10,
+        mtf10_cy_per_px_std=mtf10_std,
         angle_deg=geometry.angle_deg,
         angle_deg_std=geometry.angle_deg_std,
         distance_px=distance,
@@ -601,36 +823,31 @@ def _transfer_and_slopes(
     return otf, slopes
 
 
-def _mtf50(geometry: EdgeGeometry, esf: Array, covariance: Array) -> tuple[float | None, float | None]:
-    """First frequency at which the MTF falls to one half; None where it doesn't up to 1.5 cy/px."""
-    frequency = 1.5 * (np.arange(2, 81) / 80.0) ** 2
-    mtf = np.abs(geometry.optical_transfer(esf, frequency))
-    below = np.flatnonzero(mtf < 0.5)
-    if not len(below) or below[0] == 0:
-        return None, None
-    low, high = frequency[below[0] - 1], frequency[below[0]]
-    for _ in range(3):  # secant steps on a smooth curve, each cuts the bracket to a tenth
-        pair = np.abs(geometry.optical_transfer(esf, np.array([low, high])))
-        crossing = float(low + (0.5 - pair[0]) * (high - low) / (pair[1] - pair[0]))
-        width = 0.05 * (high - low)
-        low, high = crossing - width, crossing + width
-    slope = (pair[1] - pair[0]) / (20.0 * width)
-    otf, slopes = _transfer_and_slopes(geometry, esf, np.array([crossing]))
-    by_esf = (slopes[0] * otf[0].conj() / abs(otf[0])).real
-    return crossing, float(np.sqrt(by_esf @ covariance @ by_esf) / abs(slope))
-
-
-def _inverse_normal_matrix(basis: sparse.csr_array, gradients: Array, weight: Array, spline: Spline) -> Array:
-    """Inverse of A^T W A, A = the spline's columns and the gradients', with the bridging penalty."""
-    size = spline.size
-    normal = np.zeros((size + len(gradients),) * 2)
-    weighted = basis.T.multiply(weight).tocsr()
-    normal[:size, :size] = (weighted @ basis).toarray()
-    normal[:size, size:] = weighted @ gradients.T
-    normal[size:, :size] = normal[:size, size:].T
-    normal[size:, size:] = (gradients * weight) @ gradients.T
-    normal[:size, :size] += spline.roughness(SMOOTHING * np.trace(normal[:size, :size]) / size)
-    return np.asarray(np.linalg.inv(normal))
+def _falls_to(
+    geometry: EdgeGeometry, esf: Array, covariance: Array, levels: Sequence[float]
+) -> list[tuple[float | None, float | None]]:
+    """First frequency at which the MTF falls to each level, with its uncertainty; None where it doesn't up to 1.5 cy/px, or
+    where the curve there is no higher than its noise."""
+    grid = 1.5 * (np.arange(2, 81) / 80.0) ** 2
+    mtf = np.abs(geometry.optical_transfer(esf, grid))
+    found: list[tuple[float | None, float | None]] = []
+    for level in levels:
+        below = np.flatnonzero(mtf < level)
+        if not len(below) or below[0] == 0:
+            found.append((None, None))
+            continue
+        low, high = grid[below[0] - 1], grid[below[0]]
+        for _ in range(3):  # secant steps on a smooth curve, each cuts the bracket to a tenth
+            pair = np.abs(geometry.optical_transfer(esf, np.array([low, high])))
+            crossing = float(low + (level - pair[0]) * (high - low) / (pair[1] - pair[0]))
+            width = 0.05 * (high - low)
+            low, high = crossing - width, crossing + width
+        slope = (pair[1] - pair[0]) / (20.0 * width)
+        otf, slopes = _transfer_and_slopes(geometry, esf, np.array([crossing]))
+        by_esf = (slopes[0] * otf[0].conj() / abs(otf[0])).real
+        std = float(np.sqrt(by_esf @ covariance @ by_esf))
+        found.append((crossing, std / abs(slope)) if std < 0.3 * level else (None, None))
+    return found
 
 
 def _gradients(distance: Array, along_px: Array, light: Array, room: bool) -> Array:
@@ -647,9 +864,10 @@ def _blur_width(samples: _Samples, distance: Array, reach: float) -> float:
     value, _, _ = _levelled(samples.where(kept), distance[kept], 0.75 * reach, reach)
     count = max(int(reach / 0.5), 4)
     spline = Spline(np.arange(-count, count + 1) * reach / count)
-    basis = spline.design(distance[kept])
-    normal = (basis.T @ basis).toarray()
-    coefficients = np.linalg.solve(normal + spline.roughness(1e-3 * np.trace(normal) / spline.size), basis.T @ value)
+    placed = _Placed.of(spline, distance[kept])
+    gram = placed.gram(value[placed.order][None])
+    normal = gram[:-1, :-1]
+    coefficients = np.linalg.solve(normal + spline.roughness(1e-3 * np.trace(normal) / spline.size), gram[:-1, -1])
     fine = np.linspace(-reach, reach, 16 * count + 1)
     esf = spline.design(fine) @ coefficients
     low, high = fine[esf < 0.1], fine[esf > 0.9]
@@ -674,6 +892,14 @@ def _refuse_unless_one_edge(residual: Array, tail: NDArray[np.bool_], std: float
         raise NotDetermined("mtf", "the region holds more than one edge: narrow it down to a single one")
 
 
+def _refuse_clipped(light: Array, noise_std: float, contrast: float) -> None:
+    """A light side that stands still at its highest value although there is noise has met the converter's end."""
+    values = np.unique(light)
+    step = float(np.diff(values).min()) if len(values) > 1 else 0.0
+    if noise_std > max(0.7 * step, 1e-4 * contrast) and float(np.mean(light == values[-1])) > 0.2:
+        raise NotDetermined("mtf", f"the edge's light side is clipped at {values[-1]:g}: expose it shorter")
+
+
 def _angle_deg(slope: float, transposed: bool) -> float:
     """From the vertical, positive where the top turns to the right; -90 < angle <= 90."""
     row, col = (slope, 1.0) if transposed else (1.0, slope)
@@ -681,11 +907,17 @@ def _angle_deg(slope: float, transposed: bool) -> float:
     return angle - 180.0 * np.ceil((angle - 90.0) / 180.0)
 
 
-def _angle_deg_std(steepness: Array, foot: Array, weight: Array, slope: float, half_length: float) -> float:
-    """From the Gauss-Newton matrix of the edge's polynomial."""
-    basis = steepness / np.sqrt(1.0 + slope**2) * foot ** np.arange(EDGE_ORDER + 1)[:, None]
-    covariance = np.linalg.pinv((basis * weight) @ basis.T)
-    return float(np.degrees(np.sqrt(covariance[1, 1]) / half_length / (1.0 + slope**2)))
+def _angle_deg_std(
+    steepness: Array, distance: Array, foot: Array, variance: Array, gradients: Array, edge: _Edge
+) -> float:
+    """Of the least squares without weights that found the edge's polynomial (`_refined`), given the noise's variances."""
+    near = np.abs(distance) < REFINED_PX
+    columns = np.concatenate(
+        [steepness[near] / np.sqrt(1.0 + edge.tilt**2) * _powers(foot[near], EDGE_ORDER), gradients[:, near]]
+    )
+    inverse = np.linalg.pinv(columns @ columns.T, hermitian=True)
+    covariance = inverse @ ((columns * variance[near]) @ columns.T) @ inverse
+    return float(np.degrees(np.sqrt(covariance[1, 1]) / edge.half_length / (1.0 + edge.tilt**2)))
 
 
 # --- recordings ------------------------------------------------------------------------------------------------------------
