@@ -19,11 +19,13 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from sim.camera import CameraModel
+from sim.effects.aberration import Aberration
 from sim.effects.base import Effect
 from sim.optics.diffraction import aperture_otf
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.optics.illumination import sin_theta as sin_theta_at
 from sim.optics.imaging import DiffractionLimited
+from sim.optics.pupil import Wavefront
 from sim.scene.render import Grid, Light, cell_means, draw
 from sim.scene.scenes import Darkness, KnifeEdge, Scene, SpectralImage, UniformField
 from sim.sensor import electrons as sensor
@@ -463,10 +465,17 @@ def _highest_cy_per_px(
 def _transfer_at(
     camera: CameraModel, wavelength_nm: float, fx: FloatArray, fy: FloatArray, effects: Sequence[Effect]
 ) -> FloatArray | ComplexArray:
-    """The lens's transfer x the effects' at one wavelength; fx, fy in cy/px, which broadcast."""
+    """The lens's transfer, with all aberrations in its pupil, x the other effects' at one wavelength; fx, fy in cy/px, which
+    broadcast."""
     fx_um, fy_um = fx / camera.pixel_pitch_um, fy / camera.pixel_pitch_um
-    value = camera.lens.imaging.transfer(fx_um, fy_um, wavelength_nm, camera.lens.f_number)
+    aberration = Wavefront(())
     for effect in effects:
+        if isinstance(effect, Aberration):
+            aberration += effect.wavefront(wavelength_nm, camera)
+    value = camera.lens.imaging.transfer(fx_um, fy_um, wavelength_nm, camera.lens.f_number, aberration)
+    for effect in effects:
+        if isinstance(effect, Aberration):
+            continue
         factor = effect.transfer(fx_um, fy_um, wavelength_nm, camera)
         if factor is not None:
             value = value * factor

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-import numpy as np
-
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
-from sim.optics.pupil import Wavefront, pupil_ratio
+from sim.effects.aberration import Aberration
+from sim.effects.base import Stage
+from sim.optics.pupil import Wavefront
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
 
 
-class Astigmatism(Effect):
+class Astigmatism(Aberration):
     """Path errors quadratic along x and y apart: W = (x_defocus x^2 + y_defocus y^2) / (8 N^2)."""
 
     name: ClassVar[str] = "astigmatism"
@@ -40,11 +38,6 @@ class Astigmatism(Effect):
                  prior=(0.0, 20.0), absent=0.0, slope_power=2),
     ] = 0.0  # fmt: skip
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        if self.defocus_x_um == 0.0 and self.defocus_y_um == 0.0:
-            return None
+    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
         scale = 1.0 / (8.0 * camera.lens.f_number**2)
-        path = Wavefront.of({(2, 0): self.defocus_x_um * scale, (0, 2): -self.defocus_y_um * scale})
-        return np.real(pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path))
+        return Wavefront.of({(2, 0): self.defocus_x_um * scale, (0, 2): -self.defocus_y_um * scale})

@@ -10,6 +10,7 @@ from enum import StrEnum
 from typing import ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.camera import CameraModel
 from sim.parameters import Frozen, Quantity, declared
@@ -110,11 +111,11 @@ class Effect(Frozen):
 
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
+    ) -> FloatArray | NDArray[np.complex128] | None:
         """OPTICS or CHARGE: factor on the optical transfer function (1 at zero frequency), or None for none.
 
-        fx runs along columns (x, to the right), fy along rows (y, down). May be complex. An effect that replaces a part of
-        the baseline's OTF (defocus: diffraction with an aberrated pupil) returns the ratio to the baseline.
+        fx runs along columns (x, to the right), fy along rows (y, down). May be complex. An effect of the pupil is an
+        `Aberration`: it returns the aberrated pupil's ratio to the perfect one's, and adds up with others of its kind.
         An effect that has `charge` too acts through that on whole frames; its `transfer` is for edges and kernels of one
         channel, where there's no mosaic to move charge on (see `moves_charge`).
         """

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-import numpy as np
-
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
-from sim.optics.pupil import pupil_ratio, seidel
+from sim.effects.aberration import Aberration
+from sim.effects.base import Stage
+from sim.optics.pupil import Wavefront, seidel
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
 
 
-class Defocus(Effect):
+class Defocus(Aberration):
     """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error (Hopkins)."""
 
     name: ClassVar[str] = "defocus"
@@ -51,12 +49,5 @@ class Defocus(Effect):
         ),
     ] = 0.0
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        if self.defocus_um == 0.0:
-            return None
-        w020 = self.defocus_um / (8.0 * camera.lens.f_number**2)
-        return np.real(
-            pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, seidel(defocus_um=w020))
-        )
+    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
+        return seidel(defocus_um=self.defocus_um / (8.0 * camera.lens.f_number**2))

@@ -21,7 +21,7 @@ def effects() -> dict[str, type[Effect]]:
                 isinstance(item, type)
                 and issubclass(item, Effect)
                 and item.__module__ == content.__name__
-                and item is not Effect
+                and "name" in vars(item)  # not a base of several
             ):
                 found[item.name] = item
     return dict(sorted(found.items()))

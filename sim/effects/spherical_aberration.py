@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-import numpy as np
-
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
-from sim.optics.pupil import pupil_ratio, seidel
+from sim.effects.aberration import Aberration
+from sim.effects.base import Stage
+from sim.optics.pupil import Wavefront, seidel
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
 
 
-class SphericalAberration(Effect):
+class SphericalAberration(Aberration):
     """Path error W040 rho^4 over the pupil, in the paraxial focus."""
 
     name: ClassVar[str] = "spherical_aberration"
@@ -44,10 +42,5 @@ class SphericalAberration(Effect):
         ),
     ] = 0.0
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        if self.w040_um == 0.0:
-            return None
-        path = seidel(spherical_um=self.w040_um)
-        return np.real(pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, camera.lens.f_number, path))
+    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
+        return seidel(spherical_um=self.w040_um)

@@ -1,7 +1,8 @@
 """How a lens images a point: diffraction, an aberrated pupil, a measured point spread or transfer function, a traced lens.
 
 Each model has `transfer`, its optical transfer function at one wavelength (for a lens that isn't the same everywhere: that of
-the axis), and `cutoff_cy_per_um`, beyond which that is 0. Frequencies are cy/um on the sensor, fx along columns (to the right), fy
+the axis), and `cutoff_cy_per_um`, beyond which that is 0. A further path error over the pupil, `aberration`, adds to the model's
+own where that has a pupil; where it has none it acts as on a perfect lens, whose ratio then multiplies the transfer. Frequencies are cy/um on the sensor, fx along columns (to the right), fy
 along rows (down). The models are told apart by `kind`; all but the traced lens hold their numbers in themselves, so that they
 go to JSON or TOML and back.
 """
@@ -18,12 +19,15 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import itj0y0, j0, j1
 
 from sim.optics.diffraction import diffraction_cutoff_cy_per_um, diffraction_otf
-from sim.optics.pupil import Wavefront, noll_order, osa_order, pupil_otf, seidel, zernike
+from sim.optics.pupil import Wavefront, noll_order, osa_order, pupil_otf, pupil_ratio, seidel, zernike
 from sim.optics.table import LensTable
 from sim.parameters import Frozen, Quantity
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
+
+#: A pupil without error.
+NONE = Wavefront(())
 
 #: A point spread function's samples have to add up to 1 within this.
 SUM_TOLERANCE = 1e-3
@@ -36,9 +40,16 @@ class DiffractionLimited(Frozen):
     kind: Literal["diffraction_limited"] = "diffraction_limited"
 
     def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
+        self,
+        fx_cy_per_um: FloatArray,
+        fy_cy_per_um: FloatArray,
+        wavelength_nm: float,
+        f_number: float,
+        aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
         """(2 / pi) (arccos s - s sqrt(1 - s^2)), s = f wavelength f_number; of the broadcast shape of the frequencies."""
+        if aberration.terms:
+            return pupil_otf(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
         return diffraction_otf(np.hypot(fx_cy_per_um, fy_cy_per_um), wavelength_nm, f_number)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
@@ -105,10 +116,16 @@ class ZernikePupil(Frozen):
         return total
 
     def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
+        self,
+        fx_cy_per_um: FloatArray,
+        fy_cy_per_um: FloatArray,
+        wavelength_nm: float,
+        f_number: float,
+        aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
         """OTF by autocorrelation of the pupil (`sim.optics.pupil`), of the broadcast shape of the frequencies."""
-        return pupil_otf(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, self.wavefront(wavelength_nm, f_number))
+        path = self.wavefront(wavelength_nm, f_number) + aberration
+        return pupil_otf(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, path)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """Frequency beyond which nothing is passed: 1 / (wavelength f_number)."""
@@ -153,11 +170,17 @@ class MeasuredPsf(Frozen):
         return cube
 
     def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
+        self,
+        fx_cy_per_um: FloatArray,
+        fy_cy_per_um: FloatArray,
+        wavelength_nm: float,
+        f_number: float,
+        aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
         """Fourier sum of the samples, 1 at f = 0, of the broadcast shape of the frequencies. `f_number` doesn't matter."""
         samples = np.tensordot(_shares(self.wavelength_nm, wavelength_nm), self._samples, 1)
-        return _fourier_sum(samples, self.sample_pitch_um, fx_cy_per_um, fy_cy_per_um)
+        value = _fourier_sum(samples, self.sample_pitch_um, fx_cy_per_um, fy_cy_per_um)
+        return value * pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """The highest frequency of the samples: half a cycle a sample each way, along the diagonal."""
@@ -219,19 +242,25 @@ class MeasuredOtf(Frozen):
         return value
 
     def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
+        self,
+        fx_cy_per_um: FloatArray,
+        fy_cy_per_um: FloatArray,
+        wavelength_nm: float,
+        f_number: float,
+        aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
         """The samples looked up, of the broadcast shape of the frequencies; the conjugate at -f. `f_number` doesn't matter."""
         value = np.tensordot(_shares(self.wavelength_nm, wavelength_nm), self._samples, 1)
+        ratio = pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
         fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
         x, y = self.frequency_x_cy_per_um, self.frequency_y_cy_per_um
         if not y:
-            return np.asarray(np.interp(np.hypot(fx, fy), x, np.real(value[0]), right=0.0))
+            return np.asarray(np.interp(np.hypot(fx, fy), x, np.real(value[0]), right=0.0) * ratio)
         turned = np.where(fx < 0, -1.0, 1.0)
         across = np.abs(fy) if y[0] == 0.0 else fy * turned
         table = RegularGridInterpolator((y, x), value if self.phase_rad else np.real(value), bounds_error=False, fill_value=0.0)  # fmt: skip
         found = table(np.stack([across, np.abs(fx)], axis=-1))
-        return np.asarray(np.where(turned < 0, np.conj(found), found) if self.phase_rad else found)
+        return np.asarray(np.where(turned < 0, np.conj(found), found) * ratio)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """The highest frequency of the samples."""
@@ -265,7 +294,12 @@ class TracedLens(Frozen):
         return data
 
     def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, f_number: float
+        self,
+        fx_cy_per_um: FloatArray,
+        fy_cy_per_um: FloatArray,
+        wavelength_nm: float,
+        f_number: float,
+        aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
         """OTF of the field point next to the axis, about its chief ray; 1 at f = 0, linear in wavelength between the table's,
         held beyond them. `f_number` doesn't matter: the table has its own.
@@ -281,7 +315,8 @@ class TracedLens(Frozen):
         x, y = table.window_um[axis]
         value = _fourier_sum(samples, table.sample_pitch_um, fx, fy) * np.exp(-2j * np.pi * (fx * x + fy * y))
         radius_um = np.sqrt(samples.size / np.pi) * table.sample_pitch_um
-        return value + (1.0 - inside) * _beyond(np.hypot(fx, fy) * radius_um)
+        value = value + (1.0 - inside) * _beyond(np.hypot(fx, fy) * radius_um)
+        return value * pupil_ratio(fx, fy, wavelength_nm, f_number, aberration)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
         """The table's highest frequency: half a cycle a sample each way, along the diagonal."""
