@@ -338,6 +338,106 @@ def report(
     out.print(f"report: {write_report(out_file, recordings, fitted, validation, diagnosis, provenance)}")
 
 
+# --- simulation --------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def simulate(
+    scene: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENE", help="a scene's name (`calibench simulate list` shows them), a picture or a cube"
+        ),
+    ] = "",
+    out_file: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="the frame: .npy, .tif or .dng")
+    ] = None,
+    illuminant: Annotated[
+        str, typer.Option(metavar="NAME or CSV", help="an illuminant (D65, A, FL2, ...) or a measured light")
+    ] = "D65",
+    luminance_cd_m2: Annotated[
+        float | None, typer.Option(help="of a perfect white diffuser in that light (named lights: 100)")
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="a camera file (TOML); without one, a typical RGB camera")
+    ] = None,
+    lens: Annotated[Path | None, typer.Option(metavar="FILE.zmx", help="put this lens before the camera")] = None,
+    exposure_s: Annotated[
+        float | None, typer.Option(help="exposure (without: the brightest 1 % at 70 % of what a pixel holds)")
+    ] = None,
+    gain_db: Annotated[float, typer.Option(help="analogue gain")] = 0.0,
+    temperature_c: Annotated[float | None, typer.Option(help="temperature of the sensor")] = None,
+    distance_mm: Annotated[float, typer.Option(help="distance of the scene from the lens")] = 1000.0,
+    parameter: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="a parameter of the scene; may be repeated")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="seed of the noise: the same gives the same frame")] = 0,
+    pattern_seed: Annotated[int, typer.Option(help="seed of the fixed patterns: which camera of its kind")] = 0,
+    expected: Annotated[bool, typer.Option("--expected", help="leave the noise out")] = False,
+    cache: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="where lens tables are kept (CALIBENCH_CACHE, else the user's cache)"),
+    ] = None,
+    write_camera_file: Annotated[
+        Path | None, typer.Option("--write-camera", metavar="FILE", help="write the camera as a file to start from")
+    ] = None,
+) -> None:
+    """Simulate one raw frame, with a preview (NAME.preview.png) and a record (NAME.json) beside it."""
+    from lab import simulate as simulation
+
+    if scene == "list":
+        _print_scenes()
+        return
+    if out_file is None and write_camera_file is None:
+        raise InputError("simulate: no --out; name the frame's file, ending in .npy, .tif or .dng")
+    if out_file is not None and not scene:
+        raise InputError("simulate: no SCENE; `calibench simulate list` shows them")
+    if out_file is not None:
+        simulation.check_out(out_file)
+    options = simulation.options_of(
+        {
+            "scene": scene,
+            "parameters": simulation.parameters_of(parameter or []),
+            "illuminant": illuminant,
+            "luminance_cd_m2": luminance_cd_m2,
+            "distance_mm": distance_mm,
+            "exposure_s": exposure_s,
+            "gain_db": gain_db,
+            "temperature_c": temperature_c,
+            "seed": seed,
+            "pattern_seed": pattern_seed,
+            "expected": expected,
+        }
+    )
+    with _bar("simulate") as advance:
+        content = simulation.camera_for(camera, lens, cache, advance)
+        if write_camera_file is not None:
+            from lab.camera_file import write_camera
+
+            write_camera(write_camera_file, content)
+            out.print(f"camera: {escape(str(write_camera_file))}")
+        if out_file is None:
+            return
+        made = simulation.simulate(options, content, advance)
+        advance("files", 0.95)
+        record = simulation.write(made, out_file)
+    _warn(record.lens_warnings)
+    for line in simulation.summary_lines(record, out_file):
+        out.print(escape(line))
+
+
+def _print_scenes() -> None:
+    from sim.scene.catalogue import SCENES
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("scene", "what it shows", "parameters (--set KEY=VALUE)"):
+        table.add_column(heading)
+    for name, scene in SCENES.items():
+        keys = (f"{key}={scene.model_fields[key].default}" for key in scene.quantities())
+        table.add_row(name, scene.shows, escape(" ".join(keys)))
+    out.print(table)
+
+
 # --- commands on stations and sessions ---------------------------------------------------------------------------------
 
 
