@@ -50,10 +50,14 @@ def _border(position, first, second, gaps):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _value(pattern, row, col, gaps, surround):  # type: ignore[no-untyped-def]
     """What the cell after border `row` and border `col` holds."""
-    if gaps:
-        if (row & 1) or (col & 1):
+    if gaps[0]:
+        if col & 1:
             return surround
-        row, col = row >> 1, col >> 1
+        col = col >> 1
+    if gaps[1]:
+        if row & 1:
+            return surround
+        row = row >> 1
     if row < 0 or col < 0 or row >= pattern.shape[0] or col >= pattern.shape[1]:
         return surround
     return pattern[row, col]
@@ -62,8 +66,8 @@ def _value(pattern, row, col, gaps, surround):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _mean(pattern, u, v, u_across, u_down, v_across, v_down, lit, gaps, surround):  # type: ignore[no-untyped-def]
     """Mean over a square at (u, v) no larger than a cell, whose sides run along (u_across, v_across), (u_down, v_down)."""
-    col, u_border = _border(u, lit[0], lit[1], gaps)
-    row, v_border = _border(v, lit[2], lit[3], gaps)
+    col, u_border = _border(u, lit[0], lit[1], gaps[0])
+    row, v_border = _border(v, lit[2], lit[3], gaps[1])
     right = _share(u - u_border, u_across, u_down)
     below = _share(v - v_border, v_across, v_down)
     if abs(right - 0.5) == 0.5:
@@ -84,7 +88,7 @@ def project_means(pattern, back, row, col, step, divide, lit, gaps, surround, ou
     """Means of a pattern's cells over the squares at `row` x `col` (px, `step` wide), into `out`.
 
     `back` (3, 3) takes (x = col, y = row, 1) to the pattern's (u, v, w). Every square is divided `divide` times each way.
-    `lit` (u0, u1, v0, v1) is the lit part of every cell where there are `gaps`.
+    `lit` (u0, u1, v0, v1) is the lit part of every cell, `gaps` whether there's any other along u, along v.
     """
     fine = step / divide
     count = divide * divide

@@ -153,19 +153,17 @@ def cell_means(
         return _upright_means(pattern, warp, grid, surround, lit)
     from sim.scene.area import mapped_means, project_means  # here: the compiler's library takes a while to load
 
-    finest = 1.0 if lit is None else min(lit[1] - lit[0], lit[3] - lit[2])
-    if lit is not None:
-        gap = min(1.0 - (lit[1] - lit[0]), 1.0 - (lit[3] - lit[2]))
-        finest = min(finest, gap) if gap > 0 else finest
+    u0, u1, v0, v1 = edges = (0.0, 1.0, 0.0, 1.0) if lit is None else lit
+    gaps = u1 - u0 < 1.0, v1 - v0 < 1.0
+    finest = min(size for size in (u1 - u0, v1 - v0, 1.0 - u1 + u0, 1.0 - v1 + v0) if size > 0)
     divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / finest / 0.999)))
     if divide > MOST_DIVISIONS:
         raise ValueError(
-            f"the pattern's cells are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of {1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
+            f"the pattern's cells, or the parts and gaps of them, are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of {1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
         )
     pattern = np.ascontiguousarray(pattern, float)
     row, col = grid.axes_px()
     step = 1.0 / grid.oversample
-    edges, gaps = (0.0, 1.0, 0.0, 1.0) if lit is None else lit, lit is not None
     out = np.empty(grid.shape)
     if warp.straight:
         back = np.linalg.inv(np.asarray(warp.homography))

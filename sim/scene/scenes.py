@@ -184,14 +184,14 @@ class ZonePlate:
     highest_cy_per_px: float
     dark_radiance: Spectrum
     light_radiance: Spectrum
-    taper: float = 0.05
+    taper: float = 0.1
     kind: str = "zone_plate"
 
     def __post_init__(self) -> None:
         _above_zero("the zone plate's radius", self.radius_px, "px")
         _above_zero("the zone plate's highest frequency", self.highest_cy_per_px, "cy/px")
         if not 0.0 < self.taper <= 1.0:
-            raise ValueError(f"the zone plate's taper is {self.taper}, outside the limits 0..1: 0.05 is usual")
+            raise ValueError(f"the zone plate's taper is {self.taper}, outside the limits 0..1: 0.1 is usual")
 
 
 @dataclass(frozen=True)
