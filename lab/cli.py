@@ -36,8 +36,8 @@ from lab.errors import DeviceError, InputError
 from lab.fit import Progress as Advance
 from lab.fit import fit_recording_set
 from lab.recording import RecordingError, RecordingSet
-from lab.report.figures import by_side, stereo_figures
-from lab.results import DiagnosisResult, FitResult, Skipped, ValidationResult
+from lab.report.figures import by_side, measured, stereo_figures
+from lab.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
 
 if TYPE_CHECKING:
     from lab.store import Store
@@ -256,6 +256,34 @@ def _print_diagnosis(diagnosis: DiagnosisResult) -> None:
     _print_skipped(diagnosis.skipped)
 
 
+def _print_comparison(comparison: ComparisonResult, every: bool) -> None:
+    shown = [row for row in comparison.changes if every or row.changed]
+    table = Table(box=None, pad_edge=False)
+    for heading in ("quantity", "side", "where", "A", "B", "B - A", "sigma", "changed"):
+        table.add_column(heading)
+    for row in sorted(shown, key=lambda row: -row.significance_sigma):
+        values = (measured(row.a, row.a_std), measured(row.b, row.b_std), measured(row.difference, row.difference_std))
+        of = f"{row.where} (worst of {row.n})" if row.n > 1 else row.where
+        marks = (f"{row.significance_sigma:.1f}", "yes" if row.changed else "no")
+        table.add_row(escape(row.name), row.side or "", escape(of), *values, *marks)
+    if table.row_count:
+        out.print(table)
+    for item in comparison.projection:
+        turn = ", ".join(f"{value:.3f}" for value in item.implied_turn_mrad)
+        out.print(
+            f"projection ({item.side}): {item.difference_px:.4f} px rms apart once the implied motion is taken out, {item.expected_px:.4f} "
+            f"px by the uncertainties, {item.significance_sigma:.1f} sigma: {'changed' if item.changed else 'unchanged'} (as stated "
+            f"{item.as_stated_px:.4f} px; implied turn {turn} mrad)"
+        )
+    number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
+    total = len(comparison.changes) + len(comparison.projection)
+    out.print(
+        f"{number or 'none'} of {total} numbers and curves changed beyond {comparison.threshold_sigma:.1f} sigma, which an unchanged rig "
+        f"passes in {100 * comparison.false_alarm_rate:g} % of all comparisons"
+    )
+    _print_skipped(comparison.skipped)
+
+
 # --- commands on recordings --------------------------------------------------------------------------------------------
 
 
@@ -292,6 +320,39 @@ def diagnose(source: Source, json: Json = None, fit_file: FitFile = None) -> Non
     if str(json) != "-":
         _print_diagnosis(result)
     _write_json(result, json)
+
+
+@app.command()
+def compare(
+    a: Annotated[str, typer.Argument(metavar="A", help="a fit's JSON, a recording set's folder, or a session's id")],
+    b: Annotated[str, typer.Argument(metavar="B", help="the calibration to compare with it")],
+    json: Json = None,
+    check: Annotated[bool, typer.Option("--check", help="exit code 4 where anything changed")] = False,
+    every: Annotated[bool, typer.Option("--all", help="list what didn't change, too")] = False,
+) -> None:
+    """Two calibrations: what changed beyond its uncertainty."""
+    from lab.compare import compare as compared
+
+    _check_writable(json)
+    result = compared(_calibration(a), _calibration(b))
+    if str(json) != "-":
+        _print_comparison(result, every)
+    _write_json(result, json)
+    if check and result.changed:
+        raise typer.Exit(EXIT_CHECK)
+
+
+def _calibration(source: str) -> FitResult:
+    """A fit: of a file that `--json` wrote, as a session keeps it, or of recordings that are fitted now."""
+    from lab.store import Settings
+
+    if Path(source).is_file():
+        return _load(FitResult, Path(source))
+    if not Path(source).exists() and Settings().data.is_dir():
+        kept = _store().results(source, "fit")
+        if kept:
+            return FitResult.model_validate(kept[0].document)
+    return _fitted(_recordings(source), None)
 
 
 @app.command("import")

@@ -263,6 +263,10 @@ class MtfCurve(Frozen):
     mtf_std: tuple[float, ...]
     mtf50_cy_per_px: float | None = None
     mtf50_cy_per_px_std: float | None = None
+    mtf10_cy_per_px: float | None = None
+    mtf10_cy_per_px_std: float | None = None
+    #: Where the edge lies in the frame (row0, col0, row1, col1, end excluded): the capture's own, or as it was found.
+    region: tuple[int, int, int, int] | None = None
 
 
 class PsfKernel(Frozen):
@@ -440,6 +444,59 @@ class FitResult(Frozen):
     cameras: dict[Side, CameraFit]
     stereo: StereoFit | None = None
     skipped: tuple[Skipped, ...] = ()
+
+
+class Change(Frozen):
+    """One fitted number of two calibrations, or the point of a curve (of `n` points) at which they differ most; `difference` is B less
+    A. `significance_sigma`: of a normal distribution, two-sided, the other points of the curve allowed for."""
+
+    name: str
+    side: Side | None = None
+    where: str = ""
+    n: int = 1
+    a: float
+    a_std: float
+    b: float
+    b_std: float
+    difference: float
+    difference_std: float
+    significance_sigma: float
+    changed: bool
+
+
+class ProjectionChange(Frozen):
+    """How two calibrations of one camera project otherwise, px over the corners that both rest on: as the numbers stand, and after the
+    motion that they imply is taken out. `vectors_px` [row][column] (x, y) on a grid over the frame, motion taken out."""
+
+    side: Side
+    as_stated_px: float
+    implied_turn_mrad: tuple[float, float, float]
+    implied_shift_mm: tuple[float, float, float]
+    difference_px: float
+    expected_px: float  # by the uncertainties alone
+    significance_sigma: float
+    changed: bool
+    x_px: tuple[float, ...]
+    y_px: tuple[float, ...]
+    vectors_px: tuple[tuple[tuple[float, float], ...], ...]
+
+
+class ComparisonResult(Frozen):
+    format: Literal["calibench-comparison"] = "calibench-comparison"
+    version: Literal[1] = 1
+    a: str
+    b: str
+    #: Chance that two calibrations of one unchanged camera show any change at all, and the limit that follows for one number.
+    false_alarm_rate: float
+    threshold_sigma: float
+    changes: tuple[Change, ...]
+    projection: tuple[ProjectionChange, ...] = ()
+    skipped: tuple[Skipped, ...] = ()
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything changed beyond its uncertainty."""
+        return any(item.changed for item in self.changes) or any(item.changed for item in self.projection)
 
 
 class Patch(Frozen):

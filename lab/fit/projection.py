@@ -32,11 +32,11 @@ FLOOR_PX = 1e-3  # below this no difference counts: two calibrations of the same
 
 @dataclass(frozen=True)
 class Difference:
-    """Two calibrations at points of the frame: `vectors_px` (n, 2), second less first with the implied motion taken out, their
-    covariance (2n, 2n), and by how much all of them together exceed it."""
+    """Two calibrations at n points of the frame: `vectors_px` (n, 2), second less first with the implied motion taken out, and a
+    `factor` (2n, k) of their covariance, factor factor^T."""
 
     vectors_px: Array
-    covariance: Array
+    factor: Array
 
     @property
     def rms_px(self) -> float:
@@ -46,18 +46,23 @@ class Difference:
     @property
     def expected_px(self) -> float:
         """What `rms_px` would be by the uncertainties alone."""
-        return float(np.sqrt(np.trace(self.covariance) / len(self.vectors_px)))
+        return float(np.sqrt(np.sum(self.factor**2) / len(self.vectors_px)))
+
+    @property
+    def variances_px2(self) -> Array:
+        """(n, 2) of the vectors."""
+        return np.asarray(np.sum(self.factor**2, axis=1).reshape(-1, 2))
 
     @property
     def p_value(self) -> float:
         """Chance of such a difference by the uncertainties alone: chi2 over the directions in which the calibrations can
         differ at all."""
-        values, directions = np.linalg.eigh(self.covariance)
-        open_ones = values > max(1e-6 * float(values[-1]), FLOOR_PX**2)
+        directions, spread, _ = np.linalg.svd(self.factor, full_matrices=False)
+        open_ones = spread > max(1e-3 * float(spread[0]), FLOOR_PX)
         if not open_ones.any():
             return 1.0 if self.rms_px < 10 * FLOOR_PX else 0.0
         along = directions[:, open_ones].T @ self.vectors_px.ravel()
-        return float(stats.chi2.sf(np.sum(along**2 / values[open_ones]), int(open_ones.sum())))
+        return float(stats.chi2.sf(np.sum((along / spread[open_ones]) ** 2), int(open_ones.sum())))
 
     @property
     def significance_sigma(self) -> float:
@@ -147,4 +152,8 @@ def difference(
     rotation, shift = implied_motion(first, second, gauge)
     vectors = project(points @ rotation.T + shift, second) - project(points, first)
     operator = error_operator(first, gauge, points).reshape(-1, len(first))
-    return Difference(vectors, operator @ covariance @ operator.T)
+    unit = np.sqrt(
+        np.maximum(np.diag(covariance), 1e-300)
+    )  # focal lengths and coefficients differ by orders of magnitude
+    values, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
+    return Difference(vectors, (operator * unit) @ (axes * np.sqrt(np.maximum(values, 0.0))))
