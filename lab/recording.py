@@ -139,7 +139,7 @@ class Chart(Capture):
 
 class SlantedEdge(Capture):
     kind: Literal["slanted_edge"]
-    region: tuple[int, int, int, int]  # row0, col0, row1, col1, end excluded
+    region: tuple[int, int, int, int] | None = None  # row0, col0, row1, col1, end excluded; None: edges are looked for
     angle_deg: float | None = None
     dark_radiance: str | None = None
     light_radiance: str | None = None
@@ -612,7 +612,7 @@ def _camera_problems(camera: Camera) -> Iterator[str]:
 
 
 def _capture_problems(capture: Capture, camera: Camera) -> Iterator[str]:
-    if isinstance(capture, SlantedEdge):
+    if isinstance(capture, SlantedEdge) and capture.region is not None:
         row0, col0, row1, col1 = capture.region
         if not (0 <= row0 < row1 <= camera.rows and 0 <= col0 < col1 <= camera.cols):
             yield (

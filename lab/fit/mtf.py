@@ -20,11 +20,13 @@ pixel: the slant samples the profile more finely than the plane's pitch.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +41,7 @@ from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period
 
 Array = NDArray[np.floating[Any]]
+Region = tuple[int, int, int, int]  # row0, col0, row1, col1, end excluded
 
 KNOT_SPACING_PX = 0.25  # in the core; a cubic spline of this spacing passes 1 cy/px with an error of 1e-4
 TAIL_GROWTH = 1.6  # ratio of neighbouring knot spacings outside the core: few knots, and the tail is smooth
@@ -59,10 +62,12 @@ FAR_LENGTH, FAR_ALIKE = 4.0, 0.98  # of the tail's correlation, in the distance'
 MOST_REACH_PX = 60.0
 SMOOTHING = 1e-6  # of a knot's weight: bridges knots that no sample falls on; 1e-4 of the signal at 1 cy/px
 EDGE_ORDER = 3
+FEW_PHASES_PX, WIDEST_GAP_PX = 0.6, 1.02  # gaps between the samples' distances, of a quarter and of the whole edge
 REFINED_PX = 6.0  # the samples within see the edge's place
 CORE_PX, CORE_SIGMAS = 2.5, 3.0  # half-width of the core
 PASSES = 3  # of the least squares: noise levels and gradients need the profile
 NUMERICAL_FLOOR = 1e-6  # of the contrast: noise-free regions have weights too
+LEAST_EDGE_PX, LEAST_ROOM_PX, MOST_EDGES = 40.0, 20.0, 24  # of the edges that are looked for in a frame
 DEFAULT_FREQUENCY_CY_PER_PX: Array = np.arange(101) / 100.0
 
 
@@ -276,6 +281,12 @@ def planes_mtf(
     widest = _reach(planes, edge)
     near = _Samples.near(planes, edge, min(max(16.0, 3.0 * planes[0].step), widest) + 8.0)
     edge = _refined(near, edge, widest)
+    gap = _widest_gap(near, edge, np.ones(len(near.value), dtype=bool))
+    if gap > WIDEST_GAP_PX:
+        raise NotDetermined(
+            "mtf",
+            f"the samples lie {gap:.1f} px apart across the edge: turn the edge by 2 deg or more, or take a longer one",
+        )
     return _measure(planes, near, edge, _reach(planes, edge), frequency, noise_std)
 
 
@@ -497,6 +508,10 @@ def _levelled(samples: _Samples, distance: Array, inner: float, outer: float) ->
 def _refined(samples: _Samples, edge: _Edge, widest: float) -> _Edge:
     """The edge's polynomial by Gauss-Newton on the profile: v = E(d), dE/d(edge) = -E'(d); wide and coarse first."""
     chance = np.random.default_rng(0).random(len(samples.value))
+    # An edge along the pixels' own rows or diagonals shows each quarter of itself few phases of the profile: a curve through
+    # them could be anything, so a line it is
+    quarters = [_widest_gap(samples, edge, np.abs(samples.along - at) < 0.25) for at in (-0.75, -0.25, 0.25, 0.75)]
+    highest = EDGE_ORDER if max(quarters) < FEW_PHASES_PX else 1
     for reach, spacing, order in (
         (16.0, 1.0, 1),
         (12.0, 0.75, 2),
@@ -505,10 +520,11 @@ def _refined(samples: _Samples, edge: _Edge, widest: float) -> _Edge:
         (REFINED_PX, 0.25, 3),
         (REFINED_PX, 0.25, 3),
     ):
+        terms = min(order, highest)
         limit = min(max(reach, 3.0 * samples.step), 0.8 * widest)
         tilt = np.sqrt(1.0 + edge.tilt**2)
         kept = np.flatnonzero(np.abs(samples.across - _horner(samples.along, edge.poly)) < limit * tilt)
-        if order < EDGE_ORDER and len(kept) > 8000:  # coarse steps need few samples
+        if spacing > 0.5 and len(kept) > 8000:  # coarse steps need few samples
             kept = kept[chance[kept] < 8000.0 / len(kept)]
         part = samples.where(kept)
         distance, foot, slope = edge.distance(part.along, part.across)
@@ -526,21 +542,27 @@ def _refined(samples: _Samples, edge: _Edge, widest: float) -> _Edge:
         response = -edge.sign * placed.slopes(esf) / np.sqrt(1.0 + slope * slope)
         columns = np.concatenate(
             [
-                response * _powers(foot, order),
+                response * _powers(foot, terms),
                 # uneven illumination would else pull the edge
                 _gradients(distance, foot * edge.half_length, np.clip(profile, 0.0, 1.0), room=True),
             ]
         )
         inlier = np.abs(residual) < 5.0 * np.sqrt(np.mean(residual**2)) + 1e-9
         kept_columns = columns * inlier
-        change = np.linalg.lstsq(kept_columns @ columns.T, kept_columns @ residual, rcond=1e-10)[0][: order + 1]
+        change = np.linalg.lstsq(kept_columns @ columns.T, kept_columns @ residual, rcond=1e-10)[0][: terms + 1]
         # A free profile can be shifted against a free edge: the edge is where the profile is half way.
         grid = np.linspace(-limit, limit, 401)
         offset = _crossing(grid, spline.design(grid) @ (esf - esf[0]) / (esf[-1] - esf[0]))
         change[0] = edge.sign * offset * tilt
         change = np.clip(change, -0.25 * limit, 0.25 * limit)
-        edge = edge.shifted(np.concatenate([change, np.zeros(EDGE_ORDER - order)]))
+        edge = edge.shifted(np.concatenate([change, np.zeros(EDGE_ORDER - terms)]))
     return edge
+
+
+def _widest_gap(samples: _Samples, edge: _Edge, part: NDArray[np.bool_]) -> float:
+    """Between neighbouring distances from the edge, within 3 px of it, of some of the samples; px."""
+    distance, _, _ = edge.distance(samples.along[part], samples.across[part])
+    return float(np.diff(np.sort(np.append(distance[np.abs(distance) < 3.0], [-3.0, 3.0]))).max())
 
 
 def _powers(x: Array, order: int) -> Array:
@@ -655,7 +677,7 @@ def _measure(
             std_dark = std_light = noise_std / contrast
         variance = std_dark**2 + np.clip(esf, 0.0, 1.0) * (std_light**2 - std_dark**2) + NUMERICAL_FLOOR**2
         used = np.abs(residual) < 6.0 * np.sqrt(variance) + 0.02
-    _refuse_unless_one_edge(residual, dark_tail | light_tail, max(std_dark, std_light))
+    _refuse_unless_one_edge(residual, dark_tail | light_tail, max(std_dark, std_light), float(np.mean(~used)))
     _refuse_clipped(samples.value[placed.order][light_tail], std_dark * contrast, contrast)
 
     geometry = EdgeGeometry(
@@ -883,12 +905,12 @@ def _robust_std(residual: Array) -> float:
     return float(np.sqrt(np.mean(kept**2)))
 
 
-def _refuse_unless_one_edge(residual: Array, tail: NDArray[np.bool_], std: float) -> None:
+def _refuse_unless_one_edge(residual: Array, tail: NDArray[np.bool_], std: float, outliers: float) -> None:
     if std > 1.0:
         raise NotDetermined("mtf", f"no edge in the region: the contrast is only {1.0 / std:.2f} of the noise")
     spread = float(np.sqrt(np.mean(residual[tail] ** 2)))
     local = _robust_std(np.diff(residual[tail])) / np.sqrt(2.0)
-    if spread > max(0.12, 3.0 * local):
+    if spread > max(0.12, 3.0 * local) or outliers > 0.03:
         raise NotDetermined("mtf", "the region holds more than one edge: narrow it down to a single one")
 
 
@@ -924,7 +946,7 @@ def _angle_deg_std(
 
 
 def region_planes(
-    frame: NDArray[np.generic], region: tuple[int, int, int, int], cfa: Cfa, channel: str, black_level_dn: float
+    frame: NDArray[np.generic], region: Region, cfa: Cfa, channel: str, black_level_dn: float
 ) -> list[Plane]:
     """The channel's planes (two green ones) within `region` of a raw frame, DN above black, at their sensor coordinates."""
     row0, col0, row1, col1 = region
@@ -936,17 +958,98 @@ def region_planes(
     return found
 
 
+@dataclass(frozen=True)
+class FoundEdge:
+    """An edge that `find_edges` found: a region around its middle (row0, col0, row1, col1), its angle and its length."""
+
+    region: Region
+    angle_deg: float
+    length_px: float
+
+
+def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None = None) -> tuple[FoundEdge, ...]:
+    """Edges of a raw frame from which an MTF can be taken, the longest first, none twice.
+
+    Line segments (LSD) of the frame binned to a channel's pitch; around the middle of each a region is laid that holds no
+    other edge, and kept where both sides are uniform, unsaturated, and the MTF of the green (or only) channel can be had.
+    Raises `NotDetermined` where none is left, with the nearest miss.
+    """
+    values = np.asarray(frame, dtype=float)
+    if values.ndim != 2 or not np.isfinite(values).all():
+        raise NotDetermined("mtf", "the frame has to be two-dimensional and finite to find edges in it")
+    step = period(cfa)
+    rows, cols = (n // step * step for n in values.shape)
+    binned = values[:rows, :cols].reshape(rows // step, step, cols // step, step).mean(axis=(1, 3))
+    low, high = np.quantile(binned, [0.002, 0.998])
+    if not high > low:
+        raise NotDetermined("mtf", "no edge found in the frame: it is uniform")
+    picture = ndimage.gaussian_filter(np.clip((binned - low) / (high - low), 0.0, 1.0), 1.0)
+    lines = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(np.rint(255.0 * picture).astype(np.uint8))[0]
+    found: list[FoundEdge] = []
+    reason = "no straight line of 40 px or more stands out"
+    segments = np.empty((0, 4)) if lines is None else lines.reshape(-1, 4) * step
+    lengths = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
+    for index in np.argsort(-lengths):
+        if lengths[index] < LEAST_EDGE_PX or len(found) == MOST_EDGES:
+            break
+        x0, y0, x1, y1 = segments[index]
+        middle, along = (
+            (0.5 * (y0 + y1), 0.5 * (x0 + x1)),
+            (np.array([y1 - y0, x1 - x0]) / lengths[index]),
+        )
+        if any(
+            abs((middle[0] - 0.5 * (r0 + r1)) * along[1] - (middle[1] - 0.5 * (c0 + c1)) * along[0]) < LEAST_ROOM_PX
+            and max(abs(middle[0] - 0.5 * (r0 + r1)), abs(middle[1] - 0.5 * (c0 + c1))) < 0.75 * max(r1 - r0, c1 - c0)
+            for r0, c0, r1, c1 in (f.region for f in found)
+        ):
+            continue
+        for share in (0.9, 0.7, 0.5):
+            half = 0.5 * share * lengths[index] * np.abs(along)
+            if min(2.0 * half.max(), 2.0 * half.max()) < 0.6 * LEAST_EDGE_PX:
+                break
+            # room across, but not so much that the next side of a square comes into the region
+            room = np.maximum(half, np.minimum(LEAST_ROOM_PX + half.min(), 0.47 * lengths[index] * np.abs(along).max()))
+            start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
+            stop = np.minimum(np.floor(np.array(middle) + room) + 1, values.shape).astype(int)
+            region = (int(start[0]), int(start[1]), int(stop[0]), int(stop[1]))
+            part = values[start[0] : stop[0], start[1] : stop[1]]
+            if saturation_dn is not None and np.mean(part >= saturation_dn) > 0.002:
+                reason = f"the edge at row {middle[0]:.0f}, column {middle[1]:.0f} is saturated; expose it shorter"
+                continue
+            try:
+                planes = region_planes(values, region, cfa, "Y" if cfa == "MONO" else "G", 0.0)
+                edge = planes_mtf(planes, np.array([0.1, 0.25]))
+            except NotDetermined as refused:
+                reason = f"at row {middle[0]:.0f}, column {middle[1]:.0f}: {refused.reason}"
+                continue
+            noise = max(edge.noise_std_dark, edge.noise_std_light)
+            contrast = edge.light_level - edge.dark_level
+            if edge.residual_chi2_per_sample > 2.0 or noise > 0.1 * contrast or contrast < 0.05 * (high - low):
+                reason = (
+                    f"what lies at row {middle[0]:.0f}, column {middle[1]:.0f} isn't one edge between two even fields"
+                )
+                continue
+            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index])))
+            break
+    if not found:
+        raise NotDetermined("mtf", f"no edge found in the frame: {reason}")
+    return tuple(found)
+
+
 def measure_edge(
     recordings: RecordingSet,
     captures: Sequence[SlantedEdge],
     channel: str,
     noise: NoiseFit | None = None,
     frequency_cy_per_px: ArrayLike | None = None,
+    region: Region | None = None,
 ) -> EdgeMtf:
     """MTF of one slanted edge in one channel; `captures` are repeats of the same settings, averaged before the analysis.
 
-    The noise is what is left between the frame and the fitted edge, so that it holds the photo response non-uniformity,
-    which repeats don't average out. Raises `NotDetermined` where the light side is saturated or the region holds no edge.
+    The edge is the one in `region`: the capture's own where it isn't given, and the longest that `find_edges` finds where the
+    capture names none. The noise is what is left between the frame and the fitted edge, so that it holds the photo response
+    non-uniformity, which repeats don't average out. Raises `NotDetermined` where the light side is saturated or the region
+    holds no edge.
     """
     first = captures[0]
     camera = recordings.camera(first.side)
@@ -954,47 +1057,66 @@ def measure_edge(
     if black is None:
         raise NotDetermined("mtf", "the black level is neither fitted nor stated: add dark frames")
     frames = [recordings.frame(c) for c in captures]
-    row0, col0, row1, col1 = first.region
+    row0, col0, row1, col1 = region = region or first.region or _found(recordings, first)[0].region
     saturated = float(np.mean(frames[0][row0:row1, col0:col1] >= camera.saturation_dn))
     if saturated > 0.002:
         raise NotDetermined("mtf", f"{first.id}: {100 * saturated:.1f} % of the region is saturated; expose it shorter")
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
-    planes = region_planes(mean, first.region, camera.cfa, channel, black)
+    planes = region_planes(mean, region, camera.cfa, channel, black)
     frequency = DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else frequency_cy_per_px
     return planes_mtf(planes, frequency)
+
+
+def _found(recordings: RecordingSet, capture: SlantedEdge) -> tuple[FoundEdge, ...]:
+    camera = recordings.camera(capture.side)
+    return find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn)
 
 
 def fit_mtf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> tuple[MtfCurve, ...]:
     """One MTF curve for every slanted-edge capture of `side` and every channel (R, G, B; or Y), captures in their order.
 
-    The black level is `noise`'s where it was fitted, else the stated one. The angle is given in the turn (of 180 deg) next to
+    A capture that names no region gives the curves of all edges found in its frame (`find_edges`), each with its region. The
+    black level is `noise`'s where it was fitted, else the stated one. The angle is given in the turn (of 180 deg) next to
     the capture's nominal one. A capture without a usable edge is left out; raises `NotDetermined` where none has one.
     """
     captures = recordings.captures("slanted_edge", side)
     if not captures:
         raise NotDetermined("mtf", "no slanted_edge captures")
-    channels = ("Y",) if recordings.camera(side).cfa == "MONO" else ("R", "G", "B")
+    camera = recordings.camera(side)
     curves, reasons = [], []
     for capture in captures:
-        for channel in channels:
+        try:
+            regions = [capture.region] if capture.region else [f.region for f in _found(recordings, capture)]
+        except NotDetermined as refused:
+            reasons.append(f"{capture.id}: {refused.reason}")
+            continue
+        for region, channel in itertools.product(regions, ("Y",) if camera.cfa == "MONO" else ("R", "G", "B")):
             try:
-                edge = measure_edge(recordings, [capture], channel, noise)
+                edge = measure_edge(recordings, [capture], channel, noise, region=region)
             except NotDetermined as refused:
                 reasons.append(f"{capture.id} ({channel}): {refused.reason}")
                 continue
             turns = 0.0 if capture.angle_deg is None else 180.0 * round((capture.angle_deg - edge.angle_deg) / 180.0)
+            row0, col0, row1, col1 = region
+            field_mm = capture.field_mm
+            if capture.region is None and camera.pixel_pitch_um is not None:
+                pitch_mm = 1e-3 * camera.pixel_pitch_um
+                field_mm = (pitch_mm * (row0 + row1 - camera.rows) / 2.0, pitch_mm * (col0 + col1 - camera.cols) / 2.0)
             curves.append(
                 MtfCurve(
                     capture=capture.id,
                     channel=channel,
                     angle_deg=edge.angle_deg + turns,
                     angle_deg_std=edge.angle_deg_std,
-                    field_mm=capture.field_mm,
+                    field_mm=field_mm,
+                    region=region,
                     frequency_cy_per_px=tuple(edge.frequency_cy_per_px.tolist()),
                     mtf=tuple(edge.mtf.tolist()),
                     mtf_std=tuple(edge.mtf_std.tolist()),
                     mtf50_cy_per_px=edge.mtf50_cy_per_px,
                     mtf50_cy_per_px_std=edge.mtf50_cy_per_px_std,
+                    mtf10_cy_per_px=edge.mtf10_cy_per_px,
+                    mtf10_cy_per_px_std=edge.mtf10_cy_per_px_std,
                 )
             )
     if not curves:

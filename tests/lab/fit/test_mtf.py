@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.special import erf
+from scipy.special import erf, ndtr
 
 from lab.errors import NotDetermined
-from lab.fit.mtf import Plane, edge_mtf, fit_mtf, planes_mtf
+from lab.fit.mtf import Plane, edge_mtf, find_edges, fit_mtf, planes_mtf
 
 FULL_E = 9000.0
 
@@ -158,8 +158,103 @@ def test_no_single_edge_is_not_determined(region):
         edge_mtf(region)
 
 
+@pytest.mark.parametrize("angle_deg", [0.0, 0.3, 45.0, 44.8, 90.0, 89.6, 26.565])
+def test_edges_along_the_pixels_rows_and_diagonals(angle_deg):
+    found = edge_mtf(noisy(edge(200, angle_deg, 0.55), np.random.default_rng(9)))
+    # where all samples fall on few distances the interval is wide, and it holds
+    assert found.mtf50_cy_per_px == pytest.approx(gaussian_mtf50(0.55), abs=4 * found.mtf50_cy_per_px_std)
+    assert found.mtf50_cy_per_px_std < 0.1 * found.mtf50_cy_per_px
+
+
+def test_greens_of_an_edge_at_45_deg_are_refused():
+    image = noisy(edge(200, 45.0, 0.55), np.random.default_rng(9))
+    with pytest.raises(NotDetermined, match=r"1\.4 px apart"):
+        planes_mtf([Plane(image[0::2, 1::2], 0, 1, 2), Plane(image[1::2, 0::2], 1, 0, 2)])
+
+
+def test_mtf10_and_the_profiles_are_the_gaussians():
+    found = edge_mtf(noisy(edge(200, 5.0, 0.7), np.random.default_rng(1)))
+    mtf10 = np.sqrt(2 * np.log(10)) / (2 * np.pi * 0.7)
+    assert found.mtf10_cy_per_px == pytest.approx(mtf10, abs=4 * found.mtf10_cy_per_px_std)
+    assert found.mtf10_cy_per_px_std < 0.02 * mtf10
+    # the edge's place is known to 0.01 px: 0.006 of the profile at its steepest, and of the slope as much
+    np.testing.assert_allclose(found.esf, ndtr(found.distance_px / 0.7), atol=0.012)
+    np.testing.assert_allclose(
+        found.lsf, np.exp(-0.5 * (found.distance_px / 0.7) ** 2) / 0.7 / np.sqrt(2 * np.pi), atol=0.02
+    )
+
+
+def test_the_tail_of_diffraction_is_followed_beyond_the_region():
+    """LSF with a tail 0.13 / d^2, as a lens with its cutoff at 1 cy/px has: 2 % of the contrast is beyond 12 px."""
+
+    def profile(d):  # FT: exp(-2 pi a f) mixed with a Gaussian; a Cauchy's tail is (a / pi) / d^2
+        return 0.5 * (0.5 + np.arctan(d / 0.8) / np.pi) + 0.5 * ndtr(d / 0.5)
+
+    r, c = np.indices((200, 200)) - 99.5
+    d = c * np.cos(np.radians(5)) + r * np.sin(np.radians(5))
+    found = edge_mtf(noisy(0.1 + profile(d), np.random.default_rng(4)), [0.05, 0.1, 0.2])
+    truth = 0.5 * np.exp(-2 * np.pi * 0.8 * found.frequency_cy_per_px) + 0.5 * gaussian_mtf(
+        0.5, found.frequency_cy_per_px
+    )
+    assert (np.abs(found.mtf - truth) < 3 * found.mtf_std).all()
+    assert found.mtf_std.max() < 0.012
+
+
+def squares(shape, boxes, sigma_px):
+    """Dark squares (row, col, half side, degrees) on light, blurred: products of normal distribution functions but for the corners."""
+    r, c = np.indices(shape, dtype=float)
+    light = np.ones(shape)
+    for row, col, half, angle_deg in boxes:
+        a = np.radians(angle_deg)
+        u, v = (r - row) * np.cos(a) + (c - col) * np.sin(a), (c - col) * np.cos(a) - (r - row) * np.sin(a)
+        across, down = (ndtr((x + half) / sigma_px) - ndtr((x - half) / sigma_px) for x in (u, v))
+        light -= 0.9 * across * down
+    return light
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
+def test_edges_are_found_by_themselves(cfa):
+    light = squares((300, 420), [(100, 110, 60, 5.0), (150, 300, 70, 40.0)], 0.6)
+    raw = 64 + np.round(0.4 * np.random.default_rng(0).poisson(8000 * light))
+    found = find_edges(raw, cfa, 4095.0)
+    assert len(found) == 8
+    wanted = sorted([-5.0, -5.0, 85.0, 85.0, -40.0, -40.0, 50.0, 50.0])
+    np.testing.assert_allclose(sorted(e.angle_deg for e in found), wanted, atol=0.1)
+    for e in found:
+        row0, col0, row1, col1 = e.region
+        mtf = edge_mtf(raw[row0:row1, col0:col1] - 64)
+        assert mtf.mtf50_cy_per_px == pytest.approx(gaussian_mtf50(0.6), abs=4 * mtf.mtf50_cy_per_px_std)
+
+
+@pytest.mark.parametrize(
+    ("frame", "reason"),
+    [
+        (np.full((200, 200), 7.0), "uniform"),
+        (np.random.default_rng(0).normal(100, 3, (200, 200)), "no straight line"),
+        (np.full((200, 200), np.nan), "finite"),
+        (np.minimum(1500.0 * squares((200, 200), [(100, 100, 50, 5.0)], 0.6), 1023), "saturated"),
+    ],
+    ids=["uniform", "noise", "not finite", "saturated"],
+)
+def test_a_frame_without_an_edge_says_why(frame, reason):
+    with pytest.raises(NotDetermined, match=reason):
+        find_edges(frame, "MONO", 1023.0)
+
+
+def test_a_clipped_edge_and_a_corner_are_refused():
+    rng = np.random.default_rng(3)
+    with pytest.raises(NotDetermined, match="clipped at 3000"):
+        edge_mtf(np.minimum(noisy(edge(200, 5.0, 0.6), rng), 3000.0))
+    corner = noisy(0.1 + squares((300, 300), [(150, 150, 80, 45.0)], 0.6), rng)
+    with pytest.raises(NotDetermined, match="more than one edge"):
+        edge_mtf(corner[5:175, 5:175])
+
+
 def recordings(frames, captures, cfa="RGGB"):
-    camera = SimpleNamespace(cfa=cfa, black_level_dn=64.0, saturation_dn=4095.0)
+    rows, cols = next(iter(frames.values())).shape
+    camera = SimpleNamespace(
+        cfa=cfa, black_level_dn=64.0, saturation_dn=4095.0, pixel_pitch_um=1.5, rows=rows, cols=cols
+    )
     return SimpleNamespace(
         camera=lambda side: camera,
         captures=lambda kind=None, side=None: captures,
@@ -168,7 +263,8 @@ def recordings(frames, captures, cfa="RGGB"):
 
 
 def capture(name, **more):
-    return SimpleNamespace(id=name, side="left", region=(31, 20, 191, 180), angle_deg=95.0, field_mm=(0.0, 0.0), **more)
+    stated = {"region": (31, 20, 191, 180), "angle_deg": 95.0, "field_mm": (0.0, 0.0)}
+    return SimpleNamespace(id=name, side="left", **(stated | more))
 
 
 def test_fit_takes_every_channel_of_the_mosaic_on_its_own_grid():
@@ -193,3 +289,15 @@ def test_fit_refuses_a_saturated_edge():
     raw[:, :100] = 500
     with pytest.raises(NotDetermined, match="saturated"):
         fit_mtf(recordings({"edge-1": raw}, [capture("edge-1")]), "left")
+
+
+def test_fit_looks_for_edges_where_no_region_is_stated():
+    light = squares((220, 220), [(110, 110, 60, 5.0)], 0.6)
+    raw = (64 + np.round(0.4 * np.random.default_rng(0).poisson(8000 * light))).astype(np.uint16)
+    stated = capture("edge-1", region=None, angle_deg=None, field_mm=None)
+    curves = fit_mtf(recordings({"edge-1": raw}, [stated]), "left")
+    assert len(curves) == 12  # four sides, three channels
+    assert len({c.region for c in curves}) == 4
+    assert all(c.mtf10_cy_per_px is None or c.mtf10_cy_per_px > c.mtf50_cy_per_px for c in curves)
+    # 1.5 um pixels: regions lie 60 px from the middle of the frame
+    assert all(np.hypot(*c.field_mm) == pytest.approx(60 * 1.5e-3, abs=0.01) for c in curves)
