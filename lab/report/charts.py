@@ -48,7 +48,8 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
     } | more
 
 
-def _layout(height: int, **more: Any) -> dict[str, Any]:
+def layout(height: int, **more: Any) -> dict[str, Any]:
+    """A figure's layout in the report's style."""
     return {
         "height": height,
         "margin": {"l": 56, "r": 14, "t": 26, "b": 44},
@@ -64,7 +65,7 @@ def _bars(std: Sequence[float | None], colour: str) -> dict[str, Any]:
     return {"type": "data", "array": list(std), "color": colour, "thickness": 1, "width": 2}
 
 
-def _band(
+def band(
     x: Sequence[float], centre: np.ndarray[Any, Any], half: np.ndarray[Any, Any], colour: str, **more: Any
 ) -> Trace:
     """A filled band centre +- half."""
@@ -120,7 +121,7 @@ def photon_transfer(noise: NoiseFit) -> Figure | None:
     highest = 1.15 * max(points.variance_dn2)
     return {
         "data": data,
-        "layout": _layout(
+        "layout": layout(
             330,
             xaxis=axis("signal above dark, DN", rangemode="tozero"),
             yaxis=axis("temporal variance above dark, DN²", range=[-0.02 * highest, highest]),
@@ -160,7 +161,7 @@ def linearity(noise: NoiseFit) -> Figure | None:
         return None
     return {
         "data": data,
-        "layout": _layout(
+        "layout": layout(
             220, xaxis=axis("signal above dark, DN", rangemode="tozero"), yaxis=axis("off the line, %", zeroline=True)
         ),
     }
@@ -174,7 +175,7 @@ def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Si
         std = spectral.quantum_efficiency_std.get(channel)
         if std:
             half = spectral.coverage_factor * np.asarray(std)
-            data.append(_band(spectral.wavelength_nm, np.asarray(values), half, colour))
+            data.append(band(spectral.wavelength_nm, np.asarray(values), half, colour))
         data.append(
             {
                 "type": "scatter",
@@ -201,7 +202,7 @@ def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Si
     span = [min(spectral.wavelength_nm) - 10, max(spectral.wavelength_nm) + 10]
     return {
         "data": data,
-        "layout": _layout(
+        "layout": layout(
             340,
             xaxis=axis("wavelength, nm", range=span),
             yaxis=axis("quantum efficiency, e/photon", rangemode="tozero"),
@@ -276,7 +277,7 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
     height = 60 + rows * 190
-    layout: dict[str, Any] = {
+    panes: dict[str, Any] = {
         "grid": {
             "rows": rows,
             "columns": columns,
@@ -303,13 +304,13 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
         titles.append(_panel_title(number, title))
         for overlay in overlays:
             colour = CHANNEL.get(overlay.channel, "#888888")
-            data.append(_band(overlay.x, np.asarray(overlay.measured), np.asarray(overlay.measured_std), colour, **on))
+            data.append(band(overlay.x, np.asarray(overlay.measured), np.asarray(overlay.measured_std), colour, **on))
             add(overlay, overlay.measured, on, mode="markers", marker={"color": colour, "size": 4})
             dashed = {"color": colour, "width": 1.3, "dash": "dash"}
             add(overlay, overlay.baseline, on, mode="lines", line=dashed)
             if overlay.explained is not None:
                 add(overlay, overlay.explained, on, mode="lines", line={"color": colour, "width": 1.8})
-        layout |= {
+        panes |= {
             f"xaxis{suffix}": axis("cy/px" if number >= len(panels) - columns else ""),
             f"yaxis{suffix}": axis("MTF" if number % columns == 0 else "", range=[-0.02, 1.08]),
         }
@@ -317,7 +318,7 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
     margin = {"l": 56, "r": 14, "t": 56, "b": 44}
     return {
         "data": data,
-        "layout": _layout(height, annotations=titles, **layout) | {"legend": legend, "margin": margin},
+        "layout": layout(height, annotations=titles, **panes) | {"legend": legend, "margin": margin},
     }
 
 
@@ -365,7 +366,7 @@ def patch_comparison(patches: Sequence[Patch]) -> Figure:
     )
     return {
         "data": data,
-        "layout": _layout(
+        "layout": layout(
             560,
             xaxis=axis("predicted, DN above black", rangemode="tozero", anchor="y"),
             yaxis=axis("measured, DN above black", rangemode="tozero", domain=[0.56, 1.0]),
@@ -405,7 +406,7 @@ def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
                 "colorbar": {"title": {"text": "sigma", "side": "right"}, "thickness": 10, "outlinewidth": 0},
             }
         ],
-        "layout": _layout(
+        "layout": layout(
             110 + 44 * len(rows),
             xaxis=axis("", side="bottom", showgrid=False),
             yaxis=axis("", autorange="reversed", showgrid=False),
@@ -496,7 +497,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
         )
     return {
         "data": data,
-        "layout": _layout(
+        "layout": layout(
             330,
             xaxis=axis(curve.axis, anchor="y2"),
             yaxis=axis("measured", domain=[0.42, 1.0], range=_range(curve)),
@@ -537,7 +538,7 @@ def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
                 "showlegend": False,
             }
         ],
-        "layout": _layout(
+        "layout": layout(
             150,
             xaxis=axis("χ² / n on held-out captures (1: noise alone)", rangemode="tozero"),
             yaxis=axis("", autorange="reversed", showgrid=False),
