@@ -15,8 +15,10 @@ from lab import cli
 from lab.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.recording import load_frame
 from lab.simulate import SimulateOptions, automatic_exposure_s, capacity_e, preview, simulate
-from sim.camera import Cfa
-from sim.optics.imaging import TracedLens
+from sim.camera import CameraModel, Cfa, Lens
+from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupil
+from sim.parameters import Quantity, declared
+from sim.scene.catalogue import SCENES, NamedScene
 from sim.spectrum import Spectrum
 
 LENSES = Path(__file__).parents[2].parent / "shared" / "data" / "lenses"
@@ -198,6 +200,31 @@ def test_a_lens_is_traced_once_and_kept(small: Path, tmp_path: Path) -> None:
     content = read_camera(tmp_path / "traced.toml", cache)
     assert isinstance(content.camera.lens.imaging, TracedLens)
     assert content.camera.lens.f_number == content.camera.lens.imaging.table.f_number
+
+
+def parameter_row(key: str, quantity: Quantity) -> str:
+    """A parameter's line in the documentation."""
+    low, high = ("" if limit is None else f"{limit:g}" for limit in (quantity.lower, quantity.upper))
+    return f"| `{key}` | {quantity.unit} | {quantity.meaning} | {f'{low} .. {high}'.strip() if low or high else ''} |"
+
+
+def scene_row(scene: type[NamedScene]) -> str:
+    """A scene's line in the documentation."""
+    keys = ", ".join(f"`{key}={scene.model_fields[key].default}`" for key in scene.quantities())
+    return f"| `{scene.name}` | {scene.shows} | {keys} |"
+
+
+def test_the_documentation_is_what_the_declarations_say() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "simulate.md").read_text()
+    lines = text.splitlines()
+    for model in (CameraModel, Lens):
+        for key, quantity in declared(model).items():
+            assert parameter_row(key, quantity) in lines
+    for model in (CameraModel, Lens, ZernikePupil, MeasuredPsf, MeasuredOtf):
+        for key in model.model_fields:
+            assert key in text, f"{model.__name__}.{key} isn't described"
+    for scene in SCENES.values():
+        assert scene_row(scene) in lines
 
 
 ERRORS: list[tuple[tuple[str, ...], str]] = [
