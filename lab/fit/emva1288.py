@@ -244,29 +244,43 @@ def _dark_noise(at: _Points, gain: _Value, remarks: list[str]) -> tuple[Found, f
 def _sensitivity(at: _Points, top: int | None, gain: _Value, found: Found) -> Found:
     """Threshold, saturation capacity, largest SNR and dynamic range; in photons where the quantum efficiency is known."""
     given: Found = {}
+    responsivity = found.get("responsivity_dn_per_photon")
     efficiency = found.get("quantum_efficiency")
     dark = found.get("temporal_dark_noise_dn")
     if dark is not None:
         dark_e = dark.over(gain)
         inner = math.sqrt(dark_e.value**2 + 0.25)
         given["sensitivity_threshold_e"] = _Value(inner + 0.5, dark_e.value * dark_e.std / inner)
-    if top is not None:
-        # The largest variance lies somewhere between this level's neighbours.
-        step = float(np.abs(np.diff(at.signal[max(top - 1, 0) : top + 2])).mean()) if at.signal.size > 1 else 0.0
-        if efficiency is not None:
-            photons = _Value(float(at.light[top]), float(step / at.signal[top] * at.light[top]) / math.sqrt(12.0))
-            given["saturation_capacity_photons"] = photons
-            electrons = photons.value * efficiency.value
-            std = math.hypot(photons.std * efficiency.value, photons.value * efficiency.std)
-            given["saturation_capacity_e"] = _Value(electrons, std)
-        else:
-            given["saturation_capacity_e"] = _Value(float(at.signal[top]), step / math.sqrt(12.0)).over(gain)
-        full = given["saturation_capacity_e"]
-        given["snr_max"] = _Value(math.sqrt(full.value), full.std / (2.0 * math.sqrt(full.value)))
-    if efficiency is not None and "sensitivity_threshold_e" in given:
-        given["sensitivity_threshold_photons"] = given["sensitivity_threshold_e"].over(efficiency)
-    if "saturation_capacity_e" in given and "sensitivity_threshold_e" in given:
-        given["dynamic_range"] = given["saturation_capacity_e"].over(given["sensitivity_threshold_e"])
+        if responsivity is not None:
+            # (sqrt(sigma^2 + K^2 / 4) + K / 2) / R: nearly free of K.
+            photons = (inner + 0.5) * gain.value / responsivity.value
+            parts = (
+                dark_e.value / inner * dark.std / responsivity.value,
+                (0.5 + 0.25 / inner) * gain.std / responsivity.value,
+                photons * responsivity.std / responsivity.value,
+            )
+            given["sensitivity_threshold_photons"] = _Value(photons, math.hypot(*parts))
+    if top is None:
+        return given
+    # The largest variance lies somewhere between this level's neighbours.
+    step = float(np.abs(np.diff(at.signal[max(top - 1, 0) : top + 2])).mean()) / math.sqrt(12.0)
+    signal = _Value(float(at.signal[top]), step)
+    if efficiency is not None:
+        light = _Value(float(at.light[top]), float(at.light[top]) * step / signal.value)
+        full = _Value(
+            light.value * efficiency.value,
+            math.hypot(light.std * efficiency.value, light.value * efficiency.std),
+        )
+        given["saturation_capacity_photons"] = light
+        if "sensitivity_threshold_photons" in given:
+            given["dynamic_range"] = light.over(given["sensitivity_threshold_photons"])
+    else:
+        full = signal.over(gain)
+        if dark is not None:
+            threshold_dn = math.sqrt(dark.value**2 + gain.value**2 / 4.0) + gain.value / 2.0
+            given["dynamic_range"] = signal.over(_Value(threshold_dn, math.hypot(dark.std, gain.std)))
+    given["saturation_capacity_e"] = full
+    given["snr_max"] = _Value(math.sqrt(full.value), full.std / (2.0 * math.sqrt(full.value)))
     return given
 
 

@@ -49,6 +49,12 @@ class SpatialVariance:
     pixels: float
     pixels_std: float
 
+    def mean_std(self, shape: tuple[int, int]) -> float:
+        """Standard uncertainty of a plane's mean as that of the camera: of its rows', columns' and pixels' draw."""
+        m, n = shape
+        parts = max(self.rows, 0.0) / m + max(self.columns, 0.0) / n + max(self.pixels, 0.0) / (m * n)
+        return float(np.sqrt(parts))
+
     @classmethod
     def split(
         cls, total: float, rows_mean: float, columns_mean: float, shape: tuple[int, int], share: float, share_std: float
@@ -179,7 +185,7 @@ def _shading_factors(image: NDArray[F], degree: int) -> tuple[NDArray[F], NDArra
     means = inner.reshape(counts[0], block[0], counts[1], block[1]).mean(axis=(1, 3), dtype=float)
     full, small = [], []
     for size, count, width in zip((rows, cols), counts, block, strict=True):
-        order = min(degree, max(count // 3, 0))
+        order = _order(size, degree)
         at = 2.0 * (np.arange(size) + 0.5) / size - 1.0
         basis = np.polynomial.legendre.legvander(at, order)
         full.append(basis)
@@ -187,6 +193,11 @@ def _shading_factors(image: NDArray[F], degree: int) -> tuple[NDArray[F], NDArra
     coefficients = np.linalg.pinv(small[0]) @ means @ np.linalg.pinv(small[1]).T
     # In the image's own precision: the surface's error is then the image's.
     return (full[0] @ coefficients).astype(image.dtype), np.ascontiguousarray(full[1].T.astype(image.dtype))
+
+
+def _order(size: int, degree: int = SHADING_DEGREE) -> int:
+    """Degree of the surface along an axis of `size` pixels: small images have too few blocks for the full one."""
+    return min(degree, int(np.clip(size // 8, 1, 32)) // 3)
 
 
 def shading(image: NDArray[F], degree: int = SHADING_DEGREE) -> NDArray[F]:
@@ -214,35 +225,38 @@ def defective_pixels(image: NDArray[np.floating[Any]], cfa: Cfa) -> BoolArray:
 
 
 @njit(cache=True)
-def _take(
-    frame: NDArray[np.uint16], bad: BoolArray, period: int, white: float
-) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+def _take(frame: NDArray[np.uint16], bad: BoolArray, period: int) -> tuple[FloatArray, NDArray[np.int64]]:
     """By phase of the mosaic: sums of a frame over all pixels and over the good ones (2, phases); the highest code, how often it
-    and 0 come, how many pixels are good (4, phases)."""
+    and 0 come, and less how many pixels are bad (4, phases)."""
     phases = period * period
     sums = np.zeros((2, phases))
     counts = np.zeros((4, phases), np.int64)
-    every = np.zeros(phases, np.int64)
-    some_bad = bad.size > 0
-    for i in range(frame.shape[0]):
-        for j in range(frame.shape[1]):
-            p = (i % period) * period + j % period
-            value = np.int64(frame[i, j])
-            every[p] += value
-            if value > counts[0, p]:
-                counts[0, p] = value
-                counts[1, p] = 1
-            elif value == counts[0, p]:
-                counts[1, p] += 1
-            if value == 0:
-                counts[2, p] += 1
-            if some_bad and bad[i, j]:
-                sums[1, p] -= value
-                counts[3, p] -= 1
-    for p in range(phases):
-        sums[0, p] = every[p]
-        sums[1, p] += every[p]
-    return sums, counts, every
+    rows, cols = frame.shape
+    for i in range(rows):
+        for offset in range(period):
+            p = (i % period) * period + offset
+            total, highest, zeros = np.int64(0), np.int64(0), np.int64(0)
+            for j in range(offset, cols, period):
+                value = np.int64(frame[i, j])
+                total += value
+                highest = max(highest, value)
+                zeros += value == 0
+            sums[0, p] += total
+            counts[2, p] += zeros
+            if highest > counts[0, p]:
+                counts[0, p], counts[1, p] = highest, 0
+            if highest == counts[0, p]:
+                for j in range(offset, cols, period):
+                    counts[1, p] += frame[i, j] == highest
+    sums[1] = sums[0]
+    if bad.size > 0:
+        for i in range(rows):
+            for j in range(cols):
+                if bad[i, j]:
+                    p = (i % period) * period + j % period
+                    sums[1, p] -= frame[i, j]
+                    counts[3, p] -= 1
+    return sums, counts
 
 
 @njit(cache=True)
@@ -356,7 +370,7 @@ class Stack:
     def add(self, frame: NDArray[np.integer[Any]]) -> None:
         frame = np.ascontiguousarray(frame, np.uint16)
         bad = _NONE if self.bad is None else self.bad
-        sums, counts, _ = _take(frame, bad, self.period, self.white_dn)
+        sums, counts = _take(frame, bad, self.period)
         if self.mean is None:
             rows, cols = frame.shape
             labels = np.arange(self.period**2).reshape(self.period, self.period)
@@ -456,6 +470,11 @@ class Stack:
             clean = np.where(inside, rest, np.float32(0))
             rows_mean = float(np.var(clean.sum(axis=1, dtype=float) / np.maximum(inside.sum(axis=1), 1)))
             cols_mean = float(np.var(clean.sum(axis=0, dtype=float) / np.maximum(inside.sum(axis=0), 1)))
+        # The surface takes freedom from the rows' averages, from the columns' and from the pixels.
+        order = _order(rows) + 1, _order(cols) + 1
+        more = rows_mean * order[0] / (rows - order[0]), cols_mean * order[1] / (cols - order[1])
+        pattern = pattern * (pixels - 1) / max(pixels - order[0] * order[1], 1) + sum(more)
+        rows_mean, cols_mean = rows_mean + more[0], cols_mean + more[1]
         split = SpatialVariance.split(pattern, rows_mean, cols_mean, (rows, cols), share, share_std)
         shares = np.mean([share[:3, phase] for share in self._shares], axis=0)
         adjacent, diagonal, covariance_std = self._covariances(phase, variance)
@@ -466,7 +485,7 @@ class Stack:
             temporal_variance=variance,
             temporal_variance_std=variance_std,
             spatial_variance=spatial - share,
-            spatial_variance_std=float(np.hypot(spatial * np.sqrt(2.0 / pixels), share_std)),
+            spatial_variance_std=every.total_std,
             pattern_variance=pattern - share,
             pattern_variance_std=split.total_std,
             defects=image.size - pixels + outliers,

@@ -21,7 +21,7 @@ Definitions: EMVA Standard 1288, release 4.0 (linear). Where this departs from t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -53,6 +53,8 @@ CLIPPED_LIMIT = 1e-4  # share of clipped pixels from which a level's variance is
 PILED_LIMIT = 2e-3  # share of pixels on the plane's own highest code that says that it saturates there
 PILED_PIXELS = 12  # a normal law that spreads over some DN puts one or two pixels of a plane on its highest
 MIN_LEVELS = 3
+#: Planes that a plane's pixels adjoin along rows and columns.
+ADJACENT = {"Y": ("Y",), "R": ("G1", "G2"), "B": ("G1", "G2"), "G1": ("R", "B"), "G2": ("R", "B")}
 ASYMMETRY = 0.002  # difference of opposite edges' light that is worth a remark, of the mean
 MIN_SIZE_PX = 16
 
@@ -497,11 +499,18 @@ class _Evaluation:
     def _saturation(self) -> tuple[dict[str, float], dict[str, float | None]]:
         """Saturation of each plane, DN above black (the converter's limit where it wasn't seen), and what was seen."""
         self.clipped: dict[str, list[bool]] = {}
-        saturation, seen = {}, {}
+        seen: dict[str, float | None] = {}
         for name in self.names:
             self.clipped[name], plateau = self._saturated(name)
             seen[name] = None if plateau is None else plateau - self.lines[name].black
-            saturation[name] = (plateau if plateau is not None else self.white) - self.lines[name].black
+        # Planes differ in their light, not in their pixels: one that stays below saturation has the others'.
+        found = [value for value in seen.values() if value is not None]
+        saturation = {}
+        for name, value in seen.items():
+            black = self.lines[name].black
+            limit = max(found) if found else self.white - black
+            highest = max(level.plane[name].mean for level in self.flats) - black
+            saturation[name] = value if value is not None else max(limit, highest)
         return saturation, seen
 
     # --- photon transfer ---
@@ -624,28 +633,6 @@ class _Evaluation:
         if sentence not in self.remarks:
             self.remarks.append(sentence)
 
-    def _dark_current_from_variance(self) -> tuple[float | None, float | None]:
-        """The dark current's own shot noise: growth of the dark variance with exposure over K^2, planes together."""
-        repeated = [level for level in self.darks if level.repeats > 1]
-        exposure = np.array([level.exposure_s for level in repeated])
-        if np.unique(exposure).size < 3:
-            return None, None
-        rates, weights = [], []
-        for name in self.names:
-            own = [level.plane[name] for level in repeated]
-            std = np.array([plane.temporal_variance_std for plane in own])
-            variance = np.array([plane.temporal_variance for plane in own])
-            if variance.min() < HIDDEN_DN2:
-                return None, None
-            line = dark_line(exposure, variance, std)
-            if line.rate is not None:
-                rates.append(line.rate)
-                weights.append(1.0 / line.covariance[1, 1])
-        rate = float(np.average(rates, weights=weights))
-        gain = self.transfer.gain
-        rate_std = float(np.hypot(np.sum(weights) ** -0.5, 2.0 * rate * self.transfer.gain_std / gain))
-        return rate / gain**2, rate_std / gain**2
-
     def _temperatures(self) -> DarkCurrentTemperature | None:
         """Dark current at every temperature with darks of two exposures, and the laws through those that are above 0."""
         found: list[tuple[float, float, float]] = []
@@ -663,11 +650,15 @@ class _Evaluation:
     def _black(self) -> tuple[float | None, float | None]:
         if not self.darks:
             return None, None
-        pixels = sum(self.darks[0].plane[name].pixels for name in self.names)
-        variances = [self.darks[0].plane[name].spatial_variance for name in self.names]
-        pattern = max(float(np.nan_to_num(np.mean(variances))), 0.0)  # a single frame can't tell it from noise
-        line = self.lines[None]
-        return line.black, float(np.sqrt(line.covariance[0, 0] + pattern / pixels))
+        line, patterns = self.lines[None], []
+        for name in self.names:
+            plane = self.darks[0].plane[name]
+            if plane.every_pixel is not None and np.isfinite(
+                plane.temporal_variance
+            ):  # one frame can't tell it from noise
+                patterns.append(plane.every_pixel.mean_std(plane.shape))
+        pattern = float(np.sqrt(np.sum(np.square(patterns)))) / max(len(patterns), 1)
+        return line.black, float(np.hypot(np.sqrt(line.covariance[0, 0]), pattern))
 
     def _dark_pattern(self) -> tuple[Level, float, float] | None:
         """The darks that show the fixed pattern best (most repeats, then shortest), its variance in DN^2 and uncertainty."""
@@ -889,9 +880,8 @@ class _Evaluation:
 
     def _neighbours(self) -> tuple[float, float] | None:
         """Temporal covariance of a pixel with its eight neighbours, of the share of its shot noise's variance, at saturation:
-        4 (adjacent + diagonal) less the darks' = share K x^2 / x_sat."""
+        4 (adjacent + diagonal) less the darks' = share K x x_beside / x_sat, x_beside the mean of the planes it adjoins."""
         highest, gain = max(self.saturation.values()), self.transfer.gain
-        product, norm, chi2, freedom = 0.0, 0.0, 0.0, -1
         rows: list[tuple[float, float, float]] = []
         dark: dict[str, tuple[float, float]] = {}
         for name in self.names:
@@ -1130,7 +1120,11 @@ class _Evaluation:
         self._remark_on_shading()
         principal = self.principal()
         qe, qe_std, qe_at = self._quantum_efficiency()
-        from_variance, from_variance_std = self._dark_current_from_variance()
+        emva1288 = self._emva1288()
+        from_variance, from_variance_std = _averaged(
+            (plane.dark_current_from_variance_e_per_s, plane.dark_current_from_variance_e_per_s_std)
+            for plane in emva1288.values()
+        )
         dark = pixels is not None and self.darks
         return NoiseFit(
             **principal,
@@ -1147,10 +1141,20 @@ class _Evaluation:
             read_noise_distribution=read_noise_distribution(pixels, t.gain) if dark and pixels is not None else None,
             defects=pixels.defects(t.gain) if dark and pixels is not None else None,
             channels=self._channels(principal),
-            emva1288=self._emva1288(),
+            emva1288=emva1288,
             photon_transfer=self._photon_transfer(self._linearity()[1]),
             remarks=tuple(self.remarks),
         )
+
+
+def _averaged(found: Iterable[tuple[float | None, float | None]]) -> tuple[float | None, float | None]:
+    """Weighted mean of independent values with standard uncertainties; None where there are none."""
+    known = [(value, std) for value, std in found if value is not None and std is not None]
+    if not known:
+        return None, None
+    values, stds = np.array(known).T
+    weight = 1.0 / np.maximum(stds, 1e-12) ** 2
+    return float(np.average(values, weights=weight)), float(weight.sum() ** -0.5)
 
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5

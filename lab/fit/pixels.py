@@ -20,6 +20,7 @@ from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
 
 LISTED_DEFECTS = 32
+SAME_NOISE = 1.1  # ratio of variances up to which darks are pooled
 HISTOGRAM_BINS = 48
 NOISY_CHANCE = 0.01  # that any pixel of a sensor whose pixels are alike is called noisy
 LOW, HIGH = 0.1, 0.9  # of saturation: flats that tell pixels' gains
@@ -51,8 +52,12 @@ class DarkPixels:
     def take(self, stack: Stack, exposure_s: float) -> None:
         """A level, after those of longer exposure."""
         if stack.scatter is not None:
-            self.scatter = stack.scatter if self.scatter is None else self.scatter + stack.scatter
-            self.freedom += stack.count - 1
+            variance = float(np.median(stack.scatter)) / (stack.count - 1)
+            # Darks that are noisier than this one have dark current in them: then it isn't the read-out's noise alone.
+            if self.scatter is None or variance * SAME_NOISE < float(np.median(self.scatter)) / self.freedom:
+                self.scatter, self.freedom = stack.scatter, stack.count - 1
+            else:
+                self.scatter, self.freedom = self.scatter + stack.scatter, self.freedom + stack.count - 1
         if self.longest is None:
             self.longest, self.longest_s = stack.mean, exposure_s
         self.shortest, self.shortest_s = stack.mean, exposure_s
@@ -110,7 +115,8 @@ def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoise
     spread2 = (measured - 2.0 / nu) / (1.0 + 2.0 / nu)
     spread2_std = float(rest.std()) / np.sqrt(count) / (1.0 + 2.0 / nu)
     spread, spread_std = root(spread2, spread2_std)
-    noise = np.sqrt(np.maximum(variance - 1.0 / 12.0, 0.0)) / gain_dn_per_e
+    rounding = middle / (middle - QUANTISATION_DN2)  # the pixels differ in what isn't rounding's
+    noise = np.sqrt(np.maximum(variance - QUANTISATION_DN2, 0.0)) / gain_dn_per_e
     pixels, edges = np.histogram(noise, HISTOGRAM_BINS, (0.0, float(np.percentile(noise, 99.9)) * 1.2))
     return ReadNoiseDistribution(
         degrees_of_freedom=nu,
@@ -118,8 +124,8 @@ def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoise
         median_e=float(np.median(noise)),
         percentile_95_e=float(np.percentile(noise, 95)),
         percentile_99_e=float(np.percentile(noise, 99)),
-        spread_percent=100.0 * spread,
-        spread_percent_std=100.0 * spread_std,
+        spread_percent=100.0 * spread * rounding,
+        spread_percent_std=100.0 * spread_std * rounding,
         noisy_pixels=int(np.count_nonzero(variance > limit)),
         noise_e=tuple(float(edge) for edge in edges),
         pixels=tuple(int(number) for number in pixels),

@@ -18,6 +18,7 @@ from plotly.offline import get_plotlyjs
 from lab.errors import InputError
 from lab.recording import RecordingSet
 from lab.report import charts, words
+from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
 from lab.report.provenance import Provenance, installed_versions, provenance_of
@@ -195,6 +196,7 @@ def render_report(
         "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
         "remarks": [(side, remark) for side, noise in noises.items() if noise for remark in noise.remarks],
         "transfer": {side: charts.photon_transfer(noise) if noise else None for side, noise in noises.items()},
+        "sheets": list(data_sheets(recordings, fit)),
         "linearity": {side: charts.linearity(noise) if noise else None for side, noise in noises.items()},
         "qe": {
             side: charts.quantum_efficiency(camera.spectral, recordings, side) if camera.spectral else None
