@@ -387,8 +387,9 @@ def charuco_texture(
 
 
 def _cells_to_cover(view: View, cell_px: float) -> tuple[int, int]:
-    """Rows and columns of cells that reach a little past the frame all round, so that no blur brings in the surround."""
-    down, across = (2 * int(np.ceil((0.5 * n + 32.0) / cell_px)) for n in (view.rows, view.cols))
+    """Rows and columns of cells that reach past the frame by a quarter of it and 32 px all round, so that neither blur nor a
+    lens that draws things in brings in the surround."""
+    down, across = (2 * int(np.ceil((0.75 * n + 32.0) / cell_px)) for n in (view.rows, view.cols))
     return down, across
 
 

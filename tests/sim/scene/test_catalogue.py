@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -220,3 +222,12 @@ def test_a_rig_without_geometry_is_refused(mono_camera: CameraModel) -> None:
     rig = StereoRig(left=mono_camera, right=mono_camera, rotation=pose, translation_mm=(-60.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="left camera has no geometry"):
         target.seen_by(rig)
+
+
+def test_the_documentation_lists_every_scene_and_parameter() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "scenes.md").read_text(encoding="utf-8")
+    for item in (*SCENES.values(), PictureOnScreen, Cube):
+        section = text.split(f"**`{item.name}`**: {item.shows}.")[1].split("**`")[0]
+        for field, quantity in item.quantities().items():
+            assert f"| `{field}` | {quantity.unit} | {item.model_fields[field].default:g} |" in section
+            assert section.count(f"`{field}`") == 1
