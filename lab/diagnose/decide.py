@@ -59,7 +59,7 @@ class Verdict:
 
 def decide(evidence: Evidence, rng: np.random.Generator, report: Callable[[str], None] = lambda _: None) -> Verdict:
     """The whole chain on one side's evidence. Deterministic for a given generator."""
-    known = tuple(library().values())
+    known = tuple(effect for effect in library().values() if effect.shown_by)
     current = refit(evidence, ())
     first = signatures(evidence, evidence.camera, (), known)
     threshold = first.threshold(rng, 1.0 - FALSE_ALARM_RATE)

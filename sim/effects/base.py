@@ -39,7 +39,8 @@ class Effect(Frozen):
     invariances: ClassVar[frozenset[str]] = frozenset()
     #: Parameters that shape the effect without sizing it (a filter's edge): a score takes them from the prototype as they are.
     shapes: ClassVar[frozenset[str]] = frozenset()
-    #: Kinds of capture that can show it (`dark`, `flat`, `narrowband`, `slanted_edge`, ...).
+    #: Kinds of capture that can show it (`dark`, `flat`, `narrowband`, `slanted_edge`, ...); none: a part that a camera is known to
+    #: have, which acts like another effect and so is never looked for.
     shown_by: ClassVar[frozenset[str]] = frozenset()
     #: Names of effects that can look the same in some set of captures.
     rivals: ClassVar[frozenset[str]] = frozenset()
@@ -125,6 +126,13 @@ class Effect(Frozen):
     def moves_charge(cls) -> bool:
         """Whether the effect acts on whole frames through `charge`, and so not through `transfer`: never through both."""
         return cls.charge is not Effect.charge
+
+    def image_shift_um(
+        self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """OPTICS: how far (dx, dy) light of one wavelength lands from the place on the sensor where the baseline has it, or None for
+        nowhere else. Places are in um from the sensor's centre, x along columns, y along rows, and broadcast."""
+        return None
 
     def veil(self) -> float:
         """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""

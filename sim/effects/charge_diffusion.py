@@ -29,6 +29,7 @@ class ChargeDiffusion(Effect):
     shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {
+            "axial_chromatic_aberration",
             "defocus",
             "optical_low_pass_filter",
             "spherical_aberration",

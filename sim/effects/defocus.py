@@ -22,6 +22,7 @@ class Defocus(Aberration):
     shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {
+            "axial_chromatic_aberration",
             "spherical_aberration",
             "charge_diffusion",
             "optical_low_pass_filter",

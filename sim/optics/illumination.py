@@ -21,6 +21,15 @@ def optical_axis_px(camera: CameraModel) -> tuple[float, float]:
     return camera.geometry.camera_matrix[1][2], camera.geometry.camera_matrix[0][2]
 
 
+def from_axis_um(x_um: ArrayLike, y_um: ArrayLike, camera: CameraModel) -> tuple[FloatArray, FloatArray, float]:
+    """Places on the sensor, um from its centre (x along columns, y along rows), as um from the optical axis; and half the diagonal."""
+    row0, col0 = optical_axis_px(camera)
+    pitch = camera.pixel_pitch_um
+    x = np.asarray(x_um, float) - (col0 - 0.5 * (camera.cols - 1)) * pitch
+    y = np.asarray(y_um, float) - (row0 - 0.5 * (camera.rows - 1)) * pitch
+    return x, y, 0.5 * float(np.hypot(camera.cols, camera.rows)) * pitch
+
+
 def sin_theta(camera: CameraModel, row: ArrayLike, col: ArrayLike) -> FloatArray:
     """Sine of the chief ray's angle atan(r / focal length) at the sensor, for points in px that broadcast."""
     row0, col0 = optical_axis_px(camera)

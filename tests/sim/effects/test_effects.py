@@ -10,15 +10,18 @@ import pytest
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect, Stage
 from sim.effects.library import effect, effects
-from sim.forward import Exposure, edge_profile, electron_rate, expected, optical_transfer
+from sim.forward import Exposure, edge_profile, electron_rate, expected, expected_electrons, optical_transfer
 from sim.optics.diffraction import diffraction_otf
+from sim.optics.illumination import relative_illumination
+from sim.optics.imaging import ZernikePupil
 from sim.optics.pupil import pupil_otf, seidel
-from sim.scene.scenes import UniformField
+from sim.scene.scenes import EdgeRegion, KnifeEdge, PointArray, UniformField
 from sim.spectrum import Spectrum
 
 ALL = list(effects().values())
 WAVELENGTH = np.arange(380.0, 781.0)
 LIGHT = Spectrum.of(WAVELENGTH, np.full(WAVELENGTH.shape, 0.02))
+LINE_650 = Spectrum.of([649.999, 650.0, 650.001], [0.0, 1.0, 0.0])
 LINE = Spectrum.of(WAVELENGTH, 0.02 * np.exp(-0.5 * ((WAVELENGTH - 560.0) / 6.0) ** 2))
 
 
@@ -54,10 +57,10 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     rest: list[float] = []
     for e in acting or (Effect,):
         if e is Effect:
-            rest += [1.0, 0.02, 0.0, 0.0, 1e4, 0.0, *np.ones(5)]
+            rest += [1.0, 0.02, 0.0, 0.0, 1e4, 0.0, *np.ones(5), *np.zeros(10)]
             continue
         rest += [e.drift(600.0), e.exposure(0.02), e.ambient_e_per_s("G", CAMERA) / 1e3, e.offset_dn(600.0, 30.0, CAMERA),
-                 float(e.noise_e2(np.array(9e3), np.array(1e4), CAMERA)), e.veil(), *e.illumination(place, place, CAMERA)]  # fmt: skip
+                 float(e.noise_e2(np.array(9e3), np.array(1e4), CAMERA)), e.veil(), *e.illumination(place, place, CAMERA), *np.ravel(e.image_shift_um(place, 0.5 * place, 620.0, CAMERA) or np.zeros(10))]  # fmt: skip
     return np.concatenate(
         [np.real(np.concatenate(otf)), np.array(rates) / max(rates), frame.ravel() / frame.max(), rest]
     )
@@ -91,7 +94,7 @@ def test_declares_what_the_diagnosis_reads(kind: type[Effect]) -> None:
         "bernoulli",
         "charuco",
     }
-    assert kind.shown_by
+    assert kind.shown_by or kind.name == "cover_glass"  # a part that is known, and spherical aberration by what it does
     assert kind.quantities()
     assert kind.shapes <= set(kind.quantities())
 
@@ -137,7 +140,7 @@ def _blurs() -> list[Effect]:
 def test_a_blur_conserves_light(one: Effect) -> None:
     """OTF 1 at zero frequency: none is lost."""
     zero = np.zeros(1)
-    factor = one.transfer(zero, zero, 550.0, CAMERA)
+    factor = one.transfer(zero, zero, 480.0, CAMERA)
     assert factor is not None
     assert float(np.real(factor[0])) == pytest.approx(1.0, abs=1e-12)
 
@@ -230,3 +233,162 @@ def test_bandwidth_keeps_the_light() -> None:
 def test_unknown_effect_is_refused_with_the_list() -> None:
     with pytest.raises(KeyError, match="defocus"):
         effect("nonsense")
+
+
+# --- aberrations -----------------------------------------------------------------------------------------------------
+
+
+def test_axial_colour_is_each_wavelengths_own_defocus() -> None:
+    """dz = 8 um t + 3 um t^2: at 650 nm 11 um, at 450 nm -5 um, at 550 nm none."""
+    one = effect("axial_chromatic_aberration")(slope_um=8.0, curvature_um=3.0)
+    f, none = np.linspace(0.0, 0.4, 9), np.zeros(9)
+    for wavelength_nm, dz in ((650.0, 11.0), (450.0, 5.0)):
+        wanted = effect("defocus")(defocus_um=dz).transfer(f, none, wavelength_nm, CAMERA)
+        np.testing.assert_allclose(one.transfer(f, none, wavelength_nm, CAMERA), wanted, atol=1e-12)
+    assert one.transfer(f, none, 550.0, CAMERA) is None
+
+
+def test_axial_colour_swaps_the_channels_through_focus() -> None:
+    """Red focuses behind: with the sensor moved back red gains and blue loses, and only the sum of the paths says so."""
+    f = np.full(1, 0.3)
+    colour = effect("axial_chromatic_aberration")(slope_um=-15.0)
+    moved = effect("defocus")(defocus_um=8.0)
+    contrast = {
+        acting: [float(np.real(optical_transfer(CAMERA, c, LIGHT, f, 0 * f, acting))[0]) for c in "RB"]
+        for acting in ((), (colour,), (colour, moved))
+    }
+    red, blue = np.array(contrast[(colour, moved)]) / np.array(contrast[(colour,)])
+    assert red > 1.0 > blue
+
+
+def test_aberrations_add_up_in_the_pupil() -> None:
+    """W040 with W020 = -W040 is the best focus of spherical aberration: better than either alone, as the sum of the paths is."""
+    spherical = effect("spherical_aberration")(w040_um=0.5)
+    # defocus has one sign alone; astigmatism of equal and opposite parts doesn't: -x^2 - y^2 in two steps
+    back = effect("axial_chromatic_aberration")(slope_um=-0.5 * 8.0 * 16.0)
+    camera = CAMERA.model_copy(update={"fill_factor": 1.0, "quantum_efficiency": dict.fromkeys("RGB", LINE_650)})
+    f = np.linspace(0.05, 0.5, 6)
+    both = optical_transfer(camera, "G", None, f, 0 * f, (spherical, back))
+    um = f / camera.pixel_pitch_um
+    wanted = pupil_otf(um, 0 * um, 650.0, 4.0, seidel(spherical_um=0.5, defocus_um=-0.5)) * np.sinc(f)
+    np.testing.assert_allclose(both, wanted, atol=1e-6)
+    alone = optical_transfer(camera, "G", None, f, 0 * f, (spherical,))
+    assert np.all(np.real(both) > np.real(alone))
+
+
+def test_a_cameras_own_pupil_takes_aberrations_in() -> None:
+    """A lens with defocus of its own and one with the effect are one and the same."""
+    f = np.linspace(0.0, 0.6, 7)
+    own = ZernikePupil(coefficients=(0, 0, 0, 0.1), index="noll", unit="um")
+    w020 = 2.0 * np.sqrt(3.0) * 0.1
+    camera = CAMERA.model_copy(update={"lens": CAMERA.lens.model_copy(update={"imaging": own})})
+    more = effect("defocus")(defocus_um=5.0)
+    total = effect("defocus")(defocus_um=5.0 + 8.0 * 16.0 * w020)
+    np.testing.assert_allclose(
+        optical_transfer(camera, "G", LIGHT, f, f, (more,)),
+        optical_transfer(CAMERA, "G", LIGHT, f, f, (total,)),
+        atol=1e-6,
+    )
+
+
+def test_cover_glass_is_the_spherical_aberration_of_its_thickness() -> None:
+    """2 mm of n = 1.52 at f/4: W040 = t (n^2 - 1) / (128 n^3 N^4); left unfocused, t (1 - 1/n) of defocus comes on top."""
+    kind, f = effect("cover_glass"), np.linspace(0.0, 0.4, 9)
+    w040 = 2000.0 * (1.52**2 - 1) / (128 * 1.52**3 * 4.0**4)
+    wanted = effect("spherical_aberration")(w040_um=w040).transfer(f, 0 * f, 550.0, CAMERA)
+    np.testing.assert_allclose(kind(thickness_mm=2.0).transfer(f, 0 * f, 550.0, CAMERA), wanted, atol=1e-12)
+    blurred = kind(thickness_mm=0.05, refocused=False).transfer(f, 0 * f, 550.0, CAMERA)
+    defocus = effect("defocus")(defocus_um=50.0 * (1 - 1 / 1.52)).transfer(f, 0 * f, 550.0, CAMERA)
+    # 0.05 mm of glass has 3e-4 um of spherical aberration
+    np.testing.assert_allclose(blurred, defocus, atol=5e-3)
+
+
+def test_a_quartz_plate_splits_blue_further() -> None:
+    """Null at 1 / (2 d): d is as stated at 589.3 nm, 4 % more at 400 nm."""
+    one = effect("optical_low_pass_filter")(displacement_x_um=2.0, plate="quartz")
+    for wavelength_nm, d in ((589.3, 2.0), (400.0, 2.083)):
+        assert one.transfer(np.array([0.5 / d]), np.zeros(1), wavelength_nm, CAMERA)[0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_an_interference_filter_darkens_red_towards_the_corners() -> None:
+    """At 20 degrees and n = 1.8 an edge at 620 nm moves to 609 nm; glass stays."""
+    coating = effect("infrared_cut_filter")(cut_wavelength_nm=620.0, effective_index=1.8)
+    glass = effect("infrared_cut_filter")(cut_wavelength_nm=620.0)
+    sine = np.sin(np.deg2rad(20.0))
+    axis, corner = (electron_rate(CAMERA, "R", LIGHT, (coating,), sin_theta=s) for s in (0.0, sine))
+    assert corner < 0.95 * axis
+    assert axis == pytest.approx(electron_rate(CAMERA, "R", LIGHT, (glass,), sin_theta=sine))
+
+
+# --- where light lands -----------------------------------------------------------------------------------------------
+
+
+POINTS = np.array([(row, col) for row in (3.0, 11.5, 20.0) for col in (4.0, 15.5, 27.0)])
+
+
+def _centres(
+    camera: CameraModel, points: np.ndarray, line: Spectrum, acting: tuple[Effect, ...], around: np.ndarray
+) -> np.ndarray:
+    """Centroids [row, col] of small dots, over 3 x 3 px `around` places, in a frame without mosaic or fall-off."""
+    dots = PointArray(tuple(map(tuple, points.tolist())), 1.5, line.scaled(0.0), line)
+    frame = expected_electrons(camera, Exposure(dots, 1.0), acting, oversample=6, margin_px=16)
+    row, col = np.indices(frame.shape)
+    frame = frame / relative_illumination(camera, row, col)
+    windows = [frame * ((np.abs(row - r) < 2) & (np.abs(col - c) < 2)) for r, c in np.rint(around)]
+    return np.array([[np.sum(w * row) / w.sum(), np.sum(w * col) / w.sum()] for w in windows])
+
+
+@pytest.mark.parametrize(
+    ("one", "wavelength_nm"),
+    [
+        (effect("lateral_chromatic_aberration")(slope_um=1.5, curvature_um=0.5), 650.0),
+        (effect("lateral_chromatic_aberration")(slope_um=1.5, curvature_um=0.5), 450.0),
+        (effect("distortion")(corner_percent=2.0), 550.0),
+        (effect("decentre")(shift_x_um=0.5, shift_y_um=-0.35), 550.0),
+    ],
+    ids=lambda v: v.name if isinstance(v, Effect) else str(v),
+)
+def test_light_lands_where_the_law_says(one: Effect, wavelength_nm: float) -> None:
+    """Dots on a frame of 24 x 32 px of 3 um: as if they had been drawn where the law puts them."""
+    line = Spectrum.of([wavelength_nm - 1e-3, wavelength_nm, wavelength_nm + 1e-3], [0.0, 1.0, 0.0])
+    flat = Spectrum.of([300.0, 900.0], [0.5, 0.5])
+    camera = CAMERA.model_copy(update={"cfa": "MONO", "quantum_efficiency": {"Y": flat}, "dark_current_e_per_s": 0.0})
+    y, x = ((POINTS - (11.5, 15.5)) * 3.0).T
+    corner = 0.5 * np.hypot(24.0, 32.0) * 3.0
+    t = (wavelength_nm - 550.0) / 100.0
+    r2 = (x**2 + y**2) / corner**2
+    right, down = {
+        "lateral_chromatic_aberration": ((1.5 * t + 0.5 * t * t) / corner * x, (1.5 * t + 0.5 * t * t) / corner * y),
+        "distortion": (0.02 * r2 * x, 0.02 * r2 * y),
+        "decentre": (
+            (0.5 * (3 * x * x + y * y) - 0.7 * x * y) / corner**2,
+            (-0.35 * (x * x + 3 * y * y) + x * y) / corner**2,
+        ),
+    }[one.name]
+    law = np.stack([down, right], axis=1) / 3.0
+    assert np.abs(law).max() > 0.1
+    moved = _centres(camera, POINTS, line, (one,), POINTS + law)
+    # the scale changes by 5 % at most, and with it the dots' width: a hundredth of a pixel
+    np.testing.assert_allclose(moved, _centres(camera, POINTS + law, line, (), POINTS + law), atol=0.015)
+    plain = _centres(camera, POINTS, line, (), POINTS + law)
+    assert np.abs(moved - plain).max() > 0.05
+
+
+def test_a_uniform_field_stays_uniform_where_light_is_moved() -> None:
+    for name in ("lateral_chromatic_aberration", "distortion", "decentre"):
+        one = effect(name)(**dict.fromkeys(effect(name).quantities(), 5.0))
+        scene = Exposure(UniformField(LIGHT), 0.01)
+        np.testing.assert_array_equal(expected(CAMERA, scene, (one,)), expected(CAMERA, scene))
+
+
+def test_lateral_colour_moves_an_edge_as_it_moves_a_dot() -> None:
+    """A vertical edge 12 px right of the axis, seen in red: the edge's profile is moved by the law at the edge's middle."""
+    one = effect("lateral_chromatic_aberration")(slope_um=3.0)
+    edge = KnifeEdge((EdgeRegion((4, 24, 20, 31), 0.0),), LIGHT.scaled(0.1), LIGHT)
+    camera = CAMERA.model_copy(update={"cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
+    plain, moved = (expected_electrons(camera, Exposure(edge, 1.0), acting) for acting in ((), (one,)))
+    plain, moved = (f / relative_illumination(camera, *np.indices(f.shape)) for f in (plain, moved))
+    # the sum along a row falls by contrast x shift in px: 3 um x 11.5 px / 20 px / 3 um a px at the middle, col 27
+    contrast = plain[12, 31] - plain[12, 20]
+    shift = (plain[12].sum() - moved[12].sum()) / contrast
+    assert shift == pytest.approx(3.0 * 11.5 / 20.0 / 3.0, rel=0.02)

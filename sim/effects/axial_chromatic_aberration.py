@@ -1,0 +1,54 @@
+"""Axial chromatic aberration: colours come to focus at different distances."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+from sim.camera import CameraModel
+from sim.effects.aberration import Aberration
+from sim.effects.base import Stage
+from sim.optics.pupil import Wavefront, seidel
+from sim.parameters import Quantity
+
+#: The wavelength that is in focus.
+FOCUSED_NM = 550.0
+
+
+class AxialChromaticAberration(Aberration):
+    """The sensor lies dz = a t + b t^2 from the focus of a wavelength, t = (wavelength - 550 nm) / 100 nm: W = dz / (8 N^2) rho^2.
+
+    a is the primary spectrum, b what a corrected lens leaves. Alone, either acts by its square; with a defocus of the whole
+    lens the sign counts: one end of the spectrum comes into focus.
+    """
+
+    name: ClassVar[str] = "axial_chromatic_aberration"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on chromatic aberration"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"defocus", "spherical_aberration", "charge_diffusion"})
+    sentence: ClassVar[str] = (
+        "The lens doesn't focus all colours in one plane: some channels are sharper than others, and which ones they are changes "
+        "with the focus."
+    )
+
+    slope_um: Annotated[
+        float,
+        Quantity("um", "distance of sensor and focus 100 nm to the red of 550 nm, where it grows in proportion", lower=-100.0,
+                 upper=100.0, prior=(0.0, 10.0), absent=0.0, slope_power=2),
+    ] = 0.0  # fmt: skip
+    curvature_um: Annotated[
+        float,
+        Quantity("um", "the same where it grows as the square", lower=-100.0, upper=100.0, prior=(0.0, 10.0), absent=0.0,
+                 slope_power=2),
+    ] = 0.0  # fmt: skip
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        # the two signs differ only beside a defocus, and then they are no small change of each other
+        return tuple((cls(slope_um=sign * 4.0), cls(curvature_um=sign * 4.0)) for sign in (1.0, -1.0))
+
+    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
+        t = (wavelength_nm - FOCUSED_NM) / 100.0
+        return seidel(defocus_um=t * (self.slope_um + self.curvature_um * t) / (8.0 * camera.lens.f_number**2))

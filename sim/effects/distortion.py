@@ -1,0 +1,42 @@
+"""Distortion: the image's scale changes with the distance from the axis."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.optics.illumination import from_axis_um
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class Distortion(Effect):
+    """Radial, of the third order: light lands at r (1 + k (r / R)^2), on top of what the camera's geometry says, R half the frame's
+    diagonal, r from the optical axis."""
+
+    name: ClassVar[str] = "distortion"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "D. C. Brown, Photogramm. Eng. 37, 855 (1971)"
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco", "checkerboard"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"decentre"})
+    sentence: ClassVar[str] = (
+        "The lens distorts otherwise than the geometry says: straight lines bend, and corners lie off along the radius."
+    )
+
+    corner_percent: Annotated[
+        float,
+        Quantity("%", "shift in the frame's corner over its distance from the axis, outwards", lower=-40.0, upper=40.0,
+                 prior=(0.0, 0.5), absent=0.0),
+    ] = 0.0  # fmt: skip
+
+    def image_shift_um(
+        self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> tuple[FloatArray, FloatArray] | None:
+        if self.corner_percent == 0.0:
+            return None
+        x, y, corner = from_axis_um(x_um, y_um, camera)
+        share = self.corner_percent / 100.0 * (x * x + y * y) / corner**2
+        return share * x, share * y

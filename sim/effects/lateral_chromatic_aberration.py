@@ -1,0 +1,53 @@
+"""Lateral chromatic aberration: colours are imaged at different scales."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.optics.illumination import from_axis_um
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+#: The wavelength that lands where the camera's geometry has it.
+REFERENCE_NM = 550.0
+
+
+class LateralChromaticAberration(Effect):
+    """Shift outwards by r / R (a t + b t^2), t = (wavelength - 550 nm) / 100 nm, r from the optical axis, R half the frame's diagonal.
+
+    a is the primary spectrum, b what a corrected lens leaves. Within a channel's band the shift is a blur, along the radius. The
+    term in r^3 that wide lenses add is left to the form tolerance.
+    """
+
+    name: ClassVar[str] = "lateral_chromatic_aberration"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "ISO 19084:2015"
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco", "slanted_edge", "checkerboard", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset()
+    sentence: ClassVar[str] = (
+        "The lens images colours at different scales: towards the corners red and blue detail lies further out or in than green."
+    )
+
+    slope_um: Annotated[
+        float,
+        Quantity("um", "shift in the frame's corner 100 nm to the red of 550 nm, where it grows in proportion", lower=-50.0,
+                 upper=50.0, prior=(0.0, 2.0), absent=0.0),
+    ] = 0.0  # fmt: skip
+    curvature_um: Annotated[
+        float,
+        Quantity("um", "the same where it grows as the square", lower=-50.0, upper=50.0, prior=(0.0, 2.0), absent=0.0),
+    ] = 0.0  # fmt: skip
+
+    def image_shift_um(
+        self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> tuple[FloatArray, FloatArray] | None:
+        t = (wavelength_nm - REFERENCE_NM) / 100.0
+        corner_um = t * (self.slope_um + t * self.curvature_um)
+        if corner_um == 0.0:
+            return None
+        x, y, corner = from_axis_um(x_um, y_um, camera)
+        return corner_um / corner * x, corner_um / corner * y
