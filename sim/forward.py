@@ -226,9 +226,9 @@ def expected_electrons(
     return electrons
 
 
-def dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = ()) -> float:
-    """Mean electrons of the dark current in one exposure, at its temperature."""
-    rate = sensor.dark_current_e_per_s(camera, exposure.temperature_c)
+def dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = ()) -> FloatArray | float:
+    """Mean electrons of the dark current in one exposure, at its temperature; (rows, cols) where effects tell pixels apart."""
+    rate: FloatArray | float = sensor.dark_current_e_per_s(camera, exposure.temperature_c)
     for effect in effects:
         rate = effect.dark_current(rate, exposure.temperature_c, camera)
     return rate * exposure.exposure_s
@@ -564,7 +564,7 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
             dark, light = dark * field[0](square), light * field[1](square)
         distance = edge.distance_px(row[mine], col[mine])
         acting = _blurring(effects)
-        if _movers(effects):
+        if _light_moves(camera, effects):
             row0, col0, row1, col1 = edge.region
             middle = 0.5 * (row0 + row1 - 1), 0.5 * (col0 + col1 - 1)
             acting = (*acting, _ShiftAt(acting=acting, row=middle[0], col=middle[1]))
@@ -589,6 +589,7 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
     ny, nx = grid.shape
     fy, fx, pixel_y, pixel_x = _pixel_on_grid(camera, grid)
     images: dict[str, FloatArray] = {}
+    moves = _light_moves(camera, effects)
     transformed: list[ComplexArray] = []
     for channel in camera.channels:
         wavelength_nm, weight = _detected(camera, channel, lights, effects, scene.kind)
@@ -610,7 +611,7 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
         spectrum = np.zeros((ny, nx // 2 + 1), complex)
         moved: list[tuple[float, ComplexArray]] = []
         for k, node in enumerate(nodes):
-            if _movers(effects):
+            if moves:
                 spectrum = np.zeros((ny, nx // 2 + 1), complex)
                 moved.append((float(node), spectrum))
             over = (shares[1:, k] - shares[0, k]).tolist()
@@ -648,8 +649,8 @@ def _cube_images(
     As in `_blurred_images`, image = sum_k OTF_k F[sum_b w_bk band_b]: a cube of any number of bands becomes one picture a
     wavelength of the rule. A cube whose samples are the camera's pixels needs no finer grid: its transfer is folded.
     """
-    movers = _movers(effects)
-    aligned = scene.to_camera is None and not movers
+    moves = _light_moves(camera, effects)
+    aligned = scene.to_camera is None and not moves
     grid = Grid(camera.rows, camera.cols, 1 if aligned else oversample, margin_px)
     # An aligned picture starts at pixel [0, 0]; what is left of the grid keeps its two ends apart.
     shape = tuple(fft.next_fast_len(n, real=True) for n in grid.shape) if aligned else grid.shape
@@ -672,14 +673,14 @@ def _cube_images(
                 fine = cell_means(picture.astype(float), scene.warp(), grid, 0.0).astype(np.float32)
             transformed = fft.rfft2(fine)
             transformed *= transfer.astype(np.complex64 if np.iscomplexobj(transfer) else np.float32)
-            if movers:
+            if moves:
                 moved += _at_moved_pixels(camera, transformed * (pixel_y * pixel_x), grid, float(node), effects)
             else:
                 spectrum += transformed
         if not aligned:
             spectrum *= (pixel_y * pixel_x).astype(np.complex64)
         image = _at_pixels(spectrum, grid.oversample, nx)[start : start + grid.rows, start : start + grid.cols]
-        images[channel] = np.maximum(moved if movers else image, 0.0).astype(float)
+        images[channel] = np.maximum(moved if moves else image, 0.0).astype(float)
     return images
 
 
@@ -743,9 +744,10 @@ def _at_pixels(spectrum: ComplexArray | NDArray[np.complex64], oversample: int, 
     return np.asarray(fft.irfft(fft.ifft(folded_rows, axis=0), cols, axis=1)[:, ::oversample])
 
 
-def _movers(effects: Sequence[Effect]) -> bool:
+def _light_moves(camera: CameraModel, effects: Sequence[Effect]) -> bool:
     """Whether any effect lets light land elsewhere."""
-    return any(type(effect).image_shift_um is not Effect.image_shift_um for effect in effects)
+    axis = np.zeros(1)
+    return any(effect.image_shift_um(axis, axis, 550.0, camera) is not None for effect in effects)
 
 
 def _shift_px(

@@ -130,16 +130,19 @@ class Effect(Frozen):
     def image_shift_um(
         self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
     ) -> tuple[FloatArray, FloatArray] | None:
-        """OPTICS: how far (dx, dy) light of one wavelength lands from the place on the sensor where the baseline has it, or None for
-        nowhere else. Places are in um from the sensor's centre, x along columns, y along rows, and broadcast."""
+        """OPTICS: how far (dx, dy) light of one wavelength lands from the place on the sensor where the baseline has it; None where
+        the effect is absent, whatever the wavelength. Places are in um from the sensor's centre, x along columns, y along rows, and broadcast."""
         return None
 
     def veil(self) -> float:
         """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""
         return 0.0
 
-    def dark_current(self, e_per_s: float, temperature_c: float | None, camera: CameraModel) -> float:
-        """CHARGE: mean dark current of a pixel, given what the camera model says for that temperature of the sensor."""
+    def dark_current(
+        self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
+    ) -> FloatArray | float:
+        """CHARGE: mean dark current, of all pixels or of each (rows, cols), given what the camera model says for that
+        temperature of the sensor."""
         return e_per_s
 
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:

@@ -45,9 +45,9 @@ class LateralChromaticAberration(Effect):
     def image_shift_um(
         self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
     ) -> tuple[FloatArray, FloatArray] | None:
+        if self.slope_um == 0.0 and self.curvature_um == 0.0:
+            return None
         t = (wavelength_nm - REFERENCE_NM) / 100.0
         corner_um = t * (self.slope_um + t * self.curvature_um)
-        if corner_um == 0.0:
-            return None
         x, y, corner = from_axis_um(x_um, y_um, camera)
         return corner_um / corner * x, corner_um / corner * y
