@@ -22,7 +22,7 @@ class PupilRays:
 
     `x_mm`, `y_mm` are where a ray meets the image plane, `cosine_x`, `cosine_y` its direction there, `path_mm` its optical path,
     `area` the light that the ray stands for (K dA) and `jacobian` J / K, d(L, M) by that light. `mirrored` says that a ray
-    at +x stands for its mirror image too (`area` is that of one of them). `rim_l`, `rim_m` trace the pupil's rim in
+    at +x stands for its mirror image too (`area` is that of one of them). `rim_cosine_x`, `rim_cosine_y` trace the pupil's rim in
     direction cosines, closed, once around.
     """
 
@@ -33,8 +33,8 @@ class PupilRays:
     path_mm: FloatArray
     jacobian: FloatArray
     area: FloatArray
-    rim_l: FloatArray
-    rim_m: FloatArray
+    rim_cosine_x: FloatArray
+    rim_cosine_y: FloatArray
     mirrored: bool
     wavelength_nm: float
     index: float
@@ -79,14 +79,21 @@ def _waves(phase: Any, step: Any, weight: Any, count: int) -> Any:
     return out
 
 
-def point_spread(rays: PupilRays, centre_mm: tuple[float, float], samples: int, pitch_um: float) -> FloatArray:
+def point_spread(
+    rays: PupilRays, centre_mm: tuple[float, float], samples: int, pitch_um: float, reach_mm: float = np.inf
+) -> FloatArray:
     """(samples, samples) intensities on points around `centre_mm`, rows along y, as shares of all that leaves the lens.
 
-    Parseval: sum of |U|^2 dx dy over the whole plane is (wavelength / n)^2 times the light in the pupil.
+    Parseval: sum of |U|^2 dx dy over the whole plane is (wavelength / n)^2 times the light in the pupil. Rays that meet the
+    image farther than `reach_mm` from the centre are left out, smoothly over the outer third of that distance: they send no
+    light into a window that lies well within, and the others need fewer rays to be summed right.
     """
     k, pitch = rays.wave_number_per_mm, pitch_um * 1e-3
     first = -0.5 * (samples - 1) * pitch
     weight = np.sqrt(np.abs(rays.jacobian)) * rays.area
+    if np.isfinite(reach_mm):
+        away = np.hypot(rays.x_mm - centre_mm[0], rays.y_mm - centre_mm[1]) / reach_mm
+        weight = weight * np.cos(0.5 * np.pi * np.clip(3.0 * away - 2.0, 0.0, 1.0)) ** 2
     path = rays.plane_path_mm(*centre_mm) / rays.index
     path = path - np.mean(path)
     rows = _waves(k * (path + rays.cosine_y * first), k * rays.cosine_y * pitch, weight, samples)
@@ -153,12 +160,19 @@ def transfer(
             -rays.cosine_x * (x + rays.x_mm) + rays.cosine_y * (origin_mm[1] - rays.y_mm)
         )
         path, amplitude = np.concatenate([path, mirror]), np.concatenate([amplitude, amplitude])
-    centre = np.array([np.mean([rays.rim_l.min(), rays.rim_l.max()]), np.mean([rays.rim_m.min(), rays.rim_m.max()])])
-    half = np.array([np.ptp(rays.rim_l), np.ptp(rays.rim_m)]) * 0.5
+    centre = np.array(
+        [
+            np.mean([rays.rim_cosine_x.min(), rays.rim_cosine_x.max()]),
+            np.mean([rays.rim_cosine_y.min(), rays.rim_cosine_y.max()]),
+        ]
+    )
+    half = np.array([np.ptp(rays.rim_cosine_x), np.ptp(rays.rim_cosine_y)]) * 0.5
     terms = _terms((cosine_x - centre[0]) / half[0], (cosine_y - centre[1]) / half[1], order)
     path = path - np.mean(path)
     fitted = np.linalg.lstsq(terms, np.stack([path, amplitude], axis=1), rcond=1e-13)[0]
-    rim_along, rim_across = (rays.rim_m, rays.rim_l) if tangential else (rays.rim_l, rays.rim_m)
+    rim_along, rim_across = (
+        (rays.rim_cosine_y, rays.rim_cosine_x) if tangential else (rays.rim_cosine_x, rays.rim_cosine_y)
+    )
     t, weight = np.polynomial.legendre.leggauss(nodes)
     # Gauss-Chebyshev-like lines: square-root ends of the chords cost no accuracy.
     theta = 0.5 * np.pi * t

@@ -39,6 +39,7 @@ class Surfaces(NamedTuple):
     conic: FloatArray
     even: FloatArray  # of r^2, r^4, ...
     odd: FloatArray  # of r, r^3, ...
+    terms: NDArray[np.int64]  # how many of the even ones there are
     thickness: FloatArray
     aperture: NDArray[np.int64]
     opening: FloatArray  # half width, half height, x, y
@@ -89,6 +90,7 @@ def compiled_surfaces(prescription: Prescription, stop_radius_mm: float, image_s
         conic,
         even,
         odd,
+        np.array([int(np.max(np.flatnonzero(row), initial=-1)) + 1 for row in even]),
         thickness,
         aperture,
         opening,
@@ -175,7 +177,7 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces
             t = e / (b + np.sqrt(square))
         elif kind == STANDARD:
             return 0.0, x, y, 0.0, 0.0, 0.0, False
-    even, odd = surfaces.even[i], surfaces.odd[i]
+    even, odd = surfaces.even[i, : surfaces.terms[i]], surfaces.odd[i]
     for _ in range(_ITERATIONS):
         px, py = x + t * dir_l, y + t * dir_m
         s, s1, s2, inside = _sag(c, k, even, odd, kind, px * px + py * py)
@@ -188,7 +190,7 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces
             break
         move = (t * dir_n - s) / slope
         t -= move
-        if abs(move) < 1e-13 * (1.0 + abs(t)):
+        if abs(move) < 1e-8 * (1.0 + abs(t)):  # Newton's method: the next step would be about 1e-16
             px, py = x + t * dir_l, y + t * dir_m
             s, s1, s2, inside = _sag(c, k, even, odd, kind, px * px + py * py)
             return t, px, py, s, s1, s2, inside

@@ -323,8 +323,8 @@ class OpticalSystem:
         if centre is None:
             return None
         mirrored = self.prescription.centred and tangent[0] == 0.0
-        radial = math.ceil(0.4 * span) + 10
-        around = 2 * (math.ceil(0.6 * span) + 14)
+        radial = math.ceil(0.4 * span) + 8
+        around = max(2 * (math.ceil(0.6 * span) + 14), 96)
         half = around // 2
         # From +y over +x: the second half is the first one's mirror image.
         angle = 0.5 * np.pi - 2.0 * np.pi * (np.arange(around) + 0.5) / around
@@ -362,8 +362,8 @@ class OpticalSystem:
             path_mm=rows[:, rt.PATH],
             jacobian=jacobian,
             area=light,
-            rim_l=rim_l,
-            rim_m=rim_m,
+            rim_cosine_x=rim_l,
+            rim_cosine_y=rim_m,
             mirrored=mirrored,
             wavelength_nm=wavelength_nm,
             index=float(index[-2]),
@@ -615,23 +615,25 @@ class OpticalTable:
         solid, energy = np.zeros((w_count, f_count)), np.zeros((w_count, f_count))
         psf = np.zeros((w_count, f_count, n, n))
         centroid = np.zeros((w_count, f_count, 2))
-        half_window_mm = 0.5e-3 * n * self.pitch_um
-        half_diagonal = half_window_mm * math.sqrt(2.0)
+        half_diagonal = 0.5e-3 * math.sqrt(2.0) * n * self.pitch_um
         starts = self._starts()
         for f, tangent in enumerate(self.tangents):
             row = system.chief(tangent, system.reference_nm, starts[f])
             assert row is not None
             chief[f] = row[rt.X], row[rt.Y]
-            pupils = [self._pupil(tangent, w, starts[f], half_diagonal, chief[f]) for w in self.wavelengths]
-            for i, pupil in enumerate(pupils):
+            first = [self._pupil(tangent, w, starts[f]) for w in self.wavelengths]
+            for i, pupil in enumerate(first):
                 solid[i, f], energy[i, f] = pupil.solid_angle, pupil.energy
                 centroid[i, f] = (np.array(pupil.centroid_mm) - chief[f]) * 1e3
             window[f] = 0.5 * (centroid[:, f].min(axis=0) + centroid[:, f].max(axis=0))
-            at = chief[f] + 1e-3 * window[f]
-            if self.symmetric:
-                at[0] = 0.0
-            for i, pupil in enumerate(pupils):
-                psf[i, f] = point_spread(pupil, (float(at[0]), float(at[1])), n, self.pitch_um)
+            centre = float(chief[f, 0] + 1e-3 * window[f, 0]), float(chief[f, 1] + 1e-3 * window[f, 1])
+            for i, w in enumerate(self.wavelengths):
+                blur = float(np.max(np.hypot(first[i].x_mm - centre[0], first[i].y_mm - centre[1])))
+                # Light that arrives three half diagonals away doesn't reach into the window.
+                reach = min(blur, 3.0 * half_diagonal)
+                span = first[i].wave_number_per_mm * self._sine(first[i]) * (half_diagonal + reach)
+                pupil = self._pupil(tangent, w, starts[f], span)
+                psf[i, f] = point_spread(pupil, centre, n, self.pitch_um, reach if reach < blur else math.inf)
             if progress is not None:
                 progress(f"field {f + 1} of {f_count}", (f + 1) / f_count)
         axis = self._axis_index()
@@ -676,25 +678,18 @@ class OpticalTable:
         return [place for place in found if place is not None]
 
     def _pupil(
-        self,
-        tangent: tuple[float, float],
-        wavelength_nm: float,
-        start: tuple[float, float],
-        half_diagonal_mm: float,
-        chief_mm: FloatArray,
+        self, tangent: tuple[float, float], wavelength_nm: float, start: tuple[float, float], span: float = 0.0
     ) -> PupilRays:
-        """The pupil with as many rays as the window and the aberrations ask for."""
-        k = 2e6 * math.pi / wavelength_nm * self.system.index(wavelength_nm)[-2]
-        aperture = 0.5 / self.system.first_order.working_f_number
-        first = self.system.pupil(tangent, wavelength_nm, 0.0, start)
-        if first is None:
+        rays = self.system.pupil(tangent, wavelength_nm, span, start)
+        if rays is None:
             raise PrescriptionError(
                 f"no light comes through at {_angles(tangent)}, {wavelength_nm:g} nm; ask for a smaller field"
             )
-        blur = float(np.max(np.hypot(first.x_mm - chief_mm[0], first.y_mm - chief_mm[1])))
-        rays = self.system.pupil(tangent, wavelength_nm, k * aperture * (half_diagonal_mm + blur), start)
-        assert rays is not None
         return rays
+
+    def _sine(self, rays: PupilRays) -> float:
+        """Half the largest extent of the pupil in direction cosines: the image's numerical aperture over its index."""
+        return 0.5 * float(max(np.ptp(rays.rim_cosine_x), np.ptp(rays.rim_cosine_y)))
 
 
 def _angles(tangent: tuple[float, float]) -> str:
