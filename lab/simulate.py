@@ -202,9 +202,9 @@ def _read(
 
 
 def _check_light(
-    electrons: FloatArray, dark: float, options: SimulateOptions, white: Spectrum, camera: CameraModel
+    electrons: FloatArray, dark: FloatArray | float, options: SimulateOptions, white: Spectrum, camera: CameraModel
 ) -> None:
-    if float(electrons.max()) > dark:
+    if np.any(electrons > dark):
         return
     curves = camera.quantum_efficiency.values()
     seen = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
@@ -402,7 +402,9 @@ def summary_lines(record: SimulationRecord, file: Path) -> list[str]:
     noise = "expected, without noise" if record.options.expected else f"seed {record.options.seed}"
     return [
         f"{file}: {camera['cols']} x {camera['rows']} {camera['cfa']}, {record.options.scene} under {record.options.illuminant}, {noise}",
-        (f"exposure {s.exposure_s:.4g} s ({how}); mean {s.mean_electrons:.4g} e, brightest {BRIGHTEST_PERCENT:g} % {s.brightest_percent_electrons:.4g} e; "
-        f"mean {s.mean_dn:.4g} DN, highest {s.highest_dn} DN; saturated {s.saturated_percent:.2g} %; SNR {s.snr:.3g} at the mean"),
+        (
+            f"exposure {s.exposure_s:.4g} s ({how}); mean {s.mean_electrons:.4g} e, brightest {BRIGHTEST_PERCENT:g} % {s.brightest_percent_electrons:.4g} e; "
+            f"mean {s.mean_dn:.4g} DN, highest {s.highest_dn} DN; saturated {s.saturated_percent:.2g} %; SNR {s.snr:.3g} at the mean"
+        ),
         f"preview {preview_file(file).name}, record {record_file(file).name}",
     ]

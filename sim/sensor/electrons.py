@@ -164,7 +164,7 @@ def dn_moments(
     read_out: ReadOut = LINEAR,
     fixed_pattern: FixedPattern | None = None,
     *,
-    dark_electrons: float = 0.0,
+    dark_electrons: FloatArray | float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (DN, that of the rounded codes) and temporal variance (DN^2) of pixels with mean `electrons`.
 
@@ -214,7 +214,7 @@ def sample_from(
     rng: np.random.Generator,
     fixed_pattern: FixedPattern | None = None,
     *,
-    dark_electrons: float = 0.0,
+    dark_electrons: FloatArray | float = 0.0,
     gain_db: float = 0.0,
     read_out: ReadOut = LINEAR,
 ) -> NDArray[np.uint16]:
@@ -230,6 +230,7 @@ def sample_from(
     electrons = np.asarray(expected_electrons, float)
     check_electrons(electrons)
     frame = np.empty(electrons.shape, np.uint16)
+    dark = np.broadcast_to(np.asarray(dark_electrons, np.float32), electrons.shape)
     added = _added_electrons(electrons.shape, camera, rng, read_out)
     gain = np.float32(gain_dn_per_e(camera, gain_db))
     rows = max(1, 32_768 // max(1, electrons.shape[-1]))  # strips that stay in the processor's cache
@@ -237,7 +238,7 @@ def sample_from(
         strip = slice(start, start + rows)
         mean = electrons[strip].astype(np.float32)
         if fixed_pattern is not None:
-            mean += (mean - np.float32(dark_electrons)) * fixed_pattern.prnu[strip].astype(np.float32)
+            mean += (mean - dark[strip]) * fixed_pattern.prnu[strip].astype(np.float32)
             np.maximum(mean, np.float32(0.0), out=mean)
         charge = _read_charge(mean, camera, rng, read_out)
         if fixed_pattern is not None:

@@ -10,12 +10,21 @@ import pytest
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect, Stage
 from sim.effects.library import effect, effects
-from sim.forward import Exposure, edge_profile, electron_rate, expected, expected_electrons, optical_transfer
+from sim.forward import (
+    Exposure,
+    edge_profile,
+    electron_rate,
+    expected,
+    expected_electrons,
+    expected_sequence,
+    optical_transfer,
+    read_out,
+)
 from sim.optics.diffraction import diffraction_otf
 from sim.optics.illumination import relative_illumination
 from sim.optics.imaging import ZernikePupil
 from sim.optics.pupil import pupil_otf, seidel
-from sim.scene.scenes import EdgeRegion, KnifeEdge, PointArray, UniformField
+from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, PointArray, UniformField
 from sim.spectrum import Spectrum
 
 ALL = list(effects().values())
@@ -61,8 +70,16 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
             continue
         rest += [e.drift(600.0), e.exposure(0.02), e.ambient_e_per_s("G", CAMERA) / 1e3, e.offset_dn(600.0, 30.0, CAMERA),
                  float(e.noise_e2(np.array(9e3), np.array(1e4), CAMERA)), e.veil(), *e.illumination(place, place, CAMERA), *np.ravel(e.image_shift_um(place, 0.5 * place, 620.0, CAMERA) or np.zeros(10))]  # fmt: skip
+    # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
+    dark = Exposure(Darkness(), 0.5, temperature_c=32.0)
+    after = list(expected_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.01), dark], acting))[1]
+    out = read_out(CAMERA, dark, acting)
+    levels = np.linspace(0.0, 4000.0, 41)
+    electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (after, out.added_e, out.added_e2)]
+    codes = levels if out.codes is None else out.codes(levels)
     return np.concatenate(
         [np.real(np.concatenate(otf)), np.array(rates) / max(rates), frame.ravel() / frame.max(), rest]
+        + [values / 100.0 for values in (*electronics, codes)]
     )
 
 

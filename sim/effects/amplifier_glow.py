@@ -1,0 +1,52 @@
+"""Amplifier glow: light of the sensor's own output stage, brightest beside it."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class AmplifierGlow(Effect):
+    """g exp(-r / r0) electrons a second on top, r from the outermost pixel of one corner; it glows while charge is collected."""
+
+    name: ClassVar[str] = "amplifier_glow"
+    stage: ClassVar[Stage] = Stage.CHARGE
+    reference: ClassVar[str] = "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, luminescence"
+    form_tolerance: ClassVar[float] = 0.2
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"dark_current_temperature"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"reach_mm"})
+    sentence: ClassVar[str] = (
+        "The output stage glows: dark frames brighten with the exposure towards one corner, whatever is in front of the lens."
+    )
+
+    glow_e_per_s: Annotated[
+        float, Quantity("e/s", "electrons a second in that corner", lower=0.0, upper=1e6, prior=(0.0, 20.0), absent=0.0)
+    ] = 0.0
+    reach_mm: Annotated[
+        float, Quantity("mm", "distance over which it falls to 1/e", lower=0.01, upper=100.0, absent=1.0)
+    ] = 1.0
+    corner: Literal["top_left", "top_right", "bottom_left", "bottom_right"] = "top_left"
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return ((cls(glow_e_per_s=6.0),),)
+
+    def dark_current(
+        self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
+    ) -> FloatArray | float:
+        if self.glow_e_per_s == 0.0:
+            return e_per_s
+        side, end = self.corner.split("_")
+        down, across = np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float)
+        down = down if side == "top" else down[::-1]
+        across = across if end == "left" else across[::-1]
+        distance_mm = np.hypot(down[:, None], across[None, :]) * camera.pixel_pitch_um * 1e-3
+        return e_per_s + self.glow_e_per_s * np.exp(-distance_mm / self.reach_mm)

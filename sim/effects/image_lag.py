@@ -1,0 +1,36 @@
+"""Image lag: a share of the charge isn't read but stays in the pixel for the next frame."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class ImageLag(Effect):
+    """Read: (1 - q) (x_t + l_t), left: l_(t+1) = q (x_t + l_t). In steady light nothing changes; after it q^k of it is still there
+    in the k-th dark frame, and the first frame of a series lacks q."""
+
+    name: ClassVar[str] = "image_lag"
+    stage: ClassVar[Stage] = Stage.CHARGE
+    reference: ClassVar[str] = (
+        "E. R. Fossum, Charge transfer noise and lag in CMOS active pixel sensors, IEEE Workshop on CCDs and AIS 2003"
+    )
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset(
+        {"f_number", "exposure", "wavelength", "field", "level", "orientation"}
+    )
+    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
+    sentence: ClassVar[str] = (
+        "Charge stays behind: a frame holds a share of the one before it, so that a dark frame after a bright one shows its ghost."
+    )
+
+    lag_percent: Annotated[
+        float, Quantity("%", "share of the charge that stays", lower=0.0, upper=90.0, prior=(0.0, 1.0), absent=0.0)
+    ] = 0.0
+
+    def left_behind(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
+        return 0.0 if self.lag_percent == 0.0 else self.lag_percent / 100.0 * electrons

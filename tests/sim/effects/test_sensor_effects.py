@@ -1,0 +1,198 @@
+"""Effects on charge and read-out beyond the contract of all effects: their analytic limits, and frames that agree with their moments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.camera import CameraModel, Lens
+from sim.effects.adc_nonlinearity import AdcNonlinearity
+from sim.effects.amplifier_glow import AmplifierGlow
+from sim.effects.base import Effect
+from sim.effects.column_noise import ColumnNoise
+from sim.effects.dark_current_temperature import DarkCurrentTemperature
+from sim.effects.hot_pixels import HotPixels
+from sim.effects.image_lag import ImageLag
+from sim.effects.random_telegraph_noise import RandomTelegraphNoise
+from sim.effects.row_noise import RowNoise
+from sim.forward import (
+    Exposure,
+    dark_electrons,
+    expected,
+    expected_electrons,
+    expected_sequence,
+    moments,
+    sample,
+    sample_sequence,
+)
+from sim.scene.scenes import Darkness, UniformField
+from sim.spectrum import FloatArray, Spectrum
+
+LIGHT = Spectrum.of([500.0, 600.0], [2e-3, 2e-3])
+CAMERA = CameraModel(
+    rows=48, cols=64, pixel_pitch_um=3.45, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=100.0, white_level_dn=4095.0,
+    conversion_gain_dn_per_e=0.5, full_well_e=7500.0, read_noise_e=2.0, dark_current_e_per_s=10.0, dsnu_e=0.0, prnu_percent=0.0,
+    quantum_efficiency={"Y": Spectrum.of([400.0, 700.0], [0.5, 0.5])}, lens=Lens(f_number=4.0, focal_length_mm=50.0),
+)  # fmt: skip
+BRIGHT, DARK = Exposure(UniformField(LIGHT), 0.02), Exposure(Darkness(), 0.5, temperature_c=35.0)
+FRAMES = 200
+
+
+def _frames(exposure: Exposure, effects: tuple[Effect, ...]) -> FloatArray:
+    rng = np.random.default_rng(41)
+    return np.stack([sample(CAMERA, exposure, rng, effects) for _ in range(FRAMES)]).astype(float)
+
+
+@pytest.mark.parametrize(
+    "one",
+    [
+        HotPixels(excess_e_per_s=400.0, share_ppm=5e4),
+        AmplifierGlow(glow_e_per_s=300.0, reach_mm=0.05, corner="bottom_right"),
+        DarkCurrentTemperature(doublings_per_c=0.2),
+        ColumnNoise(offset_e=6.0),
+        RandomTelegraphNoise(amplitude_e=30.0, share_percent=10.0),
+    ],
+    ids=lambda one: one.name,
+)
+def test_frames_agree_with_expected_and_variance(one: Effect) -> None:
+    """Chi-squared over 200 dark frames at 4.5 standard deviations; the mean of s^2 / variance at 4.5 of its own."""
+    frames = _frames(DARK, (one,))
+    mean, variance = moments(CAMERA, DARK, (one,))
+    pull = (frames.mean(axis=0) - mean) / np.sqrt(variance / FRAMES)
+    assert np.sum(pull**2) == pytest.approx(pull.size, abs=4.5 * np.sqrt(2.0 * pull.size))
+    ratio = frames.var(axis=0, ddof=1) / variance
+    assert ratio.mean() == pytest.approx(1.0, abs=4.5 * ratio.std() / np.sqrt(ratio.size))
+
+
+def test_row_noise_is_shared_along_rows_only() -> None:
+    frames = _frames(DARK, (RowNoise(noise_e=5.0),))
+    mean, variance = moments(CAMERA, DARK, (RowNoise(noise_e=5.0),))
+    plain = moments(CAMERA, DARK)[1]
+    np.testing.assert_allclose(variance - plain, (0.5 * 5.0) ** 2, atol=1e-3)
+    rest = frames - frames.mean(axis=0)
+    along = (rest[:, :, 1:] * rest[:, :, :-1]).sum(axis=0).mean(axis=1) / (FRAMES - 1)
+    across = (rest[:, 1:] * rest[:, :-1]).sum(axis=0).mean(axis=1) / (FRAMES - 1)
+    assert along.mean() == pytest.approx((0.5 * 5.0) ** 2, abs=4.5 * along.std() / np.sqrt(along.size))
+    assert across.mean() == pytest.approx(0.0, abs=4.5 * across.std() / np.sqrt(across.size))
+    assert frames.mean() == pytest.approx(mean.mean(), abs=4.5 * 2.5 / np.sqrt(FRAMES * 48))
+
+
+def test_column_offsets_stay_and_have_no_mean() -> None:
+    one = ColumnNoise(offset_e=6.0)
+    offset = (expected(CAMERA, DARK, (one,)) - expected(CAMERA, DARK))[0] / 0.5
+    assert np.ptp(expected(CAMERA, DARK, (one,)) - expected(CAMERA, DARK), axis=0).max() < 1e-9
+    assert offset.mean() == pytest.approx(0.0, abs=1e-3)
+    assert offset.std() == pytest.approx(6.0, rel=4.5 / np.sqrt(2 * 64))
+    bright = expected(CAMERA, BRIGHT, (one,)) - expected(CAMERA, BRIGHT)
+    np.testing.assert_allclose(bright[0] / 0.5, offset, atol=1e-2)  # the dark frame's noise rounds to 1e-2
+    assert np.any(ColumnNoise(offset_e=6.0, pattern_seed=1).added_e((48, 64), CAMERA) != one.added_e((48, 64), CAMERA))
+
+
+def test_hot_pixels_are_as_many_and_as_hot_as_stated() -> None:
+    camera = CAMERA.model_copy(update={"rows": 400, "cols": 500})
+    one = HotPixels(excess_e_per_s=100.0, share_ppm=5000.0)
+    more = expected_electrons(camera, Exposure(Darkness(), 2.0), (one,)) - 20.0
+    hot = more[more > 0]
+    assert hot.size == 1000
+    # exponential: standard deviation equal to the mean, and so the mean's error is 1/sqrt(n) of it
+    assert hot.mean() == pytest.approx(200.0, rel=4.5 / np.sqrt(1000))
+    assert hot.std() == pytest.approx(200.0, rel=4.5 * np.sqrt(8 / 4 / 1000))
+    # in proportion to the exposure, and the same pixels
+    short = expected_electrons(camera, Exposure(Darkness(), 1.0), (one,)) - 10.0
+    np.testing.assert_allclose(2.0 * short, more, atol=1e-9)
+
+
+def test_glow_falls_from_its_corner() -> None:
+    for corner, at in {
+        "top_left": (0, 0),
+        "top_right": (0, 63),
+        "bottom_left": (47, 0),
+        "bottom_right": (47, 63),
+    }.items():
+        rate = np.asarray(
+            AmplifierGlow(glow_e_per_s=40.0, reach_mm=0.069, corner=corner).dark_current(10.0, None, CAMERA)
+        )
+        assert rate[at] == pytest.approx(50.0)
+        assert rate.max() == rate[at]
+        row = rate[at[0]] if at[1] == 0 else rate[at[0], ::-1]
+        # 20 px of 3.45 um are one reach
+        assert row[20] - 10.0 == pytest.approx(40.0 / np.e)
+
+
+def test_dark_current_doubles_with_the_temperature() -> None:
+    one = DarkCurrentTemperature(doublings_per_c=1 / 7)
+    at = {t: dark_electrons(CAMERA, Exposure(Darkness(), 1.0, temperature_c=t), (one,)) for t in (18.0, 25.0, 39.0)}
+    assert at == pytest.approx({18.0: 5.0, 25.0: 10.0, 39.0: 40.0})
+    assert dark_electrons(CAMERA, Exposure(Darkness(), 1.0), (one,)) == 10.0  # no temperature is known
+    # as the camera's own doubling does, and one on top of the other
+    warm = CAMERA.model_copy(update={"dark_current_doubling_c": 7.0})
+    assert dark_electrons(warm, Exposure(Darkness(), 1.0, temperature_c=32.0), (one,)) == pytest.approx(40.0)
+
+
+def test_lag_leaves_powers_of_its_share_and_loses_nothing() -> None:
+    q = 0.08
+    exposures = [BRIGHT, BRIGHT, BRIGHT, DARK, DARK, DARK]
+    read = [float(e[10, 10]) for e in expected_sequence(CAMERA, exposures, (ImageLag(lag_percent=8.0),))]
+    bright, dark = (float(expected_electrons(CAMERA, exposure)[10, 10]) for exposure in (BRIGHT, DARK))
+    # the k-th of equal frames: 1 - q^k of it; the k-th dark frame after them: what is left of it, and its own
+    for k in (1, 2, 3):
+        assert read[k - 1] == pytest.approx(bright * (1 - q**k))
+    left = bright * q * (1 - q**3) / (1 - q)
+    for k in (1, 2, 3):
+        assert read[2 + k] == pytest.approx(dark * (1 - q**k) + left * (1 - q) * q ** (k - 1))
+    # what was collected was read, or is left at the end
+    kept = (sum([bright] * 3 + [dark] * 3) - sum(read)) / q * (1 - q)
+    assert read[-1] == pytest.approx(kept)
+    # without lag a sequence is its frames
+    for frame, exposure in zip(expected_sequence(CAMERA, exposures), exposures, strict=True):
+        np.testing.assert_array_equal(frame, expected_electrons(CAMERA, exposure))
+
+
+def test_lag_keeps_to_the_full_well() -> None:
+    """What overflows isn't left behind."""
+    flood = Exposure(UniformField(LIGHT.scaled(100.0)), 1.0)
+    _, after = expected_sequence(CAMERA, [flood, DARK], (ImageLag(lag_percent=2.0),))
+    assert after[0, 0] == pytest.approx((5.0 + 0.02 * 7500.0) * 0.98)
+
+
+def test_frames_of_a_sequence_are_drawn_around_its_means() -> None:
+    lag = (ImageLag(lag_percent=5.0),)
+    exposures = [BRIGHT, DARK] * FRAMES
+    frames = np.stack(list(sample_sequence(CAMERA, exposures, np.random.default_rng(43), lag)))[3::2].astype(float)
+    means = list(expected_sequence(CAMERA, exposures[:20], lag))
+    dark = means[-1]
+    wanted = 100.0 + 0.5 * dark
+    variance = 0.25 * (dark + 4.0) + 1 / 12
+    pull = (frames.mean(axis=0) - wanted) / np.sqrt(variance / len(frames))
+    assert np.sum(pull**2) == pytest.approx(pull.size, abs=4.5 * np.sqrt(2.0 * pull.size))
+    ratio = frames.var(axis=0, ddof=1) / variance
+    assert ratio.mean() == pytest.approx(1.0, abs=4.5 * ratio.std() / np.sqrt(ratio.size))
+
+
+def test_telegraph_pixels_have_two_levels() -> None:
+    one = RandomTelegraphNoise(amplitude_e=40.0, share_percent=5.0)
+    drawn = np.stack([one.added((48, 64), np.random.default_rng(k), CAMERA) for k in range(400)])
+    blinking = np.any(drawn != 0, axis=0)
+    assert blinking.sum() == round(0.05 * 48 * 64)
+    assert set(np.unique(drawn[:, blinking])) == {-20.0, 20.0}
+    variance = np.asarray(one.added_e2((48, 64), CAMERA))
+    assert set(np.unique(variance)) == {0.0, 400.0}
+    assert np.all(variance[blinking] == 400.0)
+    # each half of the time: the mean of 400 x 154 signs
+    assert drawn[:, blinking].mean() == pytest.approx(0.0, abs=4.5 * 20.0 / np.sqrt(400 * blinking.sum()))
+
+
+def test_the_converters_bits_jump_where_they_stand() -> None:
+    one = AdcNonlinearity(error_dn=3.0)
+    ends = 3.0 * (1 - 2**-0.5 + 0.5 - 2**-1.5)
+    below, above = one.codes(np.array([2047.999, 2048.0]), CAMERA)
+    # at half scale the highest bit comes and the three below it go
+    assert above - below == pytest.approx(3.0 - (ends - 3.0), abs=0.01)
+    assert one.codes(np.array([0.0]), CAMERA)[0] == 0.0
+    # nothing changes at code 2^bits: the last code has all bits
+    assert one.codes(np.array([4095.999]), CAMERA)[0] == pytest.approx(4095.999, abs=0.01)
+    # between jumps, a line
+    step = np.diff(one.codes(np.arange(1024.0, 1280.0), CAMERA))
+    np.testing.assert_allclose(step, 1.0 - ends / 4096.0, atol=1e-9)
+    two = AdcNonlinearity(error_dn=6.0).codes(np.array([3000.0]), CAMERA) - 3000.0
+    assert two[0] == pytest.approx(2.0 * (one.codes(np.array([3000.0]), CAMERA)[0] - 3000.0))
