@@ -220,9 +220,13 @@ def expected_electrons(
             camera.lens.f_number
         )
     light = _light_electron_rate(camera, exposure.scene, effects, source, oversample, margin_px) * collected_s
+    for effect in effects:
+        light = effect.lit(light, exposure.exposure_s, exposure.elapsed_s, camera)
     electrons = light + dark_electrons(camera, exposure, effects)
     for effect in effects:
         electrons = effect.charge(electrons, exposure.exposure_s, camera)
+    for effect in effects:
+        electrons = effect.overflow(electrons, camera)
     return electrons
 
 
@@ -495,9 +499,10 @@ def _light_electron_rate(
     elif isinstance(scene, KnifeEdge):
         images = {c: _edge_image(camera, c, scene, effects) for c in camera.channels}
     elif isinstance(scene, SpectralImage):
-        images = _cube_images(camera, scene, effects, oversample, margin_px)
+        images = _cube_images(camera, scene, effects, oversample, _margin_for(camera, effects, margin_px))
     else:
-        images = _blurred_images(camera, scene, effects, Grid(*shape, oversample, margin_px))
+        grid = Grid(*shape, oversample, _margin_for(camera, effects, margin_px))
+        images = _blurred_images(camera, scene, effects, grid)
     row, col = np.arange(camera.rows, dtype=np.float64)[:, None], np.arange(camera.cols, dtype=np.float64)[None, :]
     shade: FloatArray = relative_illumination(camera, row, col) * source
     x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
@@ -782,19 +787,45 @@ class _ShiftAt(Effect):
         return np.asarray(np.exp(-2j * np.pi * turns))
 
 
+def _unmoved_px(
+    camera: CameraModel, row: FloatArray, col: FloatArray, wavelength_nm: float, effects: Sequence[Effect]
+) -> tuple[FloatArray, FloatArray]:
+    """The places p with p + shift(p) = (row, col), by fixed-point steps to 1e-4 px: shifts change by less than they are."""
+    from_row, from_col = row, col
+    for _ in range(40):
+        down, right = _shift_px(camera, from_row, from_col, wavelength_nm, effects)
+        step = max(np.max(np.abs(row - down - from_row)), np.max(np.abs(col - right - from_col)))
+        from_row, from_col = row - down, col - right
+        if step < 1e-4:
+            return from_row, from_col
+        if step > camera.rows + camera.cols:
+            break
+    raise ValueError(
+        f"light is moved by {max(np.max(np.abs(down)), np.max(np.abs(right))):.3g} px, and by steps of {step:.3g} px back no place is found that it comes from: the distortion folds the image; give less of it"
+    )
+
+
+def _margin_for(camera: CameraModel, effects: Sequence[Effect], margin_px: int) -> int:
+    """The margin that a frame needs for light that is moved in from outside it."""
+    if not _light_moves(camera, effects):
+        return margin_px
+    row, col = (np.linspace(0.0, n - 1.0, 33) for n in (camera.rows, camera.cols))
+    rim_row = np.concatenate([row, row, np.zeros(33), np.full(33, camera.rows - 1.0)])
+    rim_col = np.concatenate([np.zeros(33), np.full(33, camera.cols - 1.0), col, col])
+    out = 0.0
+    for wavelength_nm in (400.0, 550.0, 700.0):
+        from_row, from_col = _unmoved_px(camera, rim_row, rim_col, wavelength_nm, effects)
+        out = max(out, *(float(np.max(np.abs(a - b))) for a, b in ((from_row, rim_row), (from_col, rim_col))))
+    return margin_px + int(np.ceil(out))
+
+
 def _at_moved_pixels(
     camera: CameraModel, spectrum: ComplexArray, grid: Grid, wavelength_nm: float, effects: Sequence[Effect]
 ) -> FloatArray:
-    """Back from a transform to the frame's pixels, each taken where its light would be without the effects' shifts.
-
-    The place p with p + shift(p) = pixel, by fixed-point steps (shifts change by far less than they are); the image between
-    its samples by splines of the third order, on the drawing's grid: 1e-3 of the contrast at 1/2 cy/px and 3 samples a pixel.
-    """
+    """Back from a transform to the frame's pixels, each taken where its light would be without the effects' shifts; between
+    the image's samples by splines of the third order, on the drawing's grid: 1e-3 of the contrast at 1/2 cy/px and 3 samples a pixel."""
     row, col = np.meshgrid(np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float), indexing="ij")
-    from_row, from_col = row, col
-    for _ in range(4):
-        down, right = _shift_px(camera, from_row, from_col, wavelength_nm, effects)
-        from_row, from_col = row - down, col - right
+    from_row, from_col = _unmoved_px(camera, row, col, wavelength_nm, effects)
     image = fft.irfft2(spectrum, grid.shape)
     place = np.stack([from_row + grid.margin_px, from_col + grid.margin_px]) * grid.oversample
     return np.asarray(map_coordinates(image, place, mode="grid-wrap"))

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
+import numpy as np
+
+from sim.camera import CameraModel, Geometry
 from sim.effects.base import Effect, Stage
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
+from sim.scene.warp import distort
 from sim.spectrum import FloatArray
 
 
 class Distortion(Effect):
     """Radial, of the third order: light lands at r (1 + k (r / R)^2), on top of what the camera's geometry says, R half the frame's
-    diagonal, r from the optical axis."""
+    diagonal, r from the optical axis.
+
+    `geometry` is for scenes that an ideal pinhole placed: its whole distortion (k1 k2 p1 p2 k3) acts on top. Scenes that are
+    projected by the camera's geometry have it already.
+    """
 
     name: ClassVar[str] = "distortion"
     stage: ClassVar[Stage] = Stage.OPTICS
@@ -32,11 +39,21 @@ class Distortion(Effect):
                  prior=(0.0, 0.5), absent=0.0),
     ] = 0.0  # fmt: skip
 
+    geometry: Geometry | None = None
+
     def image_shift_um(
         self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
     ) -> tuple[FloatArray, FloatArray] | None:
-        if self.corner_percent == 0.0:
+        bent = self.geometry is not None and any(self.geometry.distortion)
+        if self.corner_percent == 0.0 and not bent:
             return None
         x, y, corner = from_axis_um(x_um, y_um, camera)
         share = self.corner_percent / 100.0 * (x * x + y * y) / corner**2
-        return share * x, share * y
+        if self.geometry is None or not bent:
+            return share * x, share * y
+        pitch = camera.pixel_pitch_um
+        col, row = np.broadcast_arrays(
+            np.asarray(x_um) / pitch + 0.5 * (camera.cols - 1), np.asarray(y_um) / pitch + 0.5 * (camera.rows - 1)
+        )
+        to_col, to_row = distort(col, row, self.geometry)
+        return share * x + (to_col - col) * pitch, share * y + (to_row - row) * pitch

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from sim.camera import CameraModel, Lens
+from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.base import Effect, Stage
 from sim.effects.library import effect, effects
 from sim.forward import (
@@ -24,7 +25,7 @@ from sim.optics.diffraction import diffraction_otf
 from sim.optics.illumination import relative_illumination
 from sim.optics.imaging import ZernikePupil
 from sim.optics.pupil import pupil_otf, seidel
-from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, PointArray, UniformField
+from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, PlanarTarget, PointArray, UniformField
 from sim.spectrum import Spectrum
 
 ALL = list(effects().values())
@@ -77,9 +78,13 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     levels = np.linspace(0.0, 4000.0, 41)
     electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (after, out.added_e, out.added_e2)]
     codes = levels if out.codes is None else out.codes(levels)
+    full = np.zeros((7, 3))
+    full[3, 1] = 2.0 * CAMERA.full_well_e
+    for e in acting:
+        full = e.overflow(full, CAMERA)
     return np.concatenate(
         [np.real(np.concatenate(otf)), np.array(rates) / max(rates), frame.ravel() / frame.max(), rest]
-        + [values / 100.0 for values in (*electronics, codes)]
+        + [values / 100.0 for values in (*electronics, codes, full.ravel())]
     )
 
 
@@ -409,3 +414,27 @@ def test_lateral_colour_moves_an_edge_as_it_moves_a_dot() -> None:
     contrast = plain[12, 31] - plain[12, 20]
     shift = (plain[12].sum() - moved[12].sum()) / contrast
     assert shift == pytest.approx(3.0 * 11.5 / 20.0 / 3.0, rel=0.02)
+
+
+def test_a_pinholes_scene_is_distorted_as_the_geometry_says() -> None:
+    """A board seen by an ideal pinhole, then distorted, is the board seen through the geometry: barrel of 4 % in the corner."""
+    matrix = ((90.0, 0.0, 46.5), (0.0, 90.0, 34.5), (0.0, 0.0, 1.0))
+    geometry = Geometry(camera_matrix=matrix, distortion=(-0.1, 0.01, 2e-3, -1e-3))
+    camera = CAMERA.model_copy(update={"rows": 72, "cols": 96, "cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
+    texture = (np.indices((14, 18)).sum(axis=0) % 2).astype(np.uint8)
+    board = PlanarTarget(texture, 10.0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (-90.0, -70.0, 100.0), Geometry(camera_matrix=matrix), LIGHT.scaled(0.1), LIGHT)  # fmt: skip
+    lens = Lens(f_number=4.0, focal_length_mm=8.0)
+    camera = camera.model_copy(update={"lens": lens})
+    seen = expected_electrons(camera, Exposure(replace(board, geometry=geometry), 1.0))
+    moved = expected_electrons(camera, Exposure(board, 1.0), (effect("distortion")(geometry=geometry),))
+    # blur comes before the warp in the one and after it in the other: 10 % of scale change the edges' width by as much
+    away = np.abs(moved - seen) / np.ptp(seen)
+    assert np.sqrt(np.mean(away**2)) < 0.01
+    assert np.mean(np.abs(expected_electrons(camera, Exposure(board, 1.0)) - seen)) / np.ptp(seen) > 0.05
+
+
+def test_distortion_that_folds_the_image_is_refused() -> None:
+    board = Exposure(PointArray(((5.0, 5.0),), 1.0, LIGHT.scaled(0.1), LIGHT), 1.0)
+    folded = Geometry(camera_matrix=((10.0, 0.0, 15.5), (0.0, 10.0, 11.5), (0.0, 0.0, 1.0)), distortion=(-0.5,))
+    with pytest.raises(ValueError, match="folds the image"):
+        expected_electrons(CAMERA, board, (effect("distortion")(geometry=folded),))
