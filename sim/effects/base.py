@@ -138,6 +138,10 @@ class Effect(Frozen):
         """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""
         return 0.0
 
+    def lit(self, electrons: FloatArray, exposure_s: float, elapsed_s: float, camera: CameraModel) -> FloatArray:
+        """RIG or CHARGE: mean electrons that light alone makes in the pixels of a whole frame (rows, cols)."""
+        return electrons
+
     def dark_current(
         self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
     ) -> FloatArray | float:
@@ -148,6 +152,10 @@ class Effect(Frozen):
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
         """CHARGE: mean electrons of a whole frame (rows, cols), after light and dark current were added. What it does to
         them, `transfer` says of one channel alone; in a frame only this acts."""
+        return electrons
+
+    def overflow(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
+        """CHARGE: mean electrons of a whole frame after what is above the full well has run over; after `charge`."""
         return electrons
 
     def left_behind(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:

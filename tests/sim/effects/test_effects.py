@@ -73,10 +73,10 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
                  float(e.noise_e2(np.array(9e3), np.array(1e4), CAMERA)), e.veil(), *e.illumination(place, place, CAMERA), *np.ravel(e.image_shift_um(place, 0.5 * place, 620.0, CAMERA) or np.zeros(10))]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
     dark = Exposure(Darkness(), 0.5, temperature_c=32.0)
-    after = list(expected_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.01), dark], acting))[1]
+    after = list(expected_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.004), dark], acting))
     out = read_out(CAMERA, dark, acting)
     levels = np.linspace(0.0, 4000.0, 41)
-    electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (after, out.added_e, out.added_e2)]
+    electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (*after, out.added_e, out.added_e2)]
     codes = levels if out.codes is None else out.codes(levels)
     full = np.zeros((7, 3))
     full[3, 1] = 2.0 * CAMERA.full_well_e

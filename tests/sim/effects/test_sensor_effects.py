@@ -9,10 +9,13 @@ from sim.camera import CameraModel, Lens
 from sim.effects.adc_nonlinearity import AdcNonlinearity
 from sim.effects.amplifier_glow import AmplifierGlow
 from sim.effects.base import Effect
+from sim.effects.blooming import Blooming
 from sim.effects.column_noise import ColumnNoise
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
+from sim.effects.green_imbalance import GreenImbalance
 from sim.effects.hot_pixels import HotPixels
 from sim.effects.image_lag import ImageLag
+from sim.effects.light_flicker import LightFlicker
 from sim.effects.random_telegraph_noise import RandomTelegraphNoise
 from sim.effects.row_noise import RowNoise
 from sim.forward import (
@@ -26,6 +29,7 @@ from sim.forward import (
     sample_sequence,
 )
 from sim.scene.scenes import Darkness, UniformField
+from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray, Spectrum
 
 LIGHT = Spectrum.of([500.0, 600.0], [2e-3, 2e-3])
@@ -196,3 +200,63 @@ def test_the_converters_bits_jump_where_they_stand() -> None:
     np.testing.assert_allclose(step, 1.0 - ends / 4096.0, atol=1e-9)
     two = AdcNonlinearity(error_dn=6.0).codes(np.array([3000.0]), CAMERA) - 3000.0
     assert two[0] == pytest.approx(2.0 * (one.codes(np.array([3000.0]), CAMERA)[0] - 3000.0))
+
+
+@pytest.mark.parametrize("at", [(20, 30), (24, 5)])
+def test_blooming_conserves_charge_and_keeps_to_the_column(at: tuple[int, int]) -> None:
+    full = CAMERA.full_well_e
+    before = np.full((48, 64), 500.0)
+    before[at] = 6.0 * full
+    after = Blooming(share_percent=60.0).overflow(before, CAMERA)
+    assert after.sum() == pytest.approx(before.sum(), rel=1e-12)  # none reaches the rim
+    changed = after != before
+    assert set(np.flatnonzero(changed.any(axis=0))) == {at[1]}
+    # 60 % of 5 full wells, half of it each way, fills 1.5 full wells of room: 1.6 pixels of 7000 e
+    column = after[:, at[1]]
+    np.testing.assert_allclose(column[at[0] + 1 : at[0] + 9], column[at[0] - 8 : at[0]][::-1], atol=1e-6)
+    assert column[at[0] + 1] == full and 500.0 < column[at[0] + 2] < full and column[at[0] + 3] == 500.0
+    assert column[at[0]] == pytest.approx(6.0 * full - 0.6 * 5.0 * full)
+    assert np.array_equal(before, np.where(changed, before, after))
+
+
+def test_blooming_of_neighbours_adds_up_and_runs_off_the_frame() -> None:
+    full = CAMERA.full_well_e
+    before = np.zeros((10, 2))
+    before[0, 0], before[1, 0] = 3.0 * full, 2.0 * full
+    after = Blooming(share_percent=100.0).overflow(before, CAMERA)
+    # downwards 1 + 0.5 full wells; upwards from row 1 through the full row 0, and from row 0, off the frame
+    np.testing.assert_allclose(after[:, 0], [full, full, full, 0.5 * full, *[0.0] * 6])
+    np.testing.assert_array_equal(after[:, 1], 0.0)
+    even = np.full((10, 2), 0.9 * full)
+    np.testing.assert_array_equal(Blooming(share_percent=50.0).overflow(even, CAMERA), even)
+
+
+def test_greens_differ_by_their_ratio_and_keep_their_mean() -> None:
+    curve = Spectrum.of([400.0, 700.0], [0.5, 0.5])
+    camera = CAMERA.model_copy(update={"cfa": "GRBG", "quantum_efficiency": dict.fromkeys("RGB", curve), "dark_current_e_per_s": 0.0})  # fmt: skip
+    far = camera.model_copy(update={"lens": Lens(f_number=4.0, focal_length_mm=5000.0)})
+    plain = expected_electrons(far, BRIGHT)
+    frame = expected_electrons(far, BRIGHT, (GreenImbalance(imbalance_percent=3.0),))
+    part, same = planes(frame, "GRBG"), planes(plain, "GRBG")
+    assert part["G1"].mean() / same["G1"].mean() == pytest.approx(1.015)
+    assert part["G2"].mean() / same["G2"].mean() == pytest.approx(0.985)
+    assert frame.mean() == pytest.approx(plain.mean(), rel=1e-9)
+    np.testing.assert_array_equal(part["R"], same["R"])
+    np.testing.assert_array_equal(expected(CAMERA, BRIGHT, (GreenImbalance(imbalance_percent=3.0),)), expected(CAMERA, BRIGHT))  # fmt: skip
+
+
+def test_flicker_has_its_period_its_null_and_its_mean() -> None:
+    one = LightFlicker(modulation_percent=20.0, frequency_hz=100.0, line_time_us=100.0)
+    even = np.full((200, 3), 1000.0)  # 200 rows of 0.1 ms: two periods
+    short = one.lit(even, 1e-6, 0.0, CAMERA)[:, 0]
+    assert short.mean() == pytest.approx(1000.0, rel=1e-9)
+    assert short.max() == pytest.approx(1200.0, rel=1e-5) and short.min() == pytest.approx(800.0, rel=1e-5)
+    np.testing.assert_allclose(short[100:], short[:100], rtol=1e-9)
+    for periods in (1, 2, 5):
+        np.testing.assert_allclose(one.lit(even, periods / 100.0, 0.3, CAMERA), even, rtol=1e-9)
+    # half a period later light and dark change places
+    np.testing.assert_allclose(one.lit(even, 1e-6, 0.005, CAMERA)[:, 0], 2000.0 - short, rtol=1e-6)
+    # half a period long: sinc(1/2) = 2 / pi
+    assert one.lit(even, 0.005, 0.0, CAMERA).max() == pytest.approx(1000.0 * (1 + 0.2 * 2 / np.pi), rel=1e-3)
+    whole = LightFlicker(modulation_percent=20.0, line_time_us=0.0).lit(even, 0.002, 0.0013, CAMERA)
+    assert np.ptp(whole) == 0.0

@@ -1,0 +1,58 @@
+"""Light flicker: a lamp on alternating current or pulsed, seen row by row through a rolling shutter."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class LightFlicker(Effect):
+    """Light x (1 + m sinc(f T) cos(2 pi f (t + T / 2))), T the exposure and t its begin: the frame's, and a line time later for each
+    row. Bands that vanish where T is a multiple of 1 / f; with a line time of 0 (global shutter) frames flicker as a whole."""
+
+    name: ClassVar[str] = "light_flicker"
+    stage: ClassVar[Stage] = Stage.RIG
+    reference: ClassVar[str] = "IEEE Std 1789-2015, modulation of current in high-brightness LEDs"
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "white"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"frequency_hz", "line_time_us"})
+    sentence: ClassVar[str] = (
+        "The light flickers: dark and bright bands move over the rows from frame to frame, and vanish at exposures of whole periods."
+    )
+
+    modulation_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "amplitude of the light's variation over its mean",
+            lower=0.0,
+            upper=100.0,
+            prior=(0.0, 5.0),
+            absent=0.0,
+        ),
+    ] = 0.0
+    frequency_hz: Annotated[float, Quantity("Hz", "frequency of the variation", lower=0.1, upper=1e6, absent=100.0)] = (
+        100.0
+    )
+    line_time_us: Annotated[
+        float, Quantity("us", "time from one row's exposure to the next one's", lower=0.0, upper=1e4, absent=15.0)
+    ] = 15.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return ((cls(modulation_percent=1.5),),)
+
+    def lit(self, electrons: FloatArray, exposure_s: float, elapsed_s: float, camera: CameraModel) -> FloatArray:
+        if self.modulation_percent == 0.0:
+            return electrons
+        middle_s = elapsed_s + 0.5 * exposure_s + 1e-6 * self.line_time_us * np.arange(len(electrons))
+        depth = 0.01 * self.modulation_percent * np.sinc(self.frequency_hz * exposure_s)
+        factor: FloatArray = 1.0 + depth * np.cos(2.0 * np.pi * self.frequency_hz * middle_s)
+        return electrons * factor[:, None]
