@@ -6,6 +6,7 @@ the image and K the light that a unit of the pupil's area takes in; k = 2 pi n /
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +65,24 @@ class PupilRays:
     def plane_path_mm(self, x_mm: float, y_mm: float) -> FloatArray:
         """Path of every ray's plane wave at the image point (x, y): OPL + n (L (x - x_j) + M (y - y_j))."""
         return self.path_mm + self.index * (self.cosine_x * (x_mm - self.x_mm) + self.cosine_y * (y_mm - self.y_mm))
+
+
+def interpolated(
+    traced: Sequence[PupilRays], wavelength_nm: Sequence[float] | FloatArray, index: Sequence[float]
+) -> list[PupilRays]:
+    """The rays at other wavelengths than the traced ones, which lie at the same places of the open pupil.
+
+    Lagrange's polynomial through all of `traced` in 1 / wavelength^2; a traced wavelength gives its own rays.
+    """
+    names = ("x_mm", "y_mm", "cosine_x", "cosine_y", "path_mm", "jacobian", "area", "rim_cosine_x", "rim_cosine_y")
+    nodes = np.array([rays.wavelength_nm for rays in traced]) ** -2.0
+    stacks = {name: np.stack([getattr(rays, name) for rays in traced]) for name in names}
+    out = []
+    for w, n in zip(wavelength_nm, index, strict=True):
+        share = np.array([np.prod([(w**-2.0 - b) / (a - b) for b in nodes if b != a]) for a in nodes])
+        values = {name: share @ stack for name, stack in stacks.items()}
+        out.append(PupilRays(**values, mirrored=traced[0].mirrored, wavelength_nm=float(w), index=float(n)))
+    return out
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

@@ -131,8 +131,9 @@ def frames(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _sag(c: float, k: float, even: Any, odd: Any, kind: int, u: float) -> Any:
+def _sag(surfaces: Any, i: int, u: float) -> Any:
     """Sag at r^2 = u with its first and second derivative by u; the last value is False outside the surface."""
+    c, k, kind = surfaces.curvature[i], surfaces.conic[i], surfaces.kind[i]
     root2 = 1.0 - (1.0 + k) * c * c * u
     if root2 <= 0.0:
         return 0.0, 0.0, 0.0, False
@@ -144,19 +145,19 @@ def _sag(c: float, k: float, even: Any, odd: Any, kind: int, u: float) -> Any:
         p = 0.0
         p1 = 0.0
         p2 = 0.0
-        for i in range(even.size - 1, -1, -1):
+        for j in range(surfaces.terms[i] - 1, -1, -1):
             p2 = p2 * u + 2.0 * p1
             p1 = p1 * u + p
-            p = p * u + even[i]
+            p = p * u + surfaces.even[i, j]
         # p is the polynomial over u: times u, with the product rule.
         s += p * u
         s1 += p + p1 * u
         s2 += 2.0 * p1 + p2 * u
         if kind == ODD:
             r = np.sqrt(max(u, 1e-24))
-            for i in range(odd.size):
-                power = 2.0 * i + 1.0
-                term = odd[i] * r**power
+            for j in range(surfaces.odd.shape[1]):
+                power = 2.0 * j + 1.0
+                term = surfaces.odd[i, j] * r**power
                 s += term
                 s1 += 0.5 * power * term / (r * r)
                 s2 += 0.25 * power * (power - 2.0) * term / (r * r * r * r)
@@ -177,10 +178,9 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces
             t = e / (b + np.sqrt(square))
         elif kind == STANDARD:
             return 0.0, x, y, 0.0, 0.0, 0.0, False
-    even, odd = surfaces.even[i, : surfaces.terms[i]], surfaces.odd[i]
     for _ in range(_ITERATIONS):
         px, py = x + t * dir_l, y + t * dir_m
-        s, s1, s2, inside = _sag(c, k, even, odd, kind, px * px + py * py)
+        s, s1, s2, inside = _sag(surfaces, i, px * px + py * py)
         if not inside:
             return 0.0, x, y, 0.0, 0.0, 0.0, False
         if kind == STANDARD:
@@ -192,7 +192,7 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces
         t -= move
         if abs(move) < 1e-8 * (1.0 + abs(t)):  # Newton's method: the next step would be about 1e-16
             px, py = x + t * dir_l, y + t * dir_m
-            s, s1, s2, inside = _sag(c, k, even, odd, kind, px * px + py * py)
+            s, s1, s2, inside = _sag(surfaces, i, px * px + py * py)
             return t, px, py, s, s1, s2, inside
     return 0.0, x, y, 0.0, 0.0, 0.0, False
 
@@ -280,7 +280,7 @@ def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
     stop_y = 0.0
     for i in range(surfaces.kind.size):
         if surfaces.kind[i] == BREAK:
-            r = surfaces.rotation[i]
+            r = surfaces.rotation[i]  # a view costs: only here
             sx, sy = surfaces.decentre[i, 0], surfaces.decentre[i, 1]
             if surfaces.decentre_last[i]:
                 x, y, z = _turn(r, x, y, z)

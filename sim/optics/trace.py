@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from sim.optics import rays as rt
 from sim.optics.glass import indices, substitutions
-from sim.optics.planewaves import PupilRays, point_spread
+from sim.optics.planewaves import PupilRays, interpolated, point_spread
 from sim.optics.prescription import Prescription, PrescriptionError
 from sim.optics.table import TABLE_VERSION, LensTable, load_cached, store_cached
 from sim.parameters import Frozen
@@ -25,6 +25,9 @@ from sim.spectrum import FloatArray
 REFERENCE_NM = 550.0
 #: Where the table of a lens begins and ends: 33 wavelengths.
 TABLE_WAVELENGTHS_NM = tuple(float(w) for w in range(400, 721, 10))
+_SPECTRAL_NODES = 8
+#: How near (relative) interpolated pupils have to come to traced ones.
+_ALIKE = 3e-4
 _STEEPEST = math.tan(math.radians(60.0))
 
 Focus = Literal["file", "best"]
@@ -308,18 +311,34 @@ class OpticalSystem:
 
     # --- pupils -------------------------------------------------------------------------------------------------------
 
+    def open_centre(
+        self, tangent: tuple[float, float], wavelengths_nm: Sequence[float], start: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[float, float] | None:
+        """A place of the entrance pupil that is open at all of the wavelengths: the chief ray's where it is, else where there
+        is most room; None where no light comes through."""
+        field = self.field(tangent)
+        middle = wavelengths_nm[len(wavelengths_nm) // 2]
+        at = self.aim(tangent, middle, start)
+        places = [at, self._open_place(self.index(middle), field, at)] if at else [None]
+        if places == [None]:
+            places = [self._open_place(self.index(middle), field, None)]
+        for place in places:
+            if place is not None and all(self._is_open(self.index(w), field, place) for w in wavelengths_nm):
+                return place
+        return None
+
     def pupil(
-        self, tangent: tuple[float, float], wavelength_nm: float, span: float, start: tuple[float, float] | None = None
+        self, tangent: tuple[float, float], wavelength_nm: float, span: float, centre: tuple[float, float] | None = None
     ) -> PupilRays | None:
         """The open pupil of a field point, laid out in rays, or None where no light comes through.
 
-        Polar about the chief ray (or about an open place, where the chief ray is clipped): Gauss-Legendre nodes out to the
-        rim, which is found for each of equally spaced directions. `span` is the largest difference of phase (rad) between
+        Polar about `centre` (`open_centre` where it isn't given): Gauss-Legendre nodes out to the rim, which is found for
+        each of equally spaced directions. `span` is the largest difference of phase (rad) between
         the pupil's centre and its rim that is to be summed: as many nodes are taken as it needs.
         """
         index, field = self.index(wavelength_nm), self.field(tangent)
-        at = self.aim(tangent, wavelength_nm, start or (0.0, 0.0))
-        centre = at if at is not None and self._is_open(index, field, at) else self._open_place(index, field, at)
+        if centre is None:
+            centre = self.open_centre(tangent, [wavelength_nm])
         if centre is None:
             return None
         mirrored = self.prescription.centred and tangent[0] == 0.0
@@ -537,6 +556,7 @@ class OpticalTable:
         if self.wavelengths.size == 0 or np.any(np.diff(self.wavelengths) <= 0):
             raise PrescriptionError(f"wavelengths {settings.wavelength_nm[:4]} don't ascend; sort them")
         system.prepare(self.wavelengths)
+        self._nodes = _spectral_nodes(self.wavelengths)
         self.symmetric = system.prescription.centred
         self.tangents = self._field_points()
         self.pitch_um = settings.sample_pitch_um or self._pitch()
@@ -568,7 +588,7 @@ class OpticalTable:
         settings, outermost = self.settings, self._outermost()
         if min(settings.fields, settings.grid) < 2 and outermost > 0:
             raise PrescriptionError("a table needs two field points at least; ask for more")
-        checked = sorted({self.wavelengths[0], self.wavelengths[-1], self.system.reference_nm})
+        checked = sorted({self._nodes[0], self._nodes[-1], self.system.reference_nm})
         for spoke in self._spokes():
             outermost = self._limited(outermost, spoke, checked)
         if self.symmetric:
@@ -621,19 +641,20 @@ class OpticalTable:
             row = system.chief(tangent, system.reference_nm, starts[f])
             assert row is not None
             chief[f] = row[rt.X], row[rt.Y]
-            first = [self._pupil(tangent, w, starts[f]) for w in self.wavelengths]
-            for i, pupil in enumerate(first):
+            centre = self._centre(tangent, starts[f])
+            coarse = [self._pupil(tangent, w, centre, 0.0) for w in self.wavelengths]
+            for i, pupil in enumerate(coarse):
                 solid[i, f], energy[i, f] = pupil.solid_angle, pupil.energy
                 centroid[i, f] = (np.array(pupil.centroid_mm) - chief[f]) * 1e3
             window[f] = 0.5 * (centroid[:, f].min(axis=0) + centroid[:, f].max(axis=0))
-            centre = float(chief[f, 0] + 1e-3 * window[f, 0]), float(chief[f, 1] + 1e-3 * window[f, 1])
-            for i, w in enumerate(self.wavelengths):
-                blur = float(np.max(np.hypot(first[i].x_mm - centre[0], first[i].y_mm - centre[1])))
-                # Light that arrives three half diagonals away doesn't reach into the window.
-                reach = min(blur, 3.0 * half_diagonal)
-                span = first[i].wave_number_per_mm * self._sine(first[i]) * (half_diagonal + reach)
-                pupil = self._pupil(tangent, w, starts[f], span)
-                psf[i, f] = point_spread(pupil, centre, n, self.pitch_um, reach if reach < blur else math.inf)
+            about = float(chief[f, 0] + 1e-3 * window[f, 0]), float(chief[f, 1] + 1e-3 * window[f, 1])
+            blur = max(float(np.max(np.hypot(p.x_mm - about[0], p.y_mm - about[1]))) for p in coarse)
+            # Light that arrives three half diagonals away doesn't reach into the window.
+            reach = min(blur, 3.0 * half_diagonal)
+            sine = max(0.5 * max(np.ptp(p.rim_cosine_x), np.ptp(p.rim_cosine_y)) for p in coarse)
+            span = coarse[0].wave_number_per_mm * float(sine) * (half_diagonal + reach)
+            for i, pupil in enumerate(self._pupils(tangent, centre, span, solid[:, f])):
+                psf[i, f] = point_spread(pupil, about, n, self.pitch_um, reach if reach < blur else math.inf)
             if progress is not None:
                 progress(f"field {f + 1} of {f_count}", (f + 1) / f_count)
         axis = self._axis_index()
@@ -677,19 +698,48 @@ class OpticalTable:
             raise PrescriptionError(f"the chief ray at {_angles(lost[0])} is lost; ask for a smaller field")
         return [place for place in found if place is not None]
 
+    def _centre(self, tangent: tuple[float, float], start: tuple[float, float]) -> tuple[float, float]:
+        centre = self.system.open_centre(tangent, [self._nodes[0], self.system.reference_nm, self._nodes[-1]], start)
+        if centre is None:
+            raise PrescriptionError(f"no light comes through at {_angles(tangent)}; ask for a smaller field")
+        return centre
+
     def _pupil(
-        self, tangent: tuple[float, float], wavelength_nm: float, start: tuple[float, float], span: float = 0.0
+        self, tangent: tuple[float, float], wavelength_nm: float, centre: tuple[float, float], span: float
     ) -> PupilRays:
-        rays = self.system.pupil(tangent, wavelength_nm, span, start)
+        rays = self.system.pupil(tangent, wavelength_nm, span, centre)
         if rays is None:
             raise PrescriptionError(
                 f"no light comes through at {_angles(tangent)}, {wavelength_nm:g} nm; ask for a smaller field"
             )
         return rays
 
-    def _sine(self, rays: PupilRays) -> float:
-        """Half the largest extent of the pupil in direction cosines: the image's numerical aperture over its index."""
-        return 0.5 * float(max(np.ptp(rays.rim_cosine_x), np.ptp(rays.rim_cosine_y)))
+    def _pupils(
+        self, tangent: tuple[float, float], centre: tuple[float, float], span: float, solid_angle: FloatArray
+    ) -> list[PupilRays]:
+        """The pupil at every wavelength of the table.
+
+        Rays are traced at a few wavelengths and interpolated between them: at the same place of the open pupil everything
+        about a ray is as smooth in 1 / wavelength^2 as the indices are. Where that doesn't give the solid angles that were
+        traced (another aperture clips at one end of the spectrum than at the other), every wavelength is traced.
+        """
+        traced = [self._pupil(tangent, w, centre, span) for w in self._nodes]
+        if len({rays.area.size for rays in traced}) == 1 and len({rays.rim_cosine_x.size for rays in traced}) == 1:
+            found = interpolated(traced, self.wavelengths, [self.system.index(w)[-2] for w in self.wavelengths])
+            if all(abs(p.solid_angle / s - 1.0) < _ALIKE for p, s in zip(found, solid_angle, strict=True)):
+                return found
+        return [self._pupil(tangent, w, centre, span) for w in self.wavelengths]
+
+
+def _spectral_nodes(wavelengths: FloatArray) -> list[float]:
+    """Wavelengths to trace at, the ends among them: Chebyshev's extrema in 1 / wavelength^2, or all where there are few."""
+    if wavelengths.size <= _SPECTRAL_NODES:
+        return [float(w) for w in wavelengths]
+    low, high = wavelengths[-1] ** -2.0, wavelengths[0] ** -2.0
+    u = 0.5 * (low + high) + 0.5 * (high - low) * np.cos(np.pi * np.arange(_SPECTRAL_NODES) / (_SPECTRAL_NODES - 1))
+    nodes = u**-0.5
+    nodes[0], nodes[-1] = wavelengths[0], wavelengths[-1]
+    return [float(w) for w in nodes]
 
 
 def _angles(tangent: tuple[float, float]) -> str:
