@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +20,7 @@ from lab.report.provenance import installed_versions
 from lab.scene_file import light, scene
 from sim import forward
 from sim.camera import CameraModel, Lens
+from sim.effects.distortion import Distortion
 from sim.forward import Exposure
 from sim.optics.imaging import TracedLens
 from sim.parameters import Frozen, Quantity
@@ -126,6 +127,7 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
     Raises InputError for a scene, a light or an exposure that can't be used: no light where the sensor sees, every pixel full.
     """
     tell = progress or (lambda text, share: None)
+    content = _distorting(content)
     camera = content.camera
     tell("scene", 0.05)
     white = light(options.illuminant, options.luminance_cd_m2)
@@ -163,6 +165,15 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
     return Simulation(
         frame, camera, white, _record(frame, electrons, exposure, options, content, camera, magnification)
     )
+
+
+def _distorting(content: CameraFile) -> CameraFile:
+    """With the distortion of the camera's geometry as an effect: named scenes are placed by a pinhole. A traced lens has its own."""
+    camera = content.camera
+    straight = camera.geometry is None or not any(camera.geometry.distortion)
+    if straight or isinstance(camera.lens.imaging, TracedLens):
+        return content
+    return replace(content, effects=(*content.effects, Distortion(geometry=camera.geometry)))
 
 
 def capacity_e(camera: CameraModel, gain_db: float = 0.0) -> float:

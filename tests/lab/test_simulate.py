@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from lab import cli
 from lab.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.recording import load_frame
 from lab.simulate import SimulateOptions, automatic_exposure_s, capacity_e, preview, simulate
-from sim.camera import CameraModel, Cfa, Lens
+from sim.camera import CameraModel, Cfa, Geometry, Lens
 from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupil
 from sim.parameters import Quantity, declared
 from sim.scene.catalogue import SCENES, NamedScene
@@ -267,3 +268,21 @@ def test_what_cannot_be_used_is_one_line(
     assert message in said
     assert said.count("\n") == 1 and "Traceback" not in said
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_the_geometrys_distortion_bends_what_a_pinhole_placed() -> None:
+    """Pincushion of 5 % in the corner: the outermost squares move out, the middle ones stay."""
+    content = default_camera()
+    camera = content.camera.model_copy(update={"rows": 96, "cols": 128})
+    focal = 1e3 * camera.lens.focal_length_mm / camera.pixel_pitch_um
+    corner = np.hypot(64.0, 48.0) / focal
+    geometry = Geometry(
+        camera_matrix=((focal, 0.0, 63.5), (0.0, focal, 47.5), (0.0, 0.0, 1.0)), distortion=(0.05 / corner**2,)
+    )
+    options = SimulateOptions(scene="checkerboard", expected=True)
+    plain, bent = (
+        simulate(options, replace(content, camera=camera.model_copy(update={"geometry": g}))).frame.astype(float)
+        for g in (None, geometry)
+    )
+    assert np.abs(plain - bent)[40:56, 56:72].max() < 0.1 * np.ptp(plain)
+    assert np.abs(plain - bent).max() > 0.3 * np.ptp(plain)
