@@ -29,66 +29,61 @@ def _share(distance, slope_x, slope_y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _border(position, first, second, gaps):  # type: ignore[no-untyped-def]
-    """Number and place of the border nearest to a position. Without gaps, cell j begins at border j, at j. With gaps, it's
-    lit from border 2 j at j + first to border 2 j + 1 at j + second."""
-    if not gaps:
-        near = np.rint(position)
-        return int(near), near
-    whole = np.floor(position)
-    within = position - whole
-    number, place = 2 * int(whole), first
-    if within > 0.5 * (first + second):
-        number, place = number + 1, second
-        if within > 0.5 * (second + 1.0 + first):
-            number, place = number + 1, 1.0 + first
-    elif within < 0.5 * (second - 1.0 + first):
-        number, place = number - 1, second - 1.0
-    return number, whole + place
-
-
-@njit(cache=True)
-def _value(pattern, row, col, gaps, surround):  # type: ignore[no-untyped-def]
-    """What the cell after border `row` and border `col` holds."""
-    if gaps[0]:
-        if col & 1:
-            return surround
-        col = col >> 1
-    if gaps[1]:
-        if row & 1:
-            return surround
-        row = row >> 1
+def _value(pattern, row, col, surround):  # type: ignore[no-untyped-def]
     if row < 0 or col < 0 or row >= pattern.shape[0] or col >= pattern.shape[1]:
         return surround
     return pattern[row, col]
 
 
-@njit(cache=True)
-def _mean(pattern, u, v, u_across, u_down, v_across, v_down, lit, gaps, surround):  # type: ignore[no-untyped-def]
+@njit(cache=True, inline="always")
+def _mean_whole(pattern, u, v, u_across, u_down, v_across, v_down, surround):  # type: ignore[no-untyped-def]
     """Mean over a square at (u, v) no larger than a cell, whose sides run along (u_across, v_across), (u_down, v_down)."""
-    col, u_border = _border(u, lit[0], lit[1], gaps[0])
-    row, v_border = _border(v, lit[2], lit[3], gaps[1])
+    u_border, v_border = np.rint(u), np.rint(v)
+    col, row = int(u_border), int(v_border)
     right = _share(u - u_border, u_across, u_down)
     below = _share(v - v_border, v_across, v_down)
     if abs(right - 0.5) == 0.5:
         col += int(right) - 1
         if abs(below - 0.5) == 0.5:
-            return _value(pattern, row + int(below) - 1, col, gaps, surround)
-        above = _value(pattern, row - 1, col, gaps, surround)
-        return above + (_value(pattern, row, col, gaps, surround) - above) * below
-    above = _value(pattern, row - 1, col - 1, gaps, surround)
-    above += (_value(pattern, row - 1, col, gaps, surround) - above) * right
-    under = _value(pattern, row, col - 1, gaps, surround)
-    under += (_value(pattern, row, col, gaps, surround) - under) * right
+            return _value(pattern, row + int(below) - 1, col, surround)
+        above = _value(pattern, row - 1, col, surround)
+        return above + (_value(pattern, row, col, surround) - above) * below
+    above = _value(pattern, row - 1, col - 1, surround)
+    above += (_value(pattern, row - 1, col, surround) - above) * right
+    under = _value(pattern, row, col - 1, surround)
+    under += (_value(pattern, row, col, surround) - under) * right
     return above + (under - above) * below
 
 
 @njit(cache=True)
-def project_means(pattern, back, row, col, step, divide, lit, gaps, surround, out):  # type: ignore[no-untyped-def]
+def _mean_parts(pattern, u, v, u_across, u_down, v_across, v_down, lit, surround):  # type: ignore[no-untyped-def]
+    """The same of cells that hold their value from u0 to u1, v0 to v1 only (`lit`), and `surround` elsewhere."""
+    wide, high = 0.5 * (abs(u_across) + abs(u_down)), 0.5 * (abs(v_across) + abs(v_down))
+    total = surround
+    first, last = int(np.floor(u - wide)), int(np.floor(u + wide))
+    for row in range(max(0, int(np.floor(v - high))), min(pattern.shape[0] - 1, int(np.floor(v + high))) + 1):
+        down = _share(v - row - lit[2], v_across, v_down) - _share(v - row - lit[3], v_across, v_down)
+        if down <= 0.0:
+            continue
+        for col in range(max(0, first), min(pattern.shape[1] - 1, last) + 1):
+            across = _share(u - col - lit[0], u_across, u_down) - _share(u - col - lit[1], u_across, u_down)
+            total += (pattern[row, col] - surround) * down * across
+    return total
+
+
+@njit(cache=True, inline="always")
+def _mean(pattern, u, v, u_across, u_down, v_across, v_down, lit, surround):  # type: ignore[no-untyped-def]
+    if lit is None:
+        return _mean_whole(pattern, u, v, u_across, u_down, v_across, v_down, surround)
+    return _mean_parts(pattern, u, v, u_across, u_down, v_across, v_down, lit, surround)
+
+
+@njit(cache=True)
+def project_means(pattern, back, row, col, step, divide, lit, surround, out):  # type: ignore[no-untyped-def]
     """Means of a pattern's cells over the squares at `row` x `col` (px, `step` wide), into `out`.
 
     `back` (3, 3) takes (x = col, y = row, 1) to the pattern's (u, v, w). Every square is divided `divide` times each way.
-    `lit` (u0, u1, v0, v1) is the lit part of every cell, `gaps` whether there's any other along u, along v.
+    `lit` (u0, u1, v0, v1) is the part of every cell that holds its value, None for all of it.
     """
     fine = step / divide
     count = divide * divide
@@ -112,14 +107,13 @@ def project_means(pattern, back, row, col, step, divide, lit, gaps, surround, ou
                         (back[1, 0] - v * back[2, 0]) * scale,
                         (back[1, 1] - v * back[2, 1]) * scale,
                         lit,
-                        gaps,
                         surround,
                     )
             out[i, j] = total / count
 
 
 @njit(cache=True)
-def mapped_means(pattern, u, v, divide, lit, gaps, surround, out):  # type: ignore[no-untyped-def]
+def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-untyped-def]
     """As `project_means`, for squares at given pattern points `u`, `v`, a frame of one square wider than needed all round;
     (rows x divide + 2, cols x divide + 2) for `out` of (rows, cols)."""
     count = divide * divide
@@ -137,7 +131,6 @@ def mapped_means(pattern, u, v, divide, lit, gaps, surround, out):  # type: igno
                         0.5 * (v[m, n + 1] - v[m, n - 1]),
                         0.5 * (v[m + 1, n] - v[m - 1, n]),
                         lit,
-                        gaps,
                         surround,
                     )
             out[i, j] = total / count

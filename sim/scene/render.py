@@ -153,13 +153,10 @@ def cell_means(
         return _upright_means(pattern, warp, grid, surround, lit)
     from sim.scene.area import mapped_means, project_means  # here: the compiler's library takes a while to load
 
-    u0, u1, v0, v1 = edges = (0.0, 1.0, 0.0, 1.0) if lit is None else lit
-    gaps = u1 - u0 < 1.0, v1 - v0 < 1.0
-    finest = min(size for size in (u1 - u0, v1 - v0, 1.0 - u1 + u0, 1.0 - v1 + v0) if size > 0)
-    divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / finest / 0.999)))
+    divide = max(1, int(np.ceil(_footprint(pattern.shape, warp, grid) / 0.999)))
     if divide > MOST_DIVISIONS:
         raise ValueError(
-            f"the pattern's cells, or the parts and gaps of them, are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of {1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
+            f"the pattern's cells are {1.0 / (divide * grid.oversample):.3g} px on the camera, below the limit of {1.0 / (MOST_DIVISIONS * grid.oversample):.3g} px: use larger cells or bring the target closer"
         )
     pattern = np.ascontiguousarray(pattern, float)
     row, col = grid.axes_px()
@@ -167,7 +164,7 @@ def cell_means(
     out = np.empty(grid.shape)
     if warp.straight:
         back = np.linalg.inv(np.asarray(warp.homography))
-        project_means(pattern, back, row, col, step, divide, edges, gaps, surround, out)
+        project_means(pattern, back, row, col, step, divide, lit, surround, out)
         return out
     # Through a distorting lens pattern points are splines' values, with one more all round for the squares' sides.
     fine = step / divide
@@ -180,7 +177,7 @@ def cell_means(
         down = (row[part, None] + offset).ravel()
         down = np.concatenate([[down[0] - fine], down, [down[-1] + fine]])
         u, v = mapper(down, across)
-        mapped_means(pattern, u, v, divide, edges, gaps, surround, out[part[0] : part[-1] + 1])
+        mapped_means(pattern, u, v, divide, lit, surround, out[part[0] : part[-1] + 1])
     return out
 
 
@@ -253,20 +250,22 @@ def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
     """Black's leakage and one layer a primary on a dark ground; all fall off with the angle of view."""
     warp = scene.warp()
     screen = scene.screen
-    seen = 1.0 if screen.falloff_exponent == 0 else scene.cosine(*grid.axes_px()) ** screen.falloff_exponent
-    drawn = []
+    pictures: list[tuple[Spectrum, FloatArray, tuple[float, float, float, float] | None]] = []
     if any(screen.black_radiance.value):
-        leak = cell_means(np.ones(scene.codes.shape[:2]), warp, grid, 0.0) * seen
-        drawn.append(Layer((screen.black_radiance, None), EVERYWHERE, leak))
-    drives = screen.drives(scene.codes)
-    for channel, primary in enumerate(screen.primaries):
+        pictures.append((screen.black_radiance, np.ones(scene.codes.shape[:2]), None))
+    for channel, (primary, drive) in enumerate(zip(screen.primaries, screen.drives(scene.codes), strict=True)):
         if screen.sub_pixels is None:
-            picture = cell_means(drives[:, :, channel], warp, grid, 0.0) * seen
+            pictures.append((primary, drive, None))
         else:
-            lit = screen.sub_pixels.lit(channel)
-            picture = cell_means(drives[:, :, channel] / screen.sub_pixels.share, warp, grid, 0.0, lit) * seen
-        drawn.append(Layer((primary, None), EVERYWHERE, picture))
-    return Drawing((NO_LIGHT, None), tuple(drawn))
+            pictures.append((primary, drive / screen.sub_pixels.share, screen.sub_pixels.lit(channel)))
+    drawn = tuple(
+        Layer((light, None), EVERYWHERE, cell_means(picture, warp, grid, 0.0, lit)) for light, picture, lit in pictures
+    )
+    if screen.falloff_exponent:
+        seen = scene.cosine(*grid.axes_px()) ** screen.falloff_exponent
+        for layer in drawn:
+            np.multiply(layer.coverage, seen, out=layer.coverage)
+    return Drawing((NO_LIGHT, None), drawn)
 
 
 def _edges(scene: KnifeEdge, grid: Grid) -> FloatArray:

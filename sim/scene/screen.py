@@ -77,14 +77,14 @@ class Screen(Frozen):
                 )
         return self
 
-    def drives(self, codes: NDArray[np.uint8]) -> FloatArray:
-        """Share 0..1 of each primary's full radiance, of codes (rows, cols, 3)."""
+    def drives(self, codes: NDArray[np.uint8]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Share 0..1 of each primary's full radiance, (rows, cols) each, of codes (rows, cols, 3)."""
         code = np.arange(256) / 255.0
-        tables = [
-            np.maximum((code - black) / (1.0 - black), 0.0) ** gamma
-            for black, gamma in zip(self.black_code, self.gamma, strict=True)
-        ]
-        return np.stack([table[codes[:, :, k]] for k, table in enumerate(tables)], axis=-1)
+        red, green, blue = (
+            (np.maximum((code - black) / (1.0 - black), 0.0) ** gamma)[codes[:, :, k]]
+            for k, (black, gamma) in enumerate(zip(self.black_code, self.gamma, strict=True))
+        )
+        return red, green, blue
 
     @property
     def white_radiance(self) -> Spectrum:

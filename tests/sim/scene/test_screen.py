@@ -21,13 +21,13 @@ def ramp() -> np.ndarray:
 
 
 def test_drives_follow_each_primarys_gamma() -> None:
-    drives = screen(gamma=(2.2, 1.8, 1.0)).drives(ramp())[:, 0]
+    drives = np.squeeze(screen(gamma=(2.2, 1.8, 1.0)).drives(ramp())).T
     code = np.arange(256) / 255
     np.testing.assert_allclose(drives, np.stack([code**2.2, code**1.8, code], axis=-1), rtol=1e-14)
 
 
 def test_codes_up_to_black_are_off() -> None:
-    drives = screen(black_code=(0.1, 0.0, 0.2)).drives(ramp())[:, 0]
+    drives = np.squeeze(screen(black_code=(0.1, 0.0, 0.2)).drives(ramp())).T
     assert np.all(drives[:26, 0] == 0)
     assert drives[26, 0] > 0
     assert np.all(drives[:52, 2] == 0)
