@@ -30,9 +30,11 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from lab.errors import InputError
+from lab.predict import camera_model
 from lab.rawfile import replacing
-from lab.recording import parse_spectrum
-from sim.camera import CameraModel, Lens
+from lab.recording import RecordingSet, parse_spectrum
+from lab.results import CameraFit
+from sim.camera import CameraModel, Lens, Side
 from sim.effects.base import Effect
 from sim.effects.library import effect, effects
 from sim.optics.imaging import DiffractionLimited, MeasuredOtf, MeasuredPsf, TracedLens
@@ -284,10 +286,13 @@ def _lines(file: Path, content: CameraFile) -> Iterator[str]:
             yield from _parameters(curve)
     yield ""
     yield "[lens]"
-    yield from _parameters(camera.lens, skip=("imaging",))
+    yield from _parameters(camera.lens, skip=("imaging", "illumination"))
     yield ""
     yield "[lens.imaging]  # how a point is imaged: diffraction_limited, zernike_pupil, measured_psf, measured_otf, traced_lens"
     yield from _imaging_lines(file, content)
+    yield ""
+    yield "[lens.illumination]  # how the light falls off: cosine_fourth, radial (a maker's curve), measured (a flat's map)"
+    yield from _parameters(camera.lens.illumination)
     if camera.geometry is not None:
         yield ""
         yield "[geometry]  # pinhole (px) and distortion k1 k2 p1 p2 k3, as OpenCV defines them"
@@ -358,6 +363,17 @@ def _text(value: Any) -> str:
             rows = parts
         return "[\n" + "".join(f"  {row},\n" for row in rows) + "]"
     return tomli_w.dumps({"value": value}).strip().removeprefix("value = ")
+
+
+def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> CameraFile:
+    """The camera that a fit found (`lab.predict.camera_model`), with the fit's uncertainties, to be written as a file."""
+    model = camera_model(recordings, side, fit)
+    std = {}
+    for key in declared(CameraModel) if fit.noise is not None else ():
+        value = getattr(fit.noise, f"{key}_std", None)
+        if value is not None:
+            std[key] = float(value)
+    return CameraFile(f"{recordings.manifest.name} {side}", model.model_copy(update={"std": std}))
 
 
 # --- the camera without a file -----------------------------------------------------------------------------------------

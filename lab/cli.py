@@ -152,15 +152,10 @@ def _write_json(result: BaseModel, file: Path | None) -> None:
     if str(file) == "-":
         sys.stdout.write(text)
         return
-    handle, partial = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        Path(partial).chmod(0o644)
-        Path(partial).replace(file)
-    except BaseException:
-        Path(partial).unlink(missing_ok=True)
-        raise
+    from lab.rawfile import replacing
+
+    with replacing(file) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def _load(model: type[Result], file: Path) -> Result:
@@ -288,7 +283,13 @@ def _print_comparison(comparison: ComparisonResult, every: bool) -> None:
 
 
 @app.command()
-def fit(source: Source, json: Json = None) -> None:
+def fit(
+    source: Source,
+    json: Json = None,
+    cameras: Annotated[
+        Path | None, typer.Option("--write-cameras", metavar="DIR", help="write each fitted camera as DIR/SIDE.toml")
+    ] = None,
+) -> None:
     """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
     _check_writable(json)
     recordings = _recordings(source)
@@ -296,6 +297,24 @@ def fit(source: Source, json: Json = None) -> None:
     if str(json) != "-":
         _print_fit(recordings, result)
     _write_json(result, json)
+    if cameras is not None:
+        _write_cameras(recordings, result, cameras)
+
+
+def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) -> None:
+    """Camera files of a fit, and what they hold that was neither fitted nor stated."""
+    from lab.camera_file import fitted_camera, write_camera
+    from lab.predict import assumptions
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be made ({error.strerror}); name a folder that is yours") from error
+    for side, fitted in result.cameras.items():
+        write_camera(folder / f"{side}.toml", fitted_camera(recordings, side, fitted))
+        taken = "; ".join(f"{one.quantity} taken as {one.value}" for one in assumptions(recordings.camera(side)))
+        note = f" (neither fitted nor stated: {taken})" if taken else ""
+        err.print(escape(f"camera: {folder / f'{side}.toml'}{note}"))
 
 
 @app.command()
