@@ -12,9 +12,15 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sim.spectrum import FloatArray
+
+ComplexArray = NDArray[np.complex128]
+
+#: Orders that are tried for a fitted wave, and the residual (waves, rms) at which one is good enough.
+_ORDERS = (10, 14, 18)
+_WAVE_RESIDUAL = 2e-3
 
 
 @dataclass(frozen=True)
@@ -154,71 +160,84 @@ def _chords(rim_along: FloatArray, rim_across: FloatArray, across: FloatArray) -
 
 
 def transfer(
-    rays: PupilRays,
-    frequency_lp_per_mm: ArrayLike,
-    tangential: bool,
-    origin_mm: tuple[float, float],
-    order: int = 14,
-    nodes: int = 64,
-) -> np.ndarray[Any, np.dtype[np.complex128]]:
-    """Complex OTF at frequencies along y (tangential) or x (sagittal), of an image about `origin_mm`; 1 at frequency 0.
+    rays: PupilRays, frequency_lp_per_mm: ArrayLike, origin_mm: tuple[float, float]
+) -> tuple[ComplexArray, ComplexArray]:
+    """Complex OTF along x (sagittal) and along y (tangential) of an image about `origin_mm`; 1 at frequency 0.
 
     Autocorrelation of the pupil in direction cosines: H(f) = integral A(s + a/2) A*(s - a/2) ds / integral |A|^2 ds, |a| =
-    f wavelength / n, A = sqrt(K / J) exp(i k W). W and A are Chebyshev sums fitted to the rays, the overlap of the pupil
-    with its shifted self is laid out by Gauss-Legendre nodes between its chords: no window cuts anything off. Good where
-    lines along the frequency cut the rim twice, which convex pupils grant.
+    f wavelength / n, A = sqrt(K / J) exp(2 pi i W / wavelength). W and sqrt(K / J) are Chebyshev sums fitted to the rays;
+    the overlap of the pupil with its shifted self is laid out by Gauss-Legendre nodes between its chords: no window cuts
+    anything off. Good where lines along the frequency cut the rim twice, which convex pupils grant.
     """
+    wave = _FittedWave.of(rays, origin_mm)
     frequency = np.atleast_1d(np.asarray(frequency_lp_per_mm, float))
-    path = rays.plane_path_mm(*origin_mm)
-    amplitude = 1.0 / np.sqrt(np.abs(rays.jacobian))
-    cosine_x, cosine_y = rays.cosine_x, rays.cosine_y
-    if rays.mirrored:
-        cosine_x, cosine_y = np.concatenate([cosine_x, -cosine_x]), np.concatenate([cosine_y, cosine_y])
-        x = origin_mm[0]
-        mirror = rays.path_mm + rays.index * (
-            -rays.cosine_x * (x + rays.x_mm) + rays.cosine_y * (origin_mm[1] - rays.y_mm)
-        )
-        path, amplitude = np.concatenate([path, mirror]), np.concatenate([amplitude, amplitude])
-    centre = np.array(
-        [
-            np.mean([rays.rim_cosine_x.min(), rays.rim_cosine_x.max()]),
-            np.mean([rays.rim_cosine_y.min(), rays.rim_cosine_y.max()]),
-        ]
-    )
-    half = np.array([np.ptp(rays.rim_cosine_x), np.ptp(rays.rim_cosine_y)]) * 0.5
-    terms = _terms((cosine_x - centre[0]) / half[0], (cosine_y - centre[1]) / half[1], order)
-    path = path - np.mean(path)
-    fitted = np.linalg.lstsq(terms, np.stack([path, amplitude], axis=1), rcond=1e-13)[0]
-    rim_along, rim_across = (
-        (rays.rim_cosine_y, rays.rim_cosine_x) if tangential else (rays.rim_cosine_x, rays.rim_cosine_y)
-    )
-    t, weight = np.polynomial.legendre.leggauss(nodes)
-    # Gauss-Chebyshev-like lines: square-root ends of the chords cost no accuracy.
-    theta = 0.5 * np.pi * t
-    middle, reach = 0.5 * (rim_across.min() + rim_across.max()), 0.5 * np.ptp(rim_across)
-    across = middle + reach * np.sin(theta)
-    line_weight = weight * 0.5 * np.pi * reach * np.cos(theta)
-    low, high = _chords(rim_along, rim_across, across)
+    return wave.transfer(frequency, False), wave.transfer(frequency, True)
 
-    def function(along: FloatArray) -> tuple[FloatArray, FloatArray]:
-        a, c = along, np.broadcast_to(across[:, None], along.shape)
-        first, second = (c, a) if tangential else (a, c)
-        values = _terms((first - centre[0]) / half[0], (second - centre[1]) / half[1], order) @ fitted
-        return values[..., 0], values[..., 1]
 
-    k = rays.wave_number_per_mm / rays.index
+@dataclass(frozen=True)
+class _FittedWave:
+    """Path (mm) and amplitude over the pupil's direction cosines as Chebyshev sums."""
 
-    def overlap(shift: float) -> complex:
-        start, end = low + 0.5 * shift, high - 0.5 * shift
-        length = np.where(end > start, end - start, 0.0)
-        length[~np.isfinite(length)] = 0.0
-        start = np.where(length > 0, start, middle)
-        along = start[:, None] + 0.5 * length[:, None] * (1.0 + t)
-        path_far, amplitude_far = function(along + 0.5 * shift)
-        path_near, amplitude_near = function(along - 0.5 * shift)
-        value = amplitude_far * amplitude_near * np.exp(1j * k * (path_far - path_near))
-        return complex(np.sum(line_weight * 0.5 * length * (value @ weight)))
+    rays: PupilRays
+    centre: FloatArray
+    half: FloatArray
+    order: int
+    coefficients: FloatArray
+    nodes: int
 
-    whole = overlap(0.0)
-    wavelength_mm = rays.wavelength_nm * 1e-6 / rays.index
-    return np.array([overlap(float(f) * wavelength_mm) / whole for f in frequency])
+    @classmethod
+    def of(cls, rays: PupilRays, origin_mm: tuple[float, float]) -> _FittedWave:
+        x, y, path = rays.cosine_x, rays.cosine_y, rays.plane_path_mm(*origin_mm)
+        amplitude = 1.0 / np.sqrt(np.abs(rays.jacobian))
+        if rays.mirrored:
+            across = rays.index * rays.cosine_x * origin_mm[0]
+            x, y = np.concatenate([x, -x]), np.concatenate([y, y])
+            path, amplitude = np.concatenate([path, path - 2.0 * across]), np.concatenate([amplitude, amplitude])
+        low = np.array([rays.rim_cosine_x.min(), rays.rim_cosine_y.min()])
+        high = np.array([rays.rim_cosine_x.max(), rays.rim_cosine_y.max()])
+        centre, half = 0.5 * (low + high), 0.5 * (high - low)
+        path = path - np.mean(path)
+        wavelength_mm = rays.wavelength_nm * 1e-6
+        nodes = int(min(56 + 2.0 * np.ptp(path) / wavelength_mm, 200))
+        for order in _ORDERS:
+            terms = _terms((x - centre[0]) / half[0], (y - centre[1]) / half[1], order)
+            q, r = np.linalg.qr(terms)
+            coefficients = np.linalg.solve(r, q.T @ np.stack([path, amplitude], axis=1))
+            left = float(np.sqrt(np.mean((terms @ coefficients[:, 0] - path) ** 2)))
+            if left < _WAVE_RESIDUAL * wavelength_mm:
+                break
+        return cls(rays, centre, half, order, coefficients, nodes)
+
+    def transfer(self, frequency_lp_per_mm: FloatArray, tangential: bool) -> ComplexArray:
+        rays = self.rays
+        rim_along, rim_across = rays.rim_cosine_x, rays.rim_cosine_y
+        if tangential:
+            rim_along, rim_across = rim_across, rim_along
+        t, weight = np.polynomial.legendre.leggauss(self.nodes)
+        # Lines in equal steps of the arc sine: the square-root ends of the chords cost no accuracy.
+        theta = 0.5 * np.pi * t
+        middle, reach = 0.5 * (rim_across.min() + rim_across.max()), 0.5 * np.ptp(rim_across)
+        across = middle + reach * np.sin(theta)
+        line_weight = weight * 0.5 * np.pi * reach * np.cos(theta)
+        low, high = _chords(rim_along, rim_across, across)
+        c = np.broadcast_to(across[:, None], (across.size, t.size))
+
+        def wave(along: FloatArray) -> tuple[FloatArray, FloatArray]:
+            x, y = (c, along) if tangential else (along, c)
+            terms = _terms((x - self.centre[0]) / self.half[0], (y - self.centre[1]) / self.half[1], self.order)
+            values = terms @ self.coefficients
+            return values[..., 0], values[..., 1]
+
+        def overlap(shift: float) -> complex:
+            length = np.maximum(np.nan_to_num(high - low - shift, posinf=0.0, neginf=0.0), 0.0)
+            start = np.where(length > 0, low + 0.5 * shift, middle)
+            along = start[:, None] + 0.5 * length[:, None] * (1.0 + t)
+            path_far, amplitude_far = wave(along + 0.5 * shift)
+            path_near, amplitude_near = wave(along - 0.5 * shift)
+            phase = 2e6 * np.pi / rays.wavelength_nm * (path_far - path_near)
+            value = amplitude_far * amplitude_near * np.exp(1j * phase)
+            return complex(np.sum(line_weight * 0.5 * length * (value @ weight)))
+
+        whole = overlap(0.0)
+        step = rays.wavelength_nm * 1e-6 / rays.index
+        return np.array([overlap(float(f) * step) / whole for f in frequency_lp_per_mm])

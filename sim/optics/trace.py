@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from sim.optics import rays as rt
 from sim.optics.glass import indices, substitutions
-from sim.optics.planewaves import PupilRays, interpolated, point_spread
+from sim.optics.planewaves import PupilRays, interpolated, point_spread, transfer
 from sim.optics.prescription import Prescription, PrescriptionError
 from sim.optics.table import TABLE_VERSION, LensTable, load_cached, store_cached
 from sim.parameters import Frozen
@@ -37,8 +37,8 @@ Progress = Callable[[str, float], None]
 class TableSettings(Frozen):
     """What a lens table is computed at.
 
-    `fields` field points from the centre to the corner, in equal steps of tan(theta) (of theta beyond 60 deg), or
-    `grid` x `grid` of them where the lens isn't centred. `maximum_field_deg` is the corner, None: the file's largest field.
+    `fields` field points from the centre to the corner along y, in equal steps of tan(theta) (of theta beyond 60 deg), or
+    `grid` x `grid` of them where the lens isn't centred and `line` doesn't ask for the line all the same. `maximum_field_deg` is the corner, None: the file's largest field.
     `sample_pitch_um` None: as fine as the smallest wavelength's diffraction needs. `focus` says whether the image lies where
     the file has it or where the wavefront on the axis is best.
     """
@@ -46,6 +46,7 @@ class TableSettings(Frozen):
     wavelength_nm: tuple[float, ...] = TABLE_WAVELENGTHS_NM
     fields: int = 21
     grid: int = 11
+    line: bool = False
     maximum_field_deg: float | None = None
     samples: int = 64
     sample_pitch_um: float | None = None
@@ -388,6 +389,32 @@ class OpticalSystem:
             index=float(index[-2]),
         )
 
+    def mtf(
+        self, tangent: tuple[float, float], wavelength_nm: float, frequency_lp_per_mm: ArrayLike, span: float = 40.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """(sagittal, tangential) MTF of a field point at frequencies in line pairs per mm of the image; see `transfer`.
+
+        Sagittal frequencies run along x, tangential ones along y. PrescriptionError where no light comes through.
+        """
+        rays = self.pupil(tangent, wavelength_nm, span)
+        if rays is None:
+            raise PrescriptionError(f"no light comes through at {_angles(tangent)}; ask for a smaller field")
+        sagittal, tangential = transfer(rays, frequency_lp_per_mm, rays.centroid_mm)
+        return np.abs(sagittal), np.abs(tangential)
+
+    def ideal_height_mm(self, tangent: float) -> float:
+        """Where a lens without distortion has the image of a field point at the reference wavelength, mm.
+
+        The real chief ray next to the axis, scaled with the tangent: f tan(theta) in the focal plane, and where the file's
+        image lies beside that, the scale of the image there.
+        """
+        small = 1e-4
+        row = self.chief((0.0, small), self.reference_nm)
+        axis = self.chief((0.0, 0.0), self.reference_nm)
+        if row is None or axis is None:
+            raise PrescriptionError("the chief ray on the axis is lost; check the apertures and the stop")
+        return float((row[rt.Y] - axis[rt.Y]) / small * tangent)
+
     def _light(self, field: FloatArray, px: FloatArray, py: FloatArray) -> FloatArray:
         """What a unit of the entrance pupil's plane takes in: that of a plane wave, or d(L, M) of a Lambertian object point."""
         if field[0] == 0.0:
@@ -558,6 +585,7 @@ class OpticalTable:
         system.prepare(self.wavelengths)
         self._nodes = _spectral_nodes(self.wavelengths)
         self.symmetric = system.prescription.centred
+        self._line_only = self.symmetric or settings.line
         self.tangents = self._field_points()
         self.pitch_um = settings.sample_pitch_um or self._pitch()
 
@@ -578,7 +606,7 @@ class OpticalTable:
 
     def _spokes(self) -> list[tuple[float, float]]:
         """Directions in which the field has to work out to its edge."""
-        if self.symmetric:
+        if self._line_only:
             return [(0.0, 1.0)]
         corner = math.sqrt(0.5)
         return [(corner * a, corner * b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
@@ -591,7 +619,7 @@ class OpticalTable:
         checked = sorted({self._nodes[0], self._nodes[-1], self.system.reference_nm})
         for spoke in self._spokes():
             outermost = self._limited(outermost, spoke, checked)
-        if self.symmetric:
+        if self._line_only:
             return [(0.0, t) for t in self._line(outermost, settings.fields)]
         half = self._line(outermost * math.sqrt(0.5), (settings.grid + 1) // 2)
         line = [-t for t in reversed(half[1:])] + half
@@ -663,7 +691,7 @@ class OpticalTable:
         return LensTable(
             wavelength_nm=self.wavelengths,
             field_deg=np.degrees(np.arctan(np.array(self.tangents))),
-            grid_shape=(f_count,) if self.symmetric else (settings.grid, settings.grid),
+            grid_shape=(f_count,) if self._line_only else (settings.grid, settings.grid),
             symmetric=self.symmetric,
             reference_wavelength_nm=system.reference_nm,
             focal_length_mm=system.first_order.focal_length_mm,
@@ -686,7 +714,7 @@ class OpticalTable:
     def _starts(self) -> list[tuple[float, float]]:
         """Where the chief rays of the field points pass the entrance pupil's plane, found from the centre outwards."""
         system = self.system
-        if self.symmetric:
+        if self._line_only:
             found = system.starts(self.tangents, system.reference_nm)
         else:
             found = []
