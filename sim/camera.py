@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import model_validator
 
+from sim.optics.illumination import CosineFourth, Illumination
 from sim.optics.imaging import DiffractionLimited, Imaging, TracedLens
 from sim.parameters import Frozen, Quantity
 from sim.spectrum import Spectrum
@@ -19,8 +20,8 @@ TABLE_AGREEMENT = 0.02
 
 
 class Lens(Frozen):
-    """The optics. `imaging` says how a point is imaged (default: diffraction limited at `f_number`); the light falls off as
-    cos^4 at `focal_length_mm`, or as a traced lens's table says. Raises where a traced lens is of another f-number or focal length.
+    """The optics. `imaging` says how a point is imaged (default: diffraction limited at `f_number`), `illumination` how the light
+    falls off (default: cos^4 at `focal_length_mm`); a traced lens's table says both. Raises where a traced lens is of another f-number or focal length.
     """
 
     f_number: Annotated[float, Quantity("1", "working f-number", lower=0.5, upper=64.0)]
@@ -29,6 +30,7 @@ class Lens(Frozen):
         float, Quantity("1", "share of the light on axis that the lens lets through", lower=0.0, upper=1.0)
     ] = 1.0
     imaging: Imaging = DiffractionLimited()
+    illumination: Illumination = CosineFourth()
 
     @model_validator(mode="after")
     def _agrees_with_its_table(self) -> Self:
