@@ -293,9 +293,6 @@ def _lines(file: Path, content: CameraFile) -> Iterator[str]:
     yield ""
     yield "[lens.illumination]  # how the light falls off: cosine_fourth, radial (a maker's curve), measured (a flat's map)"
     yield from _parameters(camera.lens.illumination)
-    yield ""
-    yield "[lens.illumination]  # how the light falls off: cosine_fourth, radial (a maker's curve), measured (a flat's map)"
-    yield from _parameters(camera.lens.illumination)
     if camera.geometry is not None:
         yield ""
         yield "[geometry]  # pinhole (px) and distortion k1 k2 p1 p2 k3, as OpenCV defines them"
