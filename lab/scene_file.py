@@ -247,6 +247,8 @@ def _envi_samples(file: Path) -> tuple[dict[str, Any], NDArray[Any]]:
         header, shape = dict(opened.metadata), tuple(int(n) for n in getattr(opened, "shape", ()))
     except Exception as error:
         raise InputError(f"can't be read as ENVI ({_reason(error)}); correct the header") from None
+    if header.get("byte order") not in ("0", "1"):  # the library takes anything else for this machine's own
+        raise InputError(f"byte order is '{header.get('byte order')}', not 0 or 1; correct the header")
     if len(shape) != 3 or min(shape) < 1 or np.prod(shape, dtype=float) > MOST_SAMPLES:
         raise InputError(
             f"says {shape} rows, columns, bands, not an image of 1 to {MOST_SAMPLES} samples; correct the header"
@@ -257,7 +259,12 @@ def _envi_samples(file: Path) -> tuple[dict[str, Any], NDArray[Any]]:
         raise InputError(
             f"{data.name} has {data.stat().st_size} bytes where the header asks for {wanted}; copy it again, or correct the header"
         )
-    values = np.array(opened.open_memmap(interleave="bip", writable=False))
+    try:
+        values = np.array(opened.open_memmap(interleave="bip", writable=False))
+    except Exception as error:
+        raise InputError(f"can't be read as ENVI ({_reason(error)}); correct the header") from None
+    if values.ndim != 3:
+        raise InputError(f"{data.name} can't be mapped into memory; correct the header's offset and sizes")
     if values.dtype.kind not in "fiu":
         raise InputError(f"its samples are {values.dtype}, not real numbers; save 4-byte or 8-byte reals")
     return header, values

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -246,7 +247,7 @@ def test_a_drawn_edge_blurs_to_the_edges_exact_profile(mono_camera: CameraModel,
     a line's spectrum of 1 / (2 pi f) a cycle and lens and pixel passing < 0.05 near 5 cy/px, below 1e-3 of the step."""
     camera = mono_camera.model_copy(update={"lens": mono_camera.lens.model_copy(update={"transmittance": 1.0})})
     dark = lamp.scaled(0.2)
-    for angle_deg in (0.0, 5.0, 45.0, 187.0):
+    for angle_deg in (0.0, 5.0, 45.0, 90.0, 187.0, 270.0):
         scene = KnifeEdge((EdgeRegion((0, 0, 72, 96), angle_deg, 0.3),), dark, lamp)
         drawn = draw(scene, Grid(72, 96, 6, 16))
         # The same picture as a screen's pattern of one cell a sample.
@@ -476,3 +477,23 @@ def test_a_screen_falls_off_with_the_angle_of_view() -> None:
         POSE["geometry"],
     )
     assert turned.cosine(np.array([19.5, 20.5]), np.array([29.5, 30.5]))[0, 0] == pytest.approx(0.5, rel=1e-9)
+
+
+def test_black_and_white_codes_are_a_screens_pattern(mono_camera: CameraModel) -> None:
+    """The screen's model and the pattern of cells that the recordings' screens show are one thing at codes 0 and 255."""
+    pattern = np.random.default_rng(4).integers(0, 2, (8, 12), dtype=np.uint8)
+    codes = np.repeat(255 * pattern[:, :, None], 3, axis=2)
+    image = ScreenImage(screen(gamma=(1.0, 2.2, 3.0)), codes, 1.0, **POSE)
+    # Around a pattern the screen is dark but leaks; around a picture there's no screen.
+    framed = np.pad(codes, ((5, 5), (5, 5), (0, 0)))
+    image = replace(image, codes=framed, translation_mm=(-11.0, -9.0, 100.0))
+    shown = ScreenPattern(
+        pattern, ScreenImage(image.screen, codes, 1.0, **POSE).warp(), LIGHT.scaled(0.01), image.screen.white_radiance
+    )
+    camera = mono_camera.model_copy(update={"rows": 40, "cols": 60})
+    one, other = (
+        forward.expected_electrons(camera, Exposure(scene, 0.001), oversample=2, margin_px=4)
+        for scene in (image, shown)
+    )
+    # The two spread their lights over wavelengths by other Gauss rules, each within 1e-3 of the transfer.
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-3 * np.max(other))
