@@ -567,12 +567,15 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
         if field is not None:
             square = sin_theta_at(camera, row[mine], col[mine]) ** 2
             dark, light = dark * field[0](square), light * field[1](square)
-        distance = edge.distance_px(row[mine], col[mine])
-        acting = _blurring(effects)
+        seen_row, seen_col, acting = row[mine], col[mine], _blurring(effects)
         if _light_moves(camera, effects):
+            # by place as the channel's mean wavelength is moved; what others differ from that, alike over a region, blurs
+            mean_nm = _mean_wavelength(camera, channel, scene.light_radiance, effects, scene.kind)
+            seen_row, seen_col = _unmoved_px(camera, seen_row, seen_col, mean_nm, effects)
             row0, col0, row1, col1 = edge.region
             middle = 0.5 * (row0 + row1 - 1), 0.5 * (col0 + col1 - 1)
-            acting = (*acting, _ShiftAt(acting=acting, row=middle[0], col=middle[1]))
+            acting = (*acting, _ShiftAt(acting=acting, row=middle[0], col=middle[1], less_at_nm=mean_nm))
+        distance = edge.distance_px(seen_row, seen_col)
         dim, bright = (
             edge_profile(camera, channel, radiance, edge.angle_deg, distance, acting, scene.kind)
             for radiance in spectra
@@ -773,18 +776,30 @@ def _shift_px(
 
 
 class _ShiftAt(Effect):
-    """The shifts of other effects at one place (px), as the phase of a transfer function: an edge is moved as its middle is."""
+    """The shifts of other effects at one place (px), less those of one wavelength, as the phase of a transfer function."""
 
     acting: tuple[Effect, ...]
     row: float
     col: float
+    less_at_nm: float
 
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
     ) -> ComplexArray:
-        down, right = _shift_px(camera, np.array(self.row), np.array(self.col), wavelength_nm, self.acting)
-        turns = (fx_cy_per_um * right + fy_cy_per_um * down) * camera.pixel_pitch_um
+        place = np.array(self.row), np.array(self.col)
+        down, right = _shift_px(camera, *place, wavelength_nm, self.acting)
+        mean_down, mean_right = _shift_px(camera, *place, self.less_at_nm, self.acting)
+        turns = (fx_cy_per_um * (right - mean_right) + fy_cy_per_um * (down - mean_down)) * camera.pixel_pitch_um
         return np.asarray(np.exp(-2j * np.pi * turns))
+
+
+def _mean_wavelength(
+    camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Effect], kind: str
+) -> float:
+    """Mean wavelength (nm) of the light that a channel detects."""
+    wavelength_nm, weight = _detected(camera, channel, [(radiance, None)], effects, kind)
+    nodes, share = _otf_wavelengths(camera, channel, wavelength_nm, weight[0], 1)
+    return float(nodes @ share)
 
 
 def _unmoved_px(

@@ -438,3 +438,17 @@ def test_distortion_that_folds_the_image_is_refused() -> None:
     folded = Geometry(camera_matrix=((10.0, 0.0, 15.5), (0.0, 10.0, 11.5), (0.0, 0.0, 1.0)), distortion=(-0.5,))
     with pytest.raises(ValueError, match="folds the image"):
         expected_electrons(CAMERA, board, (effect("distortion")(geometry=folded),))
+
+
+def test_distortion_bends_an_edge() -> None:
+    """A vertical edge 19.5 px right of the axis: at the frame's ends it lies further out than in the middle, by the law."""
+    one = effect("distortion")(corner_percent=5.0)
+    camera = CAMERA.model_copy(update={"rows": 96, "cols": 96, "cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
+    edge = KnifeEdge((EdgeRegion((0, 60, 96, 75), 0.0),), LIGHT.scaled(0.1), LIGHT)
+    frames = [expected_electrons(camera, Exposure(edge, 1.0), acting) for acting in ((), (one,))]
+    plain, moved = (f / relative_illumination(camera, *np.indices(f.shape)) for f in frames)
+    contrast = plain[48, 90] - plain[48, 40]
+    shift = (plain - moved).sum(axis=1)[[2, 48, 93]] / contrast
+    # the edge lies at column 67, 19.5 px from the axis; R is 67.9 px
+    x, y = 19.5, np.array([45.5, 0.5, 45.5])
+    np.testing.assert_allclose(shift, 0.05 * x * (x**2 + y**2) / 67.9**2, rtol=0.08, atol=0.01)
