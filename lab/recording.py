@@ -310,10 +310,14 @@ def parse_spectrum(text: str) -> Spectrum:
 
 def parse_curve(text: str, columns: tuple[str, ...]) -> tuple[str, Spectrum]:
     """As `parse_spectrum`, with any of `columns` as the second column's name; which one it was, and the curve."""
-    rows = [row for row in csv.reader(io.StringIO(text.removeprefix("\ufeff"))) if any(cell.strip() for cell in row)]
+    try:
+        lines = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=None))
+        rows = [row for row in lines if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"isn't CSV ({_reason(error)}); write rows of two numbers") from None
     names = [cell.strip() for cell in rows[0]] if rows else []
     if len(names) != 2 or names[0] != "wavelength_nm" or names[1] not in columns:
-        head = ",".join(rows[0])[:60] if rows else ""
+        head = _quoted(rows[0]) if rows else ""
         wanted = " or ".join(f"'wavelength_nm,{column}'" for column in columns)
         raise InputError(f"its first line is '{head}', not {wanted}; write that header")
     if len(rows) == 1:
@@ -324,9 +328,7 @@ def parse_curve(text: str, columns: tuple[str, ...]) -> tuple[str, Spectrum]:
         try:
             at, height = (float(cell) for cell in row)
         except ValueError:
-            raise InputError(
-                f"row {number} is '{','.join(row)[:60]}', not two numbers; write wavelength and value"
-            ) from None
+            raise InputError(f"row {number} is '{_quoted(row)}', not two numbers; write wavelength and value") from None
         if not (math.isfinite(at) and math.isfinite(height)):
             raise InputError(f"row {number} isn't finite ({at}, {height}); leave unknown samples out")
         if wavelength_nm and at <= wavelength_nm[-1]:
@@ -334,6 +336,11 @@ def parse_curve(text: str, columns: tuple[str, ...]) -> tuple[str, Spectrum]:
         wavelength_nm.append(at)
         value.append(height)
     return names[1], Spectrum(wavelength_nm=tuple(wavelength_nm), value=tuple(value))
+
+
+def _quoted(row: list[str]) -> str:
+    """The start of a row of cells, which may hold line breaks, on one line."""
+    return " ".join(",".join(row).split())[:60]
 
 
 def _load_spectrum(file: Path) -> Spectrum:

@@ -247,8 +247,10 @@ def _envi_samples(file: Path) -> tuple[dict[str, Any], NDArray[Any]]:
         header, shape = dict(opened.metadata), tuple(int(n) for n in getattr(opened, "shape", ()))
     except Exception as error:
         raise InputError(f"can't be read as ENVI ({_reason(error)}); correct the header") from None
-    if header.get("byte order") not in ("0", "1"):  # the library takes anything else for this machine's own
-        raise InputError(f"byte order is '{header.get('byte order')}', not 0 or 1; correct the header")
+    # The library takes anything else for a guess of its own.
+    for key, known in (("byte order", ("0", "1")), ("interleave", ("bsq", "bil", "bip"))):
+        if str(header.get(key)).lower() not in known:
+            raise InputError(f"{key} is '{header.get(key)}', not one of {', '.join(known)}; correct the header")
     if len(shape) != 3 or min(shape) < 1 or np.prod(shape, dtype=float) > MOST_SAMPLES:
         raise InputError(
             f"says {shape} rows, columns, bands, not an image of 1 to {MOST_SAMPLES} samples; correct the header"

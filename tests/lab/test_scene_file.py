@@ -86,6 +86,7 @@ def test_a_named_light_has_the_luminance_asked_for() -> None:
         ("wavelength_nm,radiance_w_sr_m2_nm\n500,nan\n600,1\n", "isn't finite"),
         ("wavelength_nm,radiance_w_sr_m2_nm\n600,1\n500,1\n", "500 nm follows 600 nm"),
         ("wavelength_nm,radiance_w_sr_m2_nm\n500,1\n", "no width"),
+        (f"wavelength_nm,radiance_w_sr_m2_nm\n{'1' * 200_000},1\n", "isn't CSV"),
         ("wavelength_nm,relative\n900,1\n990,1\n", "visible light"),
     ],
 )
@@ -212,8 +213,8 @@ def test_a_scaled_reflectance_is_scaled_back(tmp_path: Path) -> None:
         (("lines = 4", "lines = 400"), "bytes where the header asks for"),
         (("lines = 4", "lines = -4"), "correct the header"),
         (("header offset = 0", "header offset = -80"), "correct the header"),
-        (("byte order = 0", "byte order = high"), "not 0 or 1"),
-        (("interleave = bip", "interleave = bop"), "can't be read as ENVI"),
+        (("byte order = 0", "byte order = 2"), "not one of 0, 1"),
+        (("interleave = bip", "interleave = bop"), "not one of bsq, bil, bip"),
         (("samples = 5", "samples = 999999999999"), "correct the header"),
         (("data type = 5", "data type = 9"), "bytes where the header asks for"),
         (("bands = 3", "bands = 2"), "3"),
