@@ -52,8 +52,10 @@ class SpatialVariance:
     def mean_std(self, shape: tuple[int, int]) -> float:
         """Standard uncertainty of a plane's mean as that of the camera: of its rows', columns' and pixels' draw."""
         m, n = shape
-        parts = max(self.rows, 0.0) / m + max(self.columns, 0.0) / n + max(self.pixels, 0.0) / (m * n)
-        return float(np.sqrt(parts))
+        # Parts that may well be noise would add up otherwise: none is below 0.
+        rows = self.rows if self.rows > 2.0 * self.rows_std else 0.0
+        columns = self.columns if self.columns > 2.0 * self.columns_std else 0.0
+        return float(np.sqrt(rows / m + columns / n + max(self.pixels, 0.0) / (m * n)))
 
     @classmethod
     def split(
@@ -398,6 +400,16 @@ class Stack:
         # The mean frame keeps the first one's plane means: only its pattern is used.
         shift = means - self._frame_means[0]
         _compare(frame, self.mean, self.scatter, shift, bad, self.period, self.count, self.products, self.pairs)
+
+    def image(self) -> Float32Array:
+        """Mean of the repeats (rows, cols), DN."""
+        if self.mean is None:
+            raise ValueError("a level has no frames: give one at least")
+        image = self.mean.copy()
+        for name, plane in planes(image, self.cfa).items():
+            means = [frame[self._phases[name]] for frame in self._frame_means]
+            np.add(plane, np.float32(np.mean(means) - means[0]), out=plane)
+        return image
 
     def statistics(self) -> dict[str, PlaneStatistics]:
         if self.mean is None:

@@ -21,7 +21,7 @@ Definitions: EMVA Standard 1288, release 4.0 (linear). Where this departs from t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -403,7 +403,10 @@ class _Evaluation:
             self.darks = []
         self.lines = self._dark_lines()
         self.saturation, self.saturation_seen = self._saturation()
-        self.transfer, self.points = self._transfer()
+        self.transfer, self.points = self._transfer(self.darks)
+        present = {name for _, name in self.points}
+        self.plane_index = {name: i for i, name in enumerate(n for n in self.names if n in present)}
+        self._remark_on_transfer()
 
     def _darks_of_one_temperature(self) -> list[Level]:
         """Darks of the temperature that most flats were taken at (or that most darks have)."""
@@ -515,10 +518,10 @@ class _Evaluation:
 
     # --- photon transfer ---
 
-    def _transfer(self) -> tuple[TransferFit, list[tuple[Level, str]]]:
+    def _transfer(self, darks: Sequence[Level]) -> tuple[TransferFit, list[tuple[Level, str]]]:
         points: list[tuple[Level, str]] = []
         x, v, s, plane, light = [], [], [], [], []
-        for level in (*self.darks, *self.flats):
+        for level in (*darks, *self.flats):
             bright = level.lamp != "dark"
             for index, name in enumerate(self.names):
                 own = level.plane[name]
@@ -546,29 +549,31 @@ class _Evaluation:
         transfer = fit_transfer(
             np.array(x), np.array(v), np.array(s), compact, np.array(light), max(self.saturation.values())
         )
-        self.plane_index = {self.names[p]: i for i, p in enumerate(present)}
-        if transfer.model_error > 0:
-            self._remark(
-                f"the variances of the flats scatter about their curve by {100 * transfer.model_error:.2g} % beyond what sampling explains "
-                "(an uneven converter does that): it is in the uncertainties"
-            )
-        if transfer.by_line:
-            self._remark(
-                f"the bend of the variances ({100 * transfer.curve_bend:+.1f} +- {100 * transfer.curve_bend_std:.1f} % at saturation) isn't "
-                "established against that scatter: the conversion gain is EMVA's straight line to 70 % of saturation; at zero signal "
-                f"the curve has {transfer.curve_gain:.4g} +- {transfer.curve_gain_std:.2g} DN/e"
-            )
-        elif abs(transfer.curve_bend) > 4.0 * transfer.curve_bend_std:
-            self._remark(
-                f"the variance bends by {100 * transfer.curve_bend:+.1f} +- {100 * transfer.curve_bend_std:.1f} % of its line at saturation "
-                "(nonlinear response or brighter-fatter); the conversion gain is that at zero signal"
-            )
         if transfer.gain <= 0 or transfer.gain < 3.0 * transfer.gain_std:
             raise NotDetermined(
                 "noise",
                 "the temporal variance doesn't grow with the signal: capture repeats of flats that are steady and unprocessed",
             )
         return transfer, points
+
+    def _remark_on_transfer(self) -> None:
+        t = self.transfer
+        if t.model_error > 0:
+            self._remark(
+                f"the variances of the flats scatter about their curve by {100 * t.model_error:.2g} % beyond what sampling explains "
+                "(an uneven converter does that): it is in the uncertainties"
+            )
+        if t.by_line:
+            self._remark(
+                f"the bend of the variances ({100 * t.curve_bend:+.1f} +- {100 * t.curve_bend_std:.1f} % at saturation) isn't "
+                "established against that scatter: the conversion gain is EMVA's straight line to 70 % of saturation; at zero signal "
+                f"the curve has {t.curve_gain:.4g} +- {t.curve_gain_std:.2g} DN/e"
+            )
+        elif abs(t.curve_bend) > 4.0 * t.curve_bend_std:
+            self._remark(
+                f"the variance bends by {100 * t.curve_bend:+.1f} +- {100 * t.curve_bend_std:.1f} % of its line at saturation "
+                "(nonlinear response or brighter-fatter); the conversion gain is that at zero signal"
+            )
 
     # --- what follows from K ---
 
@@ -632,6 +637,33 @@ class _Evaluation:
     def _remark(self, sentence: str) -> None:
         if sentence not in self.remarks:
             self.remarks.append(sentence)
+
+    def _dark_current_from_variance(self) -> tuple[float | None, float | None]:
+        """The dark current's own shot noise: growth of the dark variance with exposure over K^2, planes together. K here is that of
+        the flats: the darks' own says the same as their growth."""
+        repeated = [level for level in self.darks if level.repeats > 1]
+        exposure = np.array([level.exposure_s for level in repeated])
+        if np.unique(exposure).size < 3 or self._hidden():
+            return None, None
+        rates, weights = [], []
+        for name in self.names:
+            own = [level.plane[name] for level in repeated]
+            variance = np.array([plane.temporal_variance for plane in own])
+            std = np.array([plane.temporal_variance_std for plane in own])
+            if variance.min() < HIDDEN_DN2:
+                return None, None
+            line = dark_line(exposure, variance, std)
+            if line.rate is not None:
+                rates.append(line.rate)
+                weights.append(1.0 / line.covariance[1, 1])
+        try:
+            flats = self._transfer([level for level in repeated if level.exposure_s == exposure.min()])[0]
+        except NotDetermined:
+            return None, None
+        rate = float(np.average(rates, weights=weights))
+        relative = 2.0 * flats.gain_std / flats.gain
+        std_of_rate = float(np.hypot(np.sum(weights) ** -0.5, rate * relative))
+        return rate / flats.gain**2, std_of_rate / flats.gain**2
 
     def _temperatures(self) -> DarkCurrentTemperature | None:
         """Dark current at every temperature with darks of two exposures, and the laws through those that are above 0."""
@@ -865,8 +897,14 @@ class _Evaluation:
             if len({level.light for level in levels}) < 5:
                 continue
             light, signal, std = self._response(name, levels)
-            basis = np.stack([np.ones_like(light), light, light**2], axis=1)
-            solution, covariance, chi2 = least_squares(basis, signal, std)
+            # The response bends with all its charge, the dark current's included: as light, that is below / slope.
+            below = np.array([self._dark_mean(name, level.exposure_s) - self.lines[name].black for level in levels])
+            slope = float(np.sum(light * signal) / np.sum(light * light))
+            for _ in range(2):
+                charge = light + below / slope
+                basis = np.stack([np.ones_like(light), charge, charge**2], axis=1)
+                solution, covariance, chi2 = least_squares(basis, signal + below, std)
+                slope = float(solution[1])
             covariance *= inflation(chi2, len(levels) - 3)
             _, slope, square = solution
             gradient = highest * np.array([0.0, -2.0 * square / slope**3, 1.0 / slope**2])
@@ -910,7 +948,9 @@ class _Evaluation:
         norm = float(np.sum((x / std) ** 2))
         product = float(np.sum(x * y / std**2)) / norm
         chi2, freedom = float(np.sum(((y - product * x) / std) ** 2)), len(rows) - 1
-        return product, float(np.sqrt(inflation(chi2, freedom) / norm))
+        # Each pair of a colour mosaic is counted in both its planes.
+        counted = 1.0 if self.camera.cfa == "MONO" else 2.0
+        return product, float(np.sqrt(counted * inflation(chi2, freedom) / norm))
 
     def _bends(self) -> dict[str, float]:
         """Percent at saturation: the response's bend, the variance's, what the variance lacks beyond the response's, and what
@@ -1095,6 +1135,8 @@ class _Evaluation:
         """The figures that stand for the sensor and for each channel, with their uncertainties."""
         scale = 10.0 ** (-self.gain_db / 20.0)
         errors = list(self._linearity()[0].values())
+        # Planes see the same lamp: where it drifts, their errors go together.
+        together = 1.0 if self._drift()[0] > 0 else float(np.sqrt(max(len(errors), 1)))
         found: dict[str, tuple[float | None, float | None]] = {
             "conversion_gain_dn_per_e": (self.transfer.gain * scale, self.transfer.gain_std * scale),
             "read_noise_e": self._read_noise(),
@@ -1105,8 +1147,7 @@ class _Evaluation:
             "full_well_e": self._full_well(),
             "linearity_error_percent": (
                 float(np.mean([e.error_percent for e in errors])) if errors else None,
-                # Planes see the same lamp: their errors go together.
-                float(np.mean([e.error_percent_std for e in errors])) if errors else None,
+                float(np.mean([e.error_percent_std for e in errors])) / together if errors else None,
             ),
         }
         values = {name: value for name, (value, _) in found.items()}
@@ -1120,11 +1161,7 @@ class _Evaluation:
         self._remark_on_shading()
         principal = self.principal()
         qe, qe_std, qe_at = self._quantum_efficiency()
-        emva1288 = self._emva1288()
-        from_variance, from_variance_std = _averaged(
-            (plane.dark_current_from_variance_e_per_s, plane.dark_current_from_variance_e_per_s_std)
-            for plane in emva1288.values()
-        )
+        from_variance, from_variance_std = self._dark_current_from_variance()
         dark = pixels is not None and self.darks
         return NoiseFit(
             **principal,
@@ -1141,20 +1178,10 @@ class _Evaluation:
             read_noise_distribution=read_noise_distribution(pixels, t.gain) if dark and pixels is not None else None,
             defects=pixels.defects(t.gain) if dark and pixels is not None else None,
             channels=self._channels(principal),
-            emva1288=emva1288,
+            emva1288=self._emva1288(),
             photon_transfer=self._photon_transfer(self._linearity()[1]),
             remarks=tuple(self.remarks),
         )
-
-
-def _averaged(found: Iterable[tuple[float | None, float | None]]) -> tuple[float | None, float | None]:
-    """Weighted mean of independent values with standard uncertainties; None where there are none."""
-    known = [(value, std) for value, std in found if value is not None and std is not None]
-    if not known:
-        return None, None
-    values, stds = np.array(known).T
-    weight = 1.0 / np.maximum(stds, 1e-12) ** 2
-    return float(np.average(values, weights=weight)), float(weight.sum() ** -0.5)
 
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5

@@ -113,7 +113,8 @@ def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoise
     rest = (usual / middle - 1.0) ** 2
     measured = float(rest.mean())
     spread2 = (measured - 2.0 / nu) / (1.0 + 2.0 / nu)
-    spread2_std = float(rest.std()) / np.sqrt(count) / (1.0 + 2.0 / nu)
+    influence = rest - 2.0 * measured * (usual / middle - 1.0)  # of one pixel, the mean it is compared with included
+    spread2_std = float(influence.std()) / np.sqrt(count) / (1.0 + 2.0 / nu)
     spread, spread_std = root(spread2, spread2_std)
     rounding = middle / (middle - QUANTISATION_DN2)  # the pixels differ in what isn't rounding's
     noise = np.sqrt(np.maximum(variance - QUANTISATION_DN2, 0.0)) / gain_dn_per_e
@@ -166,10 +167,10 @@ def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
     total, square, weight = np.zeros(offset[0].shape), 0.0, 0.0
     for group in _levels(recordings.captures("flat", side)):
         stack = taken(recordings, group, defective)
-        assert stack.mean is not None
-        signal = stack.mean - offset[0] - (dark[0] * group[0].exposure_s if dark is not None else 0.0)
+        image = stack.image()
+        signal = image - offset[0] - (dark[0] * group[0].exposure_s if dark is not None else 0.0)
         share = float(np.median(signal)) / white
-        if not LOW <= share <= HIGH or float(np.percentile(stack.mean, 99.9)) >= camera.saturation_dn:
+        if not LOW <= share <= HIGH or float(np.percentile(image, 99.9)) >= camera.saturation_dn:
             continue
         for plane in planes(signal, camera.cfa).values():
             np.divide(plane, shading(plane), out=plane)
@@ -215,10 +216,9 @@ def _dark_maps(recordings: RecordingSet, darks: list[list[Dark]], cfa: Cfa) -> t
     exposure, weight, means = [], [], []
     for group in darks:
         stack = taken(recordings, group)
-        assert stack.mean is not None
         exposure.append(group[0].exposure_s)
         weight.append(_pixel_std(stack) ** -2)
-        means.append(stack.mean)
+        means.append(stack.image())
     defective = defective_pixels(means[0], cfa)
     t, w = np.array(exposure), np.array(weight)
     middle = float(np.sum(w * t) / w.sum())

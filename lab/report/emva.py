@@ -416,12 +416,11 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
 
     def mean(captures: list[Dark] | list[Flat]) -> tuple[FloatArray, float]:
         stack = taken(recordings, captures)
-        assert stack.mean is not None
         camera = recordings.camera(side)
         left = 0.0
         if stack.scatter is not None:
             left = float(planes(stack.scatter, camera.cfa)[plane].mean(dtype=float)) / (stack.count - 1) / stack.count
-        return np.array(planes(stack.mean, camera.cfa)[plane], float), left
+        return np.array(planes(stack.image(), camera.cfa)[plane], float), left
 
     dark, dark_left = mean(darks)
     bright, bright_left = mean(flats) if flats else (None, 0.0)

@@ -12,7 +12,7 @@ import pytest
 from lab.errors import NotDetermined
 from lab.fit.levels import Level, defective_pixels, level_statistics, shading
 from lab.fit.lines import dark_line, linearity
-from lab.fit.noise import fit_noise, fit_transfer, noise_fit
+from lab.fit.noise import fit_noise, fit_transfer, noise_fit, temperature_law
 from lab.importers.emva1288 import read_emva1288
 from lab.recording import Camera, Manifest, RecordingSet, read
 from lab.results import NoiseFit
@@ -180,14 +180,53 @@ def test_transfer_is_exact_without_noise() -> None:
     assert fit.floor[0] == pytest.approx(2.0, rel=1e-3)
 
 
-def test_transfer_falls_back_on_the_line_where_levels_scatter() -> None:
-    rng = np.random.default_rng(6)
+def scattered(scatter: float, bend: float, seed: int) -> tuple[np.ndarray, ...]:
+    """Points of a camera of K = 0.4 whose flats scatter by `scatter` beyond their sampling noise of 0.3 %; bend at 4000 DN."""
+    rng = np.random.default_rng(seed)
     x = np.concatenate([np.zeros(5), np.linspace(100, 3500, 40)])
-    v = (2.0 + 0.4 * x) * (1.0 + np.where(x > 0, 0.02, 0.002) * rng.standard_normal(x.size))
-    fit = fit_transfer(x, v, 0.003 * v, np.zeros(x.size, int), x > 0, 4000.0)
-    assert fit.by_line
+    v = (2.0 + 0.4 * x * (1.0 + bend * x / 4000.0)) * (1.0 + 0.003 * rng.standard_normal(x.size))
+    v *= 1.0 + np.where(x > 0, scatter, 0.0) * rng.standard_normal(x.size)
+    return x, v, 0.003 * v, np.zeros(x.size, int), x > 0
+
+
+def test_scatter_beyond_sampling_is_the_models_error() -> None:
+    fit = fit_transfer(*scattered(0.02, 0.0, 6), 4000.0)
+    # 37 levels: the error is known to 1 / sqrt(74) = 12 %; three of these.
+    assert fit.model_error == pytest.approx(0.02, rel=0.35)
+    assert fit.dark_error == 0.0
     assert abs(fit.gain - 0.4) < 3.0 * fit.gain_std
-    assert fit.gain == fit.line_gain
+    calm = fit_transfer(*scattered(0.0, 0.0, 6), 4000.0)
+    assert calm.model_error == 0.0
+    assert not calm.by_line
+
+
+def test_a_bend_is_believed_only_against_the_models_error() -> None:
+    unsure = fit_transfer(*scattered(0.015, -0.05, 7), 4000.0)
+    assert unsure.by_line
+    assert unsure.gain == unsure.line_gain
+    # Line and curve are both within what is stated.
+    assert abs(unsure.curve_gain - 0.4) < 2.0 * unsure.curve_gain_std
+    assert abs(unsure.gain - 0.4) < 2.5 * unsure.gain_std
+    sure = fit_transfer(*scattered(0.004, -0.05, 7), 4000.0)
+    assert not sure.by_line
+    assert abs(sure.gain - 0.4) < 2.0 * sure.gain_std
+    assert abs(sure.line_gain - 0.4) > 5.0 * sure.gain_std / 3.0
+
+
+def test_dark_currents_follow_arrhenius_and_double() -> None:
+    kelvin = np.array([293.15, 303.15, 313.15])
+    current = 20.0 * np.exp(-0.6 / 8.617333262e-5 * (1.0 / kelvin - 1.0 / kelvin[0]))
+    law = temperature_law([(t - 273.15, i, 0.01 * i) for t, i in zip(kelvin, current, strict=True)])
+    assert law.activation_energy_ev == pytest.approx(0.6, rel=1e-6)
+    assert law.reference_current_e_per_s == pytest.approx(20.0, rel=1e-6)
+    # d ln I / dT = E / k T^2 at the middle: 9.14 deg C for a factor of 2, and the law bends within these 20 by 7 %.
+    assert law.doubling_temperature_c == pytest.approx(np.log(2.0) * 8.617333262e-5 * 303.15**2 / 0.6, rel=0.02)
+    assert law.activation_energy_ev_std == pytest.approx(
+        0.01 * np.sqrt(2) * 8.617333262e-5 / (1 / 293.15 - 1 / 313.15), rel=0.05
+    )
+    alone = temperature_law([(20.0, 5.0, 0.1), (30.0, 0.1, 0.1)])
+    assert alone.activation_energy_ev is None
+    assert alone.doubling_temperature_c is None
 
 
 def test_dark_line_finds_black_and_rate() -> None:
@@ -376,6 +415,64 @@ def test_rounding_hides_a_small_read_noise_and_that_is_said() -> None:
     assert abs(fit.conversion_gain_dn_per_e - 0.5) < 3.5 * fit.conversion_gain_dn_per_e_std
 
 
+@pytest.mark.parametrize("black", [5.0, 5.3, 5.5])
+def test_eight_bits_say_what_they_hide(black: float) -> None:
+    """Dark noise of 0.13 DN: whether 5.5 flickers between two codes or 5.0 stands still, the figures aren't there."""
+    sensor = Sensor(cfa="MONO", gain=0.025, read=5.0, black=black, dark_rate=20.0, dsnu=1.0, full=9500.0, white=255)
+    ladder = [(float(t), 2) for t in np.linspace(0.05, 1.0, 20)]
+    darks = [(float(t), 2) for t in (0.01, 0.3, 0.6, 1.0)]
+    fit = fit_noise(recording_set(sensor, darks, ladder), "left")
+    for name in ("read_noise_e", "dark_current_e_per_s", "dsnu_e", "dark_current_from_variance_e_per_s"):
+        assert getattr(fit, name) is None, name
+    assert any(
+        "rounding hides the read noise" in remark or "where rounding hides it" in remark for remark in fit.remarks
+    )
+    assert any("dark current and DSNU aren't determined" in remark for remark in fit.remarks)
+    assert abs(fit.black_level_dn - black) < 3.0 * fit.black_level_dn_std
+    assert abs(fit.conversion_gain_dn_per_e - 0.025) < 3.0 * fit.conversion_gain_dn_per_e_std
+
+
+def test_a_level_taken_twice_is_a_level_with_more_repeats() -> None:
+    sensor = Sensor()
+    fit = fit_noise(recording_set(sensor, [(0.001, 4), (1.0, 4)], LADDER + LADDER), "left")
+    assert len(fit.photon_transfer.exposure_s) == 3 * len(LADDER)
+    assert abs(fit.conversion_gain_dn_per_e - 0.5) < 3.5 * fit.conversion_gain_dn_per_e_std
+
+
+def test_every_channel_has_its_own_figures() -> None:
+    sensor = Sensor()
+    fit = fit_noise(recording_set(sensor, [(0.001, 4), (1.0, 4)], LADDER), "left")
+    assert set(fit.channels) == {"R", "G", "B"}
+    for name, channel in fit.channels.items():
+        for key in ("conversion_gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "dsnu_e"):
+            error = getattr(channel, key) - TRUTHS[key](sensor)
+            assert abs(error) < 3.5 * getattr(channel, f"{key}_std"), (name, key)
+    assert set(fit.emva1288) == {"R", "G1", "G2", "B"}
+
+
+def test_what_bends_the_variance_is_told_apart() -> None:
+    bent = measured(Sensor(shape=(240, 320), cfa="MONO", bend=0.03), np.random.default_rng(15))
+    assert abs(bent.response_bend_percent - -3.0 * 7990 / 7600) < 0.2  # at the converter's limit, 7990 e of signal
+    assert abs(bent.brighter_fatter_percent) < 3.5 * bent.brighter_fatter_percent_std
+    assert any("a response that bends" in remark for remark in bent.remarks)
+    fat = measured(Sensor(shape=(240, 320), cfa="MONO", brighter_fatter=0.06), np.random.default_rng(16))
+    assert abs(fat.response_bend_percent) < 4.0 * fat.response_bend_percent_std
+    assert abs(fat.brighter_fatter_percent - 6.0 * 7990 / 7600) < 3.5 * fat.brighter_fatter_percent_std
+    # This one's noise is missing without having gone to the neighbours.
+    assert abs(fat.neighbour_covariance_percent) < 4.0 * fat.neighbour_covariance_percent_std
+    assert any("neighbours' covariances don't show" in remark for remark in fat.remarks)
+
+
+def test_a_lamp_off_the_axis_is_said() -> None:
+    sensor = Sensor(cfa="MONO", prnu=0.0)
+    rng = np.random.default_rng(17)
+    slope = np.linspace(-0.01, 0.01, sensor.shape[0])[:, None] * np.ones(sensor.shape)
+    darks = levels(sensor, rng, np.array([0.001, 1.0]), 3, dark=True, pattern=(slope, 0.0 * slope))
+    flats = levels(sensor, rng, np.linspace(0.1, 0.9, 8), 3, pattern=(slope, 0.0 * slope))
+    fit = noise_fit(darks, flats, sensor.camera())
+    assert any("asymmetric: rows from 0.990 at the first to 1.010 at the last" in remark for remark in fit.remarks)
+
+
 def test_a_frame_of_a_few_pixels_is_refused() -> None:
     with pytest.raises(NotDetermined, match="too few"):
         fit_noise(recording_set(Sensor(shape=(4, 4)), [(0.001, 2)], LADDER), "left")
@@ -415,3 +512,15 @@ def test_a_real_ccd() -> None:
     assert fit.read_noise_e == pytest.approx(10.9, rel=0.1)
     assert fit.quantum_efficiency == pytest.approx(0.453, rel=0.03)
     assert any("lamp drifted" in remark for remark in fit.remarks)
+    assert any("shading is asymmetric: rows from 1.00" in remark for remark in fit.remarks)
+    own = fit.emva1288["Y"]
+    # By the reference implementation, on the same frames: 0.27986, 0.45286, 0.4325.
+    assert own.system_gain_dn_per_e == pytest.approx(0.27986, rel=1e-3)
+    assert own.quantum_efficiency == pytest.approx(0.45286, rel=2e-3)
+    assert own.prnu_percent == pytest.approx(0.4325, rel=2e-3)
+    assert own.saturation_capacity_photons == 30957.0
+    # The curve's gain at zero signal is within what is stated, too.
+    assert (
+        abs(fit.conversion_gain_at_zero_dn_per_e - fit.conversion_gain_dn_per_e)
+        < 2.0 * fit.conversion_gain_dn_per_e_std
+    )
