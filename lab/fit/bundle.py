@@ -135,6 +135,11 @@ def warp_shape(view: BoardView) -> Array:
     return np.column_stack([x * x - 1.0 / 3.0, y * y - 1.0 / 3.0, x * y])
 
 
+def warp_prior_mm(view: BoardView) -> float:
+    """Standard deviation of the prior of a board's warp."""
+    return WARP_PRIOR * view.capture.square_mm * float(np.hypot(*view.capture.squares))
+
+
 class Bundle:
     """The problem: `sights` in frames of `shape` (rows, cols), with the intrinsics `free` (cameras, 12) may move.
 
@@ -176,12 +181,9 @@ class Bundle:
         # over the focal length of the start is set by `solve`.
         self.half_diagonal_px = 0.5 * float(np.hypot(*shape))
         for number in range(self.boards):
-            of_board = [sight.view.capture for sight in self.sights if sight.board == number] or [
-                self.sights[0].view.capture
-            ]
-            diagonal_mm = of_board[0].square_mm * float(np.hypot(*of_board[0].squares))
+            seen = [sight.view for sight in self.sights if sight.board == number] or [self.sights[0].view]
             at = self.at_warp + 3 * number
-            self.prior_std[at : at + 3] = WARP_PRIOR * diagonal_mm
+            self.prior_std[at : at + 3] = warp_prior_mm(seen[0])
 
     def _set_distortion_prior(self, intrinsics: Array) -> None:
         at = 0
@@ -401,12 +403,14 @@ def board_pose(view: BoardView, intrinsics: Array) -> tuple[Array, Array]:
     try:
         found, turn, shift = cv2.solvePnP(points, seen, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error:
-        found = False
-    if not found:
+        found, turn, shift = False, np.zeros(3), np.zeros(3)
+    rotation = np.asarray(cv2.Rodrigues(turn)[0]) if found else np.eye(3)
+    shift = np.asarray(shift).ravel() if found else np.zeros(3)
+    if not np.all(points @ rotation[2] + shift[2] > 0):
         raise NotDetermined(
-            "geometry", f"{view.capture.id}: no pose of the board fits its corners: leave the capture out"
+            "geometry", "no pose of the board fits its corners: check what the capture says of the board"
         )
-    return np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift).ravel()
+    return rotation, shift
 
 
 def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Array:

@@ -22,7 +22,17 @@ from numpy.typing import NDArray
 
 from lab.errors import NotDetermined
 from lab.fit.board import MIN_CORNERS, BoardView, CornerFits, channel_corners, find_boards
-from lab.fit.bundle import Bundle, Sight, Solution, board_key, first_intrinsics, first_state, with_boards
+from lab.fit.bundle import (
+    Bundle,
+    Sight,
+    Solution,
+    board_key,
+    board_pose,
+    first_intrinsics,
+    first_state,
+    warp_prior_mm,
+    with_boards,
+)
 from lab.fit.pinhole import COUNT, NAMES, distortion_of, matrix_of, project_slopes, unproject
 from lab.fit.projection import Difference, difference, grid, grid_points, points_at, projection_std
 from lab.recording import RecordingSet
@@ -46,7 +56,7 @@ OUTLYING_VIEW_PX = 0.1  # below this no view is left out
 OUTLYING_CORNER = 5.0  # standard deviations of a coordinate: of 2000 good corners, one in 500 calibrations
 OUTLYING_SHARE = 0.25  # of a view's corners: more, and it is the view that is wrong
 NOT_A_BOARD = 0.005  # rms over the frame's diagonal, above which no camera explains the corners
-FOCAL_KNOWN = 0.05  # relative uncertainty of the focal length, above which it isn't determined
+FOCAL_KNOWN = 0.1  # relative uncertainty of the focal length, above which it isn't determined
 PARALLEL_DEG = 5.0
 FOLDS = 5
 OVERFITTED = 0.05  # of the squared error of held-out views, by which a richer model has to be worse to be refused
@@ -62,6 +72,7 @@ class Calibration:
 
     views: tuple[BoardView, ...]
     solution: Solution
+    shape: tuple[int, int]  # rows, cols of the frame
     models: tuple[DistortionModel, ...] = ()
     rejected: tuple[Skipped, ...] = ()
     rejected_corners: tuple[Skipped, ...] = ()
@@ -126,8 +137,15 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
     quarter of its corners would go. Raises `NotDetermined` where too few views are left, where no camera explains them, or
     where they don't determine the focal length.
     """
-    kept = list(views)
+    kept: list[BoardView] = []
     rejected: list[Skipped] = []
+    start = first_intrinsics(views, shape)
+    for view in views:
+        try:
+            board_pose(view, start)
+            kept.append(view)
+        except NotDetermined as refused:
+            rejected.append(Skipped(step=view.capture.id, reason=refused.reason, side=side))
     stray: dict[str, list[tuple[int, float]]] = {}
     while True:
         if len(kept) < MIN_VIEWS:
@@ -143,15 +161,16 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
             continue
         if not _leave_out_corners(kept, solution, stray):
             break
-    _check_determined(kept, solution, shape)
+    _check_board(kept, solution, shape)
     coefficients, models = choose_model(kept, shape, solution)
     if coefficients != MODELS[-1]:
         solution = calibrate(kept, shape, coefficients)
+    _check_focal_length(solution)
     corners = tuple(
         Skipped(step=capture, reason=_corner_reason(numbers, solution.noise_px), side=side)
         for capture, numbers in stray.items()
     )
-    return Calibration(tuple(kept), solution, models, tuple(rejected), corners)
+    return Calibration(tuple(kept), solution, shape, models, tuple(rejected), corners)
 
 
 def _outlying_view(views: Sequence[BoardView], solution: Solution) -> tuple[int, str] | None:
@@ -198,7 +217,7 @@ def _corner_reason(numbers: list[tuple[int, float]], noise_px: float) -> str:
     return f"corners {which} lie off, where the others scatter by {noise_px:.3f} px"
 
 
-def _check_determined(views: Sequence[BoardView], solution: Solution, shape: tuple[int, int]) -> None:
+def _check_board(views: Sequence[BoardView], solution: Solution, shape: tuple[int, int]) -> None:
     diagonal = float(np.hypot(*shape))
     if not solution.rms_px < NOT_A_BOARD * diagonal:
         capture = views[0].capture
@@ -207,6 +226,9 @@ def _check_determined(views: Sequence[BoardView], solution: Solution, shape: tup
             f"no camera explains the corners (rms {solution.rms_px:.1f} px): check that the board has {capture.squares[0]} x "
             f"{capture.squares[1]} squares, that it is flat, and that it didn't move while it was exposed",
         )
+
+
+def _check_focal_length(solution: Solution) -> None:
     focal = float(solution.state.intrinsics[0, 0])
     uncertain = float(solution.std()[0]) / focal if solution.determined and focal > 0 else np.inf
     if uncertain <= FOCAL_KNOWN:
@@ -305,14 +327,14 @@ def _held_out(
 # --- what the errors are ----------------------------------------------------------------------------------------------------
 
 
-def halves_differ(calibration: Calibration, shape: tuple[int, int]) -> Difference | None:
+def halves_differ(calibration: Calibration) -> Difference | None:
     """Two halves of the views, every other one, each calibrated by itself, compared where the corners were seen; None where the
     halves would be too small."""
     views, coefficients = calibration.views, _coefficients(calibration.solution)
     halves = [views[0::2], views[1::2]]
     if min(len(half) for half in halves) < MIN_VIEWS:
         return None
-    one, two = (calibrate(half, shape, coefficients) for half in halves)
+    one, two = (calibrate(half, calibration.shape, coefficients) for half in halves)
     if not (one.determined and two.determined):
         return None
     points = calibration.points
@@ -326,9 +348,9 @@ def _coefficients(solution: Solution) -> tuple[str, ...]:
     return tuple(name for name, free in zip(NAMES[4:], solution.free[0, 4:], strict=True) if free)
 
 
-def cross_validation(calibration: Calibration, shape: tuple[int, int]) -> CrossValidation | None:
+def cross_validation(calibration: Calibration) -> CrossValidation | None:
     """`halves_differ` as a result: error of the model apart from error of the sampling."""
-    found = halves_differ(calibration, shape)
+    found = halves_differ(calibration)
     if found is None:
         return None
     beyond = max(found.rms_px**2 - found.expected_px**2, 0.0) / 2.0
@@ -341,9 +363,9 @@ def cross_validation(calibration: Calibration, shape: tuple[int, int]) -> CrossV
     )
 
 
-def projection_maps(calibration: Calibration, shape: tuple[int, int]) -> tuple[ProjectionUncertainty, ...]:
+def projection_maps(calibration: Calibration) -> tuple[ProjectionUncertainty, ...]:
     """At the boards' middle distance, and at infinity."""
-    x, y = grid(shape)
+    x, y = grid(calibration.shape)
     image = grid_points(x, y)
     distances = (float(np.median(np.linalg.norm(calibration.points, axis=1))), None)
     found = []
@@ -359,20 +381,18 @@ def projection_maps(calibration: Calibration, shape: tuple[int, int]) -> tuple[P
     return tuple(found)
 
 
-def board_warps(
-    views: Sequence[BoardView], warps_mm: Array, covariance: Array, prior_std: Array
-) -> tuple[BoardWarp, ...]:
-    """The warps (boards, 3) as results; `covariance` and `prior_std` of them all, in order."""
+def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) -> tuple[BoardWarp, ...]:
+    """The warps (boards, 3) as results; `covariance` of them all, in order. What the views say little about is None."""
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(-1, 3)
-    known = std < WARP_KNOWN * prior_std.reshape(-1, 3)
     found = []
     for number, view in enumerate(_one_a_board(views)):
         capture = view.capture
-        name = f"{capture.squares[0]} x {capture.squares[1]} squares of {capture.square_mm:g} mm, {capture.dictionary}"
+        known = std[number] < WARP_KNOWN * warp_prior_mm(view)
         fields: dict[str, float | None] = {}
         for k, field in enumerate(("bend_x_mm", "bend_y_mm", "twist_mm")):
-            fields[field] = float(warps_mm[number, k]) if known[number, k] else None
-            fields[f"{field}_std"] = float(std[number, k]) if known[number, k] else None
+            fields[field] = float(warps_mm[number, k]) if known[k] else None
+            fields[f"{field}_std"] = float(std[number, k]) if known[k] else None
+        name = f"{capture.squares[0]} x {capture.squares[1]} squares of {capture.square_mm:g} mm, {capture.dictionary}"
         found.append(BoardWarp(board=name, **fields))
     return tuple(found)
 
@@ -380,9 +400,7 @@ def board_warps(
 # --- lateral colour ----------------------------------------------------------------------------------------------------------
 
 
-def channel_geometry(
-    calibration: Calibration, corners: Sequence[dict[str, CornerFits]], shape: tuple[int, int]
-) -> tuple[ChannelGeometry, ...]:
+def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, CornerFits]]) -> tuple[ChannelGeometry, ...]:
     """Each colour's camera, from where its corners (one entry for each view) lie beside the luminance's.
 
     Poses and boards are the same for all colours, so that only differences count: scale, principal point, k1 and k2 of each
@@ -483,14 +501,26 @@ def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
         why = f"; {missed[0].step}: {missed[0].reason}" if missed else ""
         raise NotDetermined("geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{why}")
     calibration = calibrate_robustly(views, shape, side)
+    channels: tuple[ChannelGeometry, ...] = ()
+    if camera.cfa != "MONO":
+        frames = (channel_corners(recordings.frame(view.capture), camera.cfa, view) for view in calibration.views)
+        channels = channel_geometry(calibration, list(frames))
+    return geometry_result(calibration, missed, channels)
+
+
+def geometry_result(
+    calibration: Calibration,
+    missed: Sequence[Skipped] = (),
+    channels: tuple[ChannelGeometry, ...] = (),
+) -> GeometryFit:
+    """A calibration with its errors as a result; `missed` are captures in which no board was found."""
     solution = calibration.solution
-    frames = (channel_corners(recordings.frame(view.capture), camera.cfa, view) for view in calibration.views)
-    channels = channel_geometry(calibration, list(frames), shape) if camera.cfa != "MONO" else ()
-    validation = cross_validation(calibration, shape)
+    validation = cross_validation(calibration)
     noises = [view.std_px for view in calibration.views if view.std_px is not None]
     of_pictures = float(np.sqrt(np.mean(np.concatenate(noises) ** 2))) if noises else None
     std = solution.std()
-    warps = solution.covariance[int(solution.free.sum()) :, int(solution.free.sum()) :]
+    intrinsics_only = int(solution.free.sum())
+    warps = solution.covariance[intrinsics_only:, intrinsics_only:]
     fx, fy, cx, cy = (float(value) for value in std[:4])
     intrinsics = calibration.intrinsics
     return GeometryFit(
@@ -506,19 +536,14 @@ def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
         covariance=_rows(solution.covariance),
         corner_px_std=solution.noise_px,
         corner_noise_px=of_pictures,
-        board_warp=board_warps(calibration.views, solution.state.warps_mm, warps, _warp_prior(calibration, shape)),
+        board_warp=board_warps(calibration.views, solution.state.warps_mm, warps),
         distortion_models=calibration.models,
         cross_validation=validation,
-        projection=projection_maps(calibration, shape),
+        projection=projection_maps(calibration),
         channels=channels,
         residuals=view_residuals(calibration),
         remarks=tuple(_remarks(solution, validation, of_pictures)),
     )
-
-
-def _warp_prior(calibration: Calibration, shape: tuple[int, int]) -> Array:
-    problem = Bundle(sights_of(calibration.views), calibration.solution.free, shape)
-    return problem.prior_std[problem.at_warp :]
 
 
 def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:

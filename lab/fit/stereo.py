@@ -66,14 +66,24 @@ def fit_stereo(
     cameras' fits rest on; a pair whose rms is more than 3 times the pairs' median is left out. `depths_mm`: where the depth's
     uncertainty is mapped. Raises `NotDetermined` below 2 pairs, or where no rig explains them.
     """
-    pairs = paired_views(recordings, left, right)
+    shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
+    return fit_pairs(paired_views(recordings, left, right), left, right, shapes, depths_mm)
+
+
+def fit_pairs(
+    pairs: Sequence[Pair],
+    left: GeometryFit,
+    right: GeometryFit,
+    shapes: Sequence[tuple[int, int]],
+    depths_mm: Sequence[float] = DEPTHS_MM,
+) -> StereoFit:
+    """`fit_stereo` from views; `shapes` are (rows, cols) of the left and right frames."""
     if len(pairs) < MIN_PAIRS:
         raise NotDetermined(
             "stereo",
             f"{len(pairs)} poses of the board were found by both cameras, {MIN_PAIRS} are needed: capture charuco poses with "
             "both, under the same pose name",
         )
-    shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
     rejected: list[Skipped] = []
     while True:
         solution = solve_rig(pairs, left, right, shapes[0])

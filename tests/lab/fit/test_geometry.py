@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from scipy.special import erf
 
 from lab.errors import NotDetermined
-from lab.fit.board import find_board, fit_corners, luminance
-from lab.fit.geometry import fit_geometry
+from lab.fit.board import CornerFits, find_board, fit_corners, luminance
+from lab.fit.geometry import (
+    board_warps,
+    calibrate_robustly,
+    channel_geometry,
+    cross_validation,
+    fit_geometry,
+    geometry_result,
+)
+from lab.recording import RecordingSet
+from lab.results import GeometryFit
+from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 
 def test_corner_is_found_where_it_is():
@@ -97,3 +109,182 @@ def test_a_displaced_view_is_left_out(boards):
 def test_too_few_views_are_not_determined(boards):
     with pytest.raises(NotDetermined, match="3 are needed"):
         fit_geometry(boards(poses=2, sides=("left",)), "left")
+
+
+def edited(recordings: RecordingSet, frames=None, **keys) -> RecordingSet:
+    """The same recordings with other words about the board, or other frames."""
+    captures = tuple(capture.model_copy(update=keys) for capture in recordings.manifest.captures)
+    pictures = {
+        c.frame: recordings.frame(c) if frames is None else np.ascontiguousarray(frames(recordings.frame(c)))
+        for c in recordings.manifest.captures
+    }
+    return RecordingSet(recordings.manifest.model_copy(update={"captures": captures}), frames=pictures)
+
+
+@pytest.mark.parametrize(
+    ("keys", "reason"),
+    [
+        ({"squares": (8, 6)}, "check that it has 8 x 6 squares"),
+        ({"dictionary": "DICT_6X6_250"}, "its dictionary is DICT_6X6_250"),
+        ({"dictionary": "DICT_NO"}, "OpenCV knows no dictionary"),
+    ],
+)
+def test_wrong_words_about_the_board_are_refused(boards, keys, reason):
+    with pytest.raises(NotDetermined, match=reason):
+        fit_geometry(edited(boards(poses=3, sides=("left",)), **keys), "left")
+
+
+def test_a_mirrored_picture_is_recognised(boards):
+    mirrored = edited(boards(poses=3, sides=("left",)), frames=lambda frame: frame[:, ::-1])
+    with pytest.raises(NotDetermined, match="mirrored"):
+        fit_geometry(mirrored, "left")
+
+
+def test_one_view_is_not_enough(boards):
+    with pytest.raises(NotDetermined, match="1 views of the board can be used, 3 are needed"):
+        fit_geometry(boards(poses=1, sides=("left",)), "left")
+
+
+def test_parallel_views_do_not_determine_the_focal_length():
+    facing = [(np.eye(3), np.array([-150.0 + 40 * k, -100.0 + 15 * k, 700.0])) for k in range(6)]
+    with pytest.raises(NotDetermined, match="all views are parallel"):
+        calibrate_robustly(seen(np.random.default_rng(0), facing), SHAPE)
+
+
+def test_corners_that_no_camera_explains_are_refused():
+    views = seen(np.random.default_rng(0), poses(6))
+    rng = np.random.default_rng(1)
+    scrambled = [replace(view, image_px=rng.permutation(view.image_px)) for view in views]
+    with pytest.raises(NotDetermined, match=r"no camera explains the corners|no pose of the board fits"):
+        calibrate_robustly(scrambled, SHAPE)
+
+
+def test_single_stray_corners_are_left_out_and_named():
+    views = seen(np.random.default_rng(0), poses(8))
+    away = views[2].image_px.copy()
+    away[[5, 40]] += [[2.0, -1.0], [0.0, 3.0]]
+    stray = [*views[:2], replace(views[2], image_px=away), *views[3:]]
+    found = calibrate_robustly(stray, SHAPE)
+    assert [item.step for item in found.rejected_corners] == [views[2].capture.id]
+    named = found.rejected_corners[0].reason
+    assert f"{views[2].index[5]} (" in named and f"{views[2].index[40]} (" in named
+    assert found.rejected == ()
+    clean = calibrate_robustly([*views[:2], views[2].only(~np.isin(np.arange(88), [5, 40])), *views[3:]], SHAPE)
+    np.testing.assert_allclose(found.intrinsics, clean.intrinsics, rtol=1e-5)
+
+
+def test_a_view_of_something_else_is_left_out_and_named():
+    views = seen(np.random.default_rng(0), poses(8))
+    other = replace(
+        views[3], image_px=views[3].image_px + np.random.default_rng(1).normal(0, 3, views[3].image_px.shape)
+    )
+    found = calibrate_robustly([*views[:3], other, *views[4:]], SHAPE)
+    assert [item.step for item in found.rejected] == [views[3].capture.id]
+
+
+def test_a_model_that_overfits_is_refused():
+    """Six views of twelve noisy corners in the middle of the frame: the coefficients beyond k1 predict unseen views worse."""
+    refused = 0
+    for draw in range(4):
+        views = seen(np.random.default_rng(draw), poses(6, squares=(4, 5)), noise_px=0.3, squares=(4, 5))
+        models = calibrate_robustly(views, SHAPE).models
+        chosen = next(model for model in models if model.chosen)
+        richest = models[-1]
+        assert chosen.held_out_rms_px <= 1.03 * min(model.held_out_rms_px for model in models[:1])
+        if richest is not chosen:
+            refused += 1
+            assert richest.reason.startswith("refused")
+            assert richest.held_out_rms_px > chosen.held_out_rms_px
+    assert refused
+
+
+def test_a_model_that_is_too_simple_is_not_chosen():
+    models = calibrate_robustly(seen(np.random.default_rng(0), poses(12)), SHAPE).models
+    assert not models[0].chosen  # the truth has k2, p1 and p2
+    assert models[0].held_out_rms_px > 1.03 * models[-1].held_out_rms_px
+
+
+def test_an_error_of_the_model_is_told_from_the_samplings():
+    """A board that takes another shape in every view: the halves differ by more than the corners' noise lets them."""
+    rng = np.random.default_rng(3)
+    at = poses(14)
+    floppy = [tuple(rng.normal(0, 2.0, 3)) for _ in at]
+    wrong = cross_validation(calibrate_robustly(seen(rng, at, noise_px=0.03, warps_mm=floppy), SHAPE))
+    right = cross_validation(calibrate_robustly(seen(rng, at, noise_px=0.03), SHAPE))
+    assert right.model_error_px == 0.0 or right.significance_sigma < 3.3  # 1 in 1000
+    assert wrong.difference_px > 2 * right.difference_px
+    assert wrong.significance_sigma > right.significance_sigma
+
+
+def test_a_flat_board_is_found_flat():
+    flat = calibrate_robustly(seen(np.random.default_rng(5), poses(12), replace(TRUTH, warp_mm=(0, 0, 0))), SHAPE)
+    warp = geometry_result(flat).board_warp[0]
+    assert abs(warp.bend_x_mm) < 4 * warp.bend_x_mm_std
+    assert warp.bend_x_mm_std < 0.1
+
+
+def test_a_warp_that_the_views_say_nothing_about_is_not_stated():
+    """The prior's standard deviation is 0.5 % of the board's diagonal, 375 mm: 1.9 mm; half of it has to be gained."""
+    views = seen(np.random.default_rng(5), poses(1))
+    (warp,) = board_warps(views, np.array([[0.3, 0.2, 0.1]]), np.diag([0.1, 1.5, 0.9]) ** 2)
+    assert (warp.bend_x_mm, warp.bend_x_mm_std) == (0.3, pytest.approx(0.1))
+    assert (warp.bend_y_mm, warp.bend_y_mm_std) == (None, None)
+    assert warp.twist_mm == 0.1
+
+
+def test_lateral_colour_of_drawn_corners():
+    """Red grown by 0.03 % and displaced by (0.02, -0.01) px beside green."""
+    rng = np.random.default_rng(6)
+    calibration = calibrate_robustly(seen(rng, poses(12), noise_px=0.02), SHAPE)
+    corners = []
+    for view in calibration.views:
+        grown = view.image_px + 3e-4 * (view.image_px - calibration.intrinsics[2:4]) + [0.02, -0.01]
+        noise = [rng.normal(0, 0.02, grown.shape) for _ in range(2)]
+        sure, std = np.ones(len(grown), bool), np.full(len(grown), 0.02)
+        corners.append(
+            {"R": CornerFits(grown + noise[0], sure, std), "G": CornerFits(view.image_px + noise[1], sure, std)}
+        )
+    red, green = channel_geometry(calibration, corners)
+    gap = np.array(red.radial_shift_px) - 3e-4 * np.array(red.radius_px)
+    assert np.all(np.abs(gap) < 4 * np.array(red.radial_shift_px_std) + 1e-6)
+    assert red.radial_shift_px[-1] > 10 * red.radial_shift_px_std[-1]
+    for k, true in enumerate((0.02, -0.01)):
+        assert abs(red.centre_shift_px[k] - true) < 4 * red.centre_shift_px_std[k]
+    assert red.camera_matrix[0][0] / green.camera_matrix[0][0] == pytest.approx(1.0003, abs=1e-4)
+
+
+def test_colours_of_a_camera_without_lateral_colour_agree(charuco_boards):
+    """Corners on each colour's own pixels: no channel may be displaced, whatever its place in the mosaic."""
+    fit = fit_geometry(charuco_boards, "left")
+    assert [channel.channel for channel in fit.channels] == ["R", "G", "B"]
+    for channel in fit.channels:
+        if channel.channel != "G":
+            assert np.all(np.abs(channel.centre_shift_px) < 5 * np.array(channel.centre_shift_px_std))
+            assert np.abs(channel.centre_shift_px).max() < 0.02
+            assert abs(channel.radial_shift_px[-1]) < 5 * channel.radial_shift_px_std[-1]
+
+
+def test_result_says_what_it_rests_on(charuco_boards):
+    fit = fit_geometry(charuco_boards, "left")
+    assert fit.parameters == (
+        "fx",
+        "fy",
+        "cx",
+        "cy",
+        "k1",
+        "k2",
+        "p1",
+        "p2",
+        "k3",
+        "bend_x_mm",
+        "bend_y_mm",
+        "twist_mm",
+    )
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance))[0], fit.camera_matrix_std[0][0])
+    assert len(fit.residuals) == 8
+    rms = np.sqrt(np.mean(np.concatenate([np.square(v.dx_px) + np.square(v.dy_px) for v in fit.residuals])))
+    assert rms == pytest.approx(fit.rms_px, rel=1e-3)
+    near, far = fit.projection
+    assert near.distance_mm == pytest.approx(400, rel=0.15) and far.distance_mm is None
+    assert np.shape(near.projection_px_std) == (len(near.y_px), len(near.x_px))
+    assert GeometryFit.model_validate_json(fit.model_dump_json()) == fit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.geometry import fit_geometry
-from lab.fit.stereo import fit_stereo
+from lab.fit.geometry import calibrate_robustly, fit_geometry, geometry_result
+from lab.fit.stereo import Pair, fit_pairs, fit_stereo, rectification_maps
 from lab.recording import Camera, Charuco, Manifest, RecordingSet
+from tests.lab.fit.projected import SHAPE, poses, seen
 
 PAIRS = Path(__file__).parents[3].parent / "shared" / "data" / "opencv_stereo"
 
@@ -41,6 +43,66 @@ def test_poses_of_one_camera_alone_are_no_pairs(charuco_boards):
     )
     with pytest.raises(NotDetermined, match="0 poses"):
         fit_stereo(apart, left, right)
+
+
+def drawn_pairs(rng: np.random.Generator, noise_px: float = 0.1, count: int = 10):
+    """Views of both cameras of `projected`, and their fits."""
+    at = poses(count)
+    sides = [seen(rng, at, noise_px=noise_px, side=side) for side in ("left", "right")]
+    calibrations = [calibrate_robustly(views, SHAPE) for views in sides]
+    pairs = [Pair(one, two) for one, two in zip(calibrations[0].views, calibrations[1].views, strict=True)]
+    return pairs, *[geometry_result(calibration) for calibration in calibrations]
+
+
+def test_depth_of_the_map_is_that_of_the_formula():
+    """Two parallel cameras: sigma_Z = Z^2 / (f B) times the disparity's uncertainty, sqrt 2 of a corner's, plus calibration."""
+    pairs, left, right = drawn_pairs(np.random.default_rng(0))
+    fit = fit_pairs(pairs, left, right, (SHAPE, SHAPE), depths_mm=(500.0, 1000.0))
+    for depth in fit.depth:
+        total = np.array(depth.total_mm_std, dtype=float)
+        own = np.array(depth.calibration_mm_std, dtype=float)
+        matching = np.sqrt(total**2 - own**2)[9, 12]  # the middle of the frame
+        formula = depth.depth_mm**2 / (1400.0 * fit.baseline_mm) * np.sqrt(2) * fit.corner_px_std
+        assert matching == pytest.approx(formula, rel=0.1)
+        assert own[9, 12] > 0
+    # what the right camera doesn't see isn't stated
+    assert np.isnan(np.array(fit.depth[0].total_mm_std, dtype=float)).any()
+
+
+def test_rectified_pairs_have_equal_rows():
+    """Maps from the fit, applied to both cameras' corners: rows agree to the corners' noise, and columns differ by f B / Z."""
+    pairs, left, right = drawn_pairs(np.random.default_rng(1), noise_px=0.05)
+    fit = fit_pairs(pairs, left, right, (SHAPE, SHAPE))
+    # rows differ by sqrt 2 of a corner's noise, magnified by about the ratio of focal lengths
+    assert fit.rectification.row_rms_px == pytest.approx(np.sqrt(2) * 0.05, rel=0.15)
+    maps = rectification_maps(fit, SHAPE)
+    x, y = maps["left"]
+    assert x.shape == y.shape == SHAPE and x.dtype == np.float32
+    # a pixel of the rectified left picture, back to the left picture and forward again
+    at = (480, 640)
+    points = np.array([[[x[at], y[at]]]], dtype=float)
+    own = fit.rectification
+    back = cv2.undistortPoints(
+        points, np.array(fit.camera_matrix_left), np.array(fit.distortion_left),
+        R=np.array(own.rotation_left), P=np.array(own.projection_left),
+    )  # fmt: skip
+    np.testing.assert_allclose(back.ravel(), at[::-1], atol=0.02)
+
+
+def test_a_mirrored_camera_makes_no_rig():
+    pairs, left, right = drawn_pairs(np.random.default_rng(2))
+    mirrored = [replace(p.right, image_px=np.array([SHAPE[1] - 1.0, 0.0]) + p.right.image_px * [-1, 1]) for p in pairs]
+    with pytest.raises(NotDetermined, match="no rig explains the pairs"):
+        fit_pairs([Pair(p.left, m) for p, m in zip(pairs, mirrored, strict=True)], left, right, (SHAPE, SHAPE))
+
+
+def test_a_pair_that_is_not_one_is_left_out():
+    """One pose under another's name."""
+    pairs, left, right = drawn_pairs(np.random.default_rng(3))
+    wrong = Pair(pairs[3].left, replace(pairs[3].right, image_px=pairs[3].right.image_px + np.array([4.0, 1.0])))
+    fit = fit_pairs([*pairs[:3], wrong, *pairs[4:]], left, right, (SHAPE, SHAPE))
+    assert fit.pairs == len(pairs) - 1
+    assert [item.step for item in fit.rejected] == ["pose pose-3"]
 
 
 @pytest.mark.skipif(not PAIRS.is_dir(), reason="the public stereo pairs aren't here")
@@ -73,5 +135,10 @@ def test_public_stereo_pairs():
     fit = fit_stereo(recordings, left, right)
     assert fit.pairs == 13
     assert fit.rms_px < 0.2
+    assert fit.rectification.row_rms_px < 0.2
+    # both cameras saw one board, and find the same bend of it, each by itself
+    bends = [camera.board_warp[0] for camera in (left, right)]
+    assert abs(bends[0].bend_y_mm - bends[1].bend_y_mm) < 4 * np.hypot(bends[0].bend_y_mm_std, bends[1].bend_y_mm_std)
+    assert bends[0].bend_y_mm > 5 * bends[0].bend_y_mm_std
     # OpenCV's own focal length of these pairs, 534.8 px, was found with one focal length for both cameras
     assert left.camera_matrix[0][0] == pytest.approx(534.8, rel=0.01)
