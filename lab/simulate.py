@@ -20,6 +20,7 @@ from lab.report.provenance import installed_versions
 from lab.scene_file import light, scene
 from sim import forward
 from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect
 from sim.effects.distortion import Distortion
 from sim.forward import Exposure
 from sim.optics.imaging import TracedLens
@@ -35,6 +36,9 @@ Progress = Callable[[str, float], None]
 BRIGHTEST_PERCENT, AUTO_SHARE = 1.0, 0.7
 #: Beyond these an automatic exposure makes no sense: something is wrong with the light.
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
+
+#: Hooks of an effect that may make electrons grow with the exposure in another way than in proportion.
+BENDING_HOOKS = ("exposure", "charge", "lit", "overflow")
 
 
 class SimulateOptions(Frozen):
@@ -154,8 +158,11 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
         if seconds is None:
             seconds = automatic_exposure_s(each_second, camera, options.gain_db)
         exposure = exposed(seconds)
+        proportional = all(
+            getattr(type(one), hook) is getattr(Effect, hook) for one in content.effects for hook in BENDING_HOOKS
+        )
         electrons = (
-            forward.expected_electrons(camera, exposure, content.effects) if content.effects else each_second * seconds
+            each_second * seconds if proportional else forward.expected_electrons(camera, exposure, content.effects)
         )
         _check_saturation(electrons, camera, exposure)
         tell("sensor", 0.8)
