@@ -22,13 +22,15 @@ from math import comb, factorial, isclose
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import map_coordinates, spline_filter1d
+from scipy.ndimage import spline_filter1d
 
 from sim.optics.diffraction import diffraction_otf
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
 
+#: Path errors below this are rounding: 1e-12 um.
+NIL_UM = 1e-12
 #: More frequencies than these are interpolated: integrating each would take longer than a table.
 FEW = 600
 #: Steps of a table over the radius that lines are drawn through, to 1e-6; least steps of one over radius and angle, for splines.
@@ -47,7 +49,7 @@ class Wavefront:
     @classmethod
     def of(cls, coefficients: Mapping[tuple[int, int], float]) -> Wavefront:
         """From {(i, j): um}."""
-        return cls(tuple(sorted((i, j, float(um)) for (i, j), um in coefficients.items() if um != 0.0)))
+        return cls(tuple(sorted((i, j, float(um)) for (i, j), um in coefficients.items() if abs(um) > NIL_UM)))
 
     def __call__(self, x: FloatArray, y: FloatArray) -> FloatArray:
         total = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
@@ -233,7 +235,12 @@ def _bent(
         one, none = np.ones(share.size), np.zeros(share.size)
         return np.real(_mean(share.ravel(), one, none, wavelength_um, bend)).reshape(share.shape)
     if share.size > FEW:
-        return _from_polar_table(share, np.arctan2(fy, fx), wavelength_um, bend)
+        from sim.optics.polar import look_up  # here, as the compiler takes a second to import
+
+        fx, fy = (np.atleast_2d(np.broadcast_to(f, shape)) for f in (fx, fy))
+        whole = tuple(f.reshape(-1, f.shape[-1]) for f in (fx, fy))
+        ratio = look_up(*whole, wavelength_um * f_number, PAD, _polar_table(bend, wavelength_um)).reshape(shape)
+        return np.asarray(ratio if bend.part(1).terms else np.real(ratio))
     safe = np.where(share > 0, share, 1.0) / (wavelength_um * f_number)
     cos, sin = np.where(share > 0, fx / safe, 1.0).ravel(), np.broadcast_to(fy / safe, shape).ravel()
     return _mean(share.ravel(), cos, sin, wavelength_um, bend).reshape(shape)
@@ -330,8 +337,8 @@ def _radial_table(bend: Wavefront, wavelength_um: float, reach: float) -> tuple[
 
 
 @lru_cache(maxsize=32)
-def _polar_table(bend: Wavefront, wavelength_um: float) -> tuple[FloatArray, FloatArray | None]:
-    """Spline coefficients (PAD + radii + PAD, angles) of the ratio's real and imaginary part over share 0..1 and angle 0..2 pi.
+def _polar_table(bend: Wavefront, wavelength_um: float) -> ComplexArray:
+    """Spline coefficients (PAD + radii + PAD, angles) of the ratio over share 0..1 and angle 0..2 pi.
 
     The ratio is smooth in both: Chebyshev's expansion in the share, Fourier's in the angle, over half a turn, as the ratio of the
     other half is the conjugate. Both are doubled until the last coefficients are nil.
@@ -359,11 +366,8 @@ def _polar_table(bend: Wavefront, wavelength_um: float) -> tuple[FloatArray, Flo
     low, high = (_continued(edge, steps) for edge in (dense[:4], dense[:-5:-1]))
     dense = np.concatenate([low[::-1], dense, high])
 
-    def spline(table: FloatArray) -> FloatArray:
-        along = spline_filter1d(table, axis=0, mode="mirror")
-        return np.asarray(spline_filter1d(along, axis=1, mode="grid-wrap"), float)
-
-    return spline(dense.real), spline(dense.imag) if bend.part(1).terms else None
+    along = spline_filter1d(dense, axis=0, mode="mirror", output=complex)
+    return np.asarray(spline_filter1d(along, axis=1, mode="grid-wrap", output=complex))
 
 
 def _continued(edge: ComplexArray, steps: FloatArray) -> ComplexArray:
@@ -375,19 +379,3 @@ def _continued(edge: ComplexArray, steps: FloatArray) -> ComplexArray:
             if a != b:
                 basis[:, a] *= (x[:, 0] - b) / (a - b)
     return np.asarray(basis @ edge)
-
-
-def _from_polar_table(
-    share: FloatArray, angle: FloatArray, wavelength_um: float, bend: Wavefront
-) -> FloatArray | ComplexArray:
-    real, imaginary = _polar_table(bend, wavelength_um)
-    inside = share < 1.0
-    rows, columns = real.shape[0] - 2 * PAD, real.shape[1]
-    at = np.stack([PAD + share[inside] * (rows - 1), (angle[inside] % (2.0 * np.pi)) * (columns / (2.0 * np.pi))])
-
-    def look_up(table: FloatArray) -> FloatArray:
-        return np.asarray(map_coordinates(table, at, mode="grid-wrap", prefilter=False))
-
-    ratio = np.ones(share.shape, float if imaginary is None else complex)
-    ratio[inside] = look_up(real) if imaginary is None else look_up(real) + 1j * look_up(imaginary)
-    return ratio
