@@ -10,17 +10,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.fit.pixels import taken
+from lab.errors import NotDetermined
+from lab.fit.pixels import pixel_maps, taken
 from lab.recording import Dark, Flat, RecordingSet
 from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, layout
-from lab.report.figures import measured
-from lab.results import Emva1288, Emva1288Points, FitResult
+from lab.report.figures import NOISE, measured
+from lab.report.pictures import png_data_uri
+from lab.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
 from sim.camera import Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
 
 MOST_POINTS = 700  # of a profile; longer ones are thinned out
 HISTOGRAM_BINS = 256  # at most, as the standard has it
+MAP_WIDTH_PX = 300
+BOLTZMANN_EV_PER_K, ZERO_C_K = 8.617333262e-5, 273.15
 HIGH_PASS_PX = 5  # side of the box whose mean is taken out of the bright image
 
 #: Field of `Emva1288` -> (quantity, symbol, unit, factor on the value), in the order of the standard's summary sheet.
@@ -66,6 +70,7 @@ class Plot:
     title: str
     figure: Figure
     caption: str
+    of_plane: bool = True  # of the sheet's plotted plane; else of all pixels
 
 
 @dataclass(frozen=True)
@@ -79,14 +84,20 @@ class Sheet:
     rows: tuple[Row, ...]
     plots: tuple[Plot, ...]
     remarks: tuple[str, ...]
+    #: Beyond the standard: the joint fit's figures by channel, and maps of single pixels as (title, picture, caption).
+    channels: tuple[str, ...]
+    channel_rows: tuple[Row, ...]
+    maps: tuple[tuple[str, str, str], ...]
+    defects: str
 
 
 def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[Sheet]:
     """A sheet for each camera whose flats and darks gave EMVA 1288 figures. Reads the frames of the spatial stacks."""
     for side, camera in fit.cameras.items():
-        found = camera.noise.emva1288 if camera.noise is not None else {}
-        if not found:
+        noise = camera.noise
+        if noise is None or not noise.emva1288:
             continue
+        found = noise.emva1288
         names = tuple(found)
         plotted = next(name for name in ("Y", "G1", *names) if name in found)
         own = found[plotted]
@@ -100,11 +111,19 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[Sheet]:
             plotted=plotted,
             conditions=tuple(_conditions(recordings, side, own)),
             rows=tuple(table_rows(found)),
-            plots=tuple(_temporal_plots(own, plotted)) + tuple(_spatial_plots(recordings, side, own, plotted)),
+            plots=(
+                *_temporal_plots(own, plotted),
+                *_spatial_plots(recordings, side, own, plotted),
+                *_beyond_the_standard(noise),
+            ),
             remarks=tuple(
                 remark if len(which) == len(names) else f"{', '.join(which)}: {remark}"
                 for remark, which in grouped.items()
             ),
+            channels=tuple(noise.channels) if len(noise.channels) > 1 else (),
+            channel_rows=tuple(_channel_rows(noise)),
+            maps=tuple(_maps(recordings, side)),
+            defects=_defect_sentence(noise.defects),
         )
 
 
@@ -124,6 +143,32 @@ def table_rows(found: dict[str, Emva1288]) -> Iterator[Row]:
             texts.append(text)
         if any(text != "–" for text in texts):
             yield Row(quantity, symbol, tuple(texts))
+
+
+def _channel_rows(noise: NoiseFit) -> Iterator[Row]:
+    """The joint fit's figures of each colour by itself."""
+    for field, (name, unit) in NOISE.items():
+        if field not in ChannelNoise.model_fields:
+            continue
+        values = [getattr(channel, field) for channel in noise.channels.values()]
+        stds = [getattr(channel, f"{field}_std") for channel in noise.channels.values()]
+        if any(value is not None for value in values):
+            texts = ("–" if v is None else measured(v, std, unit) for v, std in zip(values, stds, strict=True))
+            yield Row(name, "", tuple(texts))
+
+
+def _defect_sentence(defects: PixelDefects | None) -> str:
+    if defects is None:
+        return ""
+    strongest = "; ".join(
+        f"row {defect.row}, column {defect.col}: {defect.dark_dn:+.3g} DN"
+        + (f", {defect.dark_current_e_per_s:.3g} e/s" if defect.dark_current_e_per_s is not None else "")
+        for defect in defects.listed[:8]
+    )
+    return (
+        f"{defects.hot} pixels are hot and {defects.cold} cold in the longest dark ({defects.exposure_s:.4g} s), by more than 8 standard "
+        f"deviations of their plane. The strongest: {strongest}."
+    )
 
 
 def _conditions(recordings: RecordingSet, side: Side, own: Emva1288) -> Iterator[str]:
@@ -360,6 +405,95 @@ def _dark_current(own: Emva1288, colour: str) -> Iterator[Plot]:
         },
         "Above: mean of the darks; below: their temporal variance. Their slopes are the dark current, from means and from variances.",
     )
+
+
+def _beyond_the_standard(noise: NoiseFit) -> Iterator[Plot]:
+    """What the joint fit adds: read noise of single pixels, dark current against temperature."""
+    spread = noise.read_noise_distribution
+    if spread is not None:
+        edges = np.array(spread.noise_e)
+        yield Plot(
+            "Read noise of single pixels",
+            {
+                "data": [
+                    {
+                        "type": "bar",
+                        "name": "pixels",
+                        "x": _floats((edges[:-1] + edges[1:]) / 2.0),
+                        "y": list(spread.pixels),
+                        "marker": {"color": AFTER},
+                        "showlegend": False,
+                    }
+                ],
+                "layout": layout(
+                    310, xaxis=axis("temporal dark noise, e"), yaxis=axis("pixels", type="log"), bargap=0.05
+                ),
+            },
+            f"Over {spread.degrees_of_freedom} degrees of freedom a pixel; median {spread.median_e:.3g} e, 99 % below "
+            f"{spread.percentile_99_e:.3g} e. The pixels' true variances differ by "
+            f"{measured(spread.spread_percent, spread.spread_percent_std, '%')}, their own scatter taken out; {spread.noisy_pixels} noisy pixels.",
+            of_plane=False,
+        )
+    law = noise.dark_current_temperature
+    if law is None or len(law.temperature_c) < 2:
+        return
+    data = [
+        _points(
+            "measured",
+            law.temperature_c,
+            law.dark_current_e_per_s,
+            AFTER,
+            error_y={
+                "type": "data",
+                "array": list(law.dark_current_e_per_s_std),
+                "color": AFTER,
+                "thickness": 1,
+                "width": 2,
+            },
+        )
+    ]
+    caption = "Dark current from means at each temperature, logarithmic."
+    if law.activation_energy_ev is not None and law.reference_current_e_per_s is not None:
+        at = np.linspace(min(law.temperature_c), max(law.temperature_c), 40)
+        reference_k = (law.reference_temperature_c or 0.0) + ZERO_C_K
+        exponent = law.activation_energy_ev / BOLTZMANN_EV_PER_K * (1.0 / reference_k - 1.0 / (at + ZERO_C_K))
+        data.append(_line("Arrhenius", _floats(at), _floats(law.reference_current_e_per_s * np.exp(exponent)), "@fg"))
+        caption += f" Activation energy {measured(law.activation_energy_ev, law.activation_energy_ev_std, 'eV')}"
+        if law.doubling_temperature_c is not None:
+            caption += f"; doubles every {measured(law.doubling_temperature_c, law.doubling_temperature_c_std, 'K')}"
+        caption += "."
+    yield Plot(
+        "Dark current against temperature",
+        {
+            "data": data,
+            "layout": layout(310, xaxis=axis("temperature, °C"), yaxis=axis("dark current, e/s", type="log")),
+        },
+        caption,
+        of_plane=False,
+    )
+
+
+def _maps(recordings: RecordingSet, side: Side) -> Iterator[tuple[str, str, str]]:
+    """Offset, dark current and gain of every pixel as pictures."""
+    try:
+        maps = pixel_maps(recordings, side)
+    except NotDetermined:
+        return
+    for title, values, unit in (
+        ("Offset", maps.offset_dn, "DN"),
+        ("Dark current", maps.dark_dn_per_s, "DN/s"),
+        ("Gain, shading taken out", maps.gain, "of the neighbourhood"),
+    ):
+        if values is None:
+            continue
+        low, high = np.percentile(values, [1.0, 99.0])
+        grey = np.clip((values - low) / max(float(high - low), 1e-12), 0.0, 1.0)
+        scale = MAP_WIDTH_PX / grey.shape[1]
+        if scale < 1:
+            grey = cv2.resize(grey, (MAP_WIDTH_PX, round(grey.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+        coloured = cv2.applyColorMap((255 * grey).round().astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+        picture = png_data_uri(np.ascontiguousarray(coloured[..., ::-1], dtype=np.uint8))
+        yield title, picture, f"from {low:.4g} (dark) to {high:.4g} (bright) {unit}"
 
 
 # --- spatial plots -----------------------------------------------------------------------------------------------------

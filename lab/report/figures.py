@@ -20,6 +20,9 @@ NOISE = {
     "dsnu_e": ("DSNU", "e"),
     "prnu_percent": ("PRNU", "%"),
     "linearity_error_percent": ("linearity error", "%"),
+    "response_bend_percent": ("response bend at saturation", "%"),
+    "brighter_fatter_percent": ("noise missing at saturation", "%"),
+    "neighbour_covariance_percent": ("noise shared with neighbours", "%"),
     "quantum_efficiency": ("quantum efficiency", "1"),
 }
 
