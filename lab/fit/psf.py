@@ -17,7 +17,7 @@ answer i px down and j px right of light spread over one pixel.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.signal import fftconvolve
 
 from lab.errors import NotDetermined
-from lab.fit.screen import ScreenWarp, register
+from lab.fit.screen import MATCH, ScreenWarp, busiest_quadrilateral, register
 from lab.recording import Bernoulli, Camera, RecordingSet
 from lab.results import NoiseFit, PsfKernel
 from sim.camera import Cfa, Side
@@ -37,12 +37,21 @@ from sim.sensor.mosaic import step as period
 Array = NDArray[np.floating[Any]]
 
 LENGTHS_PX = (0.0, 0.6, 1.0, 1.6, 2.5)  # of the prior's correlation; 0: none
-STRENGTHS = (0.5, 1.0, 2.0, 4.0)  # of the prior, relative to the kernel's maximum
+STRENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the prior, relative to the kernel's maximum
 FAR_STD = 0.1  # of the prior of the light from beyond the support
 REGISTRATION_STEPS = 3
+GRID_PX, NODE_STD_PX = (
+    28.0,
+    0.5,
+)  # of the grid on which the place of a drawn pattern is refined; how far a node may move
 GRID_STD = 5e-4  # of the kernel's maximum: what five taps on half pixels leave of a diffraction-limited kernel
 SHIFT_STD_PX = 0.005  # of the corners' common place, beside their scatter: neighbouring squares of unequal shading
 RIM_SHARE = 0.04  # of a kernel in the outermost pixels, above which the support is doubled
+PHOTO_ROUNDS, ALIGN_STEPS = (
+    4,
+    4,
+)  # kernel and registration in turn; steps a blur of the registration by the pattern alone
+PATIENCE = 3  # exchanges that don't gain
 ROUNDS = 3  # envelope -> kernel -> envelope; more change less than 0.1 dB
 
 
@@ -79,13 +88,20 @@ class Normal:
 
 
 def estimate_kernel(
-    sharp: ArrayLike, blurred: ArrayLike, support: int, noise_std: float | None = None
+    sharp: ArrayLike,
+    blurred: ArrayLike,
+    support: int,
+    noise_std: float | None = None,
+    *,
+    register: bool = True,
 ) -> KernelEstimate:
     """The kernel that blurs `sharp` into `blurred`, both (rows, cols); `support` is odd.
 
     blurred[r, c] = sum_ij kernel[i, j] sharp[r - i + support // 2, c - j + support // 2] + noise, on the rows and columns at
-    least support // 2 from the border. `noise_std` is taken from the residual where it isn't given. Raises `NotDetermined`
-    where the picture is smaller than 2 x support or holds no structure.
+    least support // 2 from the border. `noise_std` is taken from the residual where it isn't given. With `register`, where the
+    residual shows that `sharp` was drawn a little off its place (`displaced`), the places are refined with the kernel: all
+    but a common shift, which is the kernel's. Raises `NotDetermined` where the picture is smaller than 2 x support, isn't
+    finite or holds no structure, or where `sharp` explains nothing of `blurred`.
     """
     u, b = np.asarray(sharp, dtype=float), np.asarray(blurred, dtype=float)
     if u.shape != b.shape or u.ndim != 2:
@@ -94,7 +110,90 @@ def estimate_kernel(
         raise ValueError(f"support = {support} must be odd and positive: the kernel has a middle")
     if min(u.shape) < 2 * support:
         raise NotDetermined("psf", f"{u.shape[0]} x {u.shape[1]} px are too few for a kernel of {support} x {support}")
-    return solve_kernel(normal_equations(u, b, support), support, noise_std)
+    for name, picture in (("sharp", u), ("blurred", b)):
+        if not np.isfinite(picture).all():
+            raise NotDetermined(
+                "psf", f"{int((~np.isfinite(picture)).sum())} pixels of the {name} picture aren't finite"
+            )
+    normal = normal_equations(u, b, support)
+    found = solve_kernel(normal, support, noise_std)
+    inner = np.s_[support // 2 : u.shape[0] - support // 2, support // 2 : u.shape[1] - support // 2]
+    _refuse_unrelated(fftconvolve(u, found.kernel, mode="same")[inner], b[inner])
+    if not register:
+        return found
+    for step in range(REGISTRATION_STEPS + 2):
+        predicted = fftconvolve(u, found.kernel, mode="same")
+        moved = displaced(predicted, b, support // 2, force=step > 0)
+        if moved is None:
+            break
+        # The kernel sees the blurred picture less what the displacement does to the predicted one: its noise stays as it is
+        right = normal_equations_right(u, b - (moved - predicted), support)
+        normal = replace(normal, right=right[0], power=right[1])
+        last = step == REGISTRATION_STEPS + 1
+        found = solve_kernel(normal, support, noise_std, like=None if last else found)
+    return found
+
+
+def _refuse_unrelated(predicted: Array, seen: Array) -> None:
+    """A pattern that isn't the one in the picture explains nothing of it, whatever the kernel: never a kernel without a basis."""
+    agreement = float(np.corrcoef(predicted.ravel(), seen.ravel())[0, 1]) if predicted.std() > 0.0 else 0.0
+    if not agreement**2 > 0.25:
+        raise NotDetermined(
+            "psf",
+            f"the sharp picture explains {100 * max(agreement, 0.0) ** 2:.0f} % of the blurred one: is it that pattern?",
+        )
+
+
+def displaced(predicted: Array, seen: Array, border: int, force: bool = False) -> Array | None:
+    """`predicted` as it lies in `seen`: moved by a displacement that is bilinear between the nodes of a grid of about
+    `GRID_PX`, its mean taken out; None where that isn't significant (5 sigma), unless by `force`.
+
+    Gauss-Newton on the residual, with the nodes' roughness held down by a weak prior of `NODE_STD_PX`.
+    """
+    inner = np.s_[border : seen.shape[0] - border, border : seen.shape[1] - border]
+    shape = seen[inner].shape
+    hats = [_hats(n, max(2, round(n / GRID_PX) + 1)) for n in shape]
+    nodes = hats[0].shape[1] * hats[1].shape[1]
+    field, moved = np.zeros((2, *seen.shape)), predicted
+    rows, cols = np.indices(seen.shape, dtype=float)
+    for turn in range(2):
+        residual = (seen - moved)[inner]
+        noise2 = float(np.mean(residual**2))
+        slopes = [np.gradient(moved, axis=axis)[inner] for axis in (0, 1)]
+        gram, right = np.zeros((2 * nodes, 2 * nodes)), np.zeros(2 * nodes)
+        for i in (0, 1):
+            right[i * nodes : (i + 1) * nodes] = (hats[0].T @ (slopes[i] * residual) @ hats[1]).ravel()
+            for j in (0, 1):
+                gram[i * nodes : (i + 1) * nodes, j * nodes : (j + 1) * nodes] = _hat_gram(hats, slopes[i] * slopes[j])
+        step = np.linalg.solve(gram + noise2 / NODE_STD_PX**2 * np.eye(2 * nodes), right)
+        if turn == 0 and not force:
+            # Of noise alone, the fall of chi2 by so many free numbers is chi2 distributed
+            fall, freedom = float(right @ step) / noise2, 2 * nodes
+            if fall < freedom + 5.0 * np.sqrt(2.0 * freedom):
+                return None
+        for i in (0, 1):
+            grid = step[i * nodes : (i + 1) * nodes].reshape(hats[0].shape[1], -1)
+            part = hats[0] @ grid @ hats[1].T
+            field[i] += np.pad(part - part.mean(), border, mode="edge")
+        moved = ndimage.map_coordinates(predicted, [rows + field[0], cols + field[1]], order=3, mode="nearest")
+    return moved
+
+
+def _hats(count: int, nodes: int) -> Array:
+    """(count, nodes): linear interpolation between evenly spread nodes."""
+    at = np.linspace(0.0, nodes - 1.0, count)
+    return np.clip(1.0 - np.abs(at[:, None] - np.arange(nodes)), 0.0, None)
+
+
+def _hat_gram(hats: Sequence[Array], weight: Array) -> Array:
+    """Products of all nodes' hats under a weight (rows, cols): (nodes, nodes)."""
+    down, across = hats
+    # by rows first: products of two hats along the columns, weighted
+    pairs = np.einsum("ri,rj->rij", down, down).reshape(len(down), -1)  # (rows, a a')
+    half = pairs.T @ weight  # (a a', cols)
+    full = half @ np.einsum("ci,cj->cij", across, across).reshape(len(across), -1)  # (a a', b b')
+    a, b = down.shape[1], across.shape[1]
+    return np.asarray(full.reshape(a, a, b, b).transpose(0, 2, 1, 3).reshape(a * b, a * b))
 
 
 def normal_equations(sharp: Array, blurred: Array, support: int) -> Normal:
@@ -108,8 +207,6 @@ def normal_equations(sharp: Array, blurred: Array, support: int) -> Normal:
     tall, wide = rows - 2 * h, cols - 2 * h
     offset = float(sharp.mean())  # products of centred values: no digits lost to the mean
     u = sharp - offset
-    level = float(blurred[h : rows - h, h : cols - h].mean())
-    b = blurred[h : rows - h, h : cols - h] - level
     index = np.arange(s)
 
     def windows(product: Array) -> Array:
@@ -135,23 +232,41 @@ def normal_equations(sharp: Array, blurred: Array, support: int) -> Normal:
             gram[ii, jj, ii + di, jj + dj] = part
             gram[ii + di, jj + dj, ii, jj] = part
     means = windows(u)[::-1, ::-1].ravel()
+    # Back from the centred values: sharp = u + offset
+    count = tall * wide
+    full = gram.reshape(s * s, s * s) + offset * (means[:, None] + means) + offset**2 * count
+    return Normal(full, *normal_equations_right(sharp, blurred, support), count)
+
+
+def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[Array, float]:
+    """The right side alone, (support^2,), and the power of `blurred`: what changes with it."""
+    s, h = support, support // 2
+    tall, wide = sharp.shape[0] - 2 * h, sharp.shape[1] - 2 * h
+    seen = blurred[h : h + tall, h : h + wide]
+    offset, level = float(sharp.mean()), float(seen.mean())
+    u, b = sharp - offset, seen - level
     right = np.empty((s, s))
     for i in range(s):
         for j in range(s):
-            right[i, j] = np.vdot(u[2 * h - i : 2 * h - i + tall, 2 * h - j : 2 * h - j + wide], b)
-    # Back from the centred values: sharp = u + offset, blurred = b + level, sum of b over the region 0
-    count = tall * wide
-    full = gram.reshape(s * s, s * s) + offset * (means[:, None] + means) + offset**2 * count
-    full_right = right.ravel() + level * means + offset * level * count
-    return Normal(full, full_right, float(np.vdot(b, b)) + level**2 * count, count)
+            part = u[2 * h - i : 2 * h - i + tall, 2 * h - j : 2 * h - j + wide]
+            right[i, j] = np.vdot(part, b) + level * part.sum()
+    # blurred = b + level, sum of b over the region 0
+    return right.ravel() + offset * level * tall * wide, float(np.vdot(b, b)) + level**2 * tall * wide
 
 
 def solve_kernel(
-    normal: Normal, support: int, noise_std: float | None = None, *, far: bool = False, rounds: int = ROUNDS
+    normal: Normal,
+    support: int,
+    noise_std: float | None = None,
+    *,
+    far: bool = False,
+    rounds: int = ROUNDS,
+    like: KernelEstimate | None = None,
 ) -> KernelEstimate:
     """The kernel of given normal equations; see `estimate_kernel`.
 
-    With `far` their last element is one of its own: light from beyond the support, which takes its share of the sum.
+    With `far` their last element is one of its own: light from beyond the support, which takes its share of the sum. The prior
+    is chosen by evidence, or it is that of the estimate `like`, with its noise.
     """
     size, total = support * support, len(normal.right)
     if total != size + far:
@@ -160,11 +275,16 @@ def solve_kernel(
     spread = normal.power / normal.count - (normal.right.mean() ** 2 / max(scale, 1e-300)) / normal.count
     if not scale > 0.0 or not spread > 0.0:
         raise NotDetermined("psf", "the target shows no structure: put a Bernoulli pattern on the screen")
-    found = on_simplex(normal.gram + 1e-9 * scale * np.eye(total), normal.right, np.full(total, 1.0 / total), 6)
+    start = np.full(total, 1.0 / total)
+    if like is not None:
+        start = np.append(like.kernel.ravel() * (1.0 - like.far), [like.far] * far)
+    found = on_simplex(normal.gram + 1e-9 * scale * np.eye(total), normal.right, start, 6 if like is None else 0)
     residual = max(
         normal.power - 2.0 * float(np.vdot(normal.right, found)) + float(np.vdot(found, normal.gram @ found)), 0.0
     )
     freedom = max(normal.count - int(np.count_nonzero(found > 0.0)), 1)
+    if noise_std is None and like is not None:
+        noise_std = like.noise_std
     noise = float(np.sqrt(residual / freedom)) if noise_std is None else float(noise_std)
     noise = max(noise, 1e-9 * float(np.sqrt(normal.power / normal.count)))
     information, weighted = normal.gram / noise**2, normal.right / noise**2
@@ -178,10 +298,13 @@ def solve_kernel(
     if far:
         precision[size, size] = FAR_STD**-2
     at = (2, 1)
-    for last in range(1 - rounds, 1):
+    for last in range(1 - rounds if like is None else 1, 1):
         prior, at = _by_evidence(inside, seen, found[:size].reshape(support, support), at)
         precision[:size, :size] = prior.precision()
-        found = on_simplex(information + precision, weighted, found, 80 if last == 0 else 6)
+        found = on_simplex(information + precision, weighted, found, 80 if last == 0 else 3)
+    if like is not None:
+        prior, precision = _Prior(_envelope(like.kernel), like.length_px, like.strength), like.precision
+        found = on_simplex(information + precision, weighted, found, 80)
     share = float(found[:size].sum())
     posterior = prior.posterior(inside) / share**2
     return KernelEstimate(
@@ -215,13 +338,14 @@ class ScreenPictures:
 @dataclass(frozen=True)
 class ScreenKernel:
     """Kernel of one channel from one pose: on the sensor's pixels, sum 1, with its covariance over all elements, and as it was
-    solved, on half pixels (`fine`). `far` is the share of the light that lands beyond the kernel's support."""
+    solved, on samples of 1 / `oversample` px (`fine`). `far` is the share of the light that lands beyond the kernel's support."""
 
     channel: str
     kernel: Array
     kernel_std: Array
     covariance: Array
     fine: KernelEstimate
+    oversample: int
     far: float
     corner_rms_px: float
     centre_px: tuple[float, float]  # (row, col) of the samples' middle
@@ -229,14 +353,22 @@ class ScreenKernel:
     def predict(self, fine_kernel: Array) -> Array:
         """Kernel on the sensor's pixels that this estimator reports, at this very place and noise-free, for a predicted one.
 
-        `fine_kernel` is on the grid of `fine.kernel`: `sim.forward.kernel(..., support=len(fine.kernel), oversample=2)`.
+        `fine_kernel` is on the grid of `fine.kernel`: `sim.forward.kernel(..., support=len(fine.kernel), oversample=oversample)`.
         """
         fine = self.fine
         size = fine.kernel.size
         data = fine.information[:, :size] @ (np.asarray(fine_kernel, dtype=float).ravel() * (1.0 - self.far))
         data = data + fine.information[:, size] * self.far
         found = on_simplex(fine.information + fine.precision, data, np.append(fine.kernel.ravel(), self.far))
-        return _on_pixels(found[:size].reshape(fine.kernel.shape))
+        return _on_pixels(found[:size].reshape(fine.kernel.shape), self.oversample)
+
+
+@dataclass(frozen=True)
+class ScreenField:
+    """Kernels of one pose: of every channel over the whole pattern, and of parts of it, row by row."""
+
+    kernels: dict[str, ScreenKernel]
+    parts: tuple[ScreenKernel, ...]
 
 
 def screen_pictures(recordings: RecordingSet, side: Side) -> list[ScreenPictures]:
@@ -301,31 +433,55 @@ def _mean_rate(recordings: RecordingSet, captures: Sequence[Any]) -> Array:
     return total / len(captures)
 
 
-def measure_kernels(pictures: ScreenPictures, cfa: Cfa, support_px: int = 9) -> dict[str, ScreenKernel]:
+def measure_kernels(
+    pictures: ScreenPictures, cfa: Cfa, support_px: int = 9, oversample: int = 2, patches: int = 0
+) -> dict[str, ScreenKernel]:
     """Kernels of all channels of one pose, `support_px` (odd) wide; doubled once where a kernel doesn't fit in.
 
     The registration from the corners is refined with the kernel, all but a common shift, by Gauss-Newton on the
-    residual: first on the green (or only) channel, then on each.
+    residual: first on the green (or only) channel, then on each. `oversample` samples a pixel (2 or 4) resolve the kernel: 4
+    is worth its time where the target's cells are about a quarter of a pixel, or the noise is low.
     """
+    return measure_field(pictures, cfa, support_px, oversample, patches).kernels
+
+
+def measure_field(
+    pictures: ScreenPictures, cfa: Cfa, support_px: int = 9, oversample: int = 2, patches: int = 3
+) -> ScreenField:
+    """As `measure_kernels`; and, of the green (or only) channel, the kernels of `patches` x `patches` parts of the pattern,
+    each by itself but for registration and prior, which are those of the whole."""
+    if oversample not in (2, 4):
+        raise ValueError(f"oversample = {oversample} must be 2 or 4 samples a pixel")
     cell = pictures.first.screen.cell_camera_px
     warp = register(
         pictures.checkerboard, pictures.bernoulli, pictures.checkerboard_target, pictures.bernoulli_target, cell
     )
-    places = phases(cfa)
+    places, step = phases(cfa), period(cfa)
     reference = "Y" if cfa == "MONO" else "G"
     found: dict[str, ScreenKernel] = {}
+    local: list[ScreenKernel] = []
     size = support_px
+
+    def drawn_for(channel: str) -> _Drawn:
+        return _Drawn.of(pictures.bernoulli, pictures.bernoulli_target, warp, places[channel], step, size, oversample)
+
     for channel in (reference, *(name for name in places if name != reference)):
         for _ in range(REGISTRATION_STEPS if channel == reference else 1):
-            drawn = _Drawn.of(pictures, warp, places[channel], cfa, size)
+            drawn = drawn_for(channel)
             estimate = solve_kernel(drawn.normal(), drawn.support, far=True, rounds=1)
-            if size == support_px and _rim_share(estimate.kernel) > RIM_SHARE:
+            if size == support_px and _rim_share(estimate.kernel, oversample) > RIM_SHARE:
                 size = 2 * support_px - 1
                 continue
             warp = drawn.refined(estimate)
-        drawn = _Drawn.of(pictures, warp, places[channel], cfa, size)
-        found[channel] = drawn.described(channel, solve_kernel(drawn.normal(), drawn.support, far=True))
-    return {channel: found[channel] for channel in places}
+        drawn = drawn_for(channel)
+        whole = solve_kernel(drawn.normal(), drawn.support, far=True)
+        found[channel] = drawn.described(channel, whole)
+        if channel == reference and patches > 1:
+            local = [
+                part.described(channel, solve_kernel(part.normal(), part.support, far=True, like=whole))
+                for part in drawn.parts(patches)
+            ]
+    return ScreenField({channel: found[channel] for channel in places}, tuple(local))
 
 
 def fit_psf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> tuple[PsfKernel, ...]:
@@ -359,6 +515,128 @@ def fit_psf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None)
     return tuple(kernels)
 
 
+@dataclass(frozen=True)
+class PhotographedKernel:
+    """Kernel from one photograph of a pattern: on the sensor's pixels and on samples of 1 / `oversample` px, with the share of
+    the pixels' variance over the pattern that it explains, and that a homography and the pixel's square explain without it."""
+
+    kernel: Array
+    kernel_std: Array
+    fine: KernelEstimate
+    oversample: int
+    warp: ScreenWarp
+    explained: float
+    explained_by_box: float
+    samples: int
+
+
+def photographed_kernel(
+    photo: ArrayLike,
+    pattern: NDArray[np.uint8],
+    support_px: int = 5,
+    oversample: int = 4,
+    corners: ArrayLike | None = None,
+) -> PhotographedKernel:
+    """Kernel from a single photograph (rows, cols), linear, one channel, of a printed or shown pattern (0 dark, 1 lit).
+
+    There are no white and black captures and no checkerboard: levels are planes in the frame, fitted with the kernel, and the
+    place is found by the pattern itself: where the picture is busiest, in any quarter turn, or at `corners` (4, 2): (x, y) of
+    the pattern's corners, clockwise from its own top left. Then homography, cubic displacement and kernel in turn.
+    Raises `NotDetermined` where the pattern isn't seen.
+    """
+    seen, target = np.asarray(photo, dtype=float), np.asarray(pattern, dtype=np.uint8)
+    if seen.ndim != 2 or target.ndim != 2 or not np.isfinite(seen).all():
+        raise NotDetermined("psf", "photograph and pattern have to be two-dimensional, the photograph finite")
+    quad = busiest_quadrilateral(seen) if corners is None else np.asarray(corners, dtype=float)
+    turns = [np.roll(quad, turn, axis=0) for turn in range(4 if corners is None else 1)]
+    rough = [_aligned(seen, target, ScreenWarp.of_corners(turn, target.shape), (2.5, 1.5)) for turn in turns]
+    warp, _ = max(rough, key=lambda found: found[1])
+    warp, agreement = _aligned(seen, target, warp, (1.0, 0.7, 0.5))
+    if agreement < MATCH:
+        raise NotDetermined("psf", f"the photograph doesn't show the pattern (correlation {max(agreement, 0.0):.2f})")
+    by_box = _box_share(seen, target, warp)
+    light = seen
+    for _ in range(PHOTO_ROUNDS):
+        drawn = _Drawn.of(light, target, warp, [(0, 0)], 1, support_px, oversample)
+        at = (drawn.row, drawn.col)
+        if light is seen:
+            predicted = ndimage.gaussian_filter(drawn.picture, 0.6 * oversample)
+        predicted = predicted[oversample * drawn.row, oversample * drawn.col]
+        low, contrast = _levels(seen[at], predicted, *at, seen.shape)
+        light = (seen - low) / contrast
+        drawn = replace(drawn, value=light[at])
+        estimate = solve_kernel(drawn.normal(), drawn.support, far=True, rounds=1)
+        predicted = drawn.blurred(estimate)
+        warp = drawn.refined(estimate)
+    drawn = _Drawn.of(light, target, warp, [(0, 0)], 1, support_px, oversample)
+    estimate = solve_kernel(drawn.normal(), drawn.support, far=True)
+    described = drawn.described("Y", estimate)
+    at = (drawn.row, drawn.col)
+    model = (low + contrast * drawn.blurred(estimate)[::oversample, ::oversample])[at]
+    return PhotographedKernel(
+        kernel=described.kernel,
+        kernel_std=described.kernel_std,
+        fine=estimate,
+        oversample=oversample,
+        warp=warp,
+        explained=1.0 - float(np.sum((seen[at] - model) ** 2) / np.sum((seen[at] - seen[at].mean()) ** 2)),
+        explained_by_box=by_box,
+        samples=len(drawn.row),
+    )
+
+
+def _levels(
+    seen: Array, predicted: Array, row: NDArray[np.int64], col: NDArray[np.int64], shape: tuple[int, ...]
+) -> tuple[Array, Array]:
+    """Dark level and contrast, (rows, cols), as planes in the frame, by least squares of seen = low + contrast x predicted."""
+
+    def plane(r: Array, c: Array) -> Array:
+        return np.stack([np.ones(np.broadcast(r, c).shape), r / shape[0] + 0.0 * c, c / shape[1] + 0.0 * r])
+
+    terms = plane(row.astype(float), col.astype(float))
+    solution = np.linalg.lstsq(np.concatenate([terms, terms * predicted]).T, seen, rcond=None)[0]
+    everywhere = plane(np.arange(shape[0], dtype=float)[:, None], np.arange(shape[1], dtype=float)[None])
+    low, contrast = (np.tensordot(part, everywhere, axes=1) for part in (solution[:3], solution[3:]))
+    if not (contrast[row, col] > 0.0).all():
+        raise NotDetermined("psf", "the photograph shows the pattern with no contrast, or reversed")
+    return low, np.where(contrast > 0.0, contrast, np.nan)
+
+
+def _aligned(
+    seen: Array, target: NDArray[np.uint8], warp: ScreenWarp, blurs_px: Sequence[float]
+) -> tuple[ScreenWarp, float]:
+    """The warp improved by Gauss-Newton on the picture blurred by ever less, and how well the last one correlates."""
+    agreement = -1.0
+    for blur in blurs_px:
+        smooth = ndimage.gaussian_filter(seen, blur)
+        for _ in range(ALIGN_STEPS):
+            # far enough inside that nothing of what is around the pattern is blurred in
+            drawn = _Drawn.of(smooth, target, warp, [(0, 0)], 1, int(5.0 * blur) | 1, 2, least=200)
+            predicted = ndimage.gaussian_filter(drawn.picture, 2.0 * float(np.hypot(blur, 0.4)))
+            at = (2 * drawn.row, 2 * drawn.col)
+            value, there = drawn.value, predicted[at]
+            agreement = float(np.corrcoef(value, there)[0, 1])
+            gain, low = np.polyfit(there, value, 1)
+            gain = max(float(gain), 1e-6)
+            down, across = (np.gradient(predicted, 0.5, axis=axis)[at] for axis in (0, 1))
+            terms = warp.basis(np.column_stack([drawn.col, drawn.row]).astype(float))
+            terms = terms[: 3 if blur > 2.0 else 6 if blur > 0.9 else len(terms)]
+            columns = np.concatenate([gain * across * terms, gain * down * terms, terms[:3], there * terms[:3]])
+            step = np.linalg.lstsq(columns @ columns.T, columns @ (value - low - gain * there), rcond=1e-9)[0][:-6]
+            change = np.zeros((2, len(warp.displacement[0])))
+            change[:, : len(terms)] = np.clip(step, -blur, blur).reshape(2, -1)
+            warp = warp.displaced(change)
+    return warp, agreement
+
+
+def _box_share(seen: Array, target: NDArray[np.uint8], warp: ScreenWarp) -> float:
+    """Share of the variance that the pattern drawn by area on the pixels explains, levels free."""
+    drawn = _Drawn.of(seen, target, warp, [(0, 0)], 1, 1, 2)
+    pixel = ndimage.correlate1d(drawn.picture, [0.25, 0.5, 0.25], axis=0)
+    pixel = ndimage.correlate1d(pixel, [0.25, 0.5, 0.25], axis=1)[2 * drawn.row, 2 * drawn.col]
+    return float(np.corrcoef(pixel, drawn.value)[0, 1] ** 2)
+
+
 def _field_mm(camera: Camera, at_px: tuple[float, float]) -> tuple[float, float] | None:
     """Of a place in the frame, from its middle, at the sensor."""
     if camera.pixel_pitch_um is None:
@@ -367,69 +645,84 @@ def _field_mm(camera: Camera, at_px: tuple[float, float]) -> tuple[float, float]
     return pitch_mm * (at_px[0] - (camera.rows - 1) / 2.0), pitch_mm * (at_px[1] - (camera.cols - 1) / 2.0)
 
 
-def _rim_share(kernel: Array) -> float:
-    """Share of the kernel in its outermost pixel (two half pixels)."""
-    return float(1.0 - kernel[2:-2, 2:-2].sum() / kernel.sum())
+def _rim_share(kernel: Array, oversample: int) -> float:
+    """Share of the kernel in its outermost pixel."""
+    inside = slice(oversample, -oversample)
+    return float(1.0 - kernel[inside, inside].sum() / kernel.sum())
 
 
-def _on_pixels(fine: Array) -> Array:
-    """From half pixels to pixels, sum 1."""
-    matrix = _pixel_matrix(len(fine))
+def _on_pixels(fine: Array, oversample: int) -> Array:
+    """From samples of 1 / oversample px to pixels, sum 1."""
+    matrix = _pixel_matrix(len(fine), oversample)
     kernel = matrix @ fine @ matrix.T
     return np.asarray(kernel / kernel.sum())
 
 
-def _pixel_matrix(size: int) -> Array:
-    """One axis: light over a whole pixel is light over two half ones, a quarter pixel to either side: cos(pi f / 2)."""
-    half = (size // 2 - 1) // 2
-    taps = _taps(lambda f: np.cos(0.5 * np.pi * f), 0.8)
-    matrix = np.zeros((2 * half + 1, size + 4))
+def _pixel_matrix(size: int, oversample: int) -> Array:
+    """One axis: light over a whole pixel is light over `oversample` narrower ones, side by side: sinc(f) / sinc(f / oversample)."""
+    reach = oversample
+    half = (size // 2 - oversample // 2) // oversample
+    taps = _taps(lambda f: np.sinc(f) / np.sinc(f / oversample), 0.8, oversample, reach)
+    matrix = np.zeros((2 * half + 1, size + 2 * reach))
     for row in range(2 * half + 1):
-        middle = size // 2 + 2 + 2 * (row - half)
-        matrix[row, middle - 2 : middle + 3] = taps
-    return matrix[:, 2:-2]
+        middle = size // 2 + reach + oversample * (row - half)
+        matrix[row, middle - reach : middle + reach + 1] = taps
+    return matrix[:, reach : matrix.shape[1] - reach]
 
 
-def _taps(response: Callable[[Array], Array], highest_cy_per_px: float) -> Array:
-    """Five symmetric taps on half pixels with a given response, 1 at 0, by least squares up to `highest_cy_per_px`."""
+def _taps(response: Callable[[Array], Array], highest_cy_per_px: float, oversample: int, reach: int) -> Array:
+    """2 reach + 1 symmetric taps on samples of 1 / oversample px with a given response, 1 at 0, by least squares up to
+    `highest_cy_per_px`."""
     frequency = np.linspace(0.0, highest_cy_per_px, 61)
-    terms = np.column_stack([np.ones_like(frequency), 2 * np.cos(np.pi * frequency), 2 * np.cos(2 * np.pi * frequency)])
+    order = np.arange(reach + 1)
+    terms = np.cos(2.0 * np.pi * frequency[:, None] * order / oversample) * np.where(order > 0, 2.0, 1.0)
     weight = np.where(frequency == 0.0, 1e3, 1.0)
-    taps = np.linalg.lstsq(terms * weight[:, None], weight * response(frequency), rcond=None)[0]
-    return np.asarray(taps[[2, 1, 0, 1, 2]] / (taps[0] + 2 * taps[1] + 2 * taps[2]))
+    # finely sampled taps hardly differ over the band: the least of the solutions
+    taps = np.linalg.lstsq(terms * weight[:, None], weight * response(frequency), rcond=1e-9)[0]
+    taps = np.concatenate([taps[:0:-1], taps])
+    return np.asarray(taps / taps.sum())
 
 
 @dataclass(frozen=True)
 class _Drawn:
-    """The target drawn on half pixels through a warp, and one channel's samples on it."""
+    """The target drawn on samples of 1 / oversample px through a warp, and one channel's pixels on it."""
 
     warp: ScreenWarp
-    picture: Array  # drawn, (2 rows, 2 cols)
+    picture: Array  # drawn, (oversample rows, oversample cols)
     around: Array  # its mean over the surroundings: what light from beyond the support sees
     row: NDArray[np.int64]  # of the samples, px
     col: NDArray[np.int64]
     value: Array
-    support: int  # half pixels
+    support: int  # samples of 1 / oversample px
+    oversample: int
 
     @staticmethod
     def of(
-        pictures: ScreenPictures, warp: ScreenWarp, places: Sequence[tuple[int, int]], cfa: Cfa, support_px: int
+        seen: Array,
+        pattern: NDArray[np.uint8],
+        warp: ScreenWarp,
+        places: Sequence[tuple[int, int]],
+        step: int,
+        support_px: int,
+        oversample: int,
+        least: int = 0,
     ) -> _Drawn:
-        rows, cols = pictures.bernoulli.shape
-        target = pictures.bernoulli_target.astype(float)
+        """`seen` is the pattern as the camera saw it, 0 dark .. 1 lit, NaN where it isn't to be used. Fewer than `least`
+        pixels are refused: twice as many as the kernel has elements."""
+        rows, cols = seen.shape
+        target = pattern.astype(float)
         # The map is smooth: worked out on a coarse grid, interpolated by cubic splines
         y, x = np.arange(-8.0, rows + 16.0, 8.0), np.arange(-8.0, cols + 16.0, 8.0)
         at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
-        fine_y, fine_x = np.arange(2 * rows) / 2.0, np.arange(2 * cols) / 2.0
+        fine_y, fine_x = np.arange(oversample * rows) / oversample, np.arange(oversample * cols) / oversample
         cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(fine_y, fine_x) for k in (0, 1))
         picture = _area_drawn(target, cell_x, cell_y)
-        # The squares of drawing and of the kernel's grid, half a pixel each, are taken out again
-        taps = _taps(lambda f: np.sinc(0.5 * f) ** -2, 0.6)
+        # The squares of drawing and of the kernel's grid, a sample each, are taken out again
+        taps = _taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
         for axis in (0, 1):
             picture = ndimage.correlate1d(picture, taps, axis=axis, mode="nearest")
-        around = ndimage.gaussian_filter(picture, 2.0 * support_px, mode="nearest", truncate=3.0)
+        around = ndimage.gaussian_filter(picture, 1.0 * oversample * support_px, mode="nearest", truncate=3.0)
 
-        step = period(cfa)
         coarse = np.gradient(at[:, :, 0])
         margin = (support_px / 2.0 + 2.0) * float(np.hypot(coarse[0].mean(), coarse[1].mean())) / 8.0  # cells
         inside = (
@@ -438,18 +731,34 @@ class _Drawn:
             & (cell_y > margin)
             & (cell_y < target.shape[0] - margin)
         )
-        usable = inside[::2, ::2] & np.isfinite(pictures.bernoulli)
+        usable = inside[::oversample, ::oversample] & np.isfinite(seen)
         usable[: support_px + 1] = usable[-support_px - 1 :] = False
         usable[:, : support_px + 1] = usable[:, -support_px - 1 :] = False
         mine = np.zeros_like(usable)
         for row0, col0 in places:
             mine[row0::step, col0::step] = True
         row, col = np.nonzero(usable & mine)
-        if len(row) < 8 * (2 * support_px + 1) ** 2:
+        support = oversample * support_px + 1  # odd, as oversample x support_px is even
+        if len(row) < (least or 2 * support**2):
             raise NotDetermined(
                 "psf", f"only {len(row)} pixels of the channel see the pattern: let it fill more of the frame"
             )
-        return _Drawn(warp, picture, around, row, col, pictures.bernoulli[row, col], 2 * support_px + 1)
+        return _Drawn(warp, picture, around, row, col, seen[row, col], support, oversample)
+
+    def parts(self, count: int) -> list[_Drawn]:
+        """The pixels in `count` x `count` parts of about as many rows and columns; parts of too few pixels are left out."""
+        across = [np.linspace(v.min(), v.max() + 1, count + 1) for v in (self.row, self.col)]
+        found = []
+        for top, bottom in zip(across[0][:-1], across[0][1:], strict=True):
+            for left, right in zip(across[1][:-1], across[1][1:], strict=True):
+                chosen = (self.row >= top) & (self.row < bottom) & (self.col >= left) & (self.col < right)
+                if np.count_nonzero(chosen) >= 2 * self.support**2:
+                    found.append(self.within(chosen))
+        return found
+
+    def within(self, chosen: NDArray[np.bool_]) -> _Drawn:
+        """Only the pixels `chosen`, (n,)."""
+        return replace(self, row=self.row[chosen], col=self.col[chosen], value=self.value[chosen])
 
     def normal(self) -> Normal:
         """Normal equations of the kernel's elements and, last, of the light from beyond."""
@@ -459,7 +768,7 @@ class _Drawn:
         windows = np.lib.stride_tricks.sliding_window_view(self.picture, (s, s))
         for start in range(0, len(self.row), 4096):
             part = slice(start, start + 4096)
-            row, col, value = 2 * self.row[part], 2 * self.col[part], self.value[part]
+            row, col, value = self.oversample * self.row[part], self.oversample * self.col[part], self.value[part]
             design = np.empty((len(row), size))
             design[:, :-1] = windows[row - h, col - h][:, ::-1, ::-1].reshape(len(row), -1)
             design[:, -1] = self.around[row, col]
@@ -468,16 +777,16 @@ class _Drawn:
         return Normal(gram, right, float(self.value @ self.value), len(self.row))
 
     def blurred(self, estimate: KernelEstimate) -> Array:
-        """The picture through the kernel, on half pixels."""
+        """The picture through the kernel, on its own samples."""
         return np.asarray(
             (1.0 - estimate.far) * fftconvolve(self.picture, estimate.kernel, mode="same") + estimate.far * self.around
         )
 
     def refined(self, estimate: KernelEstimate) -> ScreenWarp:
         """One Gauss-Newton step of the displacement, all but a common shift, which is the kernel's to say."""
-        blurred = self.blurred(estimate)
-        down, across = (np.gradient(blurred, 0.5, axis=axis)[2 * self.row, 2 * self.col] for axis in (0, 1))
-        residual = self.value - blurred[2 * self.row, 2 * self.col]
+        blurred, at = self.blurred(estimate), (self.oversample * self.row, self.oversample * self.col)
+        down, across = (np.gradient(blurred, 1.0 / self.oversample, axis=axis)[at] for axis in (0, 1))
+        residual = self.value - blurred[at]
         terms = self.warp.basis(np.column_stack([self.col, self.row]).astype(float))[1:]
         mean = terms.mean(axis=1)
         terms = terms - mean[:, None]
@@ -488,7 +797,7 @@ class _Drawn:
         return self.warp.displaced(np.column_stack([-step @ mean, step]))
 
     def described(self, channel: str, estimate: KernelEstimate) -> ScreenKernel:
-        matrix = _pixel_matrix(self.support)
+        matrix = _pixel_matrix(self.support, self.oversample)
         pixels = np.kron(matrix, matrix)
         raw = pixels @ estimate.kernel.ravel()
         total = raw.sum()
@@ -507,6 +816,7 @@ class _Drawn:
             kernel_std=np.sqrt(np.clip(np.diag(covariance), 0.0, None)).reshape(shape),
             covariance=covariance,
             fine=estimate,
+            oversample=self.oversample,
             far=estimate.far,
             corner_rms_px=self.warp.corner_rms_px,
             centre_px=(float(self.row.mean()), float(self.col.mean())),
@@ -514,23 +824,29 @@ class _Drawn:
 
 
 def _area_drawn(target: Array, cell_x: Array, cell_y: Array) -> Array:
-    """Mean of the pattern over a half pixel around points at `cell_x`, `cell_y` (cells); dark outside. The square is taken as
-    aligned with the cells: its turn counts in second order only."""
+    """Mean of the pattern over a sample's square around points at `cell_x`, `cell_y` (cells); dark outside. The square is
+    taken as aligned with the cells: its turn counts in second order only. A square may hold any number of cells."""
     rows, cols = target.shape
-    padded = np.pad(target, 1)
+    table = np.zeros(
+        (rows + 1, cols + 1)
+    )  # summed areas: the integral from the corner, exact by bilinear interpolation
+    table[1:, 1:] = target.cumsum(axis=0).cumsum(axis=1)
 
-    def neighbours(cell: Array, limit: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    def ends(cell: Array, limit: int) -> tuple[Array, Array, float]:
         by_row, by_col = np.gradient(cell[::16, ::16])
         spread = float(np.abs(by_row).mean() + np.abs(by_col).mean()) / 16.0
-        low, high = np.floor(cell - 0.5 * spread), np.floor(cell + 0.5 * spread)
-        share = np.where(high > low, (cell + 0.5 * spread - high) / spread, 0.0)
-        return (np.clip(low, -1, limit) + 1).astype(int), (np.clip(high, -1, limit) + 1).astype(int), share
+        return np.clip(cell - 0.5 * spread, 0.0, limit), np.clip(cell + 0.5 * spread, 0.0, limit), spread
 
-    left, right, across = neighbours(cell_x, cols)
-    top, bottom, down = neighbours(cell_y, rows)
-    upper = padded[top, left] * (1.0 - across) + padded[top, right] * across
-    lower = padded[bottom, left] * (1.0 - across) + padded[bottom, right] * across
-    return np.asarray(upper * (1.0 - down) + lower * down)
+    def integral(y: Array, x: Array) -> Array:
+        i, j = np.minimum(y.astype(np.int64), rows - 1), np.minimum(x.astype(np.int64), cols - 1)
+        down, across = y - i, x - j
+        upper = table[i, j] * (1.0 - across) + table[i, j + 1] * across
+        lower = table[i + 1, j] * (1.0 - across) + table[i + 1, j + 1] * across
+        return np.asarray(upper * (1.0 - down) + lower * down)
+
+    (left, right, wide), (top, bottom, high) = ends(cell_x, cols), ends(cell_y, rows)
+    total = integral(bottom, right) - integral(bottom, left) - integral(top, right) + integral(top, left)
+    return np.asarray(total / (wide * high))
 
 
 # --- the prior -------------------------------------------------------------------------------------------------------------
@@ -578,16 +894,11 @@ class _Prior:
         inner = _along_axes(waves, information * np.outer(envelope, envelope))
         return np.asarray(inner * np.sqrt(np.outer(power, power)))
 
-    def evidence(self, information: Array, weighted: Array) -> float:
-        """Log of the probability of the data under the prior, but for a constant."""
-        inner = self.seen(information)
-        inner[np.diag_indices_from(inner)] += 1.0
-        factor = linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)
+    def seen_right(self, weighted: Array) -> Array:
+        """R^T weighted."""
         power, waves = self._eigen()
         scaled = (self.strength * self.envelope * weighted).reshape(self.support, self.support)
-        right = (waves.T @ scaled @ waves).ravel() * np.sqrt(power)
-        half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
-        return float(0.5 * half @ half - np.log(np.diag(factor)).sum())
+        return np.asarray((waves.T @ scaled @ waves).ravel() * np.sqrt(power))
 
     def posterior(self, information: Array) -> Array:
         """Covariance of the kernel, given the data and that the sum is 1."""
@@ -598,6 +909,14 @@ class _Prior:
         covariance = half.T @ half
         share = covariance.sum(axis=1)
         return np.asarray(covariance - np.outer(share, share) / share.sum())
+
+
+def _evidence(inner: Array, right: Array) -> float:
+    """Log of the probability of the data under a prior, but for a constant, from R^T information R and R^T weighted."""
+    inner[np.diag_indices_from(inner)] += 1.0
+    factor = linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)
+    half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
+    return float(0.5 * half @ half - np.log(np.diag(factor)).sum())
 
 
 def _along_axes(waves: Array, matrix: Array) -> Array:
@@ -621,13 +940,18 @@ def _by_evidence(
     """The prior's length and strength by evidence, uphill on their grid from `near`; the prior and where it stands."""
     envelope, top = _envelope(kernel), float(kernel.max())
     tried: dict[tuple[int, int], tuple[float, _Prior]] = {}
+    unscaled: dict[int, tuple[Array, Array]] = {}  # what the strength only scales, by length
 
     def value(at: tuple[int, int]) -> float:
         if not (0 <= at[0] < len(LENGTHS_PX) and 0 <= at[1] < len(STRENGTHS)):
             return -np.inf
         if at not in tried:
+            if at[0] not in unscaled:
+                unit = _Prior(envelope, LENGTHS_PX[at[0]], 1.0)
+                unscaled[at[0]] = unit.seen(information), unit.seen_right(weighted)
             prior = _Prior(envelope, LENGTHS_PX[at[0]], STRENGTHS[at[1]] * top)
-            tried[at] = prior.evidence(information, weighted), prior
+            inner, right = unscaled[at[0]]
+            tried[at] = _evidence(inner * prior.strength**2, right * prior.strength), prior
         return tried[at][0]
 
     at = near
@@ -677,24 +1001,29 @@ def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = 80) 
 
 
 def _polished(q: Array, c: Array, x: Array, solves: int) -> Array:
-    """Exact optimum from a nearby point: solve on the support, step back to the border, admit what the gradient wants."""
+    """Exact optimum from a nearby point by block principal pivoting: solve on the support, exchange all that is on the wrong
+    side (negative, or wanted by the gradient); where that stops to gain, only the last of them, which ends for certain."""
     free = x > 0.0
+    fewest, patience = len(c) + 1, PATIENCE
+    tolerance = 1e-10 * np.abs(c).max()
     for _ in range(solves):
         at = np.flatnonzero(free)
         factor = linalg.cho_factor(q[np.ix_(at, at)], check_finite=False)
         both = linalg.cho_solve(factor, np.column_stack([c[at], np.ones(len(at))]), check_finite=False)
         multiplier = (1.0 - both[:, 0].sum()) / both[:, 1].sum()
-        solution = both[:, 0] + multiplier * both[:, 1]
-        if solution.min() < 0.0:
-            free[at[solution < 0.0]] = False
-            continue
-        x = np.zeros_like(x)
-        x[at] = solution
-        pull = c - q @ x + multiplier
-        wanted = ~free & (pull > 1e-10 * np.abs(c).max())
-        if not wanted.any():
+        solution = np.zeros_like(x)
+        solution[at] = both[:, 0] + multiplier * both[:, 1]
+        pull = c - q[:, at] @ solution[at] + multiplier
+        wrong = np.flatnonzero((free & (solution < 0.0)) | (~free & (pull > tolerance)))
+        x = solution
+        if not len(wrong):
             break
-        # few at a time, lest they chase each other
-        most = np.argsort(np.where(wanted, pull, -np.inf))[-max(1, int(wanted.sum()) // 3) :]
-        free[most[wanted[most]]] = True
-    return x / x.sum()
+        if len(wrong) < fewest:
+            fewest, patience = len(wrong), PATIENCE
+        elif patience > 0:
+            patience -= 1
+        else:
+            wrong = wrong[-1:]
+        free[wrong] = ~free[wrong]
+    x = np.maximum(x, 0.0)
+    return np.asarray(x / x.sum())

@@ -40,6 +40,14 @@ class ScreenWarp:
     corner_rms_px: float
     corner_std_px: float  # of their mean
 
+    @staticmethod
+    def of_corners(corners: Array, shape: tuple[int, ...]) -> ScreenWarp:
+        """The homography that takes four points (x, y), clockwise from top left, to the corners of a target of `shape`."""
+        cells = np.array([[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=np.float32)
+        homography = cv2.getPerspectiveTransform(np.asarray(corners, dtype=np.float32), cells)
+        centre = np.asarray(corners, dtype=float).mean(axis=0)
+        return ScreenWarp(homography, np.zeros((2, 10)), centre, float(np.ptp(corners, axis=0).max()) / 2.0, 0.0, 0.0)
+
     def basis(self, points: Array) -> Array:
         """Polynomial terms at `points` (n, 2): (terms, n); the first is constant."""
         x, y = ((points - self.centre) / self.scale).T
@@ -84,6 +92,28 @@ def register(
         )
     cells = _matched(points, grid, rows, cols, bernoulli, bernoulli_target)
     return _fitted_warp(points, cells)
+
+
+def busiest_quadrilateral(picture: Array) -> Array:
+    """Corners (4, 2), (x, y), clockwise from the top left, of the largest part of a picture that is full of fine structure."""
+    fine = np.abs(picture - ndimage.gaussian_filter(picture, 1.0))
+    # A pattern is busy all over, a marker or an edge only along lines: the lower quartile of a neighbourhood tells
+    busy = ndimage.percentile_filter(fine, 25, size=11)
+    busy = ndimage.gaussian_filter(busy, 1.0)
+    mask = busy > 0.5 * np.quantile(busy, 0.99)
+    narrow = max(4, int(np.sqrt(mask.sum()) / 8.0))  # what clings to the pattern is narrower than it
+    part, count = ndimage.label(ndimage.binary_opening(mask, np.ones((3, 3)), iterations=narrow))
+    if not count:
+        raise NotDetermined("psf", "the photograph shows no pattern: nothing in it is full of fine structure")
+    largest = part == 1 + int(np.argmax(ndimage.sum_labels(part > 0, part, np.arange(1, count + 1))))
+    points = np.argwhere(largest)[:, ::-1].astype(np.float32)
+    box = cv2.boxPoints(cv2.minAreaRect(points))
+    box += (
+        3.5 * (box - box.mean(axis=0)) / np.linalg.norm(box - box.mean(axis=0), axis=1).mean()
+    )  # the quartile shrinks it
+    around = np.arctan2(*(box - box.mean(axis=0)).T[::-1])
+    ordered = box[np.argsort(around)]  # clockwise, for y goes down
+    return np.asarray(np.roll(ordered, -int(np.argmin(ordered.sum(axis=1))), axis=0), dtype=float)
 
 
 def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
