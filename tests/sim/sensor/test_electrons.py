@@ -33,8 +33,8 @@ def test_far_from_the_limits_nothing_changes_to_the_last_bit() -> None:
     assert (mean[0], variance[0]) == (500.1, 33.3)
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.3, 0.9, 1.1, 3.0])
-@pytest.mark.parametrize("mean", [-0.7, 0.0, 0.4, 2.3, 7.5, 19.8, 20.6])
+@pytest.mark.parametrize("sigma", [0.05, 0.3, 0.35, 0.8, 0.89, 0.91, 1.1, 3.0])
+@pytest.mark.parametrize("mean", [-0.7, 0.0, 0.4, 2.3, 7.5, 9.9, 10.3, 19.8, 20.6])
 def test_moments_of_codes(mean: float, sigma: float) -> None:
     """Against the sum over all codes 0..20 of a normal variable's probabilities."""
     codes = np.arange(21)
