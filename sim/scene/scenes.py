@@ -288,7 +288,11 @@ class ScreenImage(Posed):
         seen at ascending camera `row` x `col` (px)."""
         turn = np.asarray(self.rotation, float)
         eye = -turn.T @ np.asarray(self.translation_mm, float)  # the camera in the screen's frame
-        u, v = self.warp().grid_to_pattern(row, col)
+        warp = self.warp()
+        if warp.upright:  # a sum of a term a row and one a column
+            u, v = warp.to_pattern(row[0], col)[0][None, :], warp.to_pattern(row, col[0])[1][:, None]
+        else:
+            u, v = warp.grid_to_pattern(row, col)
         away2 = (u * self.pixel_mm - eye[0]) ** 2 + (v * self.pixel_mm - eye[1]) ** 2
         return np.abs(eye[2]) / np.sqrt(away2 + eye[2] ** 2)
 
