@@ -131,6 +131,13 @@ def test_measured_light_and_temperature_count(small: Path, tmp_path: Path) -> No
     assert gained == pytest.approx(15.0, rel=1e-6)
 
 
+def test_dark_frames_are_asked_for_by_no_light(small: Path) -> None:
+    made = simulate(SimulateOptions(scene="uniform", luminance_cd_m2=0.0, exposure_s=2.0), read_camera(small))
+    assert made.record.summary.mean_electrons == 10.0  # 5 e/s
+    # 10 e of 0.38 DN on 64 DN; noise of sqrt(10 + 2.4^2) e in 66 x 97 pixels, and of 66 rows and 97 columns
+    assert made.frame.mean() == pytest.approx(67.8, abs=4.5 * 0.38 * np.sqrt(15.8 / 6402 + 0.04 / 66 + 0.09 / 97))
+
+
 def test_effects_of_the_camera_file_act(small: Path, tmp_path: Path) -> None:
     glare = tmp_path / "glare.toml"
     glare.write_text(small.read_text() + '\n[[effects]]\nname = "veiling_glare"\nshare_percent = 10.0\n')
