@@ -17,7 +17,7 @@ from plotly.offline import get_plotlyjs
 
 from lab.errors import InputError
 from lab.recording import RecordingSet
-from lab.report import charts, words
+from lab.report import charts, geometry, words
 from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
@@ -222,8 +222,11 @@ def render_report(
         },
         "stereo": list(stereo_figures(fit.stereo)) if fit.stereo else [],
         "pairs": fit.stereo.pairs if fit.stereo else 0,
+        "pair": geometry.stereo_context(recordings, fit.stereo),
+        "geometry_charts": geometry.charts_by_side({side: camera.geometry for side, camera in fit.cameras.items()}),
         "geometry": {
             side: {"figures": list(geometry_figures(camera.geometry)), "views": camera.geometry.views}
+            | geometry.context(camera.geometry)
             if camera.geometry
             else None
             for side, camera in fit.cameras.items()
