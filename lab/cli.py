@@ -40,6 +40,7 @@ from lab.report.figures import by_side, measured, stereo_figures
 from lab.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
 
 if TYPE_CHECKING:
+    from lab.lens import LensResult
     from lab.store import Store
 
 EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
@@ -419,6 +420,75 @@ def report(
 
 
 # --- simulation --------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def lens(
+    file: Annotated[Path, typer.Argument(metavar="FILE.zmx", help="a Zemax prescription")],
+    json: Json = None,
+    report_folder: Annotated[
+        Path | None, typer.Option("--report", metavar="DIR", help="write DIR/lens.html, one page with pictures")
+    ] = None,
+    focus: Annotated[
+        str, typer.Option(help="the image where the file has it (file) or at best focus on axis (best)")
+    ] = "file",
+    field_deg: Annotated[
+        float | None, typer.Option(help="the corner of the field (without: the file's largest)")
+    ] = None,
+    glass: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=OTHER", help="a glass for another: NAME=OTHER or NAME=nd,Vd")
+    ] = None,
+) -> None:
+    """What a lens prescription amounts to: first-order quantities, illumination, distortion, MTF, PSF."""
+    from lab.lens import parse_glasses, trace_prescription
+
+    _check_writable(json)
+    if focus not in ("file", "best"):
+        raise InputError(f"--focus {focus}: give file or best")
+    with _bar(file.name) as advance:
+        traced = trace_prescription(
+            file,
+            focus="best" if focus == "best" else "file",
+            maximum_field_deg=field_deg,
+            glasses=parse_glasses(glass or []),
+            progress=advance,
+        )
+    _warn(traced.result.warnings)
+    if str(json) != "-":
+        _print_lens(traced.result)
+    _write_json(traced.result, json)
+    if report_folder is not None:
+        from lab.report.lens import write_lens_report
+
+        out.print(f"report: {write_lens_report(report_folder, traced)}")
+
+
+def _print_lens(result: LensResult) -> None:
+    out.print(
+        f"{escape(result.name)}: f = {result.focal_length_mm:.4f} mm, f/{result.f_number:.3f}, "
+        f"entrance pupil {result.entrance_pupil_mm:.4f} mm at {result.primary_wavelength_nm:.1f} nm"
+    )
+    table = Table(box=None, pad_edge=False)
+    for heading in ("field, deg", "height, mm", "relative illumination", "distortion, %", "in the window, %"):
+        table.add_column(heading, justify="right")
+    at = result.reference_wavelength_nm
+    first = result.fields[0].mtf
+    curve = next(i for i, one in enumerate(first) if one.wavelength_nm == at)
+    frequencies = first[curve].frequency_lp_per_mm
+    for frequency in frequencies:
+        table.add_column(f"MTF S/T, {frequency:g} lp/mm", justify="right")
+    for field in result.fields[::4] if len(result.fields) == 21 else result.fields:
+        nearest = min(field.psf, key=lambda one: abs(one.wavelength_nm - at))
+        mtf = field.mtf[curve]
+        table.add_row(
+            f"{field.angle_deg:.2f}",
+            f"{field.height_mm:.4f}",
+            f"{field.relative_illumination:.4f}",
+            f"{field.distortion_percent:.3f}",
+            f"{100 * nearest.encircled_share:.2f}",
+            *(f"{s:.3f} / {t:.3f}" for s, t in zip(mtf.sagittal, mtf.tangential, strict=True)),
+        )
+    out.print(table)
 
 
 @app.command()

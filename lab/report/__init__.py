@@ -130,7 +130,8 @@ def _chart_json(figure: dict[str, Any]) -> Markup:
     return Markup(text.replace("<", "\\u003c"))  # within JSON's strings the same, and no way out of the element
 
 
-def _environment() -> jinja2.Environment:
+def page_environment() -> jinja2.Environment:
+    """Where the pages' templates lie, with their filters."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -239,7 +240,7 @@ def render_report(
         "listed": recordings.captures(),
         "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
     }
-    return _environment().get_template("page.html").render(context)
+    return page_environment().get_template("page.html").render(context)
 
 
 def write_report(

@@ -164,6 +164,12 @@ def _sag(surfaces: Any, i: int, u: float) -> Any:
     return s, s1, s2, True
 
 
+def sag(surfaces: Surfaces, i: int, square_mm2: float) -> tuple[float, bool]:
+    """Sag (mm) of a surface at r^2 (mm^2), and whether the surface reaches that far."""
+    value, _, _, inside = _sag(surfaces, i, square_mm2)
+    return float(value), bool(inside)
+
+
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces: Any, i: int) -> Any:
     """Distance from (x, y) on the vertex plane to surface i along the direction, the place there, and the sag's slopes."""
