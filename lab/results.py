@@ -353,6 +353,21 @@ class ChannelGeometry(Frozen):
     corners: int
 
 
+class PsfSymmetry(Frozen):
+    """Test of radial symmetry on kernels over the field: their second moments against a lens that looks the same all around
+    its axis, a0 + a r^2 radially, a0 + b r^2 tangentially, nothing mixed; r = 1 at the kernel farthest from the axis."""
+
+    kernels: int
+    chi2: float
+    degrees_of_freedom: int
+    probability: float  # of so large a chi2 if the lens is symmetric
+    symmetric: bool  # chi2 within its 99.9 % quantile
+    variance_on_axis_px2: float
+    radial_growth_px2: float
+    tangential_growth_px2: float
+    largest_mixed_sigma: float  # the mixed moment that is farthest from nil, in its standard uncertainties
+
+
 class GeometryFit(Frozen):
     """OpenCV's pinhole and distortion (`k1 k2 p1 p2 k3`); px."""
 
@@ -434,6 +449,9 @@ class CameraFit(Frozen):
     spectral: SpectralFit | None = None
     mtf: tuple[MtfCurve, ...] = ()
     psf: tuple[PsfKernel, ...] = ()
+    #: Of parts of the pattern, centre to edge, in the green (or only) channel; and whether they are symmetric about the axis.
+    psf_field: tuple[PsfKernel, ...] = ()
+    psf_symmetry: PsfSymmetry | None = None
     geometry: GeometryFit | None = None
 
 

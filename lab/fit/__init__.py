@@ -51,7 +51,7 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
     from lab.fit.geometry import fit_geometry
     from lab.fit.mtf import fit_mtf
     from lab.fit.noise import fit_noise
-    from lab.fit.psf import fit_psf
+    from lab.fit.psf import fit_psf_field
     from lab.fit.spectral import fit_spectral
     from lab.fit.stereo import fit_stereo
 
@@ -60,11 +60,14 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
 
     def radiometry(side: Side) -> CameraFit:
         levels = run.step("noise", side, lambda: fit_noise(recordings, side))
+        kernels = run.step("psf", side, lambda: fit_psf_field(recordings, side))
         return CameraFit(
             noise=levels,
             spectral=run.step("spectral", side, lambda: fit_spectral(recordings, side, levels)),
             mtf=run.step("mtf", side, lambda: fit_mtf(recordings, side, levels)) or (),
-            psf=run.step("psf", side, lambda: fit_psf(recordings, side, levels)) or (),
+            psf=kernels.kernels if kernels else (),
+            psf_field=kernels.parts if kernels else (),
+            psf_symmetry=kernels.symmetry if kernels else None,
         )
 
     def pinhole(side: Side) -> GeometryFit | None:

@@ -22,14 +22,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, ndimage
+from scipy import linalg, ndimage, stats
 from scipy.interpolate import RectBivariateSpline
 from scipy.signal import fftconvolve
 
 from lab.errors import NotDetermined
 from lab.fit.screen import MATCH, ScreenWarp, busiest_quadrilateral, register
 from lab.recording import Bernoulli, Camera, RecordingSet
-from lab.results import NoiseFit, PsfKernel
+from lab.results import NoiseFit, PsfKernel, PsfSymmetry
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import phases, planes
 from sim.sensor.mosaic import step as period
@@ -46,6 +46,7 @@ GRID_PX, NODE_STD_PX = (
 )  # of the grid on which the place of a drawn pattern is refined; how far a node may move
 GRID_STD = 5e-4  # of the kernel's maximum: what five taps on half pixels leave of a diffraction-limited kernel
 SHIFT_STD_PX = 0.005  # of the corners' common place, beside their scatter: neighbouring squares of unequal shading
+MOMENT_WINDOW_PX = 2.0  # of the moments that tell whether kernels over the field are symmetric
 RIM_SHARE = 0.04  # of a kernel in the outermost pixels, above which the support is doubled
 PHOTO_ROUNDS, ALIGN_STEPS = (
     4,
@@ -484,6 +485,16 @@ def measure_field(
     return ScreenField({channel: found[channel] for channel in places}, tuple(local))
 
 
+@dataclass(frozen=True)
+class PsfFit:
+    """`kernels`: one for every pose, Bernoulli target and channel; `parts`: of the green (or only) channel, over the field;
+    `symmetry`: whether the parts fit a lens that looks the same all around its axis, None where they don't tell."""
+
+    kernels: tuple[PsfKernel, ...]
+    parts: tuple[PsfKernel, ...]
+    symmetry: PsfSymmetry | None
+
+
 def fit_psf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> tuple[PsfKernel, ...]:
     """One kernel for every pose of the screen, Bernoulli target and channel of `side`.
 
@@ -491,28 +502,112 @@ def fit_psf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None)
     pattern from the middle of the frame. Raises `NotDetermined` where captures are missing or no pose can be registered.
     """
     del noise  # the residual says it better: it holds the photo response non-uniformity of all four captures too
+    return fit_psf_field(recordings, side, patches=0).kernels
+
+
+def fit_psf_field(recordings: RecordingSet, side: Side, patches: int = 3) -> PsfFit:
+    """As `fit_psf`, with the kernels of `patches` x `patches` parts of every pattern and the test of radial symmetry."""
     camera = recordings.camera(side)
-    kernels, reason = [], ""
+    kernels: list[PsfKernel] = []
+    parts: list[PsfKernel] = []
+    measured: list[ScreenKernel] = []
+    reason = ""
     for pictures in screen_pictures(recordings, side):
         try:
-            measured = measure_kernels(pictures, camera.cfa)
+            field = measure_field(pictures, camera.cfa, patches=patches)
         except NotDetermined as refused:
             reason = f"{pictures.first.id}: {refused.reason}"
             continue
-        for channel, found in measured.items():
-            kernels.append(
-                PsfKernel(
-                    capture=pictures.first.id,
-                    channel=channel,
-                    field_mm=_field_mm(camera, found.centre_px),
-                    sample_pitch_px=1.0,
-                    psf=tuple(tuple(float(v) for v in values) for values in found.kernel),
-                    psf_std=tuple(tuple(float(v) for v in values) for values in found.kernel_std),
-                )
-            )
+        kernels += [_reported(camera, pictures.first.id, found) for found in field.kernels.values()]
+        parts += [_reported(camera, pictures.first.id, found) for found in field.parts]
+        measured += field.parts
     if not kernels:
         raise NotDetermined("psf", reason)
-    return tuple(kernels)
+    try:
+        symmetry = radial_symmetry(measured, ((camera.rows - 1) / 2.0, (camera.cols - 1) / 2.0))
+    except NotDetermined:
+        symmetry = None
+    return PsfFit(tuple(kernels), tuple(parts), symmetry)
+
+
+def _reported(camera: Camera, capture: str, found: ScreenKernel) -> PsfKernel:
+    return PsfKernel(
+        capture=capture,
+        channel=found.channel,
+        field_mm=_field_mm(camera, found.centre_px),
+        sample_pitch_px=1.0,
+        psf=tuple(tuple(float(v) for v in values) for values in found.kernel),
+        psf_std=tuple(tuple(float(v) for v in values) for values in found.kernel_std),
+    )
+
+
+def radial_symmetry(parts: Sequence[ScreenKernel], axis_px: tuple[float, float]) -> PsfSymmetry:
+    """Whether kernels at several places fit a lens that looks the same all around its axis: tested, not assumed.
+
+    Of each kernel the second moments under a Gaussian window of `MOMENT_WINDOW_PX` about its centroid, turned into radial,
+    tangential and mixed: of a symmetric lens the mixed one is nil, and the others are even polynomials of the distance from
+    the axis that agree on it, here a0 + a r^2 and a0 + b r^2. Generalised least squares with the kernels' covariances; chi2
+    beyond its 99.9 % quantile says that the lens isn't symmetric about `axis_px` (row, col). Raises `NotDetermined` below
+    five kernels, or where they lie at one distance.
+    """
+    radius = np.array([np.hypot(k.centre_px[0] - axis_px[0], k.centre_px[1] - axis_px[1]) for k in parts])
+    if len(parts) < 5 or np.ptp(radius) < 10.0:
+        raise NotDetermined(
+            "psf", f"{len(parts)} kernels over the field don't test radial symmetry: 5 at unequal distances do"
+        )
+    top = float(radius.max())
+    values, weights, designs = [], [], []
+    for kernel, r in zip(parts, radius, strict=True):
+        moments, covariance = _moments(kernel)
+        away = np.array(kernel.centre_px) - axis_px
+        u = away / r if r > 1e-6 else np.array([1.0, 0.0])
+        v = np.array([-u[1], u[0]])
+        turn = np.array(  # of (row row, row col, col col) into (radial, tangential, mixed)
+            [
+                [u[0] ** 2, 2 * u[0] * u[1], u[1] ** 2],
+                [v[0] ** 2, 2 * v[0] * v[1], v[1] ** 2],
+                [u[0] * v[0], u[0] * v[1] + u[1] * v[0], u[1] * v[1]],
+            ]
+        )
+        values.append(turn @ moments)
+        weights.append(np.linalg.inv(turn @ covariance @ turn.T))
+        x = (r / top) ** 2
+        designs.append(np.array([[1.0, x, 0.0], [1.0, 0.0, x], [0.0, 0.0, 0.0]]))
+    normal = sum(d.T @ w @ d for d, w in zip(designs, weights, strict=True))
+    right = sum(d.T @ w @ v for d, w, v in zip(designs, weights, values, strict=True))
+    solution = np.linalg.solve(normal, right)
+    gaps = [v - d @ solution for v, d in zip(values, designs, strict=True)]
+    chi2 = float(sum(g @ w @ g for g, w in zip(gaps, weights, strict=True)))
+    freedom = 3 * len(parts) - 3
+    pulls = [float(g[2] * np.sqrt(w[2, 2])) for g, w in zip(gaps, weights, strict=True)]
+    return PsfSymmetry(
+        kernels=len(parts),
+        chi2=chi2,
+        degrees_of_freedom=freedom,
+        probability=float(stats.chi2.sf(chi2, freedom)),
+        symmetric=chi2 < float(stats.chi2.ppf(0.999, freedom)),
+        variance_on_axis_px2=float(solution[0]),
+        radial_growth_px2=float(solution[1]),
+        tangential_growth_px2=float(solution[2]),
+        largest_mixed_sigma=max(pulls, key=abs),
+    )
+
+
+def _moments(kernel: ScreenKernel) -> tuple[Array, Array]:
+    """Windowed second moments (row row, row col, col col) of a kernel, px^2, and their covariance."""
+    half = len(kernel.kernel) // 2
+    row, col = np.meshgrid(*(np.arange(-half, half + 1.0),) * 2, indexing="ij")
+    centre = np.zeros(2)
+    for _ in range(8):  # the window's centre is the windowed centroid
+        r, c = row - centre[0], col - centre[1]
+        window = np.exp(-0.5 * (r**2 + c**2) / MOMENT_WINDOW_PX**2) * kernel.kernel
+        centre += np.array([(window * r).sum(), (window * c).sum()]) / window.sum()
+    weight = np.exp(-0.5 * (r**2 + c**2) / MOMENT_WINDOW_PX**2)
+    total = float((weight * kernel.kernel).sum())
+    terms = np.stack([r * r, r * c, c * c]).reshape(3, -1) * weight.ravel() / total
+    moments = terms @ kernel.kernel.ravel()
+    slopes = terms - moments[:, None] * weight.ravel() / total
+    return moments, slopes @ kernel.covariance @ slopes.T
 
 
 @dataclass(frozen=True)
@@ -548,6 +643,10 @@ def photographed_kernel(
     if seen.ndim != 2 or target.ndim != 2 or not np.isfinite(seen).all():
         raise NotDetermined("psf", "photograph and pattern have to be two-dimensional, the photograph finite")
     quad = busiest_quadrilateral(seen) if corners is None else np.asarray(corners, dtype=float)
+    # Only what is around the pattern is looked at
+    first = np.maximum(np.floor(quad.min(axis=0)).astype(int) - PHOTO_MARGIN_PX, 0)
+    last = np.ceil(quad.max(axis=0)).astype(int) + PHOTO_MARGIN_PX + 1
+    seen, quad = seen[first[1] : last[1], first[0] : last[0]], quad - first
     turns = [np.roll(quad, turn, axis=0) for turn in range(4 if corners is None else 1)]
     rough = [_aligned(seen, target, ScreenWarp.of_corners(turn, target.shape), (2.5, 1.5)) for turn in turns]
     warp, _ = max(rough, key=lambda found: found[1])
@@ -578,7 +677,7 @@ def photographed_kernel(
         kernel_std=described.kernel_std,
         fine=estimate,
         oversample=oversample,
-        warp=warp,
+        warp=warp.moved(first),
         explained=1.0 - float(np.sum((seen[at] - model) ** 2) / np.sum((seen[at] - seen[at].mean()) ** 2)),
         explained_by_box=by_box,
         samples=len(drawn.row),

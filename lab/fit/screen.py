@@ -58,6 +58,11 @@ class ScreenWarp:
         moved = points + (self.displacement @ self.basis(points)).T
         return np.asarray(cv2.perspectiveTransform(moved[:, None, :].astype(np.float64), self.homography)[:, 0])
 
+    def moved(self, origin: Array) -> ScreenWarp:
+        """The same of a picture of which this one is the part that begins at `origin`, (x, y)."""
+        shift = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]])
+        return replace(self, homography=self.homography @ shift, centre=self.centre + origin)
+
     def displaced(self, change: Array) -> ScreenWarp:
         """With `change` (2, terms) added to the displacement."""
         return replace(self, displacement=self.displacement + change)
