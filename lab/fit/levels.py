@@ -129,7 +129,10 @@ class PlaneStatistics:
     @property
     def mean_std(self) -> float:
         """Standard uncertainty of `mean` from the pixels' temporal noise, and of its rounding."""
-        return float(np.hypot(np.sqrt(self.temporal_variance / (self.pixels * self.repeats)), self.mean_rounding_std))
+        variance = self.temporal_variance / self.repeats
+        if self.temporal_variance < HIDDEN_DN2:  # each pixel's own mean is rounded: repeats don't help
+            variance = max(variance, QUANTISATION_DN2)
+        return float(np.hypot(np.sqrt(variance / self.pixels), self.mean_rounding_std))
 
     @property
     def spread(self) -> float:

@@ -809,7 +809,8 @@ class _Evaluation:
         levels without repeats)."""
         signal = np.array([level.plane[name].mean - self._dark_mean(name, level.exposure_s) for level in levels])
         noise = np.array([level.plane[name].mean_std for level in levels])
-        noise = np.where(np.isfinite(noise), noise, np.sqrt(self.transfer.gain * signal / levels[0].plane[name].pixels))
+        shot = self.transfer.gain * np.maximum(signal, 0.0) + QUANTISATION_DN2
+        noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
         drift = self._drift()
         return np.array([level.light for level in levels]), signal, np.hypot(noise, drift[0] * signal)
 
@@ -824,7 +825,9 @@ class _Evaluation:
             planes_ = [level.plane[n] for n in own]
             pixels = np.array([plane.pixels for plane in planes_], float)
             frames = np.average([plane.frame_means for plane in planes_], axis=0, weights=pixels)
-            noise = float(np.average([plane.temporal_variance for plane in planes_], weights=pixels) / pixels.sum())
+            variance = float(np.average([plane.temporal_variance for plane in planes_], weights=pixels))
+            rounding = max(plane.mean_rounding_std for plane in planes_)
+            noise = max(variance, QUANTISATION_DN2) / pixels.sum() + rounding**2
             signal = float(
                 np.average([p.mean - self.lines[n].black for p, n in zip(planes_, own, strict=True)], weights=pixels)
             )

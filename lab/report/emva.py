@@ -616,7 +616,7 @@ def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float
     first = rest.min() - 0.5 * min(step, width) if step > 0 else -reach
     counts, edges = np.histogram(rest, first + width * np.arange(np.ceil((reach - first) / width) + 1))
     middle = (edges[:-1] + edges[1:]) / 2.0
-    spread = float(rest.std())
+    spread = float(rest.std()) or 1e-12  # all alike: one bin
     law = rest.size * (edges[1] - edges[0]) * np.exp(-0.5 * (middle / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
     moduli = np.sort(np.abs(rest))[::-1]
     steps = np.unique(np.geomspace(1, moduli.size, 160).astype(int)) - 1

@@ -478,6 +478,37 @@ def test_a_frame_of_a_few_pixels_is_refused() -> None:
         fit_noise(recording_set(Sensor(shape=(4, 4)), [(0.001, 2)], LADDER), "left")
 
 
+@pytest.mark.parametrize("seed", range(16))
+def test_poor_recordings_end_in_figures_or_in_a_reason(seed: int) -> None:
+    """Few levels, single frames, all-dark and all-white flats, coarse codes, clipped blacks, temperatures and gains mixed: what comes
+    out is finite, or a reason. Warnings are errors in these tests."""
+    rng = np.random.default_rng(seed)
+    bits = int(rng.choice([8, 12]))
+    white = 2**bits - 1
+    sensor = Sensor(
+        shape=(int(rng.integers(16, 60)), int(rng.integers(16, 60))),
+        cfa=str(rng.choice(["MONO", "GRBG"])),
+        gain=white / 9000.0,
+        read=float(rng.choice([0.0, 3.0, 40.0])),
+        black=float(rng.choice([0.0, 0.4, 0.02 * white])),
+        dsnu=float(rng.choice([0.0, 2.0])),
+        full=9000.0 * float(rng.choice([0.3, 0.9, 1.3, 30.0])),
+        white=white,
+    )
+    exposures = np.linspace(0.001, 1.0, int(rng.choice([1, 3, 8])))
+    flats = [(float(t), int(rng.choice([1, 2, 3]))) for t in exposures]
+    darks = [(float(t), int(rng.choice([1, 2]))) for t in exposures[:: int(rng.choice([1, 2]))]] if seed % 4 else []
+    recordings = recording_set(sensor, darks, flats, **({"temperature_c": 20.0 + seed % 3} if seed % 2 else {}))
+    try:
+        fit = fit_noise(recordings, "left")
+    except NotDetermined as refused:
+        assert len(refused.reason) > 20
+        return
+    assert np.isfinite(fit.conversion_gain_dn_per_e)
+    assert fit.conversion_gain_dn_per_e_std > 0
+    json.loads(fit.model_dump_json(), parse_constant=lambda name: pytest.fail(f"{name} in the results"))
+
+
 # --- recordings of others ----------------------------------------------------------------------------------------------
 
 
