@@ -31,8 +31,9 @@ ComplexArray = NDArray[np.complex128]
 
 #: Path errors below this are rounding: 1e-12 um.
 NIL_UM = 1e-12
-#: More frequencies than these are interpolated: integrating each would take longer than a table.
-FEW = 600
+#: More frequencies than `FEW` are interpolated, as integrating each would take longer; up to `SOME` along each direction where
+#: that has `MANY_A_DIRECTION` of them.
+FEW, SOME, MANY_A_DIRECTION = 600, 20_000, 40
 #: Steps of a table over the radius that lines are drawn through, to 1e-6; least steps of one over radius and angle, for splines.
 RADII_LINE = 4096
 RADII, ANGLES, PAD = 256, 256, 8
@@ -229,21 +230,39 @@ def _bent(
         return np.ones(shape)
     share = np.hypot(fx, fy) * (wavelength_um * f_number)
     if bend.is_isotropic:
-        if share.size > FEW:
-            radius, value = _radial_table(bend, wavelength_um, float(min(1.0, share.max())))
-            return np.where(share < 1.0, np.interp(share, radius, value), 1.0)
-        one, none = np.ones(share.size), np.zeros(share.size)
-        return np.real(_mean(share.ravel(), one, none, wavelength_um, bend)).reshape(share.shape)
-    if share.size > FEW:
-        from sim.optics.polar import look_up  # here, as the compiler takes a second to import
+        return _along(share, 0.0, wavelength_um, bend)
+    if share.size <= FEW:
+        safe = np.where(share > 0, share, 1.0) / (wavelength_um * f_number)
+        cos, sin = np.where(share > 0, fx / safe, 1.0).ravel(), np.broadcast_to(fy / safe, shape).ravel()
+        return _mean(share.ravel(), cos, sin, wavelength_um, bend).reshape(shape)
+    if share.size <= SOME:
+        # edges ask for many frequencies in few directions
+        directions, which = np.unique(np.round(np.arctan2(fy, fx), 9), return_inverse=True)
+        if directions.size <= share.size // MANY_A_DIRECTION:
+            which = which.reshape(shape)
+            total = np.empty(shape, complex)
+            for k, angle in enumerate(directions):
+                total[which == k] = _along(share[which == k], float(angle), wavelength_um, bend)
+            return np.asarray(total if bend.part(1).terms else np.real(total))
+    from sim.optics.polar import look_up  # here, as the compiler takes a second to import
 
-        fx, fy = (np.atleast_2d(np.broadcast_to(f, shape)) for f in (fx, fy))
-        whole = tuple(f.reshape(-1, f.shape[-1]) for f in (fx, fy))
-        ratio = look_up(*whole, wavelength_um * f_number, PAD, _polar_table(bend, wavelength_um)).reshape(shape)
-        return np.asarray(ratio if bend.part(1).terms else np.real(ratio))
-    safe = np.where(share > 0, share, 1.0) / (wavelength_um * f_number)
-    cos, sin = np.where(share > 0, fx / safe, 1.0).ravel(), np.broadcast_to(fy / safe, shape).ravel()
-    return _mean(share.ravel(), cos, sin, wavelength_um, bend).reshape(shape)
+    fx, fy = (np.atleast_2d(np.broadcast_to(f, shape)) for f in (fx, fy))
+    whole = tuple(f.reshape(-1, f.shape[-1]) for f in (fx, fy))
+    ratio = look_up(*whole, wavelength_um * f_number, PAD, _polar_table(bend, wavelength_um)).reshape(shape)
+    return np.asarray(ratio if bend.part(1).terms else np.real(ratio))
+
+
+def _along(share: FloatArray, angle: float, wavelength_um: float, bend: Wavefront) -> FloatArray | ComplexArray:
+    """The ratio at shares of the cutoff in one direction."""
+    odd = bool(bend.part(1).terms)
+    if share.size > SOME:
+        radius, value = _line(angle, wavelength_um, bend)
+        ratio: FloatArray | ComplexArray = np.interp(share, radius, value if odd else np.real(value))
+    else:
+        series = _series(angle, wavelength_um, bend)
+        at = 2.0 * np.minimum(share, 1.0) - 1.0
+        ratio = np.asarray(chebyshev.chebval(at, series), complex) if odd else chebyshev.chebval(at, np.real(series))
+    return np.where((share > 0.0) & (share < 1.0), ratio, 1.0)
 
 
 def _mean(
@@ -321,19 +340,26 @@ def _mean_of_any(
     return ratio
 
 
-@lru_cache(maxsize=32)
-def _radial_table(bend: Wavefront, wavelength_um: float, reach: float) -> tuple[FloatArray, FloatArray]:
-    """The ratio on even steps of the share of the cutoff up to `reach`, from few by Chebyshev's expansion."""
-    count = 32
+@lru_cache(maxsize=256)
+def _series(angle: float, wavelength_um: float, bend: Wavefront) -> ComplexArray:
+    """Chebyshev's expansion of the ratio in one direction over the share of the cutoff: smooth, so that few terms do."""
+    count = 16
     while True:
         node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
-        value = np.real(_mean(0.5 * reach * (node + 1.0), np.ones(count), np.zeros(count), wavelength_um, bend))
-        series = chebyshev.chebfit(node, value, count - 1)
-        if np.max(np.abs(series[-4:])) < SETTLED or count >= 512:
-            break
+        cos, sin = np.full(count, np.cos(angle)), np.full(count, np.sin(angle))
+        value = _mean(0.5 * (node + 1.0), cos, sin, wavelength_um, bend)
+        series = np.asarray(chebyshev.chebfit(node, value, count - 1), complex)
+        if np.max(np.abs(series[-3:])) < SETTLED or count >= 512:
+            return series
         count *= 2
-    radius = np.linspace(0.0, reach, RADII_LINE + 1)
-    return radius, np.asarray(chebyshev.chebval(2.0 * radius / max(reach, 1e-12) - 1.0, series), float)
+
+
+@lru_cache(maxsize=32)
+def _line(angle: float, wavelength_um: float, bend: Wavefront) -> tuple[FloatArray, ComplexArray]:
+    """The ratio in one direction on even steps of the share of the cutoff."""
+    radius = np.linspace(0.0, 1.0, RADII_LINE + 1)
+    series = _series(angle, wavelength_um, bend)
+    return radius, np.asarray(chebyshev.chebval(2.0 * radius - 1.0, series), complex)
 
 
 @lru_cache(maxsize=32)

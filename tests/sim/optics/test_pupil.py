@@ -77,11 +77,27 @@ def test_every_kind_of_wavefront_agrees_with_a_sum_over_rows(name: str, many: bo
     share, angle = np.array([0.02, 0.2, 0.45, 0.7, 0.95, 0.999]), np.array([0.1, 1.0, -2.0, 3.1, 4.4, 0.0])
     fx, fy = share * CUTOFF * np.cos(angle), share * CUTOFF * np.sin(angle)
     if many:
-        fx, fy = (np.concatenate([f, np.zeros(2000)]) for f in (fx, fy))
+        # scattered ones, so that no few directions hold them
+        fx, fy = (
+            np.concatenate([f, f0]) for f, f0 in zip((fx, fy), np.random.default_rng(1).random((2, 2000)), strict=True)
+        )
     otf = pupil_otf(fx, fy, 550.0, 4.0, wavefront)[:6]
     wanted = [by_brute_force(wavefront, s, a) for s, a in zip(share, angle, strict=True)]
     # the rows' own rule, and 3 waves of high order in a table: 1e-5; few at a time 1e-6
     np.testing.assert_allclose(otf, wanted, atol=1e-5 if many else 1e-6)
+
+
+@pytest.mark.parametrize("name", WAVEFRONTS)
+def test_frequencies_along_few_directions_agree_with_few_frequencies(name: str) -> None:
+    """Expanded along each direction, for sizes below and above which a table is drawn through: to 1e-6."""
+    f, wavefront = np.linspace(0.0, 1.05, 1000) * CUTOFF, WAVEFRONTS[name]
+    cos, sin = np.cos([0.1, 1.7, -2.0]), np.sin([0.1, 1.7, -2.0])
+    many = pupil_otf(np.outer(cos, f), np.outer(sin, f), 550.0, 4.0, wavefront)
+    few = pupil_otf(np.outer(cos, f[::25]), np.outer(sin, f[::25]), 550.0, 4.0, wavefront)
+    np.testing.assert_allclose(many[:, ::25], few, atol=1e-6)
+    if wavefront.is_isotropic:
+        tiled = pupil_otf(np.tile(f, 40), np.zeros(40_000), 550.0, 4.0, wavefront)
+        np.testing.assert_allclose(tiled[:1000], many[0], atol=1e-6)
 
 
 def test_aberrations_agree_with_a_sampled_pupil() -> None:
