@@ -169,7 +169,9 @@ class Prescription(Frozen):
     """A lens: surfaces in the order of the light, the image surface last.
 
     `object_distance_mm` is that of the object before the first surface, None at infinity. `stop` is the stop's place in
-    `surfaces`; `surface_numbers` are the file's own, for messages. Field points are (x, y) in what `field_kind` says.
+    `surfaces`. Field points are (x, y) in what `field_kind` says. `paraxial_stop`: the stop is as large as the paraxial
+    marginal ray makes it, not the real one (Zemax's paraxial ray aiming). `stated_` values are the file's own, to compare
+    the traced lens with.
     """
 
     name: str
@@ -183,7 +185,9 @@ class Prescription(Frozen):
     wavelength_nm: tuple[float, ...] = ()
     primary_wavelength_nm: float | None = None
     catalogues: tuple[str, ...] = ()
+    paraxial_stop: bool = False
     stated_focal_length_mm: float | None = None
+    stated_stop_mm: float | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -346,7 +350,9 @@ class _Reader:
             wavelength_nm=wavelengths,
             primary_wavelength_nm=primary,
             catalogues=tuple((self._header("GCAT") or "").upper().split()),
+            paraxial_stop=int(_optional(self._header("RAIM") or "", 1)) == 1,
             stated_focal_length_mm=self._stated_focal_length(),
+            stated_stop_mm=self._stated_stop(self.blocks[stops[0]]),
             warnings=tuple(dict.fromkeys(self.warnings)),
         )
 
@@ -490,6 +496,13 @@ class _Reader:
                 if target > 0 and weight > 0:
                     return target * self.scale
         return None
+
+    def _stated_stop(self, stop: _Block) -> float | None:
+        """The stop's semi-diameter where it is fixed or was found by aiming rays at the stop: else it is the beams' extent."""
+        stated = stop.last("DIAM") or ""
+        aimed = int(_optional(self._header("RAIM") or "", 1)) != 0
+        radius = _optional(stated, 0) * self.scale
+        return radius if radius > 0 and (aimed or _optional(stated, 1) == 1) else None
 
     # --- surfaces -----------------------------------------------------------------------------------------------------
 

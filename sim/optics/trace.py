@@ -79,7 +79,7 @@ class OpticalSystem:
     """A prescription ready to be traced: indices looked up, stop sized, image placed.
 
     The stop is as large as the real ray on the axis at the primary wavelength through the rim of the paraxial entrance
-    pupil makes it; every other field and wavelength fills that stop (ray aiming).
+    pupil makes it (the paraxial ray, where the file asks for paraxial aiming); every other field and wavelength fills that stop (ray aiming).
     """
 
     def __init__(self, prescription: Prescription, focus: Focus = "file") -> None:
@@ -178,6 +178,8 @@ class OpticalSystem:
         """Where the real ray on the axis through the entrance pupil's rim meets the stop."""
         if self.prescription.aperture_kind == "stop_semi_diameter":
             return self.prescription.aperture_value
+        if self.prescription.paraxial_stop:
+            return float(abs(self._matrices(self.primary_nm)[0][0, 0]) * 0.5 * pupil_mm)
         surfaces = rt.compiled_surfaces(_centred(self.prescription), 1.0)
         out, nowhere = np.zeros(rt.ROW), np.zeros((0, 3))
         rt.trace_ray(surfaces, self.index(self.primary_nm), self._axis(), 0.0, 0.5 * pupil_mm, False, out, nowhere)
@@ -242,8 +244,7 @@ class OpticalSystem:
             stated.append(("f-number", prescription.aperture_value, first.f_number, "", 1e-4))
         if prescription.aperture_kind == "entrance_pupil_mm":
             stated.append(("entrance pupil", prescription.aperture_value, first.entrance_pupil_mm, "mm", 1e-4))
-        stop = prescription.surfaces[prescription.stop]
-        stated.append(("stop's semi-diameter", stop.semi_diameter_mm or None, first.stop_semi_diameter_mm, "mm", 0.02))
+        stated.append(("stop's semi-diameter", prescription.stated_stop_mm, first.stop_semi_diameter_mm, "mm", 0.02))
         for name, value, computed, unit, tolerance in stated:
             if value is not None and abs(computed / value - 1.0) > tolerance:
                 self.warnings.append(
