@@ -261,7 +261,8 @@ def _along(share: FloatArray, angle: float, wavelength_um: float, bend: Wavefron
     else:
         series = _series(angle, wavelength_um, bend)
         at = 2.0 * np.minimum(share, 1.0) - 1.0
-        ratio = np.asarray(chebyshev.chebval(at, series), complex) if odd else chebyshev.chebval(at, np.real(series))
+        ratio = np.asarray(chebyshev.chebval(at, series), complex)
+        ratio = ratio if odd else np.real(ratio)
     return np.where((share > 0.0) & (share < 1.0), ratio, 1.0)
 
 
