@@ -89,9 +89,12 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
 
     found = run.step("stereo", None, pair)
     order = {side: number for number, side in enumerate((*sides, None))}
+    steps = {step: number for number, step in enumerate((*STEPS, "stereo"))}
     return FitResult(
         source=recordings.source,
         cameras=cameras,
         stereo=found,
-        skipped=tuple(sorted(run.skipped, key=lambda item: order[item.side])),  # the order of threads mustn't show
+        skipped=tuple(  # the order of threads mustn't show
+            sorted(run.skipped, key=lambda item: (order[item.side], steps.get(item.step, len(steps))))
+        ),
     )
