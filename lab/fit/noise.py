@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -811,9 +812,10 @@ class _Evaluation:
         noise = np.array([level.plane[name].mean_std for level in levels])
         shot = self.transfer.gain * np.maximum(signal, 0.0) + QUANTISATION_DN2
         noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
-        drift = self._drift()
+        drift = self._drift
         return np.array([level.light for level in levels]), signal, np.hypot(noise, drift[0] * signal)
 
+    @cached_property
     def _drift(self) -> tuple[float, float, float, float]:
         """Scatter of the repeats' means about their level's, relative to the signal, beyond noise; the scatter and the noise
         in DN; and the probability of so much by chance."""
@@ -850,7 +852,7 @@ class _Evaluation:
         )
 
     def _remark_on_lamp(self) -> None:
-        relative, scatter, expected, _ = self._drift()
+        relative, scatter, expected, _ = self._drift
         if relative > 0:
             self._remark(
                 f"the lamp drifted: the means of repeated flat frames scatter by {scatter:.2g} DN where noise explains "
@@ -1009,7 +1011,7 @@ class _Evaluation:
                 wavelength_nm=lamp[2] if photons and isinstance(lamp, tuple) else None,
                 saturation_dn=self.saturation[name],
                 variance_error=self.transfer.model_error,
-                lamp_error=self._drift()[0],
+                lamp_error=self._drift[0],
             )
             figures = emva1288_figures(given)
             if isinstance(figures, str):
@@ -1139,7 +1141,7 @@ class _Evaluation:
         scale = 10.0 ** (-self.gain_db / 20.0)
         errors = list(self._linearity()[0].values())
         # Planes see the same lamp: where it drifts, their errors go together.
-        together = 1.0 if self._drift()[0] > 0 else float(np.sqrt(max(len(errors), 1)))
+        together = 1.0 if self._drift[0] > 0 else float(np.sqrt(max(len(errors), 1)))
         found: dict[str, tuple[float | None, float | None]] = {
             "conversion_gain_dn_per_e": (self.transfer.gain * scale, self.transfer.gain_std * scale),
             "read_noise_e": self._read_noise(),

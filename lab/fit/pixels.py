@@ -52,9 +52,9 @@ class DarkPixels:
     def take(self, stack: Stack, exposure_s: float) -> None:
         """A level, after those of longer exposure."""
         if stack.scatter is not None:
-            variance = float(np.median(stack.scatter)) / (stack.count - 1)
+            variance = _usual(stack.scatter) / (stack.count - 1)
             # Darks that are noisier than this one have dark current in them: then it isn't the read-out's noise alone.
-            if self.scatter is None or variance * SAME_NOISE < float(np.median(self.scatter)) / self.freedom:
+            if self.scatter is None or variance * SAME_NOISE < _usual(self.scatter) / self.freedom:
                 self.scatter, self.freedom = stack.scatter, stack.count - 1
             else:
                 self.scatter, self.freedom = self.scatter + stack.scatter, self.freedom + stack.count - 1
@@ -91,6 +91,12 @@ class DarkPixels:
                 for row, col in strongest
             ),
         )
+
+
+def _usual(scatter: Float32Array) -> float:
+    """Median over some ten thousand pixels: noisy ones don't count."""
+    apart = max(1, min(scatter.shape) // 128)
+    return float(np.median(scatter[::apart, ::apart]))
 
 
 def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoiseDistribution | None:
