@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,11 +24,12 @@ from sim.camera import CameraModel
 from sim.effects.aberration import Aberration
 from sim.effects.base import Effect
 from sim.optics.diffraction import aperture_otf
-from sim.optics.illumination import irradiance_factor, relative_illumination
+from sim.optics.illumination import irradiance_factor, optical_axis_px, relative_illumination
 from sim.optics.illumination import sin_theta as sin_theta_at
-from sim.optics.imaging import DiffractionLimited
+from sim.optics.imaging import DiffractionLimited, TracedLens
 from sim.optics.pupil import Wavefront
-from sim.scene.render import Grid, Light, cell_means, draw
+from sim.optics.table import LensTable
+from sim.scene.render import Grid, Layer, Light, cell_means, draw
 from sim.scene.scenes import Darkness, KnifeEdge, Scene, SpectralImage, UniformField
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
@@ -41,6 +43,9 @@ ComplexArray = NDArray[np.complex128]
 OTF_WAVELENGTHS = 10
 FRAME_WAVELENGTHS = 5
 
+#: Share of the strongest picture's light below which a picture of a traced lens's scene is left out.
+LEAST_SHARE = 1e-4
+
 #: Frequencies beyond which an edge's profile isn't followed: 64 cy/px, where a pixel's aperture passes < 0.5 %.
 HIGHEST_CY_PER_PX = 64.0
 
@@ -49,7 +54,9 @@ HIGHEST_CY_PER_PX = 64.0
 class Exposure:
     """One exposure of a scene. `gain_db` is the analogue gain; `elapsed_s` the time after the session's first capture. Effects
     may depend on it and on the sensor's `temperature_c`, with which the dark current doubles as the camera model says.
-    `magnification` of the scene dims the image as in ISET: pi / (1 + 4 N^2 (1 + |m|)^2); its blur stays that of `Lens.f_number`."""
+    `magnification` of the scene dims the image as in ISET: pi / (1 + 4 N^2 (1 + |m|)^2); its blur stays that of `Lens.f_number`.
+    `placed` matters to traced lenses, whose distortion moves the light: a scene's px are those of the ideal camera, or those of
+    the image (a recording's corners), where the distortion is in them already."""
 
     scene: Scene
     exposure_s: float
@@ -57,6 +64,7 @@ class Exposure:
     temperature_c: float | None = None
     elapsed_s: float = 0.0
     magnification: float = 0.0
+    placed: Literal["ideal", "image"] = "ideal"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.exposure_s) and self.exposure_s >= 0):
@@ -219,7 +227,8 @@ def expected_electrons(
         source *= irradiance_factor(camera.lens.f_number, exposure.magnification) / irradiance_factor(
             camera.lens.f_number
         )
-    light = _light_electron_rate(camera, exposure.scene, effects, source, oversample, margin_px) * collected_s
+    rate = _light_electron_rate(camera, exposure.scene, effects, source, oversample, margin_px, exposure.placed)
+    light = rate * collected_s
     for effect in effects:
         light = effect.lit(light, exposure.exposure_s, exposure.elapsed_s, camera)
     electrons = light + dark_electrons(camera, exposure, effects)
@@ -488,12 +497,41 @@ def _transfer_at(
 
 
 def _light_electron_rate(
-    camera: CameraModel, scene: Scene, effects: Sequence[Effect], source: float, oversample: int, margin_px: int
+    camera: CameraModel,
+    scene: Scene,
+    effects: Sequence[Effect],
+    source: float,
+    oversample: int,
+    margin_px: int,
+    placed: str,
 ) -> FloatArray:
     """Electrons a second of every pixel that light makes, (rows, cols). `source`: factor on the scene's radiance."""
     shape = camera.rows, camera.cols
     if isinstance(scene, Darkness):
         return np.zeros(shape)
+    row, col = np.arange(camera.rows, dtype=np.float64)[:, None], np.arange(camera.cols, dtype=np.float64)[None, :]
+    if isinstance(camera.lens.imaging, TracedLens):
+        traced = _traced_image(camera, camera.lens.imaging.table, scene, effects, oversample, margin_px, placed)
+        images = dict.fromkeys(camera.channels, traced)
+        shade: FloatArray = np.full(shape, source)
+    else:
+        images = _plain_images(camera, scene, effects, oversample, margin_px)
+        shade = relative_illumination(camera, row, col) * source
+    x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
+    y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
+    for effect in effects:
+        shade = shade * effect.illumination(x_um, y_um, camera)
+    for channel in camera.channels:
+        ambient = sum(effect.ambient_e_per_s(channel, camera) for effect in effects)
+        images[channel] = images[channel] * shade + ambient
+    return mosaic.assemble(images, camera.cfa)
+
+
+def _plain_images(
+    camera: CameraModel, scene: Scene, effects: Sequence[Effect], oversample: int, margin_px: int
+) -> dict[str, FloatArray]:
+    """Electrons a second of every channel behind a lens that blurs alike everywhere, (rows, cols) each, before cos^4."""
+    shape = camera.rows, camera.cols
     if isinstance(scene, UniformField):
         images = {c: _uniform_image(camera, c, scene, effects) for c in camera.channels}
     elif isinstance(scene, KnifeEdge):
@@ -503,16 +541,151 @@ def _light_electron_rate(
     else:
         grid = Grid(*shape, oversample, _margin_for(camera, effects, margin_px))
         images = _blurred_images(camera, scene, effects, grid)
-    row, col = np.arange(camera.rows, dtype=np.float64)[:, None], np.arange(camera.cols, dtype=np.float64)[None, :]
-    shade: FloatArray = relative_illumination(camera, row, col) * source
-    x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
-    y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
-    for effect in effects:
-        shade = shade * effect.illumination(x_um, y_um, camera)
-    for channel in camera.channels:
-        ambient = sum(effect.ambient_e_per_s(channel, camera) for effect in effects)
-        images[channel] = images[channel] * shade + ambient
-    return mosaic.assemble(images, camera.cfa)
+    return images
+
+
+def _traced_image(
+    camera: CameraModel,
+    table: LensTable,
+    scene: Scene,
+    effects: Sequence[Effect],
+    oversample: int,
+    margin_px: int,
+    placed: str,
+) -> FloatArray:
+    """Electrons a second behind a traced lens: every pixel that of its own channel, (rows, cols).
+
+    A sum over few pictures: scattered, channel by channel, with the point spread functions of their light (summed over the
+    table's wavelengths as it is detected). The effects' `transfer`, alike all over the frame, acts on the picture in the image
+    before it is scattered: the two commute but for what the lens changes within the reach of the effect, some 1e-3 of the blur.
+    """
+    from sim.optics import scatter  # here: the compiler's library takes a while to load
+
+    if _light_moves(camera, effects):
+        raise ValueError(
+            "an effect moves the light of a traced lens, which does that itself: leave distortion and lateral colour to the prescription, or image by another model"
+        )
+    axis = optical_axis_px(camera)
+    frame = scatter.Frame(camera.rows, camera.cols, camera.pixel_pitch_um, camera.fill_factor, axis)
+    margin_px = max(margin_px, scatter.margin_px(table, camera.pixel_pitch_um))
+    target = Grid(camera.rows, camera.cols, oversample, margin_px)
+    carried = placed == "ideal"
+    grid = scatter.source_grid(table, frame, oversample, margin_px) if carried else target
+    period, phases = mosaic.step(camera.cfa), mosaic.phases(camera.cfa)
+    image = np.zeros((camera.rows, camera.cols))
+    ground, over, pictures = _pictures_by_rank(camera, table, scene, effects, grid)
+    for channel, light in zip(camera.channels, ground, strict=True):
+        even = scatter.illumination(table, light, frame)
+        for row0, col0 in phases[channel]:
+            image[row0::period, col0::period] += even[row0::period, col0::period]
+    blurs = [effect for effect in _blurring(effects) if type(effect).transfer is not Effect.transfer]
+    tile_px: int | None = None
+    for weight, picture in zip(over, pictures, strict=True):
+        imaged = scatter.carry(picture, grid, target, table, frame) if carried else picture.astype(np.float32)
+        # Without blurring effects one picture serves all channels.
+        shared = [list(range(len(weight)))] if not blurs else [[k] for k in range(len(weight))]
+        spectrum = fft.rfft2(imaged) if blurs else None
+        for members in shared:
+            kernels = scatter.Kernels(table, weight[members], frame, oversample, carried=carried)
+            # The first picture, with most of the light, says how large tiles may be.
+            tile_px = tile_px or kernels.tile_px()
+            seen = imaged
+            if spectrum is not None:
+                light = np.sum(weight[members[0]], axis=0)
+                transfer = _effects_transfer(camera, table, light, blurs, target)
+                seen = np.asarray(fft.irfft2(spectrum * transfer, imaged.shape), np.float32)
+            scatter.scatter(
+                seen, target, kernels, [phases[camera.channels[k]] for k in members], period, image, tile_px
+            )
+    return np.maximum(image, 0.0)
+
+
+def _pictures_by_rank(
+    camera: CameraModel, table: LensTable, scene: Scene, effects: Sequence[Effect], grid: Grid
+) -> tuple[FloatArray, FloatArray, Iterator[FloatArray]]:
+    """A scene as an even ground (channels, F, W) and pictures on a grid with their lights (pictures, channels, F, W): the fewest
+    that leave 1e-4 of the strongest's light."""
+    if isinstance(scene, SpectralImage):
+        rows, cols, bands = scene.radiance.shape
+        lights: list[Light] = [(band, None) for band in scene.bands()]
+        weight = _table_light(camera, table, lights, effects, scene.kind)
+        flat = scene.radiance.reshape(-1, bands)
+        # The spectra's own correlations make the rank smaller still: cube = (cube E) E^T with orthogonal pictures.
+        energy, basis = np.linalg.eigh(flat.T.astype(float) @ flat if flat.dtype == float else _gram(flat))
+        size = np.sqrt(np.maximum(energy, 0.0))
+        u, strength, vt = np.linalg.svd(size[:, None] * (basis.T @ weight.reshape(bands, -1)), full_matrices=False)
+        kept = strength > LEAST_SHARE * max(float(strength[0]), 1e-300)
+        mix = basis @ (u[:, kept] / np.where(size > 0, size, 1.0)[:, None])
+        over = (strength[kept, None] * vt[kept]).reshape(-1, *weight.shape[1:])
+        drawn = (
+            cell_means((flat @ column.astype(flat.dtype)).reshape(rows, cols).astype(float), scene.warp(), grid, 0.0)
+            for column in mix.T
+        )
+        return np.zeros(weight.shape[1:]), over, drawn
+    drawing = draw(scene, grid)
+    lights = [drawing.ground, *(layer.light for layer in drawing.layers)]
+    weight = _table_light(camera, table, lights, effects, scene.kind)
+    layers = drawing.layers
+    if len(layers) <= 1:
+        return weight[0], weight[1:] - weight[0], (_on_grid(grid, layers, [1.0]) for _ in layers)
+    u, strength, vt = np.linalg.svd((weight[1:] - weight[0]).reshape(len(layers), -1), full_matrices=False)
+    kept = strength > LEAST_SHARE * max(float(strength[0]), 1e-300)
+    over = (strength[kept, None] * vt[kept]).reshape(-1, *weight.shape[1:])
+    return weight[0], over, (_on_grid(grid, layers, column.tolist()) for column in u[:, kept].T)
+
+
+def _gram(flat: NDArray[np.floating]) -> FloatArray:
+    """flat^T flat in double precision, without a copy of all of it."""
+    total = np.zeros((flat.shape[1], flat.shape[1]))
+    for start in range(0, len(flat), 65536):
+        part = flat[start : start + 65536].astype(float)
+        total += part.T @ part
+    return total
+
+
+def _on_grid(grid: Grid, layers: Sequence[Layer], factors: Sequence[float]) -> FloatArray:
+    """The sum of factor x coverage of some layers."""
+    if len(layers) == 1 and factors[0] == 1.0 and layers[0].coverage.shape == grid.shape:
+        return layers[0].coverage
+    total = np.zeros(grid.shape)
+    for layer, factor in zip(layers, factors, strict=True):
+        total[layer.window] += factor * layer.coverage
+    return total
+
+
+def _table_light(
+    camera: CameraModel, table: LensTable, lights: Sequence[Light], effects: Sequence[Effect], kind: str
+) -> FloatArray:
+    """Electrons a second that each light gives every channel at every field and wavelength of a table, on an even field and
+    without relative illumination: (lights, channels, F, W). Between the table's wavelengths its functions are linear."""
+    radius_mm = np.hypot(*table.chief_mm.T)
+    sine = radius_mm / np.hypot(radius_mm, table.focal_length_mm)
+    out = np.empty((len(lights), len(camera.channels), sine.size, table.wavelength_nm.size))
+    for k, channel in enumerate(camera.channels):
+        wavelength_nm, weight = _detected(camera, channel, lights, effects, kind, sine)
+        hats = [np.interp(wavelength_nm, table.wavelength_nm, unit) for unit in np.eye(table.wavelength_nm.size)]
+        light = (weight @ np.stack(hats, axis=1)) * _collection_m2_sr(camera)
+        # An angle makes a difference only where an effect says so: (F, lights, W), or (lights, W) for all fields.
+        out[:, k] = np.moveaxis(np.broadcast_to(light, (sine.size, *light.shape[-2:])), 0, 1)
+    return out
+
+
+def _effects_transfer(
+    camera: CameraModel, table: LensTable, light: FloatArray, effects: Sequence[Effect], grid: Grid
+) -> NDArray[np.inexact]:
+    """Product of the effects' transfers on a grid's frequencies, averaged over the table's wavelengths with `light` (W,)."""
+    fy, fx, _, _ = _pixel_on_grid(camera, grid)
+    share = np.abs(light) / max(float(np.sum(np.abs(light))), 1e-300)
+    nodes, share = gauss_rule(table.wavelength_nm, share, FRAME_WAVELENGTHS)
+    total: FloatArray | ComplexArray = np.zeros((fy.size, fx.size))
+    for node, part in zip(nodes, share, strict=True):
+        value: FloatArray | ComplexArray = np.full((fy.size, fx.size), part)
+        for effect in effects:
+            factor = effect.transfer(fx / camera.pixel_pitch_um, fy / camera.pixel_pitch_um, float(node), camera)
+            if factor is not None:
+                value = value * factor
+        total = total + value
+    return np.asarray(total, np.complex64 if np.iscomplexobj(total) else np.float32)
 
 
 def _field_of_rates(

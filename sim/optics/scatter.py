@@ -36,12 +36,14 @@ Float32Array = NDArray[np.float32]
 
 #: Nodes a tile and direction, less one: functions are polynomials of this degree across a tile.
 DEGREE = 3
+_NODES = np.arange(DEGREE + 1) / DEGREE
 #: Tiles are made smaller, from the largest to the smallest of these (px), until the polynomial's error is below the limit.
-TILE_PX = (192, 96, 48, 24, 12)
-#: Relative rms error of a kernel half way between nodes.
+TILE_PX = (128, 64, 32, 16)
+#: Relative rms error of a function half way between nodes, and relative error of its light.
 KERNEL_ERROR = 2e-3
+LIGHT_ERROR = 1e-6
 #: The table is refined to so many samples a wavelength's resolution (wavelength x f_number), and heights so many times.
-SAMPLES_PER_RESOLUTION = 14.0
+SAMPLES_PER_RESOLUTION = 8.0
 HEIGHTS_REFINED = 4
 #: Half the side, px, of the squares on which what lies beyond the table's window is spread.
 WING_CELL_PX = 4
@@ -169,6 +171,11 @@ class Distortion:
 def distortion(table: LensTable) -> Distortion:
     """A table's distortion, kept."""
     return Distortion(table)
+
+
+def margin_px(table: LensTable, pitch_um: float) -> int:
+    """Pixels around a frame from which light gets into it: half the table's window and the sampling's reach."""
+    return int(np.ceil(0.5 * table.psf.shape[-1] * table.sample_pitch_um / pitch_um)) + 4
 
 
 def source_grid(table: LensTable, frame: Frame, oversample: int, margin_px: int) -> Grid:
@@ -344,7 +351,8 @@ class Kernels:
         return sampled
 
     def error(self, tile_px: float) -> float:
-        """Relative rms error of the tile's polynomial half way between nodes, at the worst of places over the frame."""
+        """Error of a tile's polynomials half way between nodes, as a share of what is allowed, at the worst of places over the
+        frame."""
         frame, worst = self.frame, 0.0
         spacing = tile_px / DEGREE
         for down, across in ((0.5, 0.5), (0.02, 0.5), (0.02, 0.02), (0.35, 0.65), (0.7, 0.9), (0.5, 0.98)):
@@ -357,14 +365,15 @@ class Kernels:
             g = self.at(x, y).astype(float)
             share = lagrange(np.array(0.5 / DEGREE))
             blend = np.einsum("i,j,ijcab->cab", share, share, g[:-1].reshape(DEGREE + 1, DEGREE + 1, *g.shape[1:]))
-            norm = np.sqrt(np.sum(g[-1] ** 2, axis=(1, 2)))
-            off = np.sqrt(np.sum((blend - g[-1]) ** 2, axis=(1, 2)))
-            worst = max(worst, float(np.max(off / np.maximum(norm, 1e-30))))
+            norm, off = (np.sqrt(np.sum(k**2, axis=(1, 2))) for k in (g[-1], blend - g[-1]))
+            whole, gained = (np.abs(np.sum(k, axis=(1, 2))) for k in (g[-1], blend - g[-1]))
+            for error, of, limit in ((off, norm, KERNEL_ERROR), (gained, whole, LIGHT_ERROR)):
+                worst = max(worst, float(np.max(error / np.maximum(of, 1e-30))) / limit)
         return worst
 
     def tile_px(self) -> int:
         """The largest of the tiles whose polynomials are good enough."""
-        return next((tile for tile in TILE_PX[:-1] if self.error(tile) <= KERNEL_ERROR), TILE_PX[-1])
+        return next((tile for tile in TILE_PX[:-1] if self.error(tile) <= 1.0), TILE_PX[-1])
 
 
 def scatter(
@@ -374,10 +383,12 @@ def scatter(
     places: Sequence[Sequence[tuple[int, int]]],
     period: int,
     image: FloatArray,
+    tile_px: int | None = None,
 ) -> None:
     """Add to `image` (rows, cols) what a picture on the image's grid (see `carry`) gives the pixels of every channel.
 
     `places`: for every channel of `kernels`, the first [row, col] of each of its lattices of `period` px; only those pixels change.
+    `tile_px` None: as large as the kernels' polynomials allow.
     """
     frame, s = kernels.frame, grid.oversample
     half = (kernels.size - s) // 2  # samples before a pixel's first
@@ -387,14 +398,26 @@ def scatter(
             f"the margin of {grid.margin_px} px is below the limit of {halo} px that the lens's window of {2 * kernels.radius_um:g} um asks for: take a wider margin"
         )
     rows, cols = (n // s for n in grid.shape)
-    tile = kernels.tile_px()
+    tile_px = kernels.tile_px() if tile_px is None else tile_px
     row_bounds, col_bounds = (
-        (np.linspace(0, n, max(1, round(n / tile)) + 1).round().astype(int) - grid.margin_px).tolist()
+        (np.linspace(0, n, max(1, round(n / tile_px)) + 1).round().astype(int) - grid.margin_px).tolist()
         for n in (rows, cols)
     )
+    node_col = np.append(
+        np.concatenate([left - 0.5 + _NODES[:-1] * (right - left) for left, right in pairwise(col_bounds)]),
+        col_bounds[-1] - 0.5,
+    )
+    last: Float32Array | None = None
     for top, bottom in pairwise(row_bounds):
-        for left, right in pairwise(col_bounds):
-            g = _tile_kernels(kernels, top, bottom, left, right)
+        node_row = top - 0.5 + _NODES * (bottom - top)
+        fresh = node_row if last is None else node_row[1:]
+        x, y = frame.um(*(a.ravel() for a in np.meshgrid(fresh, node_col, indexing="ij")))
+        at = kernels.at(x, y)
+        at = at.reshape(fresh.size, node_col.size, *at.shape[1:])
+        at = at if last is None else np.concatenate([last[None], at])
+        last = at[-1]
+        for tile, (left, right) in enumerate(pairwise(col_bounds)):
+            g = _by_pixel(at[:, DEGREE * tile : DEGREE * (tile + 1) + 1], kernels, bottom - top, right - left)
             # The tile's sources alone, with nothing around them, columns sorted by their place in the lattice.
             origin = (top - halo) * s - half, (left - halo) * s - half
             high = (bottom + halo) * s + half - origin[0]
@@ -420,23 +443,18 @@ def scatter(
     _spread_wings(picture, grid, kernels, places, period, image)
 
 
-def _tile_kernels(kernels: Kernels, top: int, bottom: int, left: int, right: int) -> Float32Array:
-    """(C, 4, 4, size, size): the weights of a tile's samples, as polynomials in the place of the *pixel*.
+def _by_pixel(at_nodes: Float32Array, kernels: Kernels, height: int, width: int) -> Float32Array:
+    """(C, 4, 4, size, size) from a tile's nodes' (4, 4, C, size, size): polynomials in the place of the *pixel* instead of the source.
 
     L_i(t + tau) = sum_m L_i(t_m + tau) L_m(t) with the nodes t_m: what is a polynomial in the source's place, tau from the
     pixel's, is one in the pixel's.
     """
-    node = np.arange(DEGREE + 1) / DEGREE
-    rows, cols = top - 0.5 + node * (bottom - top), left - 0.5 + node * (right - left)
-    x, y = kernels.frame.um(*(a.ravel() for a in np.meshgrid(rows, cols, indexing="ij")))
-    g = kernels.at(x, y)
-    g = g.reshape(DEGREE + 1, DEGREE + 1, *g.shape[1:])
     tau_px = (np.arange(kernels.size) - 0.5 * (kernels.size - 1)) / kernels.oversample
     by_row, by_col = (
-        np.moveaxis(lagrange(node[:, None] + tau_px[None, :] / n), 0, -1).astype(np.float32)  # [node, tap, i]
-        for n in (bottom - top, right - left)
+        np.moveaxis(lagrange(_NODES[:, None] + tau_px[None, :] / n), 0, -1).astype(np.float32)  # [node, tap, i]
+        for n in (height, width)
     )
-    g = np.einsum("mai,ijcab->mjcab", by_row, g)
+    g = np.einsum("mai,ijcab->mjcab", by_row, at_nodes)
     return np.ascontiguousarray(np.einsum("kbj,mjcab->cmkab", by_col, g))
 
 
@@ -462,8 +480,7 @@ def _padded(spectrum: NDArray[np.complex64], n: int, refine: int) -> NDArray[np.
 
 def lagrange(t: FloatArray) -> FloatArray:
     """Weights of the DEGREE + 1 nodes of a tile for places t (0..1 across it): (DEGREE + 1, *t.shape)."""
-    nodes = np.arange(DEGREE + 1) / DEGREE
-    return np.stack([np.prod([(t - b) / (a - b) for b in nodes if b != a], axis=0) for a in nodes])
+    return np.stack([np.prod([(t - b) / (a - b) for b in _NODES if b != a], axis=0) for a in _NODES])
 
 
 def _spread_wings(
@@ -535,7 +552,6 @@ def _lay_down(out, picture, node_row, node_col, step):  # type: ignore[no-untype
     """Lay every sample's light (value x the determinant of the map) around its image point; the map is bilinear between nodes."""
     ny, nx = picture.shape
     inverse = 1.0 / step
-    weight_row, weight_col = np.empty(4), np.empty(4)
     for i in range(ny):
         a = i // step + 1
         v = (i - (a - 1) * step) * inverse
@@ -554,13 +570,12 @@ def _lay_down(out, picture, node_row, node_col, step):  # type: ignore[no-untype
             row = (r00 * (1.0 - u) + r01 * u) * (1.0 - v) + (r10 * (1.0 - u) + r11 * u) * v
             col = (c00 * (1.0 - u) + c01 * u) * (1.0 - v) + (c10 * (1.0 - u) + c11 * u) * v
             light = value * abs(row_v * col_u - row_u * col_v)
-            _drop(out, row, col, light, weight_row, weight_col)
+            _drop(out, row, col, light)
 
 
 @njit(cache=True)
 def _lay_down_radially(out, picture, x_um, y_um, ratio, area, apart, scale, row0, col0):  # type: ignore[no-untyped-def]
     """`_lay_down` for a map along the radius, from tables over the radius's square."""
-    weight_row, weight_col = np.empty(4), np.empty(4)
     inverse = 1.0 / apart
     for i in range(y_um.size):
         for j in range(x_um.size):
@@ -572,41 +587,54 @@ def _lay_down_radially(out, picture, x_um, y_um, ratio, area, apart, scale, row0
             t = at - k
             by = ratio[k] + t * (ratio[k + 1] - ratio[k])
             light = value * (area[k] + t * (area[k + 1] - area[k]))
-            _drop(out, row0 + y_um[i] * by * scale, col0 + x_um[j] * by * scale, light, weight_row, weight_col)
+            _drop(out, row0 + y_um[i] * by * scale, col0 + x_um[j] * by * scale, light)
 
 
 @njit(cache=True, inline="always")
-def _drop(out, row, col, light, weight_row, weight_col):  # type: ignore[no-untyped-def]
+def _drop(out, row, col, light):  # type: ignore[no-untyped-def]
     """Spread light around a point with a cubic B-spline."""
     k, m = int(np.floor(row)), int(np.floor(col))
     if k >= 1 and m >= 1 and k < out.shape[0] - 2 and m < out.shape[1] - 2:
-        _spline_weights(row - k, weight_row)
-        _spline_weights(col - m, weight_col)
-        for p in range(4):
-            part = light * weight_row[p]
-            for q in range(4):
-                out[k - 1 + p, m - 1 + q] += part * weight_col[q]
+        a0, a1, a2, a3 = _spline_weights(row - k)
+        b0, b1, b2, b3 = _spline_weights(col - m)
+        _add_four(out, k - 1, m - 1, light * a0, b0, b1, b2, b3)
+        _add_four(out, k, m - 1, light * a1, b0, b1, b2, b3)
+        _add_four(out, k + 1, m - 1, light * a2, b0, b1, b2, b3)
+        _add_four(out, k + 2, m - 1, light * a3, b0, b1, b2, b3)
 
 
 @njit(cache=True, inline="always")
-def _spline_weights(t, weight):  # type: ignore[no-untyped-def]
+def _add_four(out, k, m, light, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
+    out[k, m] += light * b0
+    out[k, m + 1] += light * b1
+    out[k, m + 2] += light * b2
+    out[k, m + 3] += light * b3
+
+
+@njit(cache=True, inline="always")
+def _spline_weights(t):  # type: ignore[no-untyped-def]
     """Cubic B-spline at the samples -1, 0, 1, 2 around a point t beyond sample 0."""
     s = 1.0 - t
-    weight[0] = s * s * s / 6.0
-    weight[1] = (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0
-    weight[2] = (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0
-    weight[3] = t * t * t / 6.0
+    return (
+        s * s * s / 6.0,
+        (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0,
+        (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0,
+        t * t * t / 6.0,
+    )
 
 
 @njit(cache=True)
-def _sample(raw, down, across, columns, cosine, sine, offset, samples, first, step, radius):  # type: ignore[no-untyped-def]
+def _sample(  # type: ignore[no-untyped-def]  # noqa: PLR0912
+    raw, down, across, columns, cosine, sine, offset, samples, first, step, radius
+):
     """Functions turned by an angle, at minus the offsets: linear between the four fields around (down, across), by cubic B-splines
     between samples. A symmetric lens's have (0, 1) of the table in the direction (sine, cosine) [x, y]."""
-    weight_row, weight_col = np.empty(4), np.empty(4)
     channels = raw.shape[1]
     rows = samples.shape[0] // columns
     fields, shares = np.empty(4, np.int64), np.empty(4)
-    value = np.empty(channels)
+    # The fields are blended first, with four channels to a sample, which the processor adds at once.
+    blend = np.zeros((samples.shape[1], samples.shape[2], 4), np.float32)
+    value = np.empty(4, np.float32)
     highest = samples.shape[1] - 2.001
     for n in range(down.size):
         p, q = min(int(down[n]), max(rows - 2, 0)), min(int(across[n]), max(columns - 2, 0))
@@ -618,6 +646,13 @@ def _sample(raw, down, across, columns, cosine, sine, offset, samples, first, st
                 if share > 0.0:
                     fields[used], shares[used] = (p + i) * columns + q + j, share
                     used += 1
+        blend[:] = 0.0
+        for f in range(used):
+            share = np.float32(shares[f])
+            for i in range(samples.shape[1]):
+                for j in range(samples.shape[2]):
+                    for c in range(channels):
+                        blend[i, j, c] += share * samples[fields[f], i, j, c]
         for i in range(offset.size):
             for j in range(offset.size):
                 x, y = -offset[j], -offset[i]
@@ -628,15 +663,13 @@ def _sample(raw, down, across, columns, cosine, sine, offset, samples, first, st
                 if row < 1.0 or col < 1.0 or row > highest or col > highest:
                     continue
                 k, m = int(row), int(col)
-                _spline_weights(row - k, weight_row)
-                _spline_weights(col - m, weight_col)
+                weight_row, weight_col = _spline_weights(row - k), _spline_weights(col - m)
                 value[:] = 0.0
-                for f in range(used):
-                    for a in range(4):
-                        for b in range(4):
-                            w = shares[f] * weight_row[a] * weight_col[b]
-                            for c in range(channels):
-                                value[c] += w * samples[fields[f], k - 1 + a, m - 1 + b, c]
+                for a in range(4):
+                    for b in range(4):
+                        w = np.float32(weight_row[a] * weight_col[b])
+                        for c in range(4):
+                            value[c] += w * blend[k - 1 + a, m - 1 + b, c]
                 for c in range(channels):
                     raw[n, c, i, j] = value[c]
 
