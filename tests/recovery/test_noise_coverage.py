@@ -19,7 +19,7 @@ from lab.recording import Camera
 from lab.results import NoiseFit
 from sim.sensor.mosaic import planes
 
-DRAWS = 500
+DRAWS = 300
 #: A coverage of 95.4 % comes out of so many draws with this standard deviation; two of them on either side of 93..97 %.
 ALLOWED = 2.0 * 100.0 * float(np.sqrt(0.954 * 0.046 / DRAWS))
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
