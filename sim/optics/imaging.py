@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_serializer, model_validator
 from scipy.interpolate import RegularGridInterpolator
-from scipy.special import itj0y0, j0, j1
+from scipy.special import sici
 
 from sim.optics.diffraction import diffraction_cutoff_cy_per_um, diffraction_otf
 from sim.optics.pupil import Wavefront, noll_order, osa_order, pupil_otf, pupil_ratio, seidel, zernike
@@ -314,8 +314,8 @@ class TracedLens(Frozen):
         fx, fy = np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float)
         x, y = table.window_um[axis]
         value = _fourier_sum(samples, table.sample_pitch_um, fx, fy) * np.exp(-2j * np.pi * (fx * x + fy * y))
-        radius_um = np.sqrt(samples.size / np.pi) * table.sample_pitch_um
-        value = value + (1.0 - inside) * _beyond(np.hypot(fx, fy) * radius_um)
+        half_um = 0.5 * len(samples) * table.sample_pitch_um
+        value = value + (1.0 - inside) * _beyond(fx, fy, half_um)
         return value * pupil_ratio(fx, fy, wavelength_nm, f_number, aberration)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
@@ -379,10 +379,18 @@ def _fourier_sum(samples: FloatArray, pitch_um: float, fx: FloatArray, fy: Float
     return np.where(passed, total.reshape(shape), 0.0)
 
 
-def _beyond(f_radius: FloatArray) -> FloatArray:
-    """Transfer of light laid out as 1/r^3 outside a circle of radius R, as an aperture's rim diffracts it; argument f R.
+def _beyond(fx: FloatArray, fy: FloatArray, half_um: float) -> FloatArray:
+    """Transfer of light laid out as 1/r^3 outside a square of half-width `half_um`, as an aperture's rim diffracts it; 1 at f = 0.
 
-    integral_1^inf J0(a u) / u^2 du = J0(a) - a [1 - integral_0^a J0 + J1(a)], a = 2 pi f R; 1 at f = 0.
+    In each direction from the square's rim outwards integral_1^inf cos(a t) / t^2 dt = cos a - a (pi/2 - Si a), a = 2 pi f_along rim;
+    over the directions a sum.
     """
-    a = 2.0 * np.pi * f_radius
-    return np.asarray(j0(a) - a * (1.0 - itj0y0(a)[0] + j1(a)))
+    phi = np.pi * (np.arange(96) + 0.5) / 96
+    cos, sin = np.cos(phi), np.sin(phi)
+    rim = half_um / np.maximum(np.abs(cos), np.abs(sin))
+    fx, fy = np.broadcast_arrays(np.asarray(fx, float), np.asarray(fy, float))
+    total = np.zeros(fx.shape)
+    for c, s, r in zip(cos, sin, rim, strict=True):
+        along = 2.0 * np.pi * r * np.abs(fx * c + fy * s)
+        total += (np.cos(along) - along * (0.5 * np.pi - sici(along)[0])) / r
+    return np.asarray(total / np.sum(1.0 / rim))
