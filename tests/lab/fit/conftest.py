@@ -12,7 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lab.fit.geometry import fit_geometry
 from lab.recording import Camera, Charuco, Manifest, RecordingSet
+from lab.results import GeometryFit
 
 SHAPE = (300, 400)
 OVER = 3  # rays a pixel and axis
@@ -77,20 +79,26 @@ def undistorted(x, y, distortion) -> NDArray[np.float64]:
     return np.column_stack([u, v, np.ones_like(u)])
 
 
+@functools.cache
+def fine_rays(matrix: tuple[float, ...], distortion: tuple[float, ...]) -> NDArray[np.float64]:
+    """Rays (n, 3) through all samples of a frame, row by row; the same for every board that a camera sees."""
+    fine = (np.arange(SHAPE[0] * OVER) + 0.5) / OVER - 0.5, (np.arange(SHAPE[1] * OVER) + 0.5) / OVER - 0.5
+    y, x = np.meshgrid(*fine, indexing="ij")
+    return undistorted((x.ravel() - matrix[2]) / matrix[0], (y.ravel() - matrix[5]) / matrix[4], distortion)
+
+
 def draw(capture: Charuco, matrix, distortion, rotation, translation, blur_px=0.6) -> NDArray[np.float64]:
     """Share of the light, (rows, cols), 1 outside of the board."""
     mm_per_texel = 0.25
     board = texture(capture, mm_per_texel)
-    fine = (np.arange(SHAPE[0] * OVER) + 0.5) / OVER - 0.5, (np.arange(SHAPE[1] * OVER) + 0.5) / OVER - 0.5
-    y, x = np.meshgrid(*fine, indexing="ij")
-    rays = undistorted((x.ravel() - matrix[0, 2]) / matrix[0, 0], (y.ravel() - matrix[1, 2]) / matrix[1, 1], distortion)
+    rays = fine_rays(tuple(matrix.ravel()), tuple(distortion))
     to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], translation]))
     at = rays @ to_board.T
     col, row = (at[:, :2] / at[:, 2:] / mm_per_texel).T
     inside = (row >= 0) & (row < board.shape[0]) & (col >= 0) & (col < board.shape[1])
     value = np.ones(len(row))
     value[inside] = board[row[inside].astype(int), col[inside].astype(int)]
-    image = value.reshape(y.shape)
+    image = value.reshape(SHAPE[0] * OVER, SHAPE[1] * OVER)
     image = ndimage.gaussian_filter(image, blur_px * OVER)
     return image.reshape(SHAPE[0], OVER, SHAPE[1], OVER).mean(axis=(1, 3))
 
@@ -167,6 +175,12 @@ def boards() -> Callable[..., RecordingSet]:
 def charuco_boards() -> RecordingSet:
     """ChArUco boards on a Bayer pair."""
     return make_boards()
+
+
+@pytest.fixture(scope="session")
+def charuco_fits(charuco_boards: RecordingSet) -> dict[str, GeometryFit]:
+    """The geometry of both cameras of `charuco_boards`."""
+    return {"left": fit_geometry(charuco_boards, "left"), "right": fit_geometry(charuco_boards, "right")}
 
 
 @pytest.fixture(scope="session")

@@ -48,9 +48,9 @@ def test_corner_is_found_where_it_is():
     assert np.abs(np.mean(found, axis=0)).max() < 4 * scatter / np.sqrt(60)
 
 
-def test_intrinsics_of_a_bayer_camera_are_recovered_within_their_uncertainty(charuco_boards, truth):
+def test_intrinsics_of_a_bayer_camera_are_recovered_within_their_uncertainty(charuco_fits, truth):
     for side, matrix in (("left", truth.left), ("right", truth.right)):
-        fit = fit_geometry(charuco_boards, side)
+        fit = charuco_fits[side]
         gap = np.array(fit.camera_matrix) - matrix
         std = np.array(fit.camera_matrix_std)
         for at in ((0, 0), (1, 1), (0, 2), (1, 2)):
@@ -253,9 +253,9 @@ def test_lateral_colour_of_drawn_corners():
     assert red.camera_matrix[0][0] / green.camera_matrix[0][0] == pytest.approx(1.0003, abs=1e-4)
 
 
-def test_colours_of_a_camera_without_lateral_colour_agree(charuco_boards):
+def test_colours_of_a_camera_without_lateral_colour_agree(charuco_fits):
     """Corners on each colour's own pixels: no channel may be displaced, whatever its place in the mosaic."""
-    fit = fit_geometry(charuco_boards, "left")
+    fit = charuco_fits["left"]
     assert [channel.channel for channel in fit.channels] == ["R", "G", "B"]
     for channel in fit.channels:
         if channel.channel != "G":
@@ -264,8 +264,8 @@ def test_colours_of_a_camera_without_lateral_colour_agree(charuco_boards):
             assert abs(channel.radial_shift_px[-1]) < 5 * channel.radial_shift_px_std[-1]
 
 
-def test_result_says_what_it_rests_on(charuco_boards):
-    fit = fit_geometry(charuco_boards, "left")
+def test_result_says_what_it_rests_on(charuco_fits):
+    fit = charuco_fits["left"]
     assert fit.parameters == (
         "fx",
         "fy",

@@ -18,9 +18,8 @@ from tests.lab.fit.projected import SHAPE, poses, seen
 PAIRS = Path(__file__).parents[3].parent / "shared" / "data" / "opencv_stereo"
 
 
-def test_rig_is_recovered_within_its_uncertainty(charuco_boards, truth):
-    left, right = fit_geometry(charuco_boards, "left"), fit_geometry(charuco_boards, "right")
-    fit = fit_stereo(charuco_boards, left, right)
+def test_rig_is_recovered_within_its_uncertainty(charuco_boards, charuco_fits, truth):
+    fit = fit_stereo(charuco_boards, charuco_fits["left"], charuco_fits["right"])
     assert fit.pairs == 8
     assert abs(fit.baseline_mm / truth.baseline_mm - 1) < 0.005  # the goal of the mock bench
     assert abs(fit.baseline_mm - truth.baseline_mm) < 4 * fit.baseline_mm_std
@@ -31,8 +30,7 @@ def test_rig_is_recovered_within_its_uncertainty(charuco_boards, truth):
     assert fit.rms_px < 0.1
 
 
-def test_poses_of_one_camera_alone_are_no_pairs(charuco_boards):
-    left, right = fit_geometry(charuco_boards, "left"), fit_geometry(charuco_boards, "right")
+def test_poses_of_one_camera_alone_are_no_pairs(charuco_boards, charuco_fits):
     captures = [
         c if c.side == "left" else c.model_copy(update={"pose": f"other-{c.pose}"})
         for c in charuco_boards.manifest.captures
@@ -42,7 +40,7 @@ def test_poses_of_one_camera_alone_are_no_pairs(charuco_boards):
         frames={c.frame: charuco_boards.frame(c) for c in captures},
     )
     with pytest.raises(NotDetermined, match="0 poses"):
-        fit_stereo(apart, left, right)
+        fit_stereo(apart, charuco_fits["left"], charuco_fits["right"])
 
 
 def drawn_pairs(rng: np.random.Generator, noise_px: float = 0.1, count: int = 10):
