@@ -94,7 +94,7 @@ class PlaneStatistics:
     `pattern_variance` the same after shading has been taken out. `every_pixel` and `temporal_variance_of_all` count defects,
     too, as EMVA 1288 does; `pattern` is the split after shading. `adjacent_covariance` and `diagonal_covariance`: temporal, of a
     pixel with one of its four neighbours along rows and columns, and across corners, on the mosaic (of whatever plane).
-    `shading_rows`, `shading_columns`: the smooth surface's mean over the first and the last row (column), over `mean`, dark included.
+    `shading_rows`, `shading_columns`: the smooth surface's mean over the first and the last tenth of the rows (columns), over `mean`, dark included.
     """
 
     pixels: int
@@ -493,6 +493,7 @@ class Stack:
         split = SpatialVariance.split(pattern, rows_mean, cols_mean, (rows, cols), share, share_std)
         shares = np.mean([share[:3, phase] for share in self._shares], axis=0)
         adjacent, diagonal, covariance_std = self._covariances(phase, variance)
+        tenth = max(rows // 10, 1), max(cols // 10, 1)
         return PlaneStatistics(
             pixels=pixels,
             mean=float(np.mean([means[phase] for means in self._frame_means])),
@@ -516,8 +517,11 @@ class Stack:
             adjacent_covariance=adjacent,
             diagonal_covariance=diagonal,
             covariance_std=covariance_std,
-            shading_rows=(float(surface[0].mean() / first[0]), float(surface[-1].mean() / first[0])),
-            shading_columns=(float(surface[:, 0].mean() / first[0]), float(surface[:, -1].mean() / first[0])),
+            shading_rows=(float(surface[: tenth[0]].mean() / first[0]), float(surface[-tenth[0] :].mean() / first[0])),
+            shading_columns=(
+                float(surface[:, : tenth[1]].mean() / first[0]),
+                float(surface[:, -tenth[1] :].mean() / first[0]),
+            ),
         )
 
     def _covariances(self, phase: int, variance: float) -> tuple[float, float, float]:

@@ -1103,7 +1103,7 @@ class _Evaluation:
             return
         first_row, last_row, first_col, last_col = np.mean(edges, axis=0)
         found = [
-            f"{axis} from {first:.3f} at the first to {last:.3f} at the last"
+            f"{axis} from {first:.3f} in their first tenth to {last:.3f} in their last"
             for axis, first, last in (("rows", first_row, last_row), ("columns", first_col, last_col))
             if abs(last - first) > ASYMMETRY
         ]
