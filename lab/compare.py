@@ -37,6 +37,7 @@ Array = NDArray[np.floating[Any]]
 
 FALSE_ALARM_RATE = 0.01
 MIN_SEEN = 20  # corners, below which no implied motion is determined
+ROUNDING = 1e-9  # of a value: a smaller uncertainty is none
 FEW = 9  # numbers in a row of their own each; more are a curve
 POINTS = (PhotonTransfer, Emva1288Points)  # of plots: of the recordings, not of the camera
 OF_THE_SET_UP = {"angle_deg"}  # an edge's angle says nothing about the camera
@@ -188,7 +189,9 @@ def _aligned(a: _Numbers, b: _Numbers) -> tuple[_Numbers, _Numbers]:
 def _rows(a: _Numbers, b: _Numbers, side: Side | None) -> Iterator[Change]:
     value_a, value_b, std_a, std_b = (np.ravel(part) for part in (a.value, b.value, a.std, b.std))
     std = np.hypot(std_a, std_b)
-    known = np.flatnonzero(np.isfinite(value_a + value_b) & np.isfinite(std) & (std > 0))
+    # A normalised curve is 1 at frequency 0 by definition: its uncertainty there is that of rounding, and so is the difference.
+    least = ROUNDING * np.maximum(np.abs(value_a), np.abs(value_b))
+    known = np.flatnonzero(np.isfinite(value_a + value_b) & np.isfinite(std) & (std > least))
     if not len(known):
         return
     score = np.abs(value_b - value_a)[known] / std[known]

@@ -98,6 +98,29 @@ def test_one_point_of_a_curve_is_found_with_its_place():
     assert row.n == 31
 
 
+def test_rounding_is_no_change():
+    """A normalised curve is 1 at frequency 0 but for rounding, and states an uncertainty of that size."""
+    one, two = (
+        FitResult(
+            source="m",
+            cameras={
+                "left": CameraFit(
+                    mtf=(
+                        MtfCurve(
+                            capture="edge-1", channel="G", angle_deg=5.0, frequency_cy_per_px=(0.0, 0.1),
+                            mtf=(1.0 - off, 0.9), mtf_std=(1e-17, 0.01),
+                        ),
+                    )
+                )
+            },
+        )
+        for off in (0.0, 5e-16)
+    )  # fmt: skip
+    result = compare(one, two)
+    assert not result.changed
+    assert [row.where for row in result.changes] == ["frequency 0.1 cy/px"]
+
+
 def test_a_curve_on_another_axis_is_compared_where_both_reach():
     other = made(2)
     spectral = SpectralFit(
