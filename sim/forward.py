@@ -219,6 +219,7 @@ def expected_electrons(
     margin is taken as the scene's other end. On random cells of 2 px at f/4 and 3 um pixels, 2, 3, 4, 6 samples a pixel leave
     0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4.
     """
+    check_overlap(camera, exposure.scene)
     collected_s, source = exposure.exposure_s, 1.0
     for effect in effects:
         collected_s = effect.exposure(collected_s)
@@ -237,6 +238,50 @@ def expected_electrons(
     for effect in effects:
         electrons = effect.overflow(electrons, camera)
     return electrons
+
+
+def check_overlap(camera: CameraModel, scene: Scene) -> None:
+    """Raises ValueError for a scene that sheds light, none of which any channel can see: most likely a unit was mistaken."""
+    lights = [value for item in vars(scene).values() for value in (item if isinstance(item, tuple) else (item,))]
+    spectra = [light for light in lights if isinstance(light, Spectrum)]
+    if isinstance(scene, SpectralImage):
+        brightest = np.max(scene.radiance.reshape(-1, scene.radiance.shape[2]), axis=0)
+        spectra = [Spectrum.of(scene.wavelength_nm, brightest)]
+    shining = [light for light in spectra if max(light.value) > 0]
+    seen = [_span_nm([_efficiency(camera, channel)]) for channel in camera.channels]
+    lit = _span_nm(shining)
+    if shining and all(min(high, lit[1]) <= max(low, lit[0]) for low, high in seen):
+        low, high = min(span[0] for span in seen), max(span[1] for span in seen)
+        raise ValueError(
+            f"the scene's light lies at {lit[0]:g} to {lit[1]:g} nm, outside the limits {low:g} to {high:g} nm of the quantum efficiency: give wavelengths in nm, or a curve that reaches the light"
+        )
+
+
+def _span_nm(curves: Sequence[Spectrum]) -> tuple[float, float]:
+    """Between which wavelengths any of some curves is above 0."""
+    low, high = np.inf, -np.inf
+    for curve in curves:
+        wavelength_nm, value = curve.arrays
+        above = np.flatnonzero(value > 0)
+        if above.size:
+            low = min(low, float(wavelength_nm[max(above[0] - 1, 0)]))
+            high = max(high, float(wavelength_nm[min(above[-1] + 1, value.size - 1)]))
+    return low, high
+
+
+def check_not_saturated(camera: CameraModel, exposure: Exposure, electrons: FloatArray) -> None:
+    """Raises ValueError where an exposure saturates every pixel: nothing of the scene would be left in the frame.
+
+    `electrons`: of `expected_electrons`. The limit is the full well, or what the converter reads at the gain. (The physics of
+    clipping is in `expected` and `sample` all the same: whoever simulates calls this first.)
+    """
+    room_dn = camera.white_level_dn - camera.black_level_dn
+    limit = min(camera.full_well_e, room_dn / sensor.gain_dn_per_e(camera, exposure.gain_db))
+    darkest = float(np.min(electrons))
+    if darkest >= limit:
+        raise ValueError(
+            f"exposure {exposure.exposure_s:g} s saturates all pixels: the darkest collects {darkest:.4g} e, and the limit is {limit:.4g} e at {exposure.gain_db:g} dB; expose {0.5 * exposure.exposure_s * limit / darkest:.2g} s, lower the gain or dim the light"
+        )
 
 
 def dark_electrons(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = ()) -> FloatArray | float:

@@ -50,9 +50,13 @@ class Quantity:
         def check(value: Any) -> Any:
             if isinstance(value, int | float):
                 if self.lower is not None and value < self.lower:
-                    raise ValueError(f"{value} {self.unit} is below the lower limit {self.lower} {self.unit}")
+                    raise ValueError(
+                        f"{self.meaning}: {value} {self.unit} is below the lower limit {self.lower} {self.unit}; give a value within the limits"
+                    )
                 if self.upper is not None and value > self.upper:
-                    raise ValueError(f"{value} {self.unit} is above the upper limit {self.upper} {self.unit}")
+                    raise ValueError(
+                        f"{self.meaning}: {value} {self.unit} is above the upper limit {self.upper} {self.unit}; give a value within the limits"
+                    )
             return value
 
         return core_schema.no_info_after_validator_function(check, handler(source))
