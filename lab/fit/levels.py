@@ -533,6 +533,8 @@ class Stack:
         pairs = self.pairs[:, phase] / freedom
         adjacent, diagonal = self.products[:, phase] / freedom / np.maximum(pairs, 1)
         independent = pairs[0] / (2.0 if self.period == 1 else 1.0)
+        if self.period == 1:  # a frame's mean, which was taken out, is of the neighbours, too
+            adjacent, diagonal = (value + variance / self._good[phase] for value in (adjacent, diagonal))
         return float(adjacent), float(diagonal), float(variance / np.sqrt(max(independent, 1.0) * freedom))
 
 

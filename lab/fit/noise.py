@@ -942,11 +942,19 @@ class _Evaluation:
                 or signal > CURVE_LIMIT * self.saturation[name]
             ):
                 continue
+            adjacent = [level.plane[n].mean - self.lines[n].black for n in ADJACENT[name]]
+            number = self.flats.index(level)
+            if any(
+                self.clipped[n][number] or value > CURVE_LIMIT * self.saturation[n]
+                for n, value in zip(ADJACENT[name], adjacent, strict=True)
+            ):
+                continue
+            beside = float(np.mean(adjacent))
             below, below_std = dark.get(name, (0.0, 0.0))
             value = 4.0 * (plane.adjacent_covariance + plane.diagonal_covariance) - below
-            rows.append(
-                (gain * signal**2 / highest, value, float(np.hypot(np.sqrt(32.0) * plane.covariance_std, below_std)))
-            )
+            # The neighbours' noise counts as the pixel's own does.
+            std_of_both = np.sqrt(32.0 * max(beside / max(signal, 1e-9), 0.1)) * plane.covariance_std
+            rows.append((gain * signal * beside / highest, value, float(np.hypot(std_of_both, below_std))))
         if len(rows) < 3:
             return None
         x, y, std = np.array(rows).T

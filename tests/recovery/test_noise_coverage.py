@@ -183,8 +183,9 @@ def linearity_error(t: Truth) -> float:
     errors = []
     for share in ("R", "G1", "G2", "B"):
         light = np.array([v for v in t.flats if t.rate * v * t.share[share] < 0.97 * t.well])
-        charge = t.rate * light * t.share[share]
-        signal = t.gain * charge * (1.0 - t.bend * charge / t.well)
+        dark = t.dark * light  # bends with the rest, and is taken off bent
+        charge = t.rate * light * t.share[share] + dark
+        signal = t.gain * (charge * (1.0 - t.bend * charge / t.well) - dark * (1.0 - t.bend * dark / t.well))
         share_of = signal / (t.gain * t.well * (1.0 - t.bend))
         chosen = (share_of >= 0.05) & (share_of <= 0.95)
         errors.append(linearity(light[chosen], signal[chosen], np.full(chosen.sum(), 1e-9)).error_percent)
