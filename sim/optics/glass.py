@@ -113,11 +113,11 @@ def refractive_index(
 
 
 def indices(prescription: Prescription, wavelength_nm: ArrayLike) -> FloatArray:
-    """(wavelengths, surfaces + 1): the index before the first surface and behind each one."""
+    """(wavelengths, surfaces + 1): the index before the first surface and behind each one; the image lies in what is before it."""
     w = np.asarray(wavelength_nm, float)
     behind = [np.ones_like(w)]
     for number, surface in enumerate(prescription.surfaces, start=1):
-        if surface.kind == "coordinate_break":
+        if surface.kind == "coordinate_break" or number == len(prescription.surfaces):
             behind.append(behind[-1])
         else:
             behind.append(refractive_index(surface.glass, w, prescription.catalogues, f"surface {number}"))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 
 from sim.spectrum import FloatArray
 
@@ -146,6 +147,13 @@ def _terms(x: FloatArray, y: FloatArray, order: int) -> FloatArray:
     return np.stack([tx[..., i] * ty[..., j] for i in range(order + 1) for j in range(order + 1 - i)], axis=-1)
 
 
+def _dense(closed: FloatArray, factor: int = 8) -> FloatArray:
+    """A closed curve's coordinate at `factor` times as many points, by a periodic cubic spline."""
+    count = closed.size
+    spline = CubicSpline(np.arange(count + 1), np.append(closed, closed[0]), bc_type="periodic")
+    return np.asarray(spline(np.arange(count * factor) / factor))
+
+
 def _chords(rim_along: FloatArray, rim_across: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Where lines at `across` enter and leave the rim's polygon: its lower and upper end along the other axis."""
     a0, c0 = rim_along, rim_across
@@ -210,30 +218,44 @@ class _FittedWave:
 
     def transfer(self, frequency_lp_per_mm: FloatArray, tangential: bool) -> ComplexArray:
         rays = self.rays
-        rim_along, rim_across = rays.rim_cosine_x, rays.rim_cosine_y
+        rim_along, rim_across = _dense(rays.rim_cosine_x), _dense(rays.rim_cosine_y)
         if tangential:
             rim_along, rim_across = rim_across, rim_along
         t, weight = np.polynomial.legendre.leggauss(self.nodes)
-        # Lines in equal steps of the arc sine: the square-root ends of the chords cost no accuracy.
-        theta = 0.5 * np.pi * t
-        middle, reach = 0.5 * (rim_across.min() + rim_across.max()), 0.5 * np.ptp(rim_across)
-        across = middle + reach * np.sin(theta)
-        line_weight = weight * 0.5 * np.pi * reach * np.cos(theta)
-        low, high = _chords(rim_along, rim_across, across)
-        c = np.broadcast_to(across[:, None], (across.size, t.size))
+        everywhere = np.linspace(rim_across.min(), rim_across.max(), 402)[1:-1]
+        low, high = _chords(rim_along, rim_across, everywhere)
+        chord = np.nan_to_num(high - low, posinf=0.0, neginf=0.0)
 
-        def wave(along: FloatArray) -> tuple[FloatArray, FloatArray]:
+        def wave(along: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
+            c = np.broadcast_to(across[:, None], along.shape)
             x, y = (c, along) if tangential else (along, c)
             terms = _terms((x - self.centre[0]) / self.half[0], (y - self.centre[1]) / self.half[1], self.order)
             values = terms @ self.coefficients
             return values[..., 0], values[..., 1]
 
         def overlap(shift: float) -> complex:
-            length = np.maximum(np.nan_to_num(high - low - shift, posinf=0.0, neginf=0.0), 0.0)
-            start = np.where(length > 0, low + 0.5 * shift, middle)
-            along = start[:, None] + 0.5 * length[:, None] * (1.0 + t)
-            path_far, amplitude_far = wave(along + 0.5 * shift)
-            path_near, amplitude_near = wave(along - 0.5 * shift)
+            inside = np.flatnonzero(chord > shift)
+            if inside.size == 0:
+                return 0.0j
+            # Where the pupil and its shifted self part, between two of the lines: the chord is as long as the shift.
+            ends = []
+            for k, step in ((inside[0], -1), (inside[-1], 1)):
+                beyond = k + step
+                if not 0 <= beyond < chord.size:
+                    ends.append(rim_across.min() if step < 0 else rim_across.max())
+                    continue
+                share = (chord[k] - shift) / (chord[k] - chord[beyond])
+                ends.append(everywhere[k] + share * (everywhere[beyond] - everywhere[k]))
+            # Lines in equal steps of the arc sine: the square-root ends of the chords cost no accuracy.
+            theta, reach = 0.5 * np.pi * t, 0.5 * (ends[1] - ends[0])
+            across = 0.5 * (ends[0] + ends[1]) + reach * np.sin(theta)
+            line_weight = weight * 0.5 * np.pi * reach * np.cos(theta)
+            start, end = _chords(rim_along, rim_across, across)
+            length = np.maximum(np.nan_to_num(end - start, posinf=0.0, neginf=0.0) - shift, 0.0)
+            middle = np.where(length > 0, 0.5 * (start + end), 0.0)
+            along = middle[:, None] + 0.5 * length[:, None] * t
+            path_far, amplitude_far = wave(along + 0.5 * shift, across)
+            path_near, amplitude_near = wave(along - 0.5 * shift, across)
             phase = 2e6 * np.pi / rays.wavelength_nm * (path_far - path_near)
             value = amplitude_far * amplitude_near * np.exp(1j * phase)
             return complex(np.sum(line_weight * 0.5 * length * (value @ weight)))

@@ -16,7 +16,7 @@ import numpy as np
 from sim.spectrum import FloatArray
 
 #: Goes into every content hash: a table that an older way of computing made isn't taken from the cache.
-TABLE_VERSION = 2
+TABLE_VERSION = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ class LensTable:
     def load(cls, path: Path | str) -> Self:
         """Read what `save` wrote. ValueError, in one line, for a file that isn't there, is damaged or isn't a lens table."""
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
                 values = {item.name: stored[item.name] for item in fields(cls)}
             plain: dict[str, Any] = {name: value.item() if value.ndim == 0 else value for name, value in values.items()}
             plain["grid_shape"] = tuple(int(count) for count in values["grid_shape"])

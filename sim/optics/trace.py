@@ -501,12 +501,12 @@ class OpticalSystem:
     def works(self, tangents: Sequence[tuple[float, float]], wavelengths_nm: Sequence[float]) -> tuple[int, str]:
         """How many of a row of field points from the centre out work, and what ends them.
 
-        A field point works where the chief ray reaches the image, farther out than the one before, and some light comes
+        A field point works where the chief ray reaches the image, farther from the first one's than the one before, and some light comes
         through, at every one of the wavelengths.
         """
         count, reason = len(tangents), ""
         for w in wavelengths_nm:
-            height = -1e-12
+            height, origin = -1.0, (0.0, 0.0)
             for i, (tangent, place) in enumerate(zip(tangents, self.starts(tangents, w), strict=True)):
                 if i >= count:
                     break
@@ -514,7 +514,9 @@ class OpticalSystem:
                     count, reason = i, "the chief ray is lost"
                     break
                 row = self.trace(tangent, w, place[0], place[1])[0]
-                out = math.hypot(row[rt.X], row[rt.Y])
+                if i == 0:
+                    origin = (row[rt.X], row[rt.Y])
+                out = math.hypot(row[rt.X] - origin[0], row[rt.Y] - origin[1])
                 if out <= height:
                     count, reason = i, "the image turns back"
                     break
@@ -678,8 +680,8 @@ class OpticalTable:
             window[f] = 0.5 * (centroid[:, f].min(axis=0) + centroid[:, f].max(axis=0))
             about = float(chief[f, 0] + 1e-3 * window[f, 0]), float(chief[f, 1] + 1e-3 * window[f, 1])
             blur = max(float(np.max(np.hypot(p.x_mm - about[0], p.y_mm - about[1]))) for p in coarse)
-            # Light that arrives three half diagonals away doesn't reach into the window.
-            reach = min(blur, 3.0 * half_diagonal)
+            # Of light that arrives four half diagonals away, next to nothing is diffracted into the window.
+            reach = min(blur, 4.0 * half_diagonal)
             sine = max(0.5 * max(np.ptp(p.rim_cosine_x), np.ptp(p.rim_cosine_y)) for p in coarse)
             span = coarse[0].wave_number_per_mm * float(sine) * (half_diagonal + reach)
             for i, pupil in enumerate(self._pupils(tangent, centre, span, solid[:, f])):
