@@ -433,17 +433,19 @@ class _Placed:
         size, extra = self.spline.size, len(columns)
         rows = np.concatenate([self.powers, columns])
         weighted = rows if weight is None else rows * weight
+        bounds = zip(self.starts[:-1], self.starts[1:], strict=True)
+        parts = np.array([weighted[:, start:stop] @ rows[:, start:stop].T for start, stop in bounds])
+        pieces = self.spline.pieces
+        core = pieces.transpose(0, 2, 1) @ parts[:, :4, :4] @ pieces
+        cross = pieces.transpose(0, 2, 1) @ parts[:, :4, 4:]
         out = np.zeros((size + extra,) * 2)
-        for i, (start, stop) in enumerate(zip(self.starts[:-1], self.starts[1:], strict=True)):
-            if stop == start:
-                continue
-            piece = self.spline.pieces[i]
-            part = weighted[:, start:stop] @ rows[:, start:stop].T
-            cross = piece.T @ part[:4, 4:]
-            out[i : i + 4, i : i + 4] += piece.T @ part[:4, :4] @ piece
-            out[i : i + 4, size:] += cross
-            out[size:, i : i + 4] += cross.T
-            out[size:, size:] += part[4:, 4:]
+        at = np.arange(len(parts))
+        for k in range(4):
+            out[at + k, size:] += cross[:, k]
+            for other in range(4):
+                out[at + k, at + other] += core[:, k, other]
+        out[size:, :size] = out[:size, size:].T
+        out[size:, size:] = parts[:, 4:, 4:].sum(axis=0)
         return out
 
 
@@ -656,7 +658,7 @@ def _measure(
     variance = np.ones_like(value)
     used = np.ones(len(value), dtype=bool)
     esf = np.clip(0.5 + distance, 0.0, 1.0)
-    solution = np.zeros(0)
+    solution, chosen = np.zeros(0), (1, 1, 1)
     for _ in range(PASSES):
         weight = np.where(used, 1.0 / variance, 0.0)
         gradients = _gradients(distance, foot * edge.half_length, esf + offset, room)
@@ -665,7 +667,7 @@ def _measure(
         if not len(solution):
             precision = spline.roughness(SMOOTHING * np.trace(matrix[:size, :size]) / size)
         else:
-            precision = _prior_precision(spline, solution[:size], matrix, right, width, outer)
+            precision, chosen = _prior_precision(spline, solution[:size], matrix, right, width, outer, chosen)
         matrix[:size, :size] += precision
         normal = np.linalg.inv(matrix)
         solution = normal @ right
@@ -706,9 +708,16 @@ def _measure(
 
 
 def _prior_precision(
-    spline: Spline, coefficients: Array, matrix: Array, right: Array, width: float, reach: float
-) -> Array:
-    """Inverse covariance of the ESF's coefficients, (size, size), with nothing said of its levels.
+    spline: Spline,
+    coefficients: Array,
+    matrix: Array,
+    right: Array,
+    width: float,
+    reach: float,
+    best: tuple[int, int, int],
+) -> tuple[Array, tuple[int, int, int]]:
+    """Inverse covariance of the ESF's coefficients, (size, size), with nothing said of its levels; and where
+    it stands on the grid of lengths, strengths and amplitudes, on which the search for it begins at `best`.
 
     The line spread's mass between knots is a Gaussian process of two parts. Near the edge: envelope x correlation x envelope,
     the envelope from the estimate itself, strength and length by evidence given the normal equations, as for kernels
@@ -755,12 +764,11 @@ def _prior_precision(
             tried[at_grid] = evidence, precision
         return tried[at_grid][0]
 
-    best = (1, 1, 1)
     while True:
         around = [(best[0] + i, best[1] + j, best[2] + k) for i, j, k in _PRIOR_STEPS]
         uphill = max(around, key=value)
         if value(uphill) <= value(best):
-            return tried[best][1]
+            return tried[best][1], best
         best = uphill
 
 

@@ -176,9 +176,12 @@ def test_corner_errors_of_three_tenths_of_a_pixel_are_taken_out():
     placed = estimate_kernel(*misplaced_target(kernel, 0.0), 15)
     joint = estimate_kernel(*misplaced_target(kernel, 0.3), 15)
     believed = estimate_kernel(*misplaced_target(kernel, 0.3), 15, register=False)
-    # of what is left, 1 dB is the grid's, which isn't the checkerboard's; the rest a common shift of some 0.004 px
-    assert psnr_db(joint.kernel, kernel) > psnr_db(placed.kernel, kernel) - 4.0
-    assert psnr_db(joint.kernel, kernel) > psnr_db(believed.kernel, kernel) + 6.0
+    # a common shift, of some 0.004 px here, is the kernel's: moduli of the transforms don't see it
+    wrong = [
+        np.linalg.norm(np.abs(np.fft.fft2(f.kernel)) - np.abs(np.fft.fft2(kernel))) for f in (placed, joint, believed)
+    ]
+    assert wrong[1] < 1.6 * wrong[0]
+    assert wrong[2] > 4.0 * wrong[1]
 
 
 def test_a_target_in_its_place_is_left_there():
