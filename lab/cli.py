@@ -32,6 +32,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from lab import recording
+from lab.challenge.command import commands as challenge
 from lab.errors import DeviceError, InputError
 from lab.fit import Progress as Advance
 from lab.fit import fit_recording_set
@@ -743,6 +744,9 @@ def _await_ready(bench: subprocess.Popen[str]) -> None:
     threading.Thread(target=listen, daemon=True).start()
     if not ready.wait(BENCH_START_S) or bench.poll() is not None:
         raise DeviceError("mock bench: it doesn't start; see what `calibench bench` says")
+
+
+app.add_typer(challenge)
 
 
 # --- entry -------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,103 @@
+"""`calibench challenge make` and `calibench challenge score`."""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lab.errors import InputError
+
+commands = typer.Typer(
+    name="challenge",
+    help="Concealed-effect data with sealed truths, and its scoring.",
+    no_args_is_help=True,
+    add_completion=False,
+)
+
+Jobs = Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes (all cores)")]
+EXIT_CHECK = 4
+
+
+def _say(text: str, share: float) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{text} ({100 * share:.0f} %)", end="" if share < 1 else "\n", file=sys.stderr, flush=True)
+
+
+@commands.command("make")
+def make_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="the folder to write")],
+    cases: Annotated[int, typer.Option("--cases", min=1, metavar="N", help="how many recording sets")] = 40,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, metavar="S", help="what the cases are drawn from (without: a fresh one)"),
+    ] = None,
+    truths: Annotated[
+        Path | None, typer.Option("--truths", metavar="FILE", help="where the truths go (DIR.truths.json beside DIR)")
+    ] = None,
+    size: Annotated[str, typer.Option("--size", help="small, medium or full frames")] = "medium",
+    cfa: Annotated[str | None, typer.Option("--cfa", help="MONO, RGGB, ... for all cases (without: as drawn)")] = None,
+    proof: Annotated[
+        bool, typer.Option("--proof", help="a proof: its seed is scored once, and never tuned on")
+    ] = False,
+    jobs: Jobs = None,
+) -> None:
+    """Write sealed recording sets with concealed truths. An interrupted one goes on where it stopped."""
+    from lab.challenge.make import checkout, make
+    from lab.challenge.proof import refuse_scored
+    from lab.challenge.truth import FIRST_FRESH_SEED, FIRST_PROOF_SEED, purpose_of
+
+    root = checkout()
+    if seed is None:
+        seed = random.SystemRandom().randrange(
+            *((FIRST_PROOF_SEED, FIRST_FRESH_SEED) if proof else (0, FIRST_PROOF_SEED))
+        )
+    if proof and purpose_of(seed) == "tuning":
+        raise InputError(
+            f"seed {seed}: seeds below {FIRST_PROOF_SEED} are for tuning; give a proof one from {FIRST_PROOF_SEED} on"
+        )
+    if not proof and purpose_of(seed) == "proof":
+        raise InputError(
+            f"seed {seed}: seeds from {FIRST_PROOF_SEED} to {FIRST_FRESH_SEED - 1} are for proofs; give one below to tune, or --proof"
+        )
+    if proof:
+        refuse_scored(seed, root / "docs" / "proof.md")
+    file = truths if truths is not None else out.parent / f"{out.resolve().name}.truths.json"
+    made = make(out, cases, seed, file, size, jobs or os.cpu_count() or 1, cfa=cfa, progress=_say)
+    print(f"{out}: {len(made.truths)} cases, sealed in seals.json; the truths, seed among them, are in {file}")
+
+
+@commands.command("score")
+def score_command(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what `challenge make` wrote")],
+    truths: Annotated[Path, typer.Option("--truths", metavar="FILE", help="the truths that `challenge make` wrote")],
+    json: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="write the result as JSON ('-': to stdout)")
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option("--page", metavar="FILE.md", help="write tables and a picture into this page")
+    ] = None,
+    jobs: Jobs = None,
+) -> None:
+    """Diagnose what has no result yet, open the seals, and score. Exit code 4 where a goal is missed."""
+    from lab.challenge.proof import table, write_page
+    from lab.challenge.run import run_all
+    from lab.challenge.score import broken_seals, score
+    from lab.challenge.truth import Seals, Truths, load, store
+
+    seals = load(Seals, folder / "seals.json")
+    cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
+    runs = run_all(folder, cases, jobs or os.cpu_count() or 1, _say)
+    opened = load(Truths, truths)  # only now: what the diagnosis says is written down
+    found = score(opened, seals, runs, broken_seals(folder, seals, opened))
+    if page is not None:
+        write_page(found, page)
+    if json is not None and str(json) != "-":
+        store(found, json)
+    print(found.model_dump_json(indent=1) if str(json) == "-" else table(found))
+    if not found.reached:
+        raise typer.Exit(EXIT_CHECK)

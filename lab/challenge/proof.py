@@ -1,0 +1,162 @@
+"""The page on the proof: tables and a confusion-matrix picture, with the seed and the seals' hash."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from html import escape
+from pathlib import Path
+
+from lab.challenge.score import STRONG, CaseScore, ChallengeScore, Rate
+from lab.errors import InputError
+
+CELL_PX, LABEL_PX, HEAD_PX = 24, 210, 190
+RIGHT, WRONG, ABSTAINED = "#2f7d4f", "#b3372f", "#8a8f98"
+SAID_NOTHING = ("unexplained", "no_mismatch", "failed")
+
+
+def refuse_scored(seed: int, page: Path) -> None:
+    """Raises InputError where the page says that this proof seed was scored: a case once scored is never used again."""
+    if page.is_file() and re.search(rf"^\| proof \| {seed} \|", page.read_text(encoding="utf-8"), re.MULTILINE):
+        raise InputError(f"seed {seed}: was scored already, see {page}; leave --seed out for a fresh one")
+
+
+def _rate(rate: Rate) -> str:
+    if rate.share is None or rate.low is None or rate.high is None:
+        return "none"
+    return f"{rate.count} of {rate.of} ({100 * rate.low:.0f}..{100 * rate.high:.0f} %)"
+
+
+def table(found: ChallengeScore) -> str:
+    """The scores as Markdown tables; intervals are Clopper-Pearson's of 95 %."""
+    verdict = {True: "met", False: "missed", None: "none to tell"}
+    lines = ["| goal | wanted | reached | |", "| --- | --- | --- | --- |"]
+    for goal in found.goals:
+        doubt = "" if goal.sure or goal.sure is None or goal.met is None else ", too few cases to be sure"
+        lines.append(f"| {goal.name} | {goal.wanted} | {goal.reached} | {verdict[goal.met]}{doubt} |")
+    lines += [
+        "",
+        "| single effects of non-centrality | first name right | it alone | nothing named |",
+        "| --- | --- | --- | --- |",
+    ]
+    lines += [
+        f"| {s.noncentrality} | {_rate(s.top_1)} | {_rate(s.alone)} | {_rate(s.unnamed)} |" for s in found.singles
+    ]
+    lines += ["", "| also | |", "| --- | --- |"]
+    for what, rate in (
+        ("compounds, one member named at least", found.compounds_one_named),
+        ("compounds with both members above 50, both named", found.compounds_strong_both_named),
+        ("healthy, a mismatch where there is none", found.false_alarms),
+        ("outside the library above 25, the mismatch is seen", found.outside_located),
+    ):
+        lines.append(f"| {what} | {_rate(rate)} |")
+    if found.excess_removed_median is not None:
+        lines.append(f"| held-out excess chi2 removed, median | {100 * found.excess_removed_median:.1f} % |")
+    if found.cpu_median_s is not None and found.memory_max_mib is not None:
+        lines.append(
+            f"| CPU time of a case, median; memory, largest | {found.cpu_median_s:.1f} s; {found.memory_max_mib:.0f} MiB |"
+        )
+    lines += ["", "| concealed alone | right | right above 50 | else |", "| --- | --- | --- | --- |"]
+    for e in found.effects:
+        instead = ", ".join(f"{name} {n}" for name, n in e.instead.items()) or "-"
+        lines.append(
+            f"| {e.effect} | {e.top_1.count} of {e.top_1.of} | {e.strong_top_1.count} of {e.strong_top_1.of} | {instead} |"
+        )
+    lines += ["", "| outside the library, named | as |", "| --- | --- |"]
+    wrong = [s for s in found.case_scores if s.kind == "outside" and not s.right]
+    lines += [f"| {s.fault or s.truth[0]} ({s.case}) | {', '.join(s.named) or s.verdict} |" for s in wrong] or [
+        "| none | |"
+    ]
+    lines += [f"\n{case} failed: {error}" for case, error in found.failed.items()]
+    return "\n".join(lines)
+
+
+def write_page(found: ChallengeScore, page: Path) -> None:
+    """Put the section of this purpose into the page, its picture beside it, and the seed into the page's list of seeds."""
+    text = page.read_text(encoding="utf-8") if page.is_file() else "# Proof\n"
+    picture = page.with_name(f"{page.stem}-{found.purpose}.svg")
+    section = (
+        f"Seed {found.seed}, {found.cases} cases, {found.size} frames; SHA-256 over all seals `{found.seals_sha256}`.\n\n"
+        f"{table(found)}\n\n![What was said of what was concealed]({picture.name})"
+    )
+    text = _placed(text, found.purpose, section)
+    row = f"| {found.purpose} | {found.seed} | {found.cases} | {found.size} | `{found.seals_sha256[:16]}` |"
+    if row not in text:
+        begin = text.find("<!-- seeds:end -->")
+        if begin < 0:
+            text += "\n## Seeds\n\n| for | seed | cases | frames | seals |\n| --- | --- | --- | --- | --- |\n<!-- seeds:end -->\n"
+            begin = text.find("<!-- seeds:end -->")
+        text = f"{text[:begin]}{row}\n{text[begin:]}"
+    page.parent.mkdir(parents=True, exist_ok=True)
+    picture.write_text(confusion(found), encoding="utf-8")
+    page.write_text(text, encoding="utf-8")
+
+
+def _placed(text: str, name: str, section: str) -> str:
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    if begin not in text:
+        return f"{text.rstrip()}\n\n## Results, {name}\n\n{begin}\n{section}\n{end}\n"
+    head, rest = text.split(begin, 1)
+    return f"{head}{begin}\n{section}\n{end}{rest.split(end, 1)[1]}"
+
+
+# --- the picture -----------------------------------------------------------------------------------------------------------
+
+
+def _row(case: CaseScore) -> str:
+    if case.kind == "single":
+        return case.truth[0]
+    return "(healthy)" if case.kind == "healthy" else "(outside the library)"
+
+
+def confusion(found: ChallengeScore) -> str:
+    """SVG: rows what was concealed (singles above 50, healthy, outside), columns what was said; numbers of cases."""
+    shown = [
+        s
+        for s in found.case_scores
+        if s.kind in {"healthy", "outside"} or (s.kind == "single" and s.noncentrality[0] > STRONG)
+    ]
+    count = Counter((_row(s), s.named[0] if s.named else s.verdict) for s in shown)
+    rows = sorted({row for row, _ in count}, key=lambda row: (row.startswith("("), row))
+    said = {column for _, column in count}
+    columns = [*sorted(said - set(SAID_NOTHING)), *(c for c in SAID_NOTHING if c in said)]
+    width, height = LABEL_PX + CELL_PX * len(columns) + 130, HEAD_PX + CELL_PX * len(rows) + 50
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" font-size="12">',
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+    ]
+    for j, column in enumerate(columns):
+        x = LABEL_PX + CELL_PX * (j + 0.5)
+        words = escape(column.replace("_", " "))
+        parts.append(
+            f'<text x="{x + 4:.0f}" y="{HEAD_PX - 6}" transform="rotate(-55 {x + 4:.0f} {HEAD_PX - 6})" fill="#222">{words}</text>'
+        )
+    for i, row in enumerate(rows):
+        y = HEAD_PX + CELL_PX * i
+        total = sum(count[row, column] for column in columns)
+        words = escape(row.replace("_", " "))
+        parts.append(f'<text x="{LABEL_PX - 8}" y="{y + 16}" text-anchor="end" fill="#222">{words}</text>')
+        for j, column in enumerate(columns):
+            x, n = LABEL_PX + CELL_PX * j, count[row, column]
+            right = (
+                column == row
+                or (row == "(healthy)" and column == "no_mismatch")
+                or (row.startswith("(outside") and column in SAID_NOTHING)
+            )
+            colour = RIGHT if right else ABSTAINED if column in SAID_NOTHING else WRONG
+            shade = 0.25 + 0.75 * n / total if n else 0.0
+            parts.append(
+                f'<rect x="{x}" y="{y}" width="{CELL_PX}" height="{CELL_PX}" fill="{colour}" fill-opacity="{shade:.2f}" stroke="#d5d8dd"/>'
+            )
+            if n:
+                ink = "#fff" if shade > 0.55 else "#111"
+                parts.append(
+                    f'<text x="{x + CELL_PX / 2:.0f}" y="{y + 16}" text-anchor="middle" fill="{ink}">{n}</text>'
+                )
+    y = HEAD_PX + CELL_PX * len(rows) + 30
+    for k, (colour, words) in enumerate(((RIGHT, "right"), (ABSTAINED, "nothing named"), (WRONG, "a wrong name"))):
+        x = LABEL_PX + 130 * k - 150
+        parts.append(
+            f'<rect x="{x}" y="{y - 11}" width="12" height="12" fill="{colour}"/><text x="{x + 18}" y="{y}" fill="#222">{words}</text>'
+        )
+    return "\n".join([*parts, "</svg>\n"])

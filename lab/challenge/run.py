@@ -1,0 +1,77 @@
+"""Diagnosing the cases of a challenge, each for itself: what is there already is kept, and one that fails doesn't end the run."""
+
+from __future__ import annotations
+
+import contextlib
+import resource
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+from lab.challenge.truth import load, store
+from lab.results import DiagnosisResult
+from sim.parameters import Frozen
+
+
+class CaseRun(Frozen):
+    """A diagnosis (without its curves) with what it took, or why there is none. `memory_mib`: the process's peak while it ran."""
+
+    case: str
+    wall_s: float
+    cpu_s: float
+    memory_mib: float
+    error: str | None = None
+    diagnosis: DiagnosisResult | None = None
+
+
+def _peak_mib() -> float:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def run_case(folder: Path) -> CaseRun:
+    """Diagnose one recording set as `lab.diagnose` does."""
+    from lab import recording
+    from lab.diagnose import diagnose
+
+    with contextlib.suppress(OSError):  # Linux: the peak begins anew
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    wall, cpu = time.perf_counter(), time.process_time()
+    found, error = None, None
+    try:
+        found = diagnose(recording.read(folder)).model_copy(update={"curves": (), "source": folder.name})
+    except Exception as caught:  # whatever it is, it is this case's result
+        at = traceback.extract_tb(caught.__traceback__)[-1]
+        error = f"{type(caught).__name__}: {' '.join(str(caught).split())} ({Path(at.filename).name}:{at.lineno})"
+    return CaseRun(
+        case=folder.name, wall_s=time.perf_counter() - wall, cpu_s=time.process_time() - cpu, memory_mib=_peak_mib(), error=error, diagnosis=found
+    )  # fmt: skip
+
+
+def run_all(
+    folder: Path, cases: tuple[str, ...], jobs: int, progress: Callable[[str, float], None] = lambda _text, _share: None
+) -> dict[str, CaseRun]:
+    """Results by case, from DIR/results/CASE.json where it is there, else diagnosed and written there."""
+    file = {case: folder / "results" / f"{case}.json" for case in cases}
+    runs = {case: load(CaseRun, file[case]) for case in cases if file[case].exists()}
+    missing = [case for case in cases if case not in runs]
+
+    def keep(result: CaseRun) -> None:
+        store(result, file[result.case])
+        runs[result.case] = result
+        progress(f"{len(runs)} of {len(cases)} cases", len(runs) / len(cases))
+
+    if jobs == 1:
+        for case in missing:
+            keep(run_case(folder / case))
+    elif missing:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            for done in as_completed([pool.submit(run_case, folder / case) for case in missing]):
+                keep(done.result())
+    return runs

@@ -1,0 +1,342 @@
+"""Opening the seals, and scoring what a diagnosis said against what was concealed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from statistics import fmean, median
+from typing import Literal
+
+from scipy.special import betaincinv
+
+from lab.challenge.run import CaseRun
+from lab.challenge.truth import Purpose, Seals, Truth, Truths, digest, seal
+from lab.results import DiagnosisResult
+from sim.parameters import Frozen
+
+CONFIDENCE = 0.95
+#: A parameter's interval: so many standard uncertainties, 95 % of a normal distribution.
+INTERVAL_SIGMAS = 1.959964
+STRONG, SEEN = 50.0, 25.0
+CPU_GOAL_S, MEMORY_GOAL_MIB = 120.0, 3072.0  # 60 s on two cores
+#: Excess chi2 of held-out numbers above which its removal can be judged, in standard deviations of chi2.
+EXCESS_SIGMAS = 3.0
+
+
+class Rate(Frozen):
+    """`count` of `of`, with the Clopper-Pearson interval of 95 %; None where there is nothing to count."""
+
+    count: int
+    of: int
+    share: float | None
+    low: float | None
+    high: float | None
+
+    @classmethod
+    def over(cls, hits: Iterable[bool]) -> Rate:
+        seen = list(hits)
+        count, of = sum(seen), len(seen)
+        if of == 0:
+            return cls(count=0, of=0, share=None, low=None, high=None)
+        tail = (1.0 - CONFIDENCE) / 2.0
+        low = 0.0 if count == 0 else float(betaincinv(count, of - count + 1, tail))
+        high = 1.0 if count == of else float(betaincinv(count + 1, of - count, 1.0 - tail))
+        return cls(count=count, of=of, share=count / of, low=low, high=high)
+
+
+class Goal(Frozen):
+    """`met`: None where no case could tell. `sure`: whether the interval of 95 % lies on one side of what is wanted."""
+
+    name: str
+    wanted: str
+    reached: str
+    met: bool | None
+    sure: bool | None = None
+
+
+class CaseScore(Frozen):
+    """One case: what it concealed, what was said."""
+
+    case: str
+    kind: str
+    truth: tuple[str, ...]
+    variants: tuple[int, ...]
+    noncentrality: tuple[float, ...]
+    fault: str | None
+    verdict: str
+    named: tuple[str, ...]
+    rivals: tuple[str, ...]
+    unexplained: tuple[str, ...]
+    right: bool
+    excess_removed: float | None
+    cpu_s: float
+    memory_mib: float
+
+
+class SinglesScore(Frozen):
+    """Single effects of one class of non-centrality: the first name is right; it is the only one; nothing is named."""
+
+    noncentrality: str
+    top_1: Rate
+    alone: Rate
+    unnamed: Rate
+
+
+class EffectScore(Frozen):
+    """One effect over all the singles that conceal it: how often its name came first, and what came instead."""
+
+    effect: str
+    top_1: Rate
+    strong_top_1: Rate
+    instead: dict[str, int]
+
+
+class ChallengeScore(Frozen):
+    format: Literal["calibench-challenge-score"] = "calibench-challenge-score"
+    version: Literal[1] = 1
+    purpose: Purpose
+    seed: int
+    size: str
+    cases: int
+    seals_sha256: str
+    broken_seals: tuple[str, ...]
+    failed: dict[str, str]
+    singles: tuple[SinglesScore, ...]
+    effects: tuple[EffectScore, ...]
+    compounds_both_named: Rate
+    compounds_one_named: Rate
+    compounds_strong_both_named: Rate
+    rival_sets_cover: Rate
+    rival_set_mean_size: float | None
+    false_alarms: Rate
+    false_names: Rate
+    outside_not_named: Rate
+    outside_located: Rate
+    parameters_covered: Rate
+    excess_removed: float | None
+    excess_removed_median: float | None
+    wall_median_s: float | None
+    cpu_median_s: float | None
+    cpu_max_s: float | None
+    memory_max_mib: float | None
+    goals: tuple[Goal, ...]
+    case_scores: tuple[CaseScore, ...]
+
+    @property
+    def reached(self) -> bool:
+        """Whether no goal was missed."""
+        return all(goal.met is not False for goal in self.goals)
+
+
+def broken_seals(folder: Path, seals: Seals, truths: Truths) -> tuple[str, ...]:
+    """Cases whose truth or recordings aren't what was sealed, or of which either is missing."""
+    broken = []
+    for case in sorted({*seals.seals, *truths.truths}):
+        salted = truths.truths.get(case)
+        there = salted is not None and case in seals.seals and (folder / case).is_dir()
+        if (
+            salted is None
+            or not there
+            or seal(salted) != seals.seals[case]
+            or digest(folder / case) != salted.truth.recordings_sha256
+        ):
+            broken.append(case)
+    return tuple(broken)
+
+
+def seals_sha256(seals: Seals) -> str:
+    """One hash over all seals, in the order of the cases."""
+    return hashlib.sha256(
+        "".join(f"{case} {value}\n" for case, value in sorted(seals.seals.items())).encode()
+    ).hexdigest()
+
+
+def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str] = ()) -> ChallengeScore:
+    """All figures. Cases with a broken seal count nowhere, cases that failed count as saying nothing."""
+    cases = [
+        (case, truths.truths[case].truth, runs[case])
+        for case in sorted(runs)
+        if case in truths.truths and case not in broken
+    ]
+    scored = [_case_score(case, truth, run) for case, truth, run in cases]
+    diagnoses = {case: run.diagnosis for case, _, run in cases}
+    of_truth = {case: truth for case, truth, _ in cases}
+    singles = [s for s in scored if s.kind == "single"]
+    compounds = [s for s in scored if s.kind == "compound"]
+    healthy = [s for s in scored if s.kind == "healthy"]
+    outside = [s for s in scored if s.kind == "outside"]
+    strong = [s for s in compounds if min(s.noncentrality) > STRONG]
+    sets = [(s.truth[0], {s.named[0], *s.rivals}) for s in singles if s.named]
+    removed = [s.excess_removed for s in scored if s.excess_removed is not None]
+    ran = [run for _, _, run in cases if run.error is None]
+    classes = (
+        _singles("above 50", [s for s in singles if s.noncentrality[0] > STRONG]),
+        _singles("25 to 50", [s for s in singles if SEEN < s.noncentrality[0] <= STRONG]),
+        _singles("below 25", [s for s in singles if s.noncentrality[0] <= SEEN]),
+    )
+    both = Rate.over(len(set(s.truth) & set(s.named)) == 2 for s in compounds)
+    one = Rate.over(bool(set(s.truth) & set(s.named)) for s in compounds)
+    both_strong = Rate.over(set(s.truth) <= set(s.named) for s in strong)
+    cover = Rate.over(truth in names for truth, names in sets)
+    size = fmean(len(names) for _, names in sets) if sets else None
+    alarms = Rate.over(s.verdict not in {"no_mismatch", "failed"} for s in healthy)
+    names = Rate.over(bool(s.named) for s in healthy)
+    abstained = Rate.over(s.right for s in outside)
+    located = Rate.over(
+        s.verdict not in {"no_mismatch", "failed"}
+        for s in outside
+        if s.fault is None and max(s.noncentrality, default=0.0) > SEEN
+    )
+    covered = Rate.over(hit for case, truth in of_truth.items() for hit in _covered(truth, diagnoses[case]))
+    mean_removed = fmean(removed) if removed else None
+    cpu, memory = max((r.cpu_s for r in ran), default=None), max((r.memory_mib for r in ran), default=None)
+    goals = (
+        Goal(
+            name="seals that hold",
+            wanted="all",
+            reached=f"{len(seals.seals) - len(broken)} of {len(seals.seals)}",
+            met=not broken,
+            sure=True,
+        ),
+        Goal(
+            name="cases that ran",
+            wanted="all",
+            reached=f"{len(ran)} of {len(cases)}",
+            met=len(ran) == len(cases),
+            sure=True,
+        ),
+        _at_least("top-1 of single effects above 50", classes[0].top_1, 0.95),
+        _at_least("both members of a compound named", both, 0.80),
+        _at_least("rival sets cover the truth", cover, 0.95),
+        _limit("rivals in a set, mean", size, 1.5, ""),
+        _at_most("false names on healthy cameras", names, 0.01),
+        _at_least("outside the library, no cause named", abstained, 0.90),
+        _between("95 % intervals of parameters hold", covered, 0.90, 0.98),
+        Goal(
+            name="held-out excess chi2 removed",
+            wanted=">= 90 %",
+            reached=_percent(mean_removed),
+            met=None if mean_removed is None else mean_removed >= 0.9,
+        ),
+        _limit("CPU time of a case", cpu, CPU_GOAL_S, " s"),
+        _limit("memory of a case", memory, MEMORY_GOAL_MIB, " MiB"),
+    )
+    return ChallengeScore(
+        purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals), broken_seals=tuple(broken),
+        failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, effects=_by_effect(singles),
+        compounds_both_named=both, compounds_one_named=one, compounds_strong_both_named=both_strong, rival_sets_cover=cover,
+        rival_set_mean_size=size, false_alarms=alarms, false_names=names, outside_not_named=abstained, outside_located=located,
+        parameters_covered=covered, excess_removed=mean_removed, excess_removed_median=median(removed) if removed else None,
+        wall_median_s=median(r.wall_s for r in ran) if ran else None, cpu_median_s=median(r.cpu_s for r in ran) if ran else None,
+        cpu_max_s=cpu, memory_max_mib=memory, goals=goals, case_scores=tuple(scored),
+    )  # fmt: skip
+
+
+# --- one case ------------------------------------------------------------------------------------------------------------
+
+
+def _case_score(case: str, truth: Truth, run: CaseRun) -> CaseScore:
+    found = run.diagnosis
+    effects = sorted(found.effects, key=lambda e: -e.probability) if found is not None else []
+    named = tuple(e.name for e in effects)
+    rivals = tuple(r.name for r in effects[0].rivals if r.name != "unknown") if effects else ()
+    right = {
+        "healthy": found is not None and found.verdict == "no_mismatch",
+        "single": named[:1] == truth.names,
+        "compound": set(truth.names) <= set(named),
+        "outside": found is not None and set(named) <= set(truth.accepts),
+    }[truth.kind]
+    return CaseScore(
+        case=case, kind=truth.kind, truth=tuple(c.name for c in truth.concealed), variants=tuple(c.variant for c in truth.concealed),
+        noncentrality=tuple(c.noncentrality for c in truth.concealed), fault=truth.fault,
+        verdict=found.verdict if found is not None else "failed", named=named, rivals=rivals,
+        unexplained=tuple(u.measurement for u in found.unexplained) if found is not None else (), right=right,
+        excess_removed=_removed(truth, found), cpu_s=run.cpu_s, memory_mib=run.memory_mib,
+    )  # fmt: skip
+
+
+def _removed(truth: Truth, found: DiagnosisResult | None) -> float | None:
+    """(before - after) / (before - n) of held-out chi2, -1..1, where a listed effect left an excess to remove there."""
+    held = found.held_out if found is not None else None
+    if held is None or not truth.names or max(c.noncentrality for c in truth.concealed) <= STRONG:
+        return None
+    excess = held.chi2_before - held.n
+    if excess <= EXCESS_SIGMAS * (2.0 * held.n) ** 0.5:
+        return None
+    return max(-1.0, min(1.0, (held.chi2_before - held.chi2_after) / excess))
+
+
+def _covered(truth: Truth, found: DiagnosisResult | None) -> Iterable[bool]:
+    """Of every parameter that means the same in the library: whether its interval holds the truth."""
+    named = {e.name: e for e in found.effects} if found is not None else {}
+    for hidden in truth.concealed:
+        effect = named.get(hidden.effect or "")
+        for name, value in hidden.parameters.items() if effect is not None else ():
+            said = effect.parameters.get(name)  # type: ignore[union-attr]
+            if said is not None and said.std is not None:
+                yield abs(said.value - value) <= INTERVAL_SIGMAS * said.std
+
+
+# --- sums ----------------------------------------------------------------------------------------------------------------
+
+
+def _singles(what: str, cases: Sequence[CaseScore]) -> SinglesScore:
+    return SinglesScore(
+        noncentrality=what,
+        top_1=Rate.over(s.right for s in cases),
+        alone=Rate.over(s.named == s.truth for s in cases),
+        unnamed=Rate.over(not s.named for s in cases),
+    )
+
+
+def _by_effect(singles: Sequence[CaseScore]) -> tuple[EffectScore, ...]:
+    found = []
+    for effect in sorted({s.truth[0] for s in singles}):
+        mine = [s for s in singles if s.truth[0] == effect]
+        instead = Counter(s.named[0] if s.named else s.verdict for s in mine if not s.right)
+        found.append(
+            EffectScore(
+                effect=effect,
+                top_1=Rate.over(s.right for s in mine),
+                strong_top_1=Rate.over(s.right for s in mine if s.noncentrality[0] > STRONG),
+                instead=dict(instead.most_common()),
+            )
+        )
+    return tuple(found)
+
+
+def _percent(share: float | None) -> str:
+    return "none to tell" if share is None else f"{100 * share:.1f} %"
+
+
+def _said(rate: Rate) -> str:
+    if rate.share is None or rate.low is None or rate.high is None:
+        return "none to tell"
+    return f"{rate.count} of {rate.of}: {100 * rate.share:.1f} % ({100 * rate.low:.1f}..{100 * rate.high:.1f})"
+
+
+def _judged(name: str, wanted: str, rate: Rate, good: Callable[[float], bool], low: float, high: float) -> Goal:
+    if rate.share is None or rate.low is None or rate.high is None:
+        return Goal(name=name, wanted=wanted, reached="none to tell", met=None)
+    inside = low <= rate.low and rate.high <= high
+    beyond = rate.high < low or rate.low > high
+    return Goal(name=name, wanted=wanted, reached=_said(rate), met=good(rate.share), sure=inside or beyond)
+
+
+def _at_least(name: str, rate: Rate, limit: float) -> Goal:
+    return _judged(name, f">= {100 * limit:g} %", rate, lambda share: share >= limit, limit, 1.0)
+
+
+def _at_most(name: str, rate: Rate, limit: float) -> Goal:
+    return _judged(name, f"<= {100 * limit:g} %", rate, lambda share: share <= limit, 0.0, limit)
+
+
+def _between(name: str, rate: Rate, low: float, high: float) -> Goal:
+    return _judged(name, f"{100 * low:g}..{100 * high:g} %", rate, lambda share: low <= share <= high, low, high)
+
+
+def _limit(name: str, value: float | None, limit: float, unit: str) -> Goal:
+    reached = "none to tell" if value is None else f"{value:.3g}{unit}"
+    return Goal(name=name, wanted=f"<= {limit:g}{unit}", reached=reached, met=None if value is None else value <= limit)

@@ -1,0 +1,136 @@
+"""What a concealed camera hides, and the seal on it: a salted hash that binds the truth before anything was diagnosed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import tempfile
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from lab.errors import InputError
+from sim.parameters import Frozen
+
+#: Seeds below are for tuning, from here on for proofs: no seed is both. Seeds of continuous checks lie above both.
+FIRST_PROOF_SEED = 1_000_000
+FIRST_FRESH_SEED = 1 << 32
+Kind = Literal["healthy", "single", "compound", "outside"]
+Purpose = Literal["tuning", "proof", "fresh"]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Concealed(Frozen):
+    """One concealed law. `effect`: its name in the results' list, None outside it. `parameters`: what the library's parameters should
+    come out as, where they mean the same. `noncentrality`: |L^-1 (y with it - y without)|^2 over the numbers that choice may see."""
+
+    name: str
+    effect: str | None = None
+    variant: int = 0
+    strength: float
+    unit: str = "1"
+    parameters: dict[str, float] = {}
+    noncentrality: float
+
+
+class Truth(Frozen):
+    """Of one case. `fault`: what is stated wrongly, or went wrong on the rig. `accepts`: names that aren't wrong beside the concealed
+    ones. `recordings_sha256`: of every file of the set, so that the seal binds these, too."""
+
+    kind: Kind
+    concealed: tuple[Concealed, ...] = ()
+    fault: str | None = None
+    accepts: tuple[str, ...] = ()
+    cfa: str
+    f_number: float
+    frames: int
+    rows: int
+    cols: int
+    recordings_sha256: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Effects of the results' list that are concealed."""
+        return tuple(c.effect for c in self.concealed if c.effect is not None)
+
+
+class SaltedTruth(Frozen):
+    salt: str
+    truth: Truth
+
+
+class Truths(Frozen):
+    """What is kept apart from the recordings."""
+
+    format: Literal["calibench-truths"] = "calibench-truths"
+    version: Literal[1] = 1
+    purpose: Purpose
+    seed: int
+    size: str
+    cases: int
+    truths: dict[str, SaltedTruth] = {}
+
+
+class Seals(Frozen):
+    """What stands beside the recordings: case -> SHA-256 of salt and truth. It says neither seed nor purpose."""
+
+    format: Literal["calibench-seals"] = "calibench-seals"
+    version: Literal[1] = 1
+    seals: dict[str, str] = {}
+
+
+def canonical(truth: Truth) -> str:
+    """JSON with sorted keys and no blanks: one text for one truth."""
+    return json.dumps(truth.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+
+
+def seal(salted: SaltedTruth) -> str:
+    """SHA-256 (hex) of the salt followed by the canonical truth."""
+    return hashlib.sha256((salted.salt + canonical(salted.truth)).encode()).hexdigest()
+
+
+def salted(truth: Truth) -> SaltedTruth:
+    """With a fresh salt of 128 bits: the seal can't be guessed from the few truths that are likely."""
+    return SaltedTruth(salt=secrets.token_hex(16), truth=truth)
+
+
+def digest(folder: Path) -> str:
+    """SHA-256 over names and contents of all files of a folder, in the order of the names."""
+    total = hashlib.sha256()
+    for file in sorted(p for p in folder.rglob("*") if p.is_file()):
+        total.update(f"{file.relative_to(folder).as_posix()}\0{file.stat().st_size}\0".encode())
+        total.update(file.read_bytes())
+    return total.hexdigest()
+
+
+def purpose_of(seed: int) -> Purpose:
+    return "tuning" if seed < FIRST_PROOF_SEED else "proof" if seed < FIRST_FRESH_SEED else "fresh"
+
+
+def load(model: type[Model], file: Path) -> Model:
+    """A model from a JSON file; raises InputError that says what is wrong with it."""
+    try:
+        return model.model_validate_json(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{file}: can't be read ({error.strerror}); give the file that `challenge make` wrote"
+        ) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{file}: {where or 'the text'}: {first['msg']}; take the file that `challenge make` wrote"
+        ) from error
+
+
+def store(model: BaseModel, file: Path, *, mode: int = 0o644) -> None:
+    """Write a model as JSON, completely or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    handle, partial = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+    with os.fdopen(handle, "w", encoding="utf-8") as stream:
+        stream.write(model.model_dump_json(indent=1) + "\n")
+    Path(partial).chmod(mode)
+    Path(partial).replace(file)
