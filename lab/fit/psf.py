@@ -128,7 +128,10 @@ def estimate_kernel(
         right = normal_equations_right(u, b - (moved - predicted), support)
         normal = replace(normal, right=right[0], power=right[1])
         last = step == REGISTRATION_STEPS
-        found = solve_kernel(normal, support, noise_std, rounds=1, like=None if last else found)
+        if last:
+            found = solve_kernel(normal, support, noise_std, rounds=1, begin=found)
+        else:
+            found = solve_kernel(normal, support, noise_std, like=found)
     return found
 
 
@@ -144,13 +147,15 @@ def _refuse_unrelated(predicted: Array, seen: Array) -> None:
 
 def displaced(predicted: Array, seen: Array, border: int, force: bool = False) -> Array | None:
     """`predicted` as it lies in `seen`: moved by a displacement that is bilinear between the nodes of a grid of about
-    `GRID_PX`, its mean taken out; None where that isn't significant (5 sigma), unless by `force`.
+    `GRID_PX`, or the kernel's width (2 `border` + 1) if that is more, its mean taken out; None where that isn't significant (5 sigma), unless by `force`.
 
     Gauss-Newton on the residual, with the nodes' roughness held down by a weak prior of `NODE_STD_PX`.
     """
     inner = np.s_[border : seen.shape[0] - border, border : seen.shape[1] - border]
     shape = seen[inner].shape
-    hats = [_hats(n, max(2, round(n / GRID_PX) + 1)) for n in shape]
+    # a wide kernel leaves little to see finer displacements by
+    spacing = max(GRID_PX, 2.0 * border + 1.0)
+    hats = [_hats(n, max(2, round(n / spacing) + 1)) for n in shape]
     nodes = hats[0].shape[1] * hats[1].shape[1]
     field, moved = np.zeros((2, *seen.shape)), predicted
     rows, cols = np.indices(seen.shape, dtype=float)
@@ -260,11 +265,13 @@ def solve_kernel(
     far: bool = False,
     rounds: int = ROUNDS,
     like: KernelEstimate | None = None,
+    begin: KernelEstimate | None = None,
 ) -> KernelEstimate:
     """The kernel of given normal equations; see `estimate_kernel`.
 
     With `far` their last element is one of its own: light from beyond the support, which takes its share of the sum. The prior
-    is chosen by evidence, or it is that of the estimate `like`, with its noise.
+    is chosen by evidence, or it is that of the estimate `like`, with its noise. `begin`: a kernel close by, from which the search
+    for envelope and prior begins.
     """
     size, total = support * support, len(normal.right)
     if total != size + far:
@@ -273,10 +280,12 @@ def solve_kernel(
     spread = normal.power / normal.count - (normal.right.mean() ** 2 / max(scale, 1e-300)) / normal.count
     if not scale > 0.0 or not spread > 0.0:
         raise NotDetermined("psf", "the target shows no structure: put a Bernoulli pattern on the screen")
-    start = np.full(total, 1.0 / total)
-    if like is not None:
-        start = np.append(like.kernel.ravel() * (1.0 - like.far), [like.far] * far)
-    found = on_simplex(normal.gram + 1e-9 * scale * np.eye(total), normal.right, start, 6 if like is None else 0)
+    known = like or begin
+    if known is None:
+        start = np.full(total, 1.0 / total)
+        found = on_simplex(normal.gram + 1e-9 * scale * np.eye(total), normal.right, start, 6)
+    else:
+        found = np.append(known.kernel.ravel() * (1.0 - known.far), [known.far] * far)
     residual = max(
         normal.power - 2.0 * float(np.vdot(normal.right, found)) + float(np.vdot(found, normal.gram @ found)), 0.0
     )
