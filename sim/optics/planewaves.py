@@ -158,13 +158,11 @@ def _chords(rim_along: FloatArray, rim_across: FloatArray, across: FloatArray) -
     """Where lines at `across` enter and leave the rim's polygon: its lower and upper end along the other axis."""
     a0, c0 = rim_along, rim_across
     a1, c1 = np.roll(a0, -1), np.roll(c0, -1)
-    low, high = np.full(across.size, np.inf), np.full(across.size, -np.inf)
-    for i, line in enumerate(across):
-        cut = (c0 <= line) != (c1 <= line)
-        along = a0[cut] + (a1[cut] - a0[cut]) * (line - c0[cut]) / (c1[cut] - c0[cut])
-        if along.size:
-            low[i], high[i] = along.min(), along.max()
-    return low, high
+    line = across[:, None]
+    cut = (c0 <= line) != (c1 <= line)
+    share = (line - c0) / np.where(cut, c1 - c0, 1.0)
+    along = a0 + (a1 - a0) * share
+    return np.where(cut, along, np.inf).min(axis=1), np.where(cut, along, -np.inf).max(axis=1)
 
 
 def transfer(
@@ -190,7 +188,7 @@ class _FittedWave:
     centre: FloatArray
     half: FloatArray
     order: int
-    coefficients: FloatArray
+    coefficients: FloatArray  # (2: path and amplitude, order + 1 in x, order + 1 in y)
     nodes: int
 
     @classmethod
@@ -214,7 +212,11 @@ class _FittedWave:
             left = float(np.sqrt(np.mean((terms @ coefficients[:, 0] - path) ** 2)))
             if left < _WAVE_RESIDUAL * wavelength_mm:
                 break
-        return cls(rays, centre, half, order, coefficients, nodes)
+        place = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
+        matrices = np.zeros((2, order + 1, order + 1))
+        for (i, j), column in zip(place, coefficients, strict=True):
+            matrices[:, i, j] = column
+        return cls(rays, centre, half, order, matrices, nodes)
 
     def transfer(self, frequency_lp_per_mm: FloatArray, tangential: bool) -> ComplexArray:
         rays = self.rays
@@ -229,9 +231,10 @@ class _FittedWave:
         def wave(along: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
             c = np.broadcast_to(across[:, None], along.shape)
             x, y = (c, along) if tangential else (along, c)
-            terms = _terms((x - self.centre[0]) / self.half[0], (y - self.centre[1]) / self.half[1], self.order)
-            values = terms @ self.coefficients
-            return values[..., 0], values[..., 1]
+            tx = np.polynomial.chebyshev.chebvander((x - self.centre[0]) / self.half[0], self.order)
+            ty = np.polynomial.chebyshev.chebvander((y - self.centre[1]) / self.half[1], self.order)
+            path, amplitude = (np.sum((tx @ matrix) * ty, axis=-1) for matrix in self.coefficients)
+            return path, amplitude
 
         def overlap(shift: float) -> complex:
             inside = np.flatnonzero(chord > shift)
