@@ -39,9 +39,9 @@ DEGREE = 3
 _NODES = np.arange(DEGREE + 1) / DEGREE
 #: Tiles are made smaller, from the largest to the smallest of these (px), until the polynomial's error is below the limit.
 TILE_PX = (128, 64, 32, 16)
-#: Relative rms error of a function half way between nodes, and relative error of its light.
+#: Relative rms error of a function half way between nodes, and relative error of its light before that is put right.
 KERNEL_ERROR = 2e-3
-LIGHT_ERROR = 1e-6
+LIGHT_ERROR = 1e-4
 #: The table is refined to so many samples a wavelength's resolution (wavelength x f_number), and heights so many times.
 SAMPLES_PER_RESOLUTION = 8.0
 HEIGHTS_REFINED = 4
@@ -429,7 +429,8 @@ def scatter(
                 (left + grid.margin_px) * s : (right + grid.margin_px) * s,
             ]
             down, across = top * s - origin[0], left * s - origin[1]
-            local[down : down + part.shape[0], across : across + part.shape[1]] = part
+            owed = _owed(kernels, top, bottom, left, right, part.shape)
+            local[down : down + part.shape[0], across : across + part.shape[1]] = part if owed is None else part * owed
             columns = np.ascontiguousarray(local.reshape(high, -1, stride).transpose(2, 0, 1))
             seen_rows = max(top - halo, 0), min(bottom + halo, frame.rows)
             seen_cols = max(left - halo, 0), min(right + halo, frame.cols)
@@ -441,6 +442,28 @@ def scatter(
                         (half + origin[0], half + origin[1]), (top - 0.5, bottom - 0.5), (left - 0.5, right - 0.5),
                     )  # fmt: skip
     _spread_wings(picture, grid, kernels, places, period, image)
+
+
+def _owed(
+    kernels: Kernels, top: int, bottom: int, left: int, right: int, shape: tuple[int, ...]
+) -> Float32Array | None:
+    """What a tile's sources are to be multiplied with, so that their light isn't the polynomials' but the table's: of 17 x 17
+    points, straight between them. None where the channels' light has both signs, so that there's no ratio."""
+    held = np.sum(kernels.light - kernels.lost, axis=0)
+    if np.min(kernels.light) < 0 or np.min(held) <= 0:
+        return None
+    at = np.linspace(0.0, 1.0, 17)
+    light = []
+    for t in (at, _NODES):
+        rows, cols = top - 0.5 + t * (bottom - top), left - 0.5 + t * (right - left)
+        x, y = kernels.frame.um(rows[:, None], cols[None, :])
+        light.append(over_field(kernels.table, held, *np.broadcast_arrays(x, y)))
+    share = lagrange(at)
+    ratio = light[0] / (share.T @ light[1] @ share)
+    down, across = (
+        np.stack([np.interp((np.arange(n) + 0.5) / n, at, unit) for unit in np.eye(at.size)], axis=1) for n in shape
+    )
+    return np.asarray(down @ ratio @ across.T, np.float32)
 
 
 def _by_pixel(at_nodes: Float32Array, kernels: Kernels, height: int, width: int) -> Float32Array:
