@@ -67,21 +67,21 @@ def _curves(
         spectra[path] = Spectrum.of(w, np.interp(w - off, w, value))
 
 
-def _of_kind(manifest: dict[str, Any], kind: str) -> list[str]:
+def _frames_of(manifest: dict[str, Any], kind: str) -> list[str]:
     return [c["frame"] for c in manifest["captures"] if c["kind"] == kind]
 
 
 def _lamp_out(
     manifest: dict[str, Any], frames: dict[str, Any], spectra: dict[str, Spectrum], rng: np.random.Generator
 ) -> None:
-    flats, darks = _of_kind(manifest, "flat"), _of_kind(manifest, "dark")
+    flats, darks = _frames_of(manifest, "flat"), _frames_of(manifest, "dark")
     frames[str(rng.choice(flats[6:]))] = frames[darks[0]].copy()
 
 
 def _swapped(
     manifest: dict[str, Any], frames: dict[str, Any], spectra: dict[str, Spectrum], rng: np.random.Generator
 ) -> None:
-    sweep = _of_kind(manifest, "narrowband")
+    sweep = _frames_of(manifest, "narrowband")
     i = int(rng.integers(8, 18))
     frames[sweep[i]], frames[sweep[i + 2]] = frames[sweep[i + 2]], frames[sweep[i]]
 
@@ -89,7 +89,7 @@ def _swapped(
 def _stale(
     manifest: dict[str, Any], frames: dict[str, Any], spectra: dict[str, Spectrum], rng: np.random.Generator
 ) -> None:
-    sweep = _of_kind(manifest, "narrowband")
+    sweep = _frames_of(manifest, "narrowband")
     i = int(rng.integers(6, 20))
     frames[sweep[i]] = frames[sweep[i - 1]].copy()
 
@@ -124,10 +124,12 @@ def draw(
     cfa: str | None = None,
     kind: Kind | None = None,
     law: type[Law] | None = None,
+    sized: bool = True,
 ) -> Case:
-    """Case number `index` of a challenge. The same arguments give the same case; `cfa`, `kind`, `law`: not as drawn."""
+    """Case number `index` of a challenge. The same arguments give the same case; `cfa`, `kind`, `law`: not as drawn; without
+    `sized`, laws have their nominal strengths."""
     rng = np.random.default_rng([seed, index])
-    what = kind or _kind(seed, index)
+    what = kind or kind_of(seed, index)
     rows, cols = SIZES[size]
     camera_seed = int(rng.integers(1, 2**31))
     plan = Plan(
@@ -163,7 +165,7 @@ def draw(
         return Camera(camera_seed, present, cfa=cfa, rows=rows, cols=cols).record(plan)
 
     targets = [float(np.exp(rng.uniform(*np.log(NEAR if rng.random() < 0.5 else STRONG)))) for _ in laws]
-    chosen, sizes = _sized(take, laws, targets)
+    chosen, sizes = _sized(take, laws, targets if sized else [])
     recordings = take(chosen)
     recordings = _copied(recordings, fault, rng)  # healthy ones too: what is written has the same form for all
     concealed = tuple(
@@ -186,7 +188,8 @@ def draw(
     )  # fmt: skip
 
 
-def _kind(seed: int, index: int) -> Kind:
+def kind_of(seed: int, index: int) -> Kind:
+    """Which kind of case number `index` (from 1 on) is: every twenty hold the whole mix."""
     deck = [name for name, count in SHARES for _ in range(count)]
     order = np.random.default_rng([seed, 1000 + (index - 1) // len(deck)]).permutation(len(deck))
     return deck[order[(index - 1) % len(deck)]]
@@ -203,7 +206,7 @@ class _Picker:
     def __init__(self, seed: int, index: int, rng: np.random.Generator, cfa: str, plan: Plan) -> None:
         self.rng, self.mono = rng, cfa == "MONO"
         # the how-manieth case of its kind this is: laws are dealt over these, not over all cases
-        kinds = [_kind(seed, i) for i in range(1, index + 1)]
+        kinds = [kind_of(seed, i) for i in range(1, index + 1)]
         self.turn, self.seed = kinds.count(kinds[-1]), seed
 
     def laws(self, pool: Sequence[type[Law]], count: int) -> list[Law]:

@@ -440,6 +440,7 @@ class HotPixels(Law):
     def dark(self, rate: Array, temperature_c: float) -> Array:
         rng = self.rng(1)
         hot = rng.random((self.cam.rows, self.cam.cols)) < 5e-4
+        hot[self.cam.rows // 3, self.cam.cols // 3] = True  # one at least
         size = 1.0 if self.v == 0 else rng.lognormal(-0.3, 0.8, hot.shape)
         return rate + np.where(hot, self.s * size, 0.0)
 

@@ -1,0 +1,153 @@
+"""Scores of made-up results against figures worked out by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lab.challenge.proof import confusion, table, write_page
+from lab.challenge.run import CaseRun
+from lab.challenge.score import ChallengeScore, Rate, score
+from lab.challenge.truth import Concealed, Kind, Seals, Truth, Truths, salted, seal
+from lab.results import DiagnosisResult, HeldOut, NamedEffect, ParameterValue, Rival
+
+
+def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, accepts: tuple[str, ...] = ()) -> Truth:
+    concealed = tuple(
+        Concealed(
+            name=name, effect=None if kind == "outside" else name, strength=1.0, noncentrality=size, parameters={"size_um": 2.0}
+        )
+        for name, size in hidden
+    )  # fmt: skip
+    return Truth(
+        kind=kind, concealed=concealed, fault=fault, accepts=accepts, cfa="MONO", f_number=2.8, frames=9, rows=8, cols=8
+    )
+
+
+def named(
+    *names: str, rivals: tuple[str, ...] = (), value: float = 2.0, held: tuple[float, float, int] | None = None
+) -> DiagnosisResult:
+    """Names with probabilities that fall from the first on; the first has the rivals."""
+    effects = tuple(
+        NamedEffect(
+            name=name, probability=0.99 - 0.1 * i, sides=("left",), statement="",
+            parameters={"size_um": ParameterValue(value=value, std=0.1, unit="um")},
+            rivals=tuple(Rival(name=r, probability=0.1) for r in rivals) if i == 0 else (),
+        )
+        for i, name in enumerate(names)
+    )  # fmt: skip
+    held_out = HeldOut(captures=(), chi2_before=held[0], chi2_after=held[1], n=held[2]) if held else None
+    return DiagnosisResult(
+        source="", verdict="explained" if effects else "unexplained", effects=effects, held_out=held_out
+    )
+
+
+HEALTHY = DiagnosisResult(source="", verdict="no_mismatch")
+CASES: tuple[tuple[Truth, DiagnosisResult | None], ...] = (
+    (truth("healthy"), HEALTHY),
+    (truth("healthy"), HEALTHY),
+    (truth("healthy"), named()),  # a false alarm without a name
+    (truth("healthy"), named("defocus")),  # a false name
+    (
+        truth("single", ("defocus", 80.0)),
+        named("defocus", rivals=("crosstalk", "unknown"), held=(300.0, 120.0, 100)),
+    ),  # 90 % removed
+    (truth("single", ("crosstalk", 60.0)), named("defocus", rivals=("crosstalk",), held=(300.0, 200.0, 100))),  # 50 %
+    (truth("single", ("defocus", 55.0)), named()),
+    (truth("single", ("defocus", 30.0)), named("defocus", "vignetting", value=2.19)),  # 1.9 sigma
+    (truth("single", ("defocus", 5.0)), named("defocus", value=2.21)),  # 2.1 sigma
+    (truth("compound", ("defocus", 80.0), ("vignetting", 90.0)), named("vignetting", "defocus")),
+    (truth("compound", ("defocus", 80.0), ("vignetting", 20.0)), named("vignetting")),
+    (truth("compound", ("defocus", 80.0), ("vignetting", 90.0)), None),  # failed
+    (truth("outside", ("smear", 80.0)), named()),
+    (truth("outside", ("motion", 80.0), accepts=("vibration_blur",)), named("vibration_blur")),
+    (truth("outside", ("halo", 80.0)), named("veiling_glare")),
+    (truth("outside", fault="stale_frame"), HEALTHY),
+)
+
+
+def scored(broken: tuple[str, ...] = ()) -> ChallengeScore:
+    names = [f"case-{i:04d}" for i in range(1, len(CASES) + 1)]
+    kept = {name: salted(t) for name, (t, _) in zip(names, CASES, strict=True)}
+    truths = Truths(purpose="tuning", seed=3, size="small", cases=len(CASES), truths=kept)
+    runs = {
+        name: CaseRun(case=name, wall_s=2.0, cpu_s=float(i), memory_mib=100.0 + i, diagnosis=d, error=None if d else "ValueError: x")
+        for i, (name, (_, d)) in enumerate(zip(names, CASES, strict=True))
+    }  # fmt: skip
+    return score(truths, Seals(seals={n: seal(s) for n, s in kept.items()}), runs, broken)
+
+
+def counts(rate: Rate) -> tuple[int, int]:
+    return rate.count, rate.of
+
+
+def test_every_figure_is_what_a_hand_counts() -> None:
+    found = scored()
+    assert [counts(s.top_1) for s in found.singles] == [(1, 3), (1, 1), (1, 1)]
+    assert [counts(s.alone) for s in found.singles] == [(1, 3), (0, 1), (1, 1)]
+    assert [counts(s.unnamed) for s in found.singles] == [(1, 3), (0, 1), (0, 1)]
+    assert counts(found.compounds_both_named) == (1, 3)
+    assert counts(found.compounds_one_named) == (2, 3)
+    assert counts(found.compounds_strong_both_named) == (1, 2)
+    # sets of the named singles: {defocus, crosstalk}, {defocus, crosstalk}, {defocus}, {defocus}
+    assert counts(found.rival_sets_cover) == (4, 4)
+    assert found.rival_set_mean_size == pytest.approx(1.5)
+    assert counts(found.false_alarms) == (2, 4)
+    assert counts(found.false_names) == (1, 4)
+    assert counts(found.outside_not_named) == (3, 4)
+    assert counts(found.outside_located) == (3, 3)
+    # 2.0, 2.19 and 2.21 of the singles, 2.0 twice of the first compound, 2.0 of the second's one; the interval is 2 +- 0.196
+    assert counts(found.parameters_covered) == (5, 6)
+    assert found.excess_removed == pytest.approx((0.9 + 0.5) / 2)
+    assert found.cpu_max_s == 15.0
+    assert found.memory_max_mib == 115.0
+    assert found.failed == {"case-0012": "ValueError: x"}
+    assert not found.reached
+    by_name = {e.effect: e for e in found.effects}
+    assert counts(by_name["defocus"].strong_top_1) == (1, 2)
+    assert by_name["crosstalk"].instead == {"defocus": 1}
+
+
+def test_goals_say_what_was_missed() -> None:
+    met = {goal.name: goal.met for goal in scored().goals}
+    assert met["seals that hold"] is True
+    assert met["cases that ran"] is False
+    assert met["top-1 of single effects above 50"] is False
+    assert met["rival sets cover the truth"] is True
+    assert met["rivals in a set, mean"] is True
+    assert met["false names on healthy cameras"] is False
+    assert met["memory of a case"] is True
+
+
+def test_a_broken_seal_counts_nowhere_and_misses() -> None:
+    found = scored(broken=("case-0004",))
+    assert counts(found.false_names) == (0, 3)
+    assert {goal.name: goal.met for goal in found.goals}["seals that hold"] is False
+
+
+def test_clopper_pearson() -> None:
+    """None of 10: 1 - 0.025^(1/10) = 0.3085 above; 1 of 2: symmetric, 1 - sqrt(0.975) = 0.01258 below."""
+    none, all_, one = Rate.over([False] * 10), Rate.over([True] * 10), Rate.over([True, False])
+    assert (none.low, none.high) == (0.0, pytest.approx(0.30850, abs=1e-5))
+    assert (all_.low, all_.high) == (pytest.approx(1 - 0.30850, abs=1e-5), 1.0)
+    assert (one.low, one.high) == (pytest.approx(0.01258, abs=1e-5), pytest.approx(1 - 0.01258, abs=1e-5))
+    assert Rate.over([]).share is None
+
+
+def test_the_page_gets_tables_picture_and_seed_once(tmp_path: Path) -> None:
+    page = tmp_path / "proof.md"
+    page.write_text("# Proof\n\nWords.\n")
+    found = scored()
+    write_page(found, page)
+    write_page(found, page)
+    text = page.read_text()
+    assert text.startswith("# Proof\n\nWords.\n")
+    assert text.count(table(found)) == 1
+    assert text.count(f"| tuning | 3 | 16 | small | `{found.seals_sha256[:16]}` |") == 1
+    assert "(proof-tuning.svg)" in text
+    picture = (tmp_path / "proof-tuning.svg").read_text()
+    assert picture == confusion(found)
+    # defocus above 50: once right, once unexplained; healthy: two right
+    assert picture.count(">2</text>") == 1
+    assert "veiling glare" in picture
