@@ -38,7 +38,7 @@ Float32Array = NDArray[np.float32]
 DEGREE = 3
 _NODES = np.arange(DEGREE + 1) / DEGREE
 #: Tiles are made smaller, from the largest to the smallest of these (px), until the polynomial's error is below the limit.
-TILE_PX = (128, 64, 32, 16)
+TILE_PX = (128, 96, 64, 48, 32, 16)
 #: Relative rms error of a function half way between nodes, and relative error of its light before that is put right.
 KERNEL_ERROR = 2e-3
 LIGHT_ERROR = 1e-4
