@@ -9,7 +9,16 @@ import pytest
 from lab.diagnose import diagnose
 from lab.recording import read
 from lab.results import DiagnosisResult
-from tests.proof.foreign import Body
+from tests.proof.former import Camera, Law
+from tests.proof.former.laws import (
+    ChargeDiffusion,
+    CoverGlassFringe,
+    Defocus,
+    InfraredCutFilter,
+    Nonlinearity,
+    OpticalLowPassFilter,
+    VeilingGlare,
+)
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
@@ -42,38 +51,40 @@ def test_two_effects_of_another_image_former_are_named() -> None:
     assert result.held_out.chi2_after < 1.3 * result.held_out.n
 
 
-CASES = [
-    ("healthy mono", {}, 1, "MONO"),
-    ("glare", {"veiling_glare": 2.0}, 1, "GRBG"),
-    ("bend", {"nonlinearity": 2.0}, 0, "BGGR"),
+CASES: list[tuple[str, tuple[Law, ...], str]] = [
+    ("healthy mono", (), "MONO"),
+    ("glare", (VeilingGlare(2.0, 0),), "GRBG"),
+    ("bend", (Nonlinearity(2.0, 0),), "BGGR"),
 ]
 
 
-@pytest.mark.parametrize(("name", "concealed", "variant", "cfa"), CASES, ids=[c[0] for c in CASES])
-def test_one_effect_by_another_law_is_named_alone(
-    name: str, concealed: dict[str, float], variant: int, cfa: str
-) -> None:
-    result = diagnose(Body(900, concealed, variant=variant, cfa=cfa).record())
-    assert {e.name for e in result.effects} == set(concealed)
+def named(concealed: tuple[Law, ...]) -> set[str]:
+    return {str(law.effect) for law in concealed}
+
+
+@pytest.mark.parametrize(("name", "concealed", "cfa"), CASES, ids=[c[0] for c in CASES])
+def test_one_effect_by_another_law_is_named_alone(name: str, concealed: tuple[Law, ...], cfa: str) -> None:
+    result = diagnose(Camera(900, concealed, cfa=cfa).record())
+    assert {e.name for e in result.effects} == named(concealed)
     assert result.verdict == ("explained" if concealed else "no_mismatch")
 
 
-MORE = [
-    ({"defocus": 12.0}, 1), ({"charge_diffusion": 0.7}, 2), ({"optical_low_pass_filter": 1.4}, 1), ({"infrared_cut_filter": 665.0}, 1),
-    ({"defocus": 14.0, "nonlinearity": 1.5}, 0), ({"charge_diffusion": 0.8, "veiling_glare": 2.0}, 1),
+MORE: list[tuple[Law, ...]] = [
+    (Defocus(12.0, 1),), (ChargeDiffusion(0.7, 2),), (OpticalLowPassFilter(1.4, 1),), (InfraredCutFilter(55.0, 1),),
+    (Defocus(14.0, 1), Nonlinearity(1.5, 0)), (ChargeDiffusion(0.8, 1), VeilingGlare(2.0, 0)),
 ]  # fmt: skip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("concealed", "variant"), MORE)
-def test_more_concealed_effects(concealed: dict[str, float], variant: int) -> None:
-    result = diagnose(Body(910, concealed, variant=variant, cfa="RGGB").record())
-    assert {e.name for e in result.effects} == set(concealed)
+@pytest.mark.parametrize("concealed", MORE)
+def test_more_concealed_effects(concealed: tuple[Law, ...]) -> None:
+    result = diagnose(Camera(910, concealed, cfa="RGGB").record())
+    assert {e.name for e in result.effects} == named(concealed)
 
 
 @pytest.mark.slow
 def test_what_nobody_lists_is_located_and_not_named() -> None:
-    result = diagnose(Body(920, {"fringe": 0.03}, cfa="GBRG").record())
+    result = diagnose(Camera(920, [CoverGlassFringe(3.0)], cfa="GBRG").record())
     assert not result.effects
     assert result.verdict == "unexplained"
     assert any(m.measurement == "narrowband" for m in result.mismatches)

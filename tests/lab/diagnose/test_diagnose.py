@@ -25,7 +25,8 @@ from sim.effects.base import Effect
 from sim.effects.library import effect, effects
 from sim.forward import edge_profile
 from sim.spectrum import Spectrum
-from tests.proof.foreign import Body
+from tests.proof.former import Camera as ConcealedCamera
+from tests.proof.former import Plan
 
 FREQUENCY = np.linspace(0.02, 0.9, 23)
 NOISE = 0.004
@@ -197,7 +198,8 @@ def test_gaussians_agree_with_their_formulas() -> None:
 
 @pytest.fixture(scope="module")
 def edges() -> RecordingSet:
-    return Body(7, cfa="RGGB", rows=280, cols=280).record(("dark", "slanted_edge"))
+    # at f/2 the operator's nodes end before the transfer does, and cost 2e-3
+    return ConcealedCamera(7, cfa="RGGB", f_number=4.0, rows=280, cols=280).record(Plan(("dark", "slanted_edge")))
 
 
 def test_edges_linear_operator_is_the_estimator(edges: RecordingSet) -> None:
@@ -228,7 +230,7 @@ def test_a_subset_is_judged_by_what_it_has(edges: RecordingSet) -> None:
         "diagnose screen",
     }
     assert result.held_out is not None
-    assert all(c.startswith(("dark", "slanted_edge")) for c in result.held_out.captures)
+    assert set(result.held_out.captures) <= {c.id for c in edges.manifest.captures}
 
 
 def test_nothing_to_judge_is_said(edges: RecordingSet) -> None:

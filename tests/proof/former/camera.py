@@ -8,6 +8,7 @@ recordings is the law's alone.
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from .laws import FULL_CODE, WL, Array, Law
 HC_J_NM = 1.98644586e-16
 NODES = np.arange(384.0, 781.0, 9.0)  # nm, at which transfer functions are formed
 PUPIL = np.polynomial.legendre.leggauss(20)
-FINE = 4  # samples a pixel of a pattern's picture
+FINE, PARTS = 4, 3  # samples a pixel of a pattern's picture; parts a side that each is the mean of
 NORMAL_FROM_E = 60.0  # above, a Poisson number is a skewed normal one to 1e-3 of its standard deviation
 PERIOD_PX, STEP_PX = 204.8, 0.025
 STEP_S = 20.0  # from one capture to the next
@@ -268,15 +269,20 @@ class Camera:
 
     def pattern(self, target: Array, radiance: Array, dark: float, cell_px: float = 4.0) -> dict[str, Array]:
         """Cells on a screen, turned by 0.6 degrees, drawn on the fine grid and filtered there."""
-        r = (np.arange(self.rows * FINE) + 0.5) / FINE - 0.5 - (self.rows - 1) / 2
-        c = (np.arange(self.cols * FINE) + 0.5) / FINE - 0.5 - (self.cols - 1) / 2
+        r = ((np.arange(self.rows * FINE) + 0.5) / FINE - 0.5 - (self.rows - 1) / 2)[:, None]
+        c = ((np.arange(self.cols * FINE) + 0.5) / FINE - 0.5 - (self.cols - 1) / 2)[None, :]
         t = np.deg2rad(0.6)
-        i = np.floor((r[:, None] * np.cos(t) - c[None, :] * np.sin(t)) / cell_px + target.shape[0] / 2).astype(int)
-        j = np.floor((r[:, None] * np.sin(t) + c[None, :] * np.cos(t)) / cell_px + target.shape[1] / 2).astype(int)
-        ok = (i >= 0) & (i < target.shape[0]) & (j >= 0) & (j < target.shape[1])
-        fine = np.where(ok, target[np.clip(i, 0, target.shape[0] - 1), np.clip(j, 0, target.shape[1] - 1)], 0.0)
+        fine = np.zeros((self.rows * FINE, self.cols * FINE))
+        # each fine sample is a mean over its square: else the cells' turned rims would be jagged
+        inside = (np.arange(PARTS) + 0.5) / PARTS / FINE - 0.5 / FINE
+        for y, x in itertools.product(inside, inside):
+            i = np.floor(((r + y) * np.cos(t) - (c + x) * np.sin(t)) / cell_px + target.shape[0] / 2).astype(np.int32)
+            j = np.floor(((r + y) * np.sin(t) + (c + x) * np.cos(t)) / cell_px + target.shape[1] / 2).astype(np.int32)
+            ok = (i >= 0) & (i < target.shape[0]) & (j >= 0) & (j < target.shape[1])
+            cells = target[np.clip(i, 0, target.shape[0] - 1), np.clip(j, 0, target.shape[1] - 1)]
+            fine += np.where(ok, cells, 0.0) / PARTS**2
         for law in self.laws:
-            fine = law.screen(fine, r[:, None], c[None, :])
+            fine = law.screen(fine, r, c)
         return {
             ch: self.rate(radiance, ch) * (dark + (1 - dark) * im)
             for ch, im in self._filtered(dict.fromkeys(self.qe, fine), radiance, FINE).items()
@@ -302,6 +308,8 @@ class Camera:
                 else np.interp(radius, grid_f, table[0])
             )
             h = h * self._grey(fx / self.pitch, fy / self.pitch)
+            if over > 1:
+                h = h / (np.sinc(fx / over) * np.sinc(fy / over))  # the samples' own squares
             # samples lie at (k + 0.5) / over - 0.5: half a fine step less half a pixel is taken out with the phase
             turn = np.exp(2j * np.pi * (fx + fy) * (0.5 - 0.5 / over))
             out[ch] = np.fft.irfft2(spectra[id(picture)] * h * turn, shape)[
