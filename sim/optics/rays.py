@@ -23,6 +23,11 @@ OUTCOMES = {
     TURNED: "turns back",
 }
 
+# Places in a surface's row of `Surfaces.shape`.
+KIND, CURVATURE, CONIC, TERMS, EVEN_FROM = range(5)
+ODD_FROM = EVEN_FROM + ASPHERE_TERMS
+ODD_TERMS = ASPHERE_TERMS // 2
+
 # Places in a traced ray's row.
 STATUS, SURFACE, X, Y, L, M, N, PATH, CLIP, STOP_X, STOP_Y = range(11)
 DL_DX, DL_DY, DM_DX, DM_DY, DS_XX, DS_XY, DS_YX, DS_YY, DX_DX, DX_DY, DY_DX, DY_DY = range(11, 23)
@@ -39,7 +44,7 @@ class Surfaces(NamedTuple):
     conic: FloatArray
     even: FloatArray  # of r^2, r^4, ...
     odd: FloatArray  # of r, r^3, ...
-    terms: NDArray[np.int64]  # how many of the even ones there are
+    shape: FloatArray  # (surfaces, SHAPE): all that says where a surface is, in one array that is cheap to hand on
     thickness: FloatArray
     aperture: NDArray[np.int64]
     opening: FloatArray  # half width, half height, x, y
@@ -90,7 +95,7 @@ def compiled_surfaces(prescription: Prescription, stop_radius_mm: float, image_s
         conic,
         even,
         odd,
-        np.array([int(np.max(np.flatnonzero(row), initial=-1)) + 1 for row in even]),
+        _shapes(kind, curvature, conic, even, odd),
         thickness,
         aperture,
         opening,
@@ -100,6 +105,14 @@ def compiled_surfaces(prescription: Prescription, stop_radius_mm: float, image_s
         prescription.stop,
         stop_radius_mm,
     )
+
+
+def _shapes(
+    kind: NDArray[np.int64], curvature: FloatArray, conic: FloatArray, even: FloatArray, odd: FloatArray
+) -> FloatArray:
+    terms = np.array([int(np.max(np.flatnonzero(row), initial=-1)) + 1 for row in even])
+    columns = np.stack([kind.astype(float), curvature, conic, terms.astype(float)], axis=1)
+    return np.ascontiguousarray(np.concatenate([columns, even, odd], axis=1))
 
 
 def _rotation(tilt_deg: tuple[float, float, float], reverse: bool) -> FloatArray:
@@ -130,10 +143,10 @@ def frames(surfaces: Surfaces) -> tuple[FloatArray, FloatArray]:
     return np.array(vertices), np.array(turned)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _sag(surfaces: Any, i: int, u: float) -> Any:
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _sag(shape: Any, i: int, u: float) -> Any:
     """Sag at r^2 = u with its first and second derivative by u; the last value is False outside the surface."""
-    c, k, kind = surfaces.curvature[i], surfaces.conic[i], surfaces.kind[i]
+    c, k, kind = shape[i, CURVATURE], shape[i, CONIC], shape[i, KIND]
     root2 = 1.0 - (1.0 + k) * c * c * u
     if root2 <= 0.0:
         return 0.0, 0.0, 0.0, False
@@ -145,19 +158,19 @@ def _sag(surfaces: Any, i: int, u: float) -> Any:
         p = 0.0
         p1 = 0.0
         p2 = 0.0
-        for j in range(surfaces.terms[i] - 1, -1, -1):
+        for j in range(int(shape[i, TERMS]) - 1, -1, -1):
             p2 = p2 * u + 2.0 * p1
             p1 = p1 * u + p
-            p = p * u + surfaces.even[i, j]
+            p = p * u + shape[i, EVEN_FROM + j]
         # p is the polynomial over u: times u, with the product rule.
         s += p * u
         s1 += p + p1 * u
         s2 += 2.0 * p1 + p2 * u
         if kind == ODD:
             r = np.sqrt(max(u, 1e-24))
-            for j in range(surfaces.odd.shape[1]):
+            for j in range(ODD_TERMS):
                 power = 2.0 * j + 1.0
-                term = surfaces.odd[i, j] * r**power
+                term = shape[i, ODD_FROM + j] * r**power
                 s += term
                 s1 += 0.5 * power * term / (r * r)
                 s2 += 0.25 * power * (power - 2.0) * term / (r * r * r * r)
@@ -166,14 +179,14 @@ def _sag(surfaces: Any, i: int, u: float) -> Any:
 
 def sag(surfaces: Surfaces, i: int, square_mm2: float) -> tuple[float, bool]:
     """Sag (mm) of a surface at r^2 (mm^2), and whether the surface reaches that far."""
-    value, _, _, inside = _sag(surfaces, i, square_mm2)
+    value, _, _, inside = _sag(surfaces.shape, i, square_mm2)
     return float(value), bool(inside)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces: Any, i: int) -> Any:
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, shape: Any, i: int) -> Any:
     """Distance from (x, y) on the vertex plane to surface i along the direction, the place there, and the sag's slopes."""
-    c, k, kind = surfaces.curvature[i], surfaces.conic[i], surfaces.kind[i]
+    c, k, kind = shape[i, CURVATURE], shape[i, CONIC], shape[i, KIND]
     t = 0.0
     if c != 0.0:
         a = c * (1.0 + k * dir_n * dir_n)
@@ -186,7 +199,7 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces
             return 0.0, x, y, 0.0, 0.0, 0.0, False
     for _ in range(_ITERATIONS):
         px, py = x + t * dir_l, y + t * dir_m
-        s, s1, s2, inside = _sag(surfaces, i, px * px + py * py)
+        s, s1, s2, inside = _sag(shape, i, px * px + py * py)
         if not inside:
             return 0.0, x, y, 0.0, 0.0, 0.0, False
         if kind == STANDARD:
@@ -198,12 +211,12 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, surfaces
         t -= move
         if abs(move) < 1e-8 * (1.0 + abs(t)):  # Newton's method: the next step would be about 1e-16
             px, py = x + t * dir_l, y + t * dir_m
-            s, s1, s2, inside = _sag(surfaces, i, px * px + py * py)
+            s, s1, s2, inside = _sag(shape, i, px * px + py * py)
             return t, px, py, s, s1, s2, inside
     return 0.0, x, y, 0.0, 0.0, 0.0, False
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _turn(r: Any, a: float, b: float, c: float) -> Any:
     """A vector of the old frame in the new one."""
     return (
@@ -213,7 +226,7 @@ def _turn(r: Any, a: float, b: float, c: float) -> Any:
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _carried(p: Any, d: Any, t: float, direction: Any, gradient: Any) -> Any:
     """A ray's derivative carried by t onto a surface with that gradient: it stays on the surface."""
     qx, qy, qz = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
@@ -222,7 +235,7 @@ def _carried(p: Any, d: Any, t: float, direction: Any, gradient: Any) -> Any:
     return qx + dt * direction[0], qy + dt * direction[1], qz + dt * direction[2]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _refracted(p: Any, d: Any, bend: Any, direction: Any, normal: Any, length: float, optics: Any) -> Any:
     """The derivative of the refracted direction: D' = mu D + gamma n, gamma = cos T - mu cos I."""
     sxx, sxy, syy = bend
@@ -247,7 +260,7 @@ def _refracted(p: Any, d: Any, bend: Any, direction: Any, normal: Any, length: f
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
     surfaces: Any, index: Any, field: Any, px: float, py: float, with_slopes: bool, out: Any, points: Any
 ) -> None:
@@ -281,6 +294,7 @@ def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
         p2 = (0.0, 1.0, 0.0)
         d1 = (0.0, 0.0, 0.0)
         d2 = (0.0, 0.0, 0.0)
+    shape = surfaces.shape
     clip = -1.0
     stop_x = 0.0
     stop_y = 0.0
@@ -309,7 +323,7 @@ def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
             continue
         t0 = -z / dn
         x0, y0 = x + t0 * dl, y + t0 * dm
-        t, x, y, z, s1, s2, hit = _step(x0, y0, dl, dm, dn, surfaces, i)
+        t, x, y, z, s1, s2, hit = _step(x0, y0, dl, dm, dn, shape, i)
         if not hit:
             out[STATUS] = MISSED
             out[SURFACE] = i
@@ -363,7 +377,7 @@ def trace_ray(  # noqa: PLR0912, PLR0915  (one loop, compiled as one)
         out[DX_DX], out[DX_DY], out[DY_DX], out[DY_DY] = p1[0], p2[0], p1[1], p2[1]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def trace_rays(surfaces: Any, index: Any, field: Any, px: Any, py: Any) -> Any:
     """(rays, ROW): the rays through the places (px, py) of the entrance pupil's plane, with their derivatives."""
     out = np.zeros((px.size, ROW))
@@ -373,7 +387,7 @@ def trace_rays(surfaces: Any, index: Any, field: Any, px: Any, py: Any) -> Any:
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def aim(surfaces: Any, index: Any, field: Any, px: float, py: float) -> Any:
     """The place in the entrance pupil's plane whose ray passes the stop's centre, from a start near it: (x, y, found).
 
@@ -410,7 +424,7 @@ def aim(surfaces: Any, index: Any, field: Any, px: float, py: float) -> Any:
     return px, py, np.sqrt(out[STOP_X] ** 2 + out[STOP_Y] ** 2) < 1e-8 * scale
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def rim(surfaces: Any, index: Any, field: Any, px: float, py: float, angle: Any, guess: float) -> Any:  # noqa: PLR0912
     """Distance from an open place of the pupil to its rim in the given directions, where rays begin to be clipped or lost.
 

@@ -54,7 +54,8 @@ def test_the_page_holds_every_picture_and_nothing_from_elsewhere(traced: TracedP
     ):
         assert heading in page
     assert page.count('class="chart"') == 6 and page.count('<img src="data:image/png;base64,') == 15
-    assert 'src="http' not in page and 'href="http' not in page
+    markup = page[: page.rindex("<h2>Fields</h2>")]  # the plotting library behind it holds addresses in its own text
+    assert "http" not in markup
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["lens.html"]
 
 
