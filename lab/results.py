@@ -239,6 +239,19 @@ class PhotonTransfer(Frozen):
     linearity_residual_percent: tuple[float | None, ...]
 
 
+class MakerDeparture(Frozen):
+    """A band in which a fitted sensitivity parts from the maker's curve times `maker_scale`: the mean difference over the band in
+    electrons a photon, fitted less stated, and its significance, allowed for the number of bands that were tested."""
+
+    channel: str
+    from_nm: float
+    to_nm: float
+    difference: float
+    difference_std: float
+    difference_percent: float | None  # of the scaled maker's mean over the band
+    significance_sigma: float
+
+
 class SpectralFit(Frozen):
     """Absolute quantum efficiency per channel, electrons a photon, of the camera behind its lens: the lens's stated
     transmittance is divided out."""
@@ -246,6 +259,15 @@ class SpectralFit(Frozen):
     wavelength_nm: tuple[float, ...]
     quantum_efficiency: dict[str, tuple[float, ...]]
     quantum_efficiency_std: dict[str, tuple[float, ...]]
+    #: The highest value of all channels set to 1: without the uncertainty of the scale, nor of what the channels share.
+    relative_sensitivity: dict[str, tuple[float, ...]] = {}
+    relative_sensitivity_std: dict[str, tuple[float, ...]] = {}
+    #: Bands (first, last) by channel in which no light tells the curve: what stands there is the prior, with its band.
+    not_determined_nm: dict[str, tuple[tuple[float, float], ...]] = {}
+    #: One factor between the fitted curves and the maker's, and where they part beyond it. None: there are none to compare, or
+    #: the fit leans on them.
+    maker_scale: float | None = None
+    maker_departures: tuple[MakerDeparture, ...] = ()
     #: Times the standard uncertainty: a band of about 95 %.
     coverage_factor: float = 2.0
     #: What the curve rests on where light is missing, and what was taken as known, in sentences.

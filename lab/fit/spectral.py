@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy import linalg, optimize
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg, optimize, special
 
 from lab.errors import NotDetermined
 from lab.fit.lines import DarkLine, dark_line
-from lab.recording import Capture, Flat, RecordingSet
-from lab.results import NoiseFit, SpectralFit
+from lab.recording import Capture, Flat, Narrowband, RecordingSet
+from lab.results import MakerDeparture, NoiseFit, SpectralFit
 from sim.camera import Side
 from sim.optics.illumination import irradiance_factor
 from sim.sensor.mosaic import phases, step
@@ -40,17 +40,29 @@ SATURATED_SHARE = 0.98  # of the fitted full well
 FLAT_RANGE = (0.2, 0.9)  # of saturation: flats that may help out
 MIN_LIGHTS = 5
 OUTPUT_STEP_NM = 10.0
+NEGATIVE_LIGHT = 0.05  # of a light's maximum: what a radiometer's noise may go below zero
+MIN_SPECTRA = 3  # lights that differ: a curve with a bend has three points
+CENTROID_MARGIN_NM = 1.0  # beyond the outer lights' centroids that the curve is stated
+STATED_DIGITS = 1e-3  # of the maximum: how finely a maker's curve is stated
+DETERMINED_SHARE = 0.25  # of the curve's maximum: a standard uncertainty above it says nothing of the value
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
     """A sensitivity on the wavelengths of the lights, `std` one standard uncertainty, `coverage_factor` what to multiply it by
-    for a band of about 95 %, and the covariance (before the positivity, which only takes away)."""
+    for a band of about 95 %, and the covariance (before the positivity, which only takes away). `gain` (m, n): by how much the
+    curve moves with each signal; what several channels' signals share is propagated by it."""
 
     sensitivity: FloatArray
     std: FloatArray
     coverage_factor: float
     covariance: FloatArray
+    gain: FloatArray
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """(m,): where the lights say something of the curve: its standard uncertainty is below a quarter of its maximum."""
+        return self.std < DETERMINED_SHARE * max(float(self.sensitivity.max()), 1e-300)
 
 
 def estimate_sensitivity(
@@ -59,8 +71,9 @@ def estimate_sensitivity(
     """Sensitivity S(w) from signals C_i = integral L_i(w) S(w) dw + noise.
 
     `wavelength_nm` (m,), ascending; `lights` (n, m), photons (or power) per nm; `signal`, `signal_std` (n,). S is in signal per
-    photon (or energy), on `wavelength_nm`; integrals are trapezoids. Raises ValueError where shapes don't fit, values aren't
-    finite, a standard deviation isn't above 0, or there are fewer than 3 lights.
+    photon (or energy), on `wavelength_nm`; integrals are trapezoids. Where no light shines, `std` is large and `determined` False.
+    Raises ValueError where shapes don't fit, values aren't finite, a light is negative by more than noise, a standard deviation
+    isn't above 0, or there are fewer than 3 lights that differ.
     """
     wave, light, value, std = (np.asarray(a, float) for a in (wavelength_nm, lights, signal, signal_std))
     _check(wave, light, value, std)
@@ -81,6 +94,24 @@ def _check(wave: FloatArray, light: FloatArray, value: FloatArray, std: FloatArr
         raise ValueError("lights and signals must be finite, standard deviations above 0 and finite")
     if not np.all(np.any(light > 0, axis=1)):
         raise ValueError(f"light {int(np.argmin(np.any(light > 0, axis=1)))} is dark at all wavelengths: leave it out")
+    negative = light.min(axis=1) < -NEGATIVE_LIGHT * light.max(axis=1)
+    if negative.any():
+        at = int(np.argmax(negative))
+        raise ValueError(
+            f"light {at} is negative, {light[at].min():.3g} at {wave[np.argmin(light[at])]:g} nm where its maximum is "
+            f"{light[at].max():.3g}: measure it again, with the radiometer's dark subtracted"
+        )
+    if (different := _different(light)) < MIN_SPECTRA:
+        raise ValueError(
+            f"{value.size} lights, of {different} different spectra, {MIN_SPECTRA} needed: add other lights"
+        )
+
+
+def _different(light: FloatArray) -> int:
+    """How many spectra of (n, wavelengths) differ by more than the radiometer's repeatability: the number of singular values of
+    the normalised lights above it. One light taken twice, or at two levels, counts once."""
+    unit = light / np.linalg.norm(light, axis=1, keepdims=True)
+    return int(np.sum(np.linalg.svd(unit, compute_uv=False) > np.sqrt(2.0) * RADIOMETER_RELATIVE_STD))
 
 
 def _trapezoid(wave: FloatArray) -> FloatArray:
@@ -120,6 +151,7 @@ def _solve(
         np.sqrt(np.clip(np.diag(covariance), 0.0, None)),
         COVERAGE_FACTOR,
         covariance,
+        (covariance @ operator.T) / std**2,
     )
 
 
@@ -234,6 +266,7 @@ class _Signals:
     std: FloatArray
     saturated: FloatArray  # (k, m)
     limit: FloatArray
+    light: tuple[str, ...] = ()  # paths of the lights' spectra: two channels' signals of one light share its error
 
     @property
     def has_gaps(self) -> bool:
@@ -308,6 +341,7 @@ def _with_maker(wave: FloatArray, signals: Sequence[_Signals], maker: Sequence[F
                 np.sqrt(np.clip(np.diag(covariance), 0.0, None)),
                 COVERAGE_FACTOR,
                 covariance,
+                linalg.cho_solve(factor, cross.T).T[:, at] / signals[c].std,
             )
         )
     return result
@@ -335,14 +369,28 @@ class _Recording:
         self.recordings, self.side, self.noise = recordings, side, noise
         self.camera = recordings.camera(side)
         self.remarks: list[str] = []
-        self.narrowband = [c for c in recordings.captures("narrowband", side) if c.exposure_s > 0]
-        if not self.narrowband:
-            raise NotDetermined("spectral", "no narrowband captures: capture them over the visible by 10 nm or finer")
+        self.narrowband: list[Narrowband | Flat] = [
+            c for c in recordings.captures("narrowband", side) if c.exposure_s > 0
+        ]
+        if len({self._path(c) for c in self.narrowband}) < MIN_LIGHTS:
+            # Broadband lights of known radiance, LEDs or lamps behind filters, say the same in fewer words.
+            flats = [f for f in recordings.captures("flat", side) if f.exposure_s > 0 and f.radiance is not None]
+            self.narrowband.extend(flats)
+            if not self.narrowband:
+                raise NotDetermined(
+                    "spectral",
+                    "no narrowband captures and no flats of known radiance: capture narrowband light over the visible by "
+                    "10 nm or finer",
+                )
         self.gain, self.gain_std = self._conversion_gain()
         self.region = self._central_region()
         self.pixels = {channel: self._count(channel) for channel in phases(self.camera.cfa)}
         self.photons = self._photons_per_radiance()
         self.darks: dict[tuple[float, str], DarkLine] = {}
+
+    @staticmethod
+    def _path(capture: Narrowband | Flat) -> str:
+        return cast(str, capture.radiance)
 
     def _conversion_gain(self) -> tuple[float, float]:
         if self.noise is not None and self.noise.conversion_gain_dn_per_e is not None:
@@ -461,8 +509,16 @@ class _Recording:
 
     def _lights(self) -> dict[str, FloatArray]:
         """Spectral photon rates of a pixel (photons s^-1 nm^-1) by the path of the radiance, on `self.wave`."""
-        paths = dict.fromkeys(capture.radiance for capture in self.narrowband)
+        paths = dict.fromkeys(self._path(capture) for capture in self.narrowband)
         spectra = {path: self.recordings.spectrum(path) for path in paths}
+        for path in paths:
+            value = spectra[path].arrays[1]
+            if not np.all(np.isfinite(value)) or value.min() < -NEGATIVE_LIGHT * value.max():
+                self.remarks.append(
+                    f"the light {path} is left out: its radiance is negative or not a number "
+                    f"(lowest {value.min():.3g}, highest {value.max():.3g}); measure it again"
+                )
+                del spectra[path]
         low, high = np.inf, -np.inf
         for spectrum in spectra.values():
             wave, value = np.array(spectrum.wavelength_nm), np.array(spectrum.value)
@@ -470,9 +526,9 @@ class _Recording:
             if lit.size:
                 low, high = min(low, lit[0]), max(high, lit[-1])
         if not low < high:
-            raise NotDetermined("spectral", "all narrowband spectra are dark: measure them with the light on")
+            raise NotDetermined("spectral", "all spectra are dark or unusable: measure them with the light on")
         self.wave = np.arange(np.floor(low), np.ceil(high) + 0.5)
-        return {path: self._photon_rate(path) for path in paths}
+        return {path: self._photon_rate(path) for path in spectra}
 
     def _photon_rate(self, path: str) -> FloatArray:
         spectrum = self.recordings.spectrum(path)
@@ -484,10 +540,11 @@ class _Recording:
         rates: dict[tuple[str, str], list[tuple[float, float, bool, float]]] = {}
         for capture in self.narrowband:
             for channel, values in self._values(capture).items():
-                rates.setdefault((channel, capture.radiance), []).append(self._rate(capture, channel, values))
+                rates.setdefault((channel, self._path(capture)), []).append(self._rate(capture, channel, values))
         result = {}
         for channel in phases(self.camera.cfa):
             good: list[tuple[FloatArray, float, float]] = []
+            seen: list[str] = []
             high: list[tuple[FloatArray, float]] = []
             for path, light in lights.items():
                 if not np.any(light > 0):
@@ -498,6 +555,7 @@ class _Recording:
                     weight = 1.0 / np.array([std for _, std in usable]) ** 2
                     mean = float(np.sum(weight * [rate for rate, _ in usable]) / weight.sum())
                     spread = float(np.sqrt(1.0 / weight.sum()))
+                    seen.append(path)
                     good.append((light * weights, mean, float(np.hypot(spread, RADIOMETER_RELATIVE_STD * mean))))
                 else:
                     # A saturated mean is a lower limit; 1 % below leaves room for its noise.
@@ -505,8 +563,14 @@ class _Recording:
             if len(good) < MIN_LIGHTS:
                 raise NotDetermined(
                     "spectral",
-                    f"only {len(good)} of {len(lights)} narrowband lights leave channel {channel} unsaturated, {MIN_LIGHTS} needed: "
-                    "expose shorter",
+                    f"only {len(good)} of {len(lights)} lights leave channel {channel} unsaturated, {MIN_LIGHTS} needed: "
+                    + ("expose shorter" if high else "capture narrowband light over the visible by 10 nm or finer"),
+                )
+            if (different := _different(np.array([g[0] for g in good]))) < MIN_LIGHTS:
+                raise NotDetermined(
+                    "spectral",
+                    f"the {len(good)} lights are of {different} different spectra, {MIN_LIGHTS} needed: capture narrowband light over "
+                    "the visible by 10 nm or finer",
                 )
             size = self.wave.size
             result[channel] = _Signals(
@@ -515,6 +579,7 @@ class _Recording:
                 np.array([g[2] for g in good]),
                 np.array([h[0] for h in high]).reshape(-1, size),
                 np.array([h[1] for h in high]),
+                tuple(seen),
             )
         return result
 
@@ -534,7 +599,7 @@ class _Recording:
         weights = _trapezoid(self.wave)
         result = {}
         for channel, own in signals.items():
-            rows, values_, stds = [own.operator], [own.value], [own.std]
+            rows, values_, stds, seen = [own.operator], [own.value], [own.std], list(own.light)
             for path in used:
                 found = rates.get((channel, path))
                 spectrum = self.recordings.spectrum(path)
@@ -546,11 +611,17 @@ class _Recording:
                 weight = 1.0 / np.array([std for _, std in found]) ** 2
                 mean = float(np.sum(weight * [rate for rate, _ in found]) / weight.sum())
                 outside = 1.0 - inside / total
+                seen.append(path)
                 rows.append((self._photon_rate(path) * weights)[None])
                 values_.append(np.array([mean]))
                 stds.append(np.array([mean * np.hypot(RADIOMETER_RELATIVE_STD, outside)]))
             result[channel] = _Signals(
-                np.concatenate(rows), np.concatenate(values_), np.concatenate(stds), own.saturated, own.limit
+                np.concatenate(rows),
+                np.concatenate(values_),
+                np.concatenate(stds),
+                own.saturated,
+                own.limit,
+                tuple(seen),
             )
         return result
 
@@ -578,38 +649,182 @@ class _Recording:
                 f"saturated narrowband captures are left out ({listed} lights): {filled}; expose shorter to measure it"
             )
         if maker:
-            helped = self._with_flats(signals)
+            signals = self._with_flats(signals)
             solved = dict(
-                zip(helped, _with_maker(self.wave, list(helped.values()), [maker[c] for c in helped]), strict=True)
+                zip(signals, _with_maker(self.wave, list(signals.values()), [maker[c] for c in signals]), strict=True)
             )
         else:
             solved = {
                 c: _solve(self.wave, s.operator, s.value, s.std, _Bounds(s.saturated, s.limit) if s.has_gaps else None)
                 for c, s in signals.items()
             }
-        return self._result(solved)
+        self.leans_on_maker = bool(maker)
+        return self._result(solved, signals)
 
-    def _result(self, solved: dict[str, Sensitivity]) -> SpectralFit:
-        nominal = [capture.wavelength_nm for capture in self.narrowband]
-        low, high = max(min(nominal), self.wave[0]), min(max(nominal), self.wave[-1])
-        first, last = np.ceil(low / OUTPUT_STEP_NM), np.floor(high / OUTPUT_STEP_NM)
-        out = np.arange(first, last + 1) * OUTPUT_STEP_NM
+    def _span(self) -> tuple[float, float]:
+        """First and last wavelength that the lights can speak of: narrowband by the centroids of their measured spectra (their
+        names may be some nm off), broadband wholly."""
+        if any(isinstance(capture, Flat) for capture in self.narrowband):
+            return float(self.wave[0]), float(self.wave[-1])
+        paths = {self._path(capture) for capture in self.narrowband}
+        centroids = []
+        for rate in (self._photon_rate(path) for path in paths):
+            if rate.max() > 0:
+                centroids.append(float(np.sum(rate * self.wave) / rate.sum()))
+        margin = CENTROID_MARGIN_NM
+        return max(min(centroids) - margin, self.wave[0]), min(max(centroids) + margin, self.wave[-1])
+
+    def _result(self, solved: dict[str, Sensitivity], signals: dict[str, _Signals]) -> SpectralFit:
+        low, high = self._span()
+        out = np.arange(np.ceil(low / OUTPUT_STEP_NM), np.floor(high / OUTPUT_STEP_NM) + 1) * OUTPUT_STEP_NM
+        known = {c: np.interp(out, self.wave, found.determined.astype(float)) > 0.5 for c, found in solved.items()}
+        any_channel = np.flatnonzero(np.any(list(known.values()), axis=0))
+        inside = slice(any_channel[0], any_channel[-1] + 1) if any_channel.size else slice(0, 0)
+        out = out[inside]
         if out.size < 2:
             raise NotDetermined(
-                "spectral", f"the narrowband lights span {low:g}..{high:g} nm only: capture them over the visible"
+                "spectral",
+                f"the lights within {low:.0f}..{high:.0f} nm don't span the spectrum: capture narrowband light over the visible by "
+                "10 nm or finer",
             )
-        prnu = self.noise.prnu_percent if self.noise is not None else None
-        efficiency, std = {}, {}
-        for channel, found in solved.items():
-            scale = np.hypot(self.gain_std / self.gain, (prnu or 0.0) / 100.0 / np.sqrt(self.pixels[channel]))
-            value = np.interp(out, self.wave, found.sensitivity)
-            own = np.interp(out, self.wave, found.std)
-            efficiency[channel] = tuple(value.tolist())
-            std[channel] = tuple(np.hypot(own, scale * value).tolist())
+        gaps = {c: _runs(out, ~k[inside]) for c, k in known.items()}
+        for channel, runs in gaps.items():
+            if runs:
+                where = ", ".join(f"{a:g}..{b:g} nm" for a, b in runs)
+                self.remarks.append(
+                    f"{channel} isn't identifiable at {where}: no light that was measured tells it there; capture narrowband light there"
+                )
+        channels = list(solved)
+        joint = _joint(self.wave, out, solved, signals)
+        value = np.concatenate([np.interp(out, self.wave, solved[c].sensitivity) for c in channels])
+        # The region's own PRNU differs from channel to channel; the conversion gain is the same for all.
+        prnu = (self.noise.prnu_percent if self.noise is not None else None) or 0.0
+        for k, channel in enumerate(channels):
+            at = slice(k * out.size, (k + 1) * out.size)
+            joint[at, at] += (prnu / 100.0) ** 2 / self.pixels[channel] * np.outer(value[at], value[at])
+        absolute = np.sqrt(np.diag(joint) + (self.gain_std / self.gain * value) ** 2)
+        peak = int(np.argmax(value))
+        ratio = value / value[peak]
+        spread = np.diag(joint) - 2.0 * ratio * joint[peak] + ratio**2 * joint[peak, peak]
+        relative = np.sqrt(np.clip(spread, 0.0, None)) / value[peak]
+
+        def by_channel(array: FloatArray) -> dict[str, tuple[float, ...]]:
+            return {c: tuple(row.tolist()) for c, row in zip(channels, array.reshape(len(channels), -1), strict=True)}
+
+        scale, departures = self._departures(out, channels, value, joint)
         return SpectralFit(
             wavelength_nm=tuple(out.tolist()),
-            quantum_efficiency=efficiency,
-            quantum_efficiency_std=std,
+            quantum_efficiency=by_channel(value),
+            quantum_efficiency_std=by_channel(absolute),
+            relative_sensitivity=by_channel(ratio),
+            relative_sensitivity_std=by_channel(relative),
+            not_determined_nm={c: runs for c, runs in gaps.items() if runs},
+            maker_scale=scale,
+            maker_departures=departures,
             coverage_factor=COVERAGE_FACTOR,
             remarks=tuple(self.remarks),
         )
+
+    def _departures(
+        self, out: FloatArray, channels: Sequence[str], value: FloatArray, joint: FloatArray
+    ) -> tuple[float | None, tuple[MakerDeparture, ...]]:
+        """The maker's curves beside the fitted ones. None where the maker states none, or where the fit leans on them."""
+        maker = self._maker()
+        if maker is None or self.leans_on_maker:
+            return None, ()
+        ends = [
+            self.recordings.spectrum((self.camera.quantum_efficiency or {})[c]).arrays[0][[0, -1]] for c in channels
+        ]
+        covered = (out >= max(low for low, _ in ends)) & (out <= min(high for _, high in ends))
+        if not covered.any():
+            return None, ()
+        every = np.tile(covered, len(channels))
+        stated = np.concatenate([np.interp(out[covered], self.wave, maker[c]) for c in channels])
+        return compare_curves(out[covered], channels, value[every], joint[np.ix_(every, every)], stated)
+
+
+def _runs(wave: FloatArray, where: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+    """First and last wavelength of each run."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
+    return tuple((float(wave[a]), float(wave[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
+
+
+def _joint(
+    wave: FloatArray, out: FloatArray, solved: dict[str, Sensitivity], signals: dict[str, _Signals]
+) -> FloatArray:
+    """Covariance of all channels' curves at `out`, channel after channel. Channels share the radiometer's error of each light:
+    Cov(S_c, S_d) = G_c diag(r^2 C_c C_d) G_d'."""
+    at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
+    blocks = []
+    for c, one in solved.items():
+        row = []
+        for d, two in solved.items():
+            if c == d:
+                row.append(at @ one.covariance @ at.T)
+                continue
+            place = {path: i for i, path in enumerate(signals[d].light)}
+            pairs = np.array([(i, place[p]) for i, p in enumerate(signals[c].light) if p in place], int).reshape(-1, 2)
+            i, j = pairs.T
+            shared = RADIOMETER_RELATIVE_STD**2 * signals[c].value[i] * signals[d].value[j]
+            row.append((at @ one.gain[:, i] * shared) @ (at @ two.gain[:, j]).T)
+        blocks.append(row)
+    return np.block(blocks)
+
+
+# --- beside the maker's curves -----------------------------------------------------------------------------------------
+
+
+def compare_curves(
+    wavelength_nm: FloatArray, channels: Sequence[str], value: FloatArray, covariance: FloatArray, stated: FloatArray
+) -> tuple[float, tuple[MakerDeparture, ...]]:
+    """Where fitted curves part from stated ones, but for one factor that all channels share.
+
+    `value`, `stated` (channels x wavelengths,), channel after channel; `covariance` of `value` without what is common to all. The
+    factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that part don't move it. Every
+    band of neighbouring wavelengths of every channel is tested by its mean difference; the significance (normal, two-sided) is
+    allowed for the number of bands. Bands are taken by significance, each apart from those before it, down to the level that
+    curves which are as stated exceed in at most 1 % of fits.
+    """
+    high = stated > 0.2 * stated.max()
+    scale = float(np.median(value[high] / stated[high]))
+    # The factor's own error, as by a mean over where it was taken.
+    weight = high / (high.sum() * np.where(high, stated, 1.0))
+    centre = np.eye(value.size) - np.outer(stated, weight)
+    spread = centre @ covariance @ centre.T + (STATED_DIGITS * stated.max()) ** 2 * np.eye(value.size)
+    difference = value - scale * stated
+    size = wavelength_nm.size
+    found: list[tuple[float, int, int, int]] = []
+    for k in range(len(channels)):
+        own = slice(k * size, (k + 1) * size)
+        total = np.concatenate([[0.0], np.cumsum(difference[own])])
+        square = np.zeros((size + 1, size + 1))
+        square[1:, 1:] = np.cumsum(np.cumsum(spread[own, own], axis=0), axis=1)
+        for a in range(size):
+            for b in range(a + 1, size + 1):
+                variance = square[b, b] - 2.0 * square[a, b] + square[a, a]
+                found.append((abs(total[b] - total[a]) / float(np.sqrt(variance)), k, a, b))
+    count = len(found)
+    limit = float(special.ndtri(1.0 - 0.005 / count))
+    departures: list[MakerDeparture] = []
+    taken = np.zeros((len(channels), size), bool)
+    for z, k, a, b in sorted(found, reverse=True):
+        if z <= limit:
+            break
+        if taken[k, a:b].any():
+            continue
+        taken[k, max(a - 1, 0) : b + 1] = True
+        part = slice(k * size + a, k * size + b)
+        mean, expected = float(difference[part].mean()), float(scale * stated[part].mean())
+        log_p = min(float(special.log_ndtr(-z)) + float(np.log(count)), -0.7)
+        departures.append(
+            MakerDeparture(
+                channel=channels[k],
+                from_nm=float(wavelength_nm[a]),
+                to_nm=float(wavelength_nm[b - 1]),
+                difference=mean,
+                difference_std=abs(mean) / z,
+                difference_percent=100.0 * mean / expected if expected > 0 else None,
+                significance_sigma=float(-special.ndtri_exp(log_p)),
+            )
+        )
+    return scale, tuple(departures)

@@ -10,7 +10,7 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.fit.noise import fit_noise
-from lab.fit.spectral import estimate_sensitivity, fit_spectral
+from lab.fit.spectral import compare_curves, estimate_sensitivity, fit_spectral
 from lab.recording import Camera, Manifest, RecordingSet, read
 from lab.results import NoiseFit, SpectralFit
 from sim.camera import CameraModel, Lens
@@ -115,6 +115,15 @@ def test_measured_curves_are_recovered_within_their_bands(width_nm: float, step_
         ([400, 500, 600], np.ones((2, 3)), [1, 1], [1, 1], "3 needed"),
         ([400, 500, 600], np.ones((3, 3)), [1, 1, 1], [1, 0, 1], "above 0"),
         ([400, 500, 600], np.diag([1, 0, 1]), [1, 1, 1], [1, 1, 1], "light 1 is dark"),
+        (
+            [400, 500, 600],
+            np.eye(3) - 0.2 * np.eye(3, k=1),
+            [1, 1, 1],
+            [1, 1, 1],
+            "light 0 is negative, -0.2 at 500 nm",
+        ),
+        ([400, 500, 600], np.diag([1, np.nan, 1]), [1, 1, 1], [1, 1, 1], "finite"),
+        ([400, 500, 600], np.eye(3)[[0, 1, 1]], [1, 1, 1], [1, 1, 1], "of 2 different spectra"),
     ],
 )
 def test_what_cannot_be_solved_is_refused(
@@ -122,6 +131,40 @@ def test_what_cannot_be_solved_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         estimate_sensitivity(wave, light, signal, std)
+
+
+def test_where_no_light_shines_the_curve_is_not_determined() -> None:
+    wave = np.arange(400.0, 701.0, 5.0)
+    truth = 0.1 + np.exp(-0.5 * ((wave - 540.0) / 40.0) ** 2)
+    light = lights(wave, np.arange(400.0, 561.0, 10.0), 10.0)
+    signal = np.trapezoid(light * truth, wave, axis=1)
+    found = estimate_sensitivity(wave, light, signal, 0.002 * signal)
+    assert found.determined[wave <= 560].all()
+    assert not found.determined[wave >= 640].any()
+    # The prior alone: its band has to hold the truth there too.
+    assert np.all(np.abs(found.sensitivity - truth)[wave >= 640] <= 3.0 * found.std[wave >= 640])
+
+
+def test_bands_that_part_are_found_where_they_are_and_nowhere_else() -> None:
+    wave = np.arange(400.0, 721.0, 10.0)
+    maker = np.concatenate([np.exp(-0.5 * ((wave - p) / 35.0) ** 2) for p in (600.0, 530.0, 460.0)])
+    std = 0.003 * maker + 0.001
+    rng = np.random.default_rng(8)
+    off = maker.copy()
+    off[wave.size + 8 : wave.size + 12] *= 1.06  # green, 480..510 nm
+    scale, found = compare_curves(
+        wave, "RGB", 0.4 * (off + std * rng.standard_normal(off.size)), np.diag((0.4 * std) ** 2), maker
+    )
+    assert scale == pytest.approx(0.4, rel=0.005)
+    assert [d.channel for d in found] == ["G"]
+    assert (found[0].from_nm, found[0].to_nm) == (pytest.approx(480.0, abs=10.0), pytest.approx(510.0, abs=10.0))
+    # 4 % where an end of the band was missed.
+    assert found[0].difference_percent == pytest.approx(6.0, abs=2.0)
+    alarms = 0
+    for _ in range(200):
+        same = 0.4 * (maker + std * rng.standard_normal(maker.size))
+        alarms += bool(compare_curves(wave, "RGB", same, np.diag((0.4 * std) ** 2), maker)[1])
+    assert alarms <= 6  # 1 % of 200 are 2; 6 are exceeded by chance in 0.5 %
 
 
 # --- recording sets ----------------------------------------------------------------------------------------------------
@@ -250,6 +293,86 @@ def test_saturated_light_rests_on_the_makers_curves() -> None:
 def test_what_the_scale_needs_is_said(changes: dict[str, object], noise: NoiseFit | None, words: str) -> None:
     with pytest.raises(NotDetermined, match=words):
         fit_spectral(recordings(step_nm=40.0, camera=stated(**changes)), "left", noise)
+
+
+def with_maker(base: RecordingSet, curves_of: dict[str, Spectrum]) -> RecordingSet:
+    """The same recordings with a maker's curves."""
+    camera = stated(quantum_efficiency={c: f"qe_{c}.csv" for c in curves_of})
+    spectra = {c.radiance: base.spectrum(c.radiance) for c in base.captures("narrowband")}
+    return RecordingSet(
+        base.manifest.model_copy(update={"cameras": {"left": camera}}),
+        {c.frame: base.frame(c) for c in base.captures()},
+        spectra | {f"qe_{c}.csv": curve for c, curve in curves_of.items()},
+    )
+
+
+def test_makers_curves_are_held_against_the_fit() -> None:
+    base = recordings()
+    right = dict(model().quantum_efficiency)
+    fit = fit_spectral(with_maker(base, right), "left", NOISE)
+    assert fit.maker_scale == pytest.approx(1.0, abs=0.005)
+    assert fit.maker_departures == ()
+    dented = Spectrum.of(WAVE, np.array(right["G"].value) * (1 - 0.1 * np.exp(-0.5 * ((WAVE - 560.0) / 12.0) ** 2)))
+    fit = fit_spectral(with_maker(base, right | {"G": dented}), "left", NOISE)
+    first = fit.maker_departures[0]
+    assert first.channel == "G"
+    assert 530 <= first.from_nm <= 560 <= first.to_nm <= 590
+    assert first.difference > 0
+    assert first.significance_sigma > 5
+
+
+def test_relative_curves_do_not_know_the_scale() -> None:
+    gain = NoiseFit(conversion_gain_dn_per_e=0.4, conversion_gain_dn_per_e_std=0.02, prnu_percent=0.5)
+    fit = fit_spectral(recordings(), "left", gain)
+    assert max(max(row) for row in fit.relative_sensitivity.values()) == 1.0
+    at = fit.wavelength_nm.index(530.0)
+    # 5 % of scale in the one, not in the other.
+    assert fit.quantum_efficiency_std["G"][at] > 0.045 * fit.quantum_efficiency["G"][at]
+    assert fit.relative_sensitivity_std["G"][at] < 0.01
+
+
+def test_broadband_lights_do_where_they_span_and_say_where_not() -> None:
+    rng = np.random.default_rng(9)
+    captures, frames, spectra = [], {}, {}
+
+    def add(kind: str, scene: Darkness | UniformField, **extra: object) -> None:
+        name = f"{kind}-{len(captures)}"
+        captures.append({"id": name, "kind": kind, "side": "left", "frame": name, "exposure_s": 0.1, **extra})
+        frames[name] = sample(model(), Exposure(scene, 0.1), rng)
+
+    add("dark", Darkness())
+    rate = np.pi / 65.0 * 0.9 * 0.8 * (4e-6) ** 2
+    for centre in np.arange(420.0, 661.0, 20.0):  # LEDs, 30 nm wide
+        shape = np.exp(-0.5 * ((WAVE - centre) * 2.3548 / 30.0) ** 2)
+        spectra[f"led{centre:.0f}.csv"] = Spectrum.of(
+            WAVE, 8e4 / rate * shape / np.trapezoid(shape, WAVE) * PHOTON_ENERGY_J_NM / WAVE
+        )
+        add("flat", UniformField(spectra[f"led{centre:.0f}.csv"]), radiance=f"led{centre:.0f}.csv")
+    fit = fit_spectral(
+        RecordingSet(Manifest(cameras={"left": stated()}, captures=tuple(captures)), frames, spectra), "left", NOISE
+    )
+    for channel in "RGB":
+        truth = model().quantum_efficiency[channel].at(fit.wavelength_nm)
+        score = (np.array(fit.quantum_efficiency[channel]) - truth) / np.array(fit.quantum_efficiency_std[channel])
+        assert np.sqrt(np.mean(score**2)) < 2.0, channel
+    few = captures[:1] + captures[1:4] * 3  # three LEDs, each three times
+    few = [capture | {"id": f"{k}"} for k, capture in enumerate(few)]
+    with pytest.raises(NotDetermined, match="narrowband light over the visible"):
+        fit_spectral(
+            RecordingSet(Manifest(cameras={"left": stated()}, captures=tuple(few)), frames, spectra), "left", NOISE
+        )
+
+
+def test_negative_light_is_left_out_and_named() -> None:
+    base = recordings()
+    wrong = base.spectrum("nb540.csv")
+    spectra = {c.radiance: base.spectrum(c.radiance) for c in base.captures("narrowband")}
+    spectra["nb540.csv"] = wrong.scaled(-1.0)
+    fit = fit_spectral(
+        RecordingSet(base.manifest, {c.frame: base.frame(c) for c in base.captures()}, spectra), "left", NOISE
+    )
+    assert any("nb540.csv is left out" in remark for remark in fit.remarks)
+    assert rms_of_peak_percent(fit, "G") < 2.0
 
 
 def test_no_light_and_too_much_light_are_said() -> None:
