@@ -32,6 +32,7 @@ FINE, PARTS = 4, 3  # samples a pixel of a pattern's picture; parts a side that 
 NORMAL_FROM_E = 60.0  # above, a Poisson number is a skewed normal one to 1e-3 of its standard deviation
 PERIOD_PX, STEP_PX = 204.8, 0.025
 STEP_S = 20.0  # from one capture to the next
+DRAW_STEP = 100_000  # more than a session's frames: another draw of the noise has other numbers throughout
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,13 @@ class Plan:
 
 
 class Camera:
-    """One camera, drawn from `seed`, with laws built in. `cfa`, `f_number` None: drawn."""
+    """One camera, drawn from `seed`, with laws built in. `cfa`, `f_number` None: drawn. `noise_draw`: which of the noises that the same
+    camera may make; its fixed patterns stay."""
 
     def __init__(
-        self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None, rows: int = 384, cols: int = 512
+        self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None, rows: int = 384, cols: int = 512, noise_draw: int = 0
     ) -> None:  # fmt: skip
-        self.seed, self.rows, self.cols = seed, rows, cols
+        self.seed, self.noise_draw, self.rows, self.cols = seed, noise_draw, rows, cols
         rng = np.random.default_rng([seed, 1])
         drawn = str(rng.choice(["RGGB", "BGGR", "GRBG", "GBRG", "MONO"], p=[0.2, 0.2, 0.2, 0.2, 0.2]))
         self.cfa = cfa or drawn
@@ -212,7 +214,8 @@ class Camera:
     def expose(self, images: dict[str, Array] | None, exposure_s: float, k: int, temperature_c: float = 25.0) -> Array:
         """Frame number k of electrons a second by channel (before shading), None: no light. Raw DN."""
         laws, shape, elapsed = self.laws, (self.rows, self.cols), STEP_S * k
-        rng = np.random.default_rng([self.seed, 2, k])
+        turn = k + DRAW_STEP * self.noise_draw
+        rng = np.random.default_rng([self.seed, 2, turn])
         z = rng.standard_normal(shape)
         e: Array = np.zeros(shape)
         if images is not None:
@@ -224,7 +227,7 @@ class Camera:
             rate = self._mosaic(lit) * self.prnu_map
             time = exposure_s
             for law in laws:
-                rate = rate * law.source(elapsed) * law.rows(self.rows, exposure_s, k)
+                rate = rate * law.source(elapsed) * law.rows(self.rows, exposure_s, turn)
                 time = law.exposure(time)
             e = rate * time
             for law in laws:
@@ -243,7 +246,7 @@ class Camera:
             e = law.respond(e)
         e = e + self.dsnu_map + self.read * rng.standard_normal(shape)
         for law in laws:
-            e = e + law.noise(shape, k)
+            e = e + law.noise(shape, turn)
         dn = self.black + self.gain * e + sum(law.offset(elapsed, temperature_c) for law in laws)
         for law in laws:
             dn = law.processed(law.codes(dn))

@@ -14,12 +14,13 @@ from sim.spectrum import Spectrum
 
 from .camera import Camera, Plan
 from .laws import LISTED, OUTSIDE, Law
-from .power import evidence, noncentrality
+from .power import Evidence, evidence, noncentrality
 
 SIZES = {"small": (96, 128), "medium": (192, 256), "full": (384, 512)}
 #: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
 SHARES: tuple[tuple[Kind, int], ...] = (("healthy", 6), ("single", 7), ("compound", 3), ("outside", 4))
 NEAR, STRONG = (10.0, 50.0), (50.0, 2000.0)  # non-centralities aimed at, half of the cases each
+BLIND = 1.0  # a non-centrality below which a strength isn't worth searching
 FAULT_SHARE = 0.35  # of the cases outside the library
 
 
@@ -127,7 +128,7 @@ def draw(
     sized: bool = True,
 ) -> Case:
     """Case number `index` of a challenge. The same arguments give the same case; `cfa`, `kind`, `law`: not as drawn; without
-    `sized`, laws have their nominal strengths."""
+    `sized`, laws have their nominal strengths, and their non-centralities are of one draw of the noise: quick, and too high."""
     rng = np.random.default_rng([seed, index])
     what = kind or kind_of(seed, index)
     rows, cols = SIZES[size]
@@ -161,11 +162,11 @@ def draw(
         plan.exposures,
     )
 
-    def take(present: Sequence[Law]) -> RecordingSet:
-        return Camera(camera_seed, present, cfa=cfa, rows=rows, cols=cols).record(plan)
+    def take(present: Sequence[Law], noise_draw: int = 0) -> RecordingSet:
+        return Camera(camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw).record(plan)
 
     targets = [float(np.exp(rng.uniform(*np.log(NEAR if rng.random() < 0.5 else STRONG)))) for _ in laws]
-    chosen, sizes = _sized(take, laws, targets if sized else [])
+    chosen, sizes = _sized(take, laws, targets if sized else [], (0, 1) if sized else (0, 0))
     recordings = take(chosen)
     recordings = _copied(recordings, fault, rng)  # healthy ones too: what is written has the same form for all
     concealed = tuple(
@@ -226,22 +227,30 @@ def _resized(law: Law, strength: float) -> Law:
 
 
 def _sized(
-    take: Callable[[Sequence[Law]], RecordingSet], laws: list[Law], targets: list[float]
+    take: Callable[[Sequence[Law], int], RecordingSet], laws: list[Law], targets: list[float], draws: tuple[int, int]
 ) -> tuple[list[Law], list[float]]:
     """Laws at the strengths that give the wanted non-centralities, and what these are in the end."""
     if not laws:
         return [], []
-    none = evidence(take(()))
+
+    def both(present: Sequence[Law]) -> list[Evidence | None]:
+        found = {k: evidence(take(present, k)) for k in set(draws)}
+        return [found[k] for k in draws]
+
+    def shown(present: list[Evidence | None], absent: list[Evidence | None]) -> float:
+        return noncentrality(list(zip(present, absent, strict=True)))
+
+    none = both(())
     for i, target in enumerate(targets):
         for _ in range(3):
-            size = noncentrality(evidence(take((laws[i],))), none)
-            if size < 0.01 or target / 1.6 < size < 1.6 * target:
+            size = shown(both((laws[i],)), none)
+            if size < BLIND or target / 1.6 < size < 1.6 * target:
                 break  # the summaries are blind to it, or it is near enough
             ratio = float(np.clip((target / size) ** (0.5 / laws[i].power), 0.1, 10.0))
             laws[i] = _resized(laws[i], laws[i].s * ratio)
-    whole = evidence(take(laws))
-    without = [none] if len(laws) == 1 else [evidence(take([one for one in laws if one is not law])) for law in laws]
-    return laws, [noncentrality(whole, absent) for absent in without]
+    whole = both(laws)
+    without = [none] if len(laws) == 1 else [both([one for one in laws if one is not law]) for law in laws]
+    return laws, [shown(whole, absent) for absent in without]
 
 
 def _copied(recordings: RecordingSet, fault: Fault | None, rng: np.random.Generator) -> RecordingSet:

@@ -7,7 +7,7 @@ the law's; the covariance is that of the recordings with it, free quantities mar
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -44,15 +44,28 @@ def _keys(found: Evidence) -> list[Hashable]:
     return keys
 
 
-def noncentrality(present: Evidence | None, absent: Evidence | None) -> float:
-    """d' C^-1 d, d the difference of what both have, C the covariance under the baseline of the one with the law."""
-    if present is None or absent is None:
-        return 0.0
+def _change(present: Evidence, absent: Evidence) -> dict[Hashable, float]:
+    """What the law does to every number that both have and choice may see."""
     other = dict(zip(_keys(absent), absent.value, strict=True))
+    seen = zip(_keys(present), present.value, present.seen, strict=True)
+    return {key: value - other[key] for key, value, use in seen if use and key in other}
+
+
+def noncentrality(pairs: Sequence[tuple[Evidence | None, Evidence | None]]) -> float:
+    """d1' C^-1 d2 of two pairs (with the law, without it), each of another draw of the noise, never below 0.
+
+    d is the difference of what both have, C the covariance under the baseline of the first pair's recordings with the law. Noise
+    that the difference leaves (a law that moves an edge moves it over other noise) is independent in d1 and d2, so that it doesn't
+    count; |d|^2 of one pair would have it twice.
+    """
+    (present, absent), (again, without) = pairs
+    if present is None or absent is None or again is None or without is None:
+        return 0.0
+    one, two = _change(present, absent), _change(again, without)
     keys = _keys(present)
-    where = np.array([key in other and seen for key, seen in zip(keys, present.seen, strict=True)])
+    where = np.array([key in one and key in two for key in keys])
     if not where.any():
         return 0.0
-    change = np.array([value - other[key] for key, value, use in zip(keys, present.value, where, strict=True) if use])
+    first, second = (np.array([d[key] for key, use in zip(keys, where, strict=True) if use]) for d in (one, two))
     covariance = present.gaussian(()).covariance[np.ix_(where, where)]
-    return float(change @ cho_solve(cho_factor(covariance, lower=True), change))
+    return max(float(first @ cho_solve(cho_factor(covariance, lower=True), second)), 0.0)
