@@ -117,6 +117,7 @@ def confusion(found: ChallengeScore) -> str:
         if s.kind in {"healthy", "outside"} or (s.kind == "single" and s.noncentrality[0] > STRONG)
     ]
     count = Counter((_row(s), s.named[0] if s.named else s.verdict) for s in shown)
+    rightly = {(_row(s), s.named[0] if s.named else s.verdict) for s in shown if s.right}
     rows = sorted({row for row, _ in count}, key=lambda row: (row.startswith("("), row))
     said = {column for _, column in count}
     columns = [*sorted(said - set(SAID_NOTHING)), *(c for c in SAID_NOTHING if c in said)]
@@ -138,11 +139,7 @@ def confusion(found: ChallengeScore) -> str:
         parts.append(f'<text x="{LABEL_PX - 8}" y="{y + 16}" text-anchor="end" fill="#222">{words}</text>')
         for j, column in enumerate(columns):
             x, n = LABEL_PX + CELL_PX * j, count[row, column]
-            right = (
-                column == row
-                or (row == "(healthy)" and column == "no_mismatch")
-                or (row.startswith("(outside") and column in SAID_NOTHING)
-            )
+            right = (row, column) in rightly
             colour = RIGHT if right else ABSTAINED if column in SAID_NOTHING else WRONG
             shade = 0.25 + 0.75 * n / total if n else 0.0
             parts.append(
