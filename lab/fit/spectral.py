@@ -34,6 +34,9 @@ COVERAGE_FACTOR = 2.0  # times the standard uncertainty: a band of about 95 %
 RADIOMETER_RELATIVE_STD = 0.003  # repeatability of one measured spectrum
 LOCAL_WIDTH_NM = 10.0  # over which the local roughness is averaged
 ROUGHNESS_FLOORS = (0.02, 0.05, 0.15, 0.4, 1.0, 3.0)  # of the local scale's maximum; 3: the same everywhere
+# A recording's curve is stated every 10 nm, mostly at the lights' own wavelengths, where structure finer than the lights shows most.
+FINE_LENGTH_NM = 5.0
+FINE_SHARE = 0.12  # chosen so that bands hold measured curves at the wavelengths where they are stated
 CENTRAL_SHARE = 0.25  # of rows and columns: the region on axis that signals are averaged over
 CLIPPED_LIMIT = 1e-4  # share of clipped pixels from which a mean is too low
 SATURATED_SHARE = 0.98  # of the fitted full well
@@ -129,9 +132,14 @@ class _Bounds:
 
 
 def _solve(
-    wave: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray, bounds: _Bounds | None = None
+    wave: FloatArray,
+    operator: FloatArray,
+    value: FloatArray,
+    std: FloatArray,
+    bounds: _Bounds | None = None,
+    fine_share: float = 0.0,
 ) -> Sensitivity:
-    """Solution of value = operator S + noise in two passes: alike roughness everywhere, then local."""
+    """Solution of value = operator S + noise in two passes: alike roughness everywhere, then local, with fine structure."""
     mean, covariance = _tikhonov(wave, operator, value, std, [np.ones_like(wave)])
     distance = (wave[:, None] - wave) / LOCAL_WIDTH_NM
     average = np.exp(-0.5 * distance**2)
@@ -140,7 +148,9 @@ def _solve(
         local = _roughness(wave, mean, average)
         if local is None:
             break
-        mean, covariance = _tikhonov(wave, operator, value, std, [local + floor for floor in ROUGHNESS_FLOORS])
+        mean, covariance = _tikhonov(
+            wave, operator, value, std, [local + floor for floor in ROUGHNESS_FLOORS], fine_share
+        )
     everywhere = _Bounds(np.eye(wave.size), np.zeros(wave.size))
     if bounds is not None:
         everywhere = _Bounds(
@@ -168,6 +178,17 @@ def _roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) -> Floa
 def _smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
     """(m, m): columns span curves whose second difference is white with standard deviation `roughness`, but for the line."""
     return np.clip(wave[:, None] - wave, 0.0, None) * (np.sqrt(np.gradient(wave)) * roughness)
+
+
+def _rough_root(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
+    """(m, m) like `_smooth_root`, with fine structure beside it: what bends within FINE_LENGTH_NM, exponentially correlated, as
+    high as `fine_share` of what the bend amounts to over 10 nm. Lights hardly tell it; the bands have to hold it."""
+    smooth = _smooth_root(wave, roughness)
+    if fine_share == 0.0:
+        return smooth
+    height = fine_share * LOCAL_WIDTH_NM**1.5 * roughness
+    fine = np.outer(height, height) * np.exp(-np.abs(wave[:, None] - wave) / FINE_LENGTH_NM)
+    return np.linalg.cholesky(smooth @ smooth.T + fine)
 
 
 def _line(wave: FloatArray) -> FloatArray:
@@ -205,11 +226,12 @@ def _tikhonov(
     value: FloatArray,
     std: FloatArray,
     shapes: Sequence[FloatArray],
+    fine_share: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
     """Posterior mean and covariance of S under a second-difference prior and free line; of the prior's `shapes` (roughness
     against wavelength) that with the highest evidence, at its best strength."""
     line = _line(wave)
-    roots = [_smooth_root(wave, shape) for shape in shapes]
+    roots = [_rough_root(wave, shape, fine_share) for shape in shapes]
     roots = [root - line @ np.linalg.lstsq(line, root, rcond=None)[0] for root in roots]  # the line is free anyway
     evidence = [_evidence(root, line, operator, value, std) for root in roots]
     best = min(range(len(roots)), key=lambda i: evidence[i][0])
@@ -655,7 +677,14 @@ class _Recording:
             )
         else:
             solved = {
-                c: _solve(self.wave, s.operator, s.value, s.std, _Bounds(s.saturated, s.limit) if s.has_gaps else None)
+                c: _solve(
+                    self.wave,
+                    s.operator,
+                    s.value,
+                    s.std,
+                    _Bounds(s.saturated, s.limit) if s.has_gaps else None,
+                    FINE_SHARE,
+                )
                 for c, s in signals.items()
             }
         self.leans_on_maker = bool(maker)
