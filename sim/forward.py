@@ -624,7 +624,7 @@ def _traced_image(
         for row0, col0 in phases[channel]:
             image[row0::period, col0::period] += even[row0::period, col0::period]
     blurs = [effect for effect in _blurring(effects) if type(effect).transfer is not Effect.transfer]
-    tile_px: int | None = None
+    tiles: list[scatter.Tile] | None = None
     for weight, picture in zip(over, pictures, strict=True):
         imaged = scatter.carry(picture, grid, target, table, frame) if carried else picture.astype(np.float32)
         # Without blurring effects one picture serves all channels.
@@ -633,15 +633,13 @@ def _traced_image(
         for members in shared:
             kernels = scatter.Kernels(table, weight[members], frame, oversample, carried=carried)
             # The first picture, with most of the light, says how large tiles may be.
-            tile_px = tile_px or kernels.tile_px()
+            tiles = kernels.tiles(target) if tiles is None else tiles
             seen = imaged
             if spectrum is not None:
                 light = np.sum(weight[members[0]], axis=0)
                 transfer = _effects_transfer(camera, table, light, blurs, target)
                 seen = np.asarray(fft.irfft2(spectrum * transfer, imaged.shape), np.float32)
-            scatter.scatter(
-                seen, target, kernels, [phases[camera.channels[k]] for k in members], period, image, tile_px
-            )
+            scatter.scatter(seen, target, kernels, [phases[camera.channels[k]] for k in members], period, image, tiles)
     return np.maximum(image, 0.0)
 
 

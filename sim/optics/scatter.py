@@ -5,11 +5,13 @@ scattered with the lens table's point spread function of the *source's* field (`
 
     image(x) = sum over sources s of light(s) PSF(x - s; field of s)
 
-The picture is cut into tiles of sources. Between 4 x 4 nodes of a tile the function of a source at s is a cubic polynomial in its row and
-column, sum_n L_n(s) PSF_n(x - s); a polynomial in s is one in x of the same degree, tap by tap, so that what a tile gives a pixel
-is a blend of sixteen sums over the tile. PSF_n is brought onto the drawing's samples with the pixel's aperture in it, and has the sum
-that the light from there has: no source gains or loses. Only the pixels that are asked for are computed. What the
-table's window doesn't hold (and what lies in its corners) is spread as 1 / r^3 beyond it, as diffraction by an edge does.
+The picture is first averaged over the pixel's aperture, once for all: that is alike everywhere, and a lens changes too little across a
+pixel to tell the order. It is then cut into tiles of sources, small where the lens changes fast. Between 4 x 4 nodes of a tile the
+function of a source at s is a cubic polynomial in its row and column, sum_n L_n(s) PSF_n(x - s); a polynomial in s is one in x of the
+same degree, tap by tap, so that what a tile gives a pixel is a blend of sixteen sums over the tile. PSF_n is sampled as the drawing is,
+without what such samples can't hold, and has the sum that the light from there has: no source gains or loses. Only the pixels that are
+asked for are computed. What the table's window doesn't hold (and what lies in its corners) is spread as 1 / r^3 beyond it, as
+diffraction by an edge does.
 
 Lengths are in um from the optical axis, x along columns (right), y along rows (down). Energy is conserved: the light of a source
 arrives with the share 1, on or off the frame.
@@ -17,7 +19,7 @@ arrives with the share 1, on or off the frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -37,14 +39,20 @@ Float32Array = NDArray[np.float32]
 #: Nodes a tile and direction, less one: functions are polynomials of this degree across a tile.
 DEGREE = 3
 _NODES = np.arange(DEGREE + 1) / DEGREE
-#: Tiles are made smaller, from the largest to the smallest of these (px), until the polynomial's error is below the limit.
-TILE_PX = (128, 96, 64, 48, 32, 16)
+#: Sides (px) of the largest and the smallest tiles: they are cut in four until the polynomial's error is below the limit.
+LARGEST_TILE_PX, SMALLEST_TILE_PX = 128, 24
 #: Relative rms error of a function half way between nodes, and relative error of its light before that is put right.
 KERNEL_ERROR = 2e-3
 LIGHT_ERROR = 1e-4
-#: The table is refined to so many samples a wavelength's resolution (wavelength x f_number), and heights so many times.
-SAMPLES_PER_RESOLUTION = 8.0
+#: The table is refined to so many samples a period of the highest frequency that is left in it, and heights so many times.
+SAMPLES_PER_PERIOD = 6.0
+#: Functions are cut off around the highest frequency of the drawing's samples, by a cosine so wide either way of it (as a share),
+#: and reach so many samples at least, for what that makes ring.
+ROLL_OFF = 0.3
+LEAST_REACH = 6.0
 HEIGHTS_REFINED = 4
+#: Pixels of a row that are summed at once.
+BLOCK_PX = 16
 #: Half the side, px, of the squares on which what lies beyond the table's window is spread.
 WING_CELL_PX = 4
 
@@ -254,30 +262,70 @@ def illumination(table: LensTable, weight: FloatArray, frame: Frame) -> FloatArr
 
 
 def over_field(table: LensTable, value: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
-    """A smooth quantity of the table's fields (F,) at image points: cubic in the square of the height, or in row and column of
-    the field grid; held beyond it."""
+    """Smooth quantities of the table's fields (..., F) at image points: (..., *points)."""
+    return field_function(table, value)(x_um, y_um)
+
+
+def field_function(table: LensTable, value: FloatArray) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """`over_field` as a function of points: cubic in the square of the height, or in row and column of the field grid; held beyond."""
     lens = distortion(table)
     if table.symmetric:
-        ideal_x, ideal_y = lens.ideal_um(x_um, y_um)
         square = (table.focal_length_mm * 1e3 * np.tan(np.deg2rad(table.field_deg[:, 1]))) ** 2
-        return np.asarray(CubicSpline(square, value)(np.minimum(ideal_x**2 + ideal_y**2, square[-1])))
+        curve = CubicSpline(square, value, axis=-1)
+
+        def along_radius(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+            ideal_x, ideal_y = lens.ideal_um(x_um, y_um)
+            return np.asarray(curve(np.minimum(ideal_x**2 + ideal_y**2, square[-1])))
+
+        return along_radius
     fy, fx = table.grid_shape
-    spline = RectBivariateSpline(
-        np.arange(fy), np.arange(fx), value.reshape(fy, fx), kx=min(3, fy - 1), ky=min(3, fx - 1)
-    )
-    return np.asarray(spline(*lens.places(x_um, y_um), grid=False))
+    splines = [
+        RectBivariateSpline(np.arange(fy), np.arange(fx), one.reshape(fy, fx), kx=min(3, fy - 1), ky=min(3, fx - 1))
+        for one in value.reshape(-1, fy * fx)
+    ]
+
+    def over_plane(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        places = lens.places(x_um, y_um)
+        return np.stack([spline(*places, grid=False) for spline in splines]).reshape(
+            *value.shape[:-1], *places[0].shape
+        )
+
+    return over_plane
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Sources of the rows top..bottom and the columns left..right, in px of the frame."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    def place(self, down: FloatArray, across: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(row, col) in px of places 0..1 in it."""
+        return self.top - 0.5 + down * (self.bottom - self.top), self.left - 0.5 + across * (self.right - self.left)
+
+    def quarters(self) -> list[Tile]:
+        """Cut in four."""
+        row, col = (self.top + self.bottom) // 2, (self.left + self.right) // 2
+        return [
+            Tile(top, bottom, left, right)
+            for top, bottom in ((self.top, row), (row, self.bottom))
+            for left, right in ((self.left, col), (col, self.right))
+        ]
 
 
 class Kernels:
     """The point spread functions of some channels, ready to be turned, placed and sampled.
 
     `weight` (C, F, W): light of every channel, field and wavelength of the table. Tables are summed over wavelength with the
-    relative illumination, cut to the window's circle, refined by Fourier series, and over the heights of a symmetric lens by
-    cubic splines. `light` (C, F) is all of a source's light, `lost` (C, F) what lies outside the circle.
+    relative illumination, cut to the window's circle, refined by Fourier series (less what the drawing's samples can't hold), and over
+    the heights of a symmetric lens by cubic splines. `light` (C, F) is all of a source's light, `lost` (C, F) what lies outside the circle.
     """
 
     def __init__(self, table: LensTable, weight: FloatArray, frame: Frame, oversample: int, *, carried: bool) -> None:
-        self.table, self.frame, self.oversample, self.carried = table, frame, oversample, carried
+        self.table, self.frame, self.oversample = table, frame, oversample
         self.lens = distortion(table)
         n = table.psf.shape[-1]
         self.radius_um = 0.5 * n * table.sample_pitch_um
@@ -291,43 +339,75 @@ class Kernels:
         )
         psf *= inside.ravel()
         self.lost = self.light - np.sum(psf, axis=2).T
+        self.held = field_function(table, self.light - self.lost)
         if table.symmetric and len(psf) > 3:
             heights = np.arange(len(psf), dtype=float)
             dense = np.linspace(0.0, heights[-1], HEIGHTS_REFINED * (len(psf) - 1) + 1)
             psf = CubicSpline(heights, psf)(dense)
+        # What the samples can't hold is taken away gently, so that little rings: no farther than a few samples.
+        self.step_um = frame.pitch_um / oversample
+        self.reach_um = max(self.radius_um, LEAST_REACH * self.step_um)
+        around = int(np.ceil((self.reach_um - self.radius_um) / table.sample_pitch_um))
+        psf = np.pad(psf.reshape(*psf.shape[:2], n, n), [(0, 0), (0, 0), (around, around), (around, around)])
+        n += 2 * around
         # Samples are per area from here on; a frame of zeros for the interpolation at the rim.
+        finest = 0.5 / self.step_um
         shortest = float(np.min(table.wavelength_nm)) * 1e-3 * table.f_number
-        refine = max(1, int(np.ceil(table.sample_pitch_um * SAMPLES_PER_RESOLUTION / shortest)))
+        refine = max(
+            1, int(np.ceil(table.sample_pitch_um * SAMPLES_PER_PERIOD * min((1.0 + ROLL_OFF) * finest, 1.0 / shortest)))
+        )
+        self.sample_um = table.sample_pitch_um / refine
+        f = fft.fftfreq(n * refine, self.sample_um)
+        beyond = np.hypot(f[:, None], f[None, : n * refine // 2 + 1]) / finest
+        passed = 0.5 + 0.5 * np.cos(np.pi * np.clip((beyond - 1.0 + ROLL_OFF) / (2.0 * ROLL_OFF), 0.0, 1.0))
         # What is interpolated with cubic B-splines are the splines' coefficients.
         inverse = 3.0 / (2.0 + np.cos(2.0 * np.pi * fft.fftfreq(n * refine)))
-        spline = inverse[:, None] * inverse[None, : n * refine // 2 + 1] * (refine / table.sample_pitch_um) ** 2
+        spline = (
+            inverse[:, None] * inverse[None, : n * refine // 2 + 1] * passed * (refine / table.sample_pitch_um) ** 2
+        )
         spline = spline.astype(np.float32)
-        self.samples = np.zeros((len(psf), n * refine + 4, n * refine + 4, light.shape[0]), np.float32)
-        for field, functions in enumerate(psf.astype(np.float32).reshape(len(psf), -1, n, n)):
+        # Four channels to a sample, used or not, which the processor adds at once.
+        self.channels = len(light)
+        self.samples = np.zeros((len(psf), n * refine + 4, n * refine + 4, 4), np.float32)
+        for field, functions in enumerate(psf.astype(np.float32)):
             spectrum = _padded(fft.rfft2(functions), n, refine)
             spectrum *= spline
-            self.samples[field, 2:-2, 2:-2] = np.moveaxis(fft.irfft2(spectrum, (n * refine, n * refine)), 0, -1)
-        self.sample_um = table.sample_pitch_um / refine
-        self.first_um = at[0] - 2.0 * self.sample_um  # of the padded table's sample 0
-        # The kernel's samples: those of the drawing, or finer where a drawing's samples are too coarse for the lens.
-        self.step_um = frame.pitch_um / oversample
-        cutoff = 0.8 / (0.45 * table.f_number)
-        self.finer = max(1, int(np.ceil(2.0 * self.step_um * cutoff - 1e-9)))
-        reach = self.radius_um / self.step_um + 0.5 * oversample + 3.0
-        self.size = fft.next_fast_len(int(np.ceil(2.0 * reach)), real=True)
+            self.samples[field, 2:-2, 2:-2, : self.channels] = np.moveaxis(
+                fft.irfft2(spectrum, (n * refine, n * refine)), 0, -1
+            )
+        self.first_um = -0.5 * (n - 1) * table.sample_pitch_um - 2.0 * self.sample_um  # of the padded table's sample 0
+        # Full pixels are put into the functions: the sums over a pixel's samples then leave no source with less light than another,
+        # whatever the lens changes in between. Pixels with gaps don't conserve light anyway, and are put into the picture.
+        self.box = oversample if frame.fill_factor == 1.0 else 1
+        reach = self.reach_um / self.step_um + 1.0 + 0.5 * (self.box - 1)
+        self.size = int(np.ceil(2.0 * reach))
         if (self.size - oversample) % 2:  # a pixel's centre has as many samples on either side
             self.size += 1
-        f = fft.fftfreq(self.size * self.finer, 1.0 / (oversample * self.finer))
-        undone = np.sinc(np.minimum(np.abs(f), 0.5 * oversample) / oversample) ** (5 if carried else 1)
-        pixel = np.sinc(np.sqrt(frame.fill_factor) * f) / undone
-        self._filter = (pixel[:, None] * pixel[None, : self.size * self.finer // 2 + 1]).astype(np.float32)
+        self._undo = 5 if carried else 1
+        self._kept: dict[Tile, Float32Array] = {}
+
+    def through_pixels(self, picture: Float32Array) -> Float32Array:
+        """A picture with the blur of its own samples (and of `carry`) undone, as the pixels' aperture averages it where that isn't in
+        the functions: after the former, a full pixel is just the mean of its samples."""
+        s, side, undo = self.oversample, np.sqrt(self.frame.fill_factor), self._undo
+        if self.box > 1:
+            side, undo = 0.0, undo - 1
+        if undo == 0:
+            return picture
+        shape = [fft.next_fast_len(n) for n in picture.shape]
+        fy, fx = fft.fftfreq(shape[0], 1.0 / s), fft.rfftfreq(shape[1], 1.0 / s)
+        down, across = ((np.sinc(side * f) / np.sinc(f / s) ** undo).astype(np.float32) for f in (fy, fx))
+        spectrum = fft.rfft2(picture, shape)
+        spectrum *= down[:, None]
+        spectrum *= across
+        return np.asarray(fft.irfft2(spectrum, shape, overwrite_x=True)[: picture.shape[0], : picture.shape[1]])
 
     def at(self, x_um: FloatArray, y_um: FloatArray) -> Float32Array:
         """Functions of sources at image points (N,): (N, C, size, size), what a pixel gets of the light on its k-th sample's square."""
-        table, size = self.table, self.size * self.finer
+        table, size = self.table, self.size - self.box + 1
         # The sample of index k lies (k - (size - 1) / 2) steps from the pixel's centre.
-        offset = -0.5 * (self.size - 1) * self.step_um + np.arange(size) * (self.step_um / self.finer)
-        raw = np.zeros((x_um.size, self.samples.shape[-1], size, size), np.float32)
+        offset = (np.arange(size) - 0.5 * (size - 1)) * self.step_um
+        sampled = np.zeros((x_um.size, self.channels, size, size), np.float32)
         if table.symmetric:
             radius, place = self.lens.heights(len(self.samples))
             r = np.hypot(x_um, y_um)
@@ -336,44 +416,67 @@ class Kernels:
         else:
             down, across = self.lens.places(x_um, y_um)
             turn, columns = np.zeros(x_um.size), table.grid_shape[1]
-        _sample(raw, down, across, columns, np.cos(turn), np.sin(turn), offset, self.samples, self.first_um,
-                self.sample_um, self.radius_um)  # fmt: skip
-        spectrum = fft.rfft2(raw)
-        spectrum *= self._filter
-        sampled: Float32Array = fft.irfft2(spectrum, (size, size))[..., :: self.finer, :: self.finer]
-        sampled *= np.float32(self.step_um**2)
+        _sample(sampled, down, across, columns, np.cos(turn), np.sin(turn), offset, self.samples, self.first_um,
+                self.sample_um, self.reach_um)  # fmt: skip
+        for _ in range(2 if self.box > 1 else 0):  # down, then across
+            wide = np.zeros((*sampled.shape[:2], sampled.shape[3], self.size), np.float32)
+            for k in range(self.box):
+                wide[..., k : k + size] += np.swapaxes(sampled, 2, 3)
+            sampled = wide
+        sampled *= np.float32((self.step_um / self.box) ** 2)
         # Sampling leaves 1e-5 of the light; each channel gets its own, where its function has any.
-        held = np.stack([over_field(table, v, x_um, y_um) for v in self.light - self.lost], axis=1)
+        held = self.held(x_um, y_um).T
         weight = np.abs(sampled)
         short = held - np.sum(sampled, axis=(2, 3), dtype=float)
         total = np.maximum(np.sum(weight, axis=(2, 3), dtype=float), 1e-300)
         sampled += (short / total).astype(np.float32)[..., None, None] * weight
         return sampled
 
-    def error(self, tile_px: float) -> float:
-        """Error of a tile's polynomials half way between nodes, as a share of what is allowed, at the worst of places over the
-        frame."""
-        frame, worst = self.frame, 0.0
-        spacing = tile_px / DEGREE
-        for down, across in ((0.5, 0.5), (0.02, 0.5), (0.02, 0.02), (0.35, 0.65), (0.7, 0.9), (0.5, 0.98)):
-            row0 = down * max(frame.rows - tile_px, 0.0)
-            col0 = across * max(frame.cols - tile_px, 0.0)
-            n = np.arange(DEGREE + 1) * spacing
-            rows, cols = np.meshgrid(row0 + n, col0 + n, indexing="ij")
-            middle_row, middle_col = row0 + 0.5 * spacing, col0 + 0.5 * spacing
-            x, y = frame.um(np.append(rows.ravel(), middle_row), np.append(cols.ravel(), middle_col))
-            g = self.at(x, y).astype(float)
-            share = lagrange(np.array(0.5 / DEGREE))
-            blend = np.einsum("i,j,ijcab->cab", share, share, g[:-1].reshape(DEGREE + 1, DEGREE + 1, *g.shape[1:]))
-            norm, off = (np.sqrt(np.sum(k**2, axis=(1, 2))) for k in (g[-1], blend - g[-1]))
-            whole, gained = (np.abs(np.sum(k, axis=(1, 2))) for k in (g[-1], blend - g[-1]))
-            for error, of, limit in ((off, norm, KERNEL_ERROR), (gained, whole, LIGHT_ERROR)):
-                worst = max(worst, float(np.max(error / np.maximum(of, 1e-30))) / limit)
+    def at_nodes(self, tile: Tile) -> Float32Array:
+        """Functions at a tile's nodes, (4, 4, C, size, size). Those that `tiles` found good enough are handed out once."""
+        if tile in self._kept:
+            return self._kept.pop(tile)
+        nodes = self.at(*self.frame.um(*(a.ravel() for a in tile.place(*np.meshgrid(_NODES, _NODES, indexing="ij")))))
+        return nodes.reshape(_NODES.size, _NODES.size, *nodes.shape[1:])
+
+    def error(self, tile: Tile, at_nodes: Float32Array) -> float:
+        """Error of a tile's polynomials half way between nodes, as a share of what is allowed: the worst of a few places."""
+        nodes, worst = at_nodes.reshape(_NODES.size**2, -1), 0.0
+        down, across = (np.array(a) / DEGREE for a in ((0.5, 1.5, 2.5, 0.5, 2.5), (0.5, 1.5, 0.5, 2.5, 2.5)))
+        wanted = self.at(*self.frame.um(*tile.place(down, across)))
+        share = np.einsum("ip,jp->pij", lagrange(down), lagrange(across)).reshape(down.size, -1).astype(np.float32)
+        off = (share @ nodes).reshape(wanted.shape) - wanted
+        norm, away = (np.sqrt(np.sum(k**2, axis=(2, 3))) for k in (wanted, off))
+        whole, gained = (np.abs(np.sum(k, axis=(2, 3), dtype=float)) for k in (wanted, off))
+        for error, of, limit in ((away, norm, KERNEL_ERROR), (gained, whole, LIGHT_ERROR)):
+            worst = max(worst, float(np.max(error / np.maximum(of, 1e-30))) / limit)
         return worst
 
-    def tile_px(self) -> int:
-        """The largest of the tiles whose polynomials are good enough."""
-        return next((tile for tile in TILE_PX[:-1] if self.error(tile) <= 1.0), TILE_PX[-1])
+    def tiles(self, grid: Grid) -> list[Tile]:
+        """Tiles that cover a grid, as large as the polynomials are good enough in them."""
+        bounds = (
+            np.linspace(
+                -grid.margin_px, n + grid.margin_px, max(1, round((n + 2 * grid.margin_px) / LARGEST_TILE_PX)) + 1
+            )
+            for n in (grid.rows, grid.cols)
+        )
+        rows, cols = (edge.round().astype(int).tolist() for edge in bounds)
+        return [
+            part
+            for top, bottom in pairwise(rows)
+            for left, right in pairwise(cols)
+            for part in self._good(Tile(top, bottom, left, right))
+        ]
+
+    def _good(self, tile: Tile) -> Iterator[Tile]:
+        """A tile, or the parts of it in which the polynomials are good enough."""
+        nodes = self.at_nodes(tile)
+        if min(tile.bottom - tile.top, tile.right - tile.left) < 2 * SMALLEST_TILE_PX or self.error(tile, nodes) <= 1.0:
+            self._kept[tile] = nodes
+            yield tile
+        else:
+            for part in tile.quarters():
+                yield from self._good(part)
 
 
 def scatter(
@@ -383,12 +486,12 @@ def scatter(
     places: Sequence[Sequence[tuple[int, int]]],
     period: int,
     image: FloatArray,
-    tile_px: int | None = None,
+    tiles: Sequence[Tile] | None = None,
 ) -> None:
     """Add to `image` (rows, cols) what a picture on the image's grid (see `carry`) gives the pixels of every channel.
 
     `places`: for every channel of `kernels`, the first [row, col] of each of its lattices of `period` px; only those pixels change.
-    `tile_px` None: as large as the kernels' polynomials allow.
+    `tiles` None: as large as the kernels' polynomials allow.
     """
     frame, s = kernels.frame, grid.oversample
     half = (kernels.size - s) // 2  # samples before a pixel's first
@@ -397,71 +500,63 @@ def scatter(
         raise ValueError(
             f"the margin of {grid.margin_px} px is below the limit of {halo} px that the lens's window of {2 * kernels.radius_um:g} um asks for: take a wider margin"
         )
-    rows, cols = (n // s for n in grid.shape)
-    tile_px = kernels.tile_px() if tile_px is None else tile_px
-    row_bounds, col_bounds = (
-        (np.linspace(0, n, max(1, round(n / tile_px)) + 1).round().astype(int) - grid.margin_px).tolist()
-        for n in (rows, cols)
-    )
-    node_col = np.append(
-        np.concatenate([left - 0.5 + _NODES[:-1] * (right - left) for left, right in pairwise(col_bounds)]),
-        col_bounds[-1] - 0.5,
-    )
-    last: Float32Array | None = None
-    for top, bottom in pairwise(row_bounds):
-        node_row = top - 0.5 + _NODES * (bottom - top)
-        fresh = node_row if last is None else node_row[1:]
-        x, y = frame.um(*(a.ravel() for a in np.meshgrid(fresh, node_col, indexing="ij")))
-        at = kernels.at(x, y)
-        at = at.reshape(fresh.size, node_col.size, *at.shape[1:])
-        at = at if last is None else np.concatenate([last[None], at])
-        last = at[-1]
-        for tile, (left, right) in enumerate(pairwise(col_bounds)):
-            g = _by_pixel(at[:, DEGREE * tile : DEGREE * (tile + 1) + 1], kernels, bottom - top, right - left)
-            # The tile's sources alone, with nothing around them, columns sorted by their place in the lattice.
-            origin = (top - halo) * s - half, (left - halo) * s - half
-            high = (bottom + halo) * s + half - origin[0]
-            wide = (right + halo) * s + half + 4 - origin[1]
-            stride = period * s
-            local = np.zeros((high, -(-wide // stride) * stride), np.float32)
-            part = picture[
-                (top + grid.margin_px) * s : (bottom + grid.margin_px) * s,
-                (left + grid.margin_px) * s : (right + grid.margin_px) * s,
-            ]
-            down, across = top * s - origin[0], left * s - origin[1]
-            owed = _owed(kernels, top, bottom, left, right, part.shape)
-            local[down : down + part.shape[0], across : across + part.shape[1]] = part if owed is None else part * owed
-            columns = np.ascontiguousarray(local.reshape(high, -1, stride).transpose(2, 0, 1))
-            seen_rows = max(top - halo, 0), min(bottom + halo, frame.rows)
-            seen_cols = max(left - halo, 0), min(right + halo, frame.cols)
-            for channel, lattices in enumerate(places):
-                for row0, col0 in lattices:
-                    first = seen_rows[0] + (row0 - seen_rows[0]) % period, seen_cols[0] + (col0 - seen_cols[0]) % period
-                    _gather(
-                        image, columns, g[channel], (first[0], seen_rows[1]), (first[1], seen_cols[1]), period, s,
-                        (half + origin[0], half + origin[1]), (top - 0.5, bottom - 0.5), (left - 0.5, right - 0.5),
-                    )  # fmt: skip
+    seen = kernels.through_pixels(picture)
+    taps = _taps_in_circle(kernels)
+    for tile in kernels.tiles(grid) if tiles is None else tiles:
+        top, bottom, left, right = tile.top, tile.bottom, tile.left, tile.right
+        g = _by_pixel(kernels.at_nodes(tile), kernels, bottom - top, right - left)
+        # The tile's sources alone, with nothing around them, columns sorted by their place in the lattice.
+        origin = (top - halo) * s - half, (left - halo) * s - half
+        high = (bottom + halo) * s + half - origin[0]
+        stride = period * s
+        # Wider by the taps that fill up a row's fours, and by the pixels that fill up the last block.
+        wide = (right + halo) * s + half + 4 - origin[1] + BLOCK_PX * stride
+        local = np.zeros((high, -(-wide // stride) * stride), np.float32)
+        part = seen[
+            (top + grid.margin_px) * s : (bottom + grid.margin_px) * s,
+            (left + grid.margin_px) * s : (right + grid.margin_px) * s,
+        ]
+        down, across = top * s - origin[0], left * s - origin[1]
+        owed = _owed(kernels, tile, part.shape)
+        local[down : down + part.shape[0], across : across + part.shape[1]] = part if owed is None else part * owed
+        columns = np.ascontiguousarray(local.reshape(high, -1, stride).transpose(2, 0, 1))
+        seen_rows = max(top - halo, 0), min(bottom + halo, frame.rows)
+        seen_cols = max(left - halo, 0), min(right + halo, frame.cols)
+        for channel, lattices in enumerate(places):
+            for row0, col0 in lattices:
+                first = seen_rows[0] + (row0 - seen_rows[0]) % period, seen_cols[0] + (col0 - seen_cols[0]) % period
+                _gather(
+                    image, columns, g[channel], taps, (first[0], seen_rows[1]), (first[1], seen_cols[1]), period, s,
+                    (half + origin[0], half + origin[1]), (top - 0.5, bottom - 0.5), (left - 0.5, right - 0.5),
+                )  # fmt: skip
     _spread_wings(picture, grid, kernels, places, period, image)
 
 
-def _owed(
-    kernels: Kernels, top: int, bottom: int, left: int, right: int, shape: tuple[int, ...]
-) -> Float32Array | None:
+def _taps_in_circle(kernels: Kernels) -> NDArray[np.int64]:
+    """(size, 2): of every row of a kernel, the first tap that may differ from 0 and the one after the last, by fours."""
+    away = np.arange(kernels.size) - 0.5 * (kernels.size - 1)
+    radius = kernels.reach_um / kernels.step_um + (kernels.box - 1) / np.sqrt(2.0)
+    wide = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
+    first = np.ceil(0.5 * (kernels.size - 1) - wide).astype(np.int64)
+    count = np.where(wide > 0, kernels.size - 2 * first, 0)
+    return np.stack([first, first + count + (-count) % 4], axis=1)
+
+
+def _owed(kernels: Kernels, tile: Tile, shape: tuple[int, ...]) -> Float32Array | None:
     """What a tile's sources are to be multiplied with, so that their light isn't the polynomials' but the table's: of 17 x 17
     points, straight between them. None where the channels' light has both signs, so that there's no ratio."""
-    held = np.sum(kernels.light - kernels.lost, axis=0)
-    if np.min(kernels.light) < 0 or np.min(held) <= 0:
+    if np.min(kernels.light) < 0 or np.min(np.sum(kernels.light - kernels.lost, axis=0)) <= 0:
         return None
     at = np.linspace(0.0, 1.0, 17)
-    light = []
-    for t in (at, _NODES):
-        rows, cols = top - 0.5 + t * (bottom - top), left - 0.5 + t * (right - left)
-        x, y = kernels.frame.um(rows[:, None], cols[None, :])
-        light.append(over_field(kernels.table, held, *np.broadcast_arrays(x, y)))
+    light = [
+        np.sum(kernels.held(*kernels.frame.um(*tile.place(*np.meshgrid(t, t, indexing="ij")))), axis=0)
+        for t in (at, _NODES)
+    ]
     share = lagrange(at)
     ratio = light[0] / (share.T @ light[1] @ share)
     down, across = (
-        np.stack([np.interp((np.arange(n) + 0.5) / n, at, unit) for unit in np.eye(at.size)], axis=1) for n in shape
+        np.maximum(1.0 - np.abs((np.arange(n) + 0.5)[:, None] * (at.size - 1) / n - np.arange(at.size)), 0.0)
+        for n in shape
     )
     return np.asarray(down @ ratio @ across.T, np.float32)
 
@@ -655,7 +750,7 @@ def _sample(  # type: ignore[no-untyped-def]  # noqa: PLR0912
     channels = raw.shape[1]
     rows = samples.shape[0] // columns
     fields, shares = np.empty(4, np.int64), np.empty(4)
-    # The fields are blended first, with four channels to a sample, which the processor adds at once.
+    # The fields are blended first.
     blend = np.zeros((samples.shape[1], samples.shape[2], 4), np.float32)
     value = np.empty(4, np.float32)
     highest = samples.shape[1] - 2.001
@@ -674,7 +769,7 @@ def _sample(  # type: ignore[no-untyped-def]  # noqa: PLR0912
             share = np.float32(shares[f])
             for i in range(samples.shape[1]):
                 for j in range(samples.shape[2]):
-                    for c in range(channels):
+                    for c in range(4):
                         blend[i, j, c] += share * samples[fields[f], i, j, c]
         for i in range(offset.size):
             for j in range(offset.size):
@@ -687,12 +782,18 @@ def _sample(  # type: ignore[no-untyped-def]  # noqa: PLR0912
                     continue
                 k, m = int(row), int(col)
                 weight_row, weight_col = _spline_weights(row - k), _spline_weights(col - m)
+                b0, b1 = np.float32(weight_col[0]), np.float32(weight_col[1])
+                b2, b3 = np.float32(weight_col[2]), np.float32(weight_col[3])
                 value[:] = 0.0
                 for a in range(4):
-                    for b in range(4):
-                        w = np.float32(weight_row[a] * weight_col[b])
-                        for c in range(4):
-                            value[c] += w * blend[k - 1 + a, m - 1 + b, c]
+                    w = np.float32(weight_row[a])
+                    for c in range(4):
+                        value[c] += w * (
+                            b0 * blend[k - 1 + a, m - 1, c]
+                            + b1 * blend[k - 1 + a, m, c]
+                            + b2 * blend[k - 1 + a, m + 1, c]
+                            + b3 * blend[k - 1 + a, m + 2, c]
+                        )
                 for c in range(channels):
                     raw[n, c, i, j] = value[c]
 
@@ -708,11 +809,11 @@ def _cubic(t, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath={"contract"})
-def _gather(image, columns, g, rows, cols, period, oversample, origin, row_range, col_range):  # type: ignore[no-untyped-def]
+def _gather(image, columns, g, within, rows, cols, period, oversample, origin, row_range, col_range):  # type: ignore[no-untyped-def]
     """Add what a tile gives the pixels of one lattice: kernels blended for a row, then four sums a pixel blended along it.
 
     `columns` [k, row, i] is the tile's column stride i + k: neighbouring pixels of the lattice lie side by side in it. `origin`:
-    its first row and column, in samples from the first that pixel 0 takes. `row_range`, `col_range`: where the tile lies, px.
+    its first row and column, in samples from the first that pixel 0 takes. `within`: a kernel's taps, row by row. `row_range`, `col_range`: where the tile lies, px.
     """
     size = g.shape[2]
     stride = period * oversample
@@ -722,10 +823,10 @@ def _gather(image, columns, g, rows, cols, period, oversample, origin, row_range
     # The tile's samples are reached by unsigned offsets into one flat array: views would be counted, signs looked at.
     flat = columns.ravel()
     plane, line = columns.shape[1] * columns.shape[2], columns.shape[2]
-    taps = size + (-size) % 4
-    blend = np.zeros((4, size, taps), np.float32)
+    blend = np.zeros((4, size, size + 4), np.float32)
     share = np.empty(4)
-    sums = np.empty((4, count), np.float32)
+    blocks = (count + BLOCK_PX - 1) // BLOCK_PX
+    sums = np.empty((4, blocks * BLOCK_PX), np.float32)
     height, width = row_range[1] - row_range[0], col_range[1] - col_range[0]
     fine_col = cols[0] * oversample - origin[1]
     for row in range(rows[0], rows[1], period):
@@ -739,7 +840,7 @@ def _gather(image, columns, g, rows, cols, period, oversample, origin, row_range
         base = row * oversample - origin[0]
         for a in range(size):
             at = (base + a) * line
-            for b in range(0, taps, 4):
+            for b in range(within[a, 0], within[a, 1], 4):
                 q = fine_col + b
                 o0 = np.uintp((q % stride) * plane + at + q // stride)
                 o1 = np.uintp(((q + 1) % stride) * plane + at + (q + 1) // stride)
@@ -749,7 +850,7 @@ def _gather(image, columns, g, rows, cols, period, oversample, origin, row_range
                 b0, b1, b2, b3 = blend[1, a, b], blend[1, a, b + 1], blend[1, a, b + 2], blend[1, a, b + 3]
                 c0, c1, c2, c3 = blend[2, a, b], blend[2, a, b + 1], blend[2, a, b + 2], blend[2, a, b + 3]
                 d0, d1, d2, d3 = blend[3, a, b], blend[3, a, b + 1], blend[3, a, b + 2], blend[3, a, b + 3]
-                for i in range(count):
+                for i in range(blocks * BLOCK_PX):
                     n = np.uintp(i)
                     p0, p1, p2, p3 = flat[o0 + n], flat[o1 + n], flat[o2 + n], flat[o3 + n]
                     sums[0, n] += a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3
