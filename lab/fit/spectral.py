@@ -36,7 +36,7 @@ LOCAL_WIDTH_NM = 10.0  # over which the local roughness is averaged
 ROUGHNESS_FLOORS = (0.02, 0.05, 0.15, 0.4, 1.0, 3.0)  # of the local scale's maximum; 3: the same everywhere
 # A recording's curve is stated every 10 nm, mostly at the lights' own wavelengths, where structure finer than the lights shows most.
 FINE_LENGTH_NM = 5.0
-FINE_SHARE = 0.12  # chosen so that bands hold measured curves at the wavelengths where they are stated
+FINE_SHARE = 0.13  # chosen so that bands hold measured curves at the wavelengths where they are stated
 CENTRAL_SHARE = 0.25  # of rows and columns: the region on axis that signals are averaged over
 CLIPPED_LIMIT = 1e-4  # share of clipped pixels from which a mean is too low
 SATURATED_SHARE = 0.98  # of the fitted full well
