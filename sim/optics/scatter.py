@@ -45,7 +45,7 @@ LARGEST_TILE_PX, SMALLEST_TILE_PX = 128, 24
 KERNEL_ERROR = 2e-3
 LIGHT_ERROR = 1e-4
 #: The table is refined to so many samples a period of the highest frequency that is left in it, and heights so many times.
-SAMPLES_PER_PERIOD = 6.0
+SAMPLES_PER_PERIOD = 3.0
 #: Functions are cut off around the highest frequency of the drawing's samples, by a cosine so wide either way of it (as a share),
 #: and reach so many samples at least, for what that makes ring.
 ROLL_OFF = 0.3
@@ -248,13 +248,16 @@ def _cut(frame: Frame, lens: Distortion) -> bool:
     return bool(np.any(lens.outside(x * shrink, y * shrink)))
 
 
-def illumination(table: LensTable, weight: FloatArray, frame: Frame) -> FloatArray:
-    """An even field's image (rows, cols): sum over wavelengths of weight x relative illumination, by place in the image.
+def illumination(
+    table: LensTable, weight: FloatArray, frame: Frame, first: tuple[int, int] = (0, 0), period: int = 1
+) -> FloatArray:
+    """An even field's image, at every `period`-th row and column from pixel `first` on: sum over wavelengths of weight x relative illumination, by place in the image.
 
     `weight` (F, W): light of every wavelength of the table at every field (the same at all, or as filters pass it there).
     """
     lens = distortion(table)
-    x, y = frame.um(np.arange(frame.rows, dtype=float)[:, None], np.arange(frame.cols, dtype=float)[None, :])
+    row, col = (np.arange(k, n, period, dtype=float) for k, n in zip(first, (frame.rows, frame.cols), strict=True))
+    x, y = frame.um(row[:, None], col[None, :])
     image = over_field(table, np.sum(weight * table.relative_illumination.T, axis=1), x, y)
     if _cut(frame, lens):
         image = np.where(lens.outside(*lens.ideal_um(x, y)), 0.0, image)

@@ -16,7 +16,7 @@ import numpy as np
 from sim.spectrum import FloatArray
 
 #: Goes into every content hash: a table that an older way of computing made isn't taken from the cache.
-TABLE_VERSION = 3
+TABLE_VERSION = 4
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,8 @@ from sim.spectrum import FloatArray
 REFERENCE_NM = 550.0
 #: Where the table of a lens begins and ends: 33 wavelengths.
 TABLE_WAVELENGTHS_NM = tuple(float(w) for w in range(400, 721, 10))
+#: Share of a spread's light below which its window is called too small.
+LEAST_SHARE = 0.9
 _SPECTRAL_NODES = 8
 #: How near (relative) interpolated pupils have to come to traced ones.
 _ALIKE = 3e-4
@@ -688,6 +690,14 @@ class OpticalTable:
                 psf[i, f] = point_spread(pupil, about, n, self.pitch_um, reach if reach < blur else math.inf)
             if progress is not None:
                 progress(f"field {f + 1} of {f_count}", (f + 1) / f_count)
+        share = psf.sum(axis=(2, 3))
+        w, f = divmod(int(np.argmin(share)), f_count)
+        if share[w, f] < LEAST_SHARE:
+            self.warnings.append(
+                f"{share[w, f]:.0%} of the light of {self.wavelengths[w]:g} nm at {_angles(self.tangents[f])} arrives within the "
+                f"{n * self.pitch_um:g} um of its window, the least of all: the rest is in no picture of the table; "
+                "take more samples or a coarser pitch"
+            )
         axis = self._axis_index()
         # Everything is seen through the same unit of the entrance pupil; the image's own solid angle is what lights it.
         relative = solid / solid[:, axis : axis + 1]
@@ -705,7 +715,7 @@ class OpticalTable:
             psf=psf,
             window_um=window,
             sample_pitch_um=self.pitch_um,
-            encircled_share=psf.sum(axis=(2, 3)),
+            encircled_share=share,
             centroid_um=centroid,
             warnings=tuple(dict.fromkeys([*system.warnings, *self.warnings])),
             content_hash=content_hash(system.prescription, settings),
