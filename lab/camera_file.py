@@ -199,7 +199,8 @@ def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str,
         else:
             value = repr(problem["input"])
             shown = "" if len(value) > 60 or value in problem["msg"] else f" is {value}"
-            what = f"{key}{shown}: {problem['msg'].removeprefix('Value error, ')}; correct it"
+            told = problem["msg"].removeprefix("Value error, ")
+            what = f"{key}{shown}: {told}" + ("" if "; " in told else "; correct it")
         raise InputError(f"{file}: {' '.join(what.split())}") from error
 
 

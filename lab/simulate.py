@@ -164,7 +164,7 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
         electrons = (
             each_second * seconds if proportional else forward.expected_electrons(camera, exposure, content.effects)
         )
-        _check_saturation(electrons, camera, exposure)
+        forward.check_not_saturated(camera, exposure, electrons)
         tell("sensor", 0.8)
         frame = _read(electrons, camera, content, exposure, options)
     except ValueError as error:
@@ -230,14 +230,6 @@ def _check_light(
     raise InputError(
         f"scene {options.scene!r} under {options.illuminant!r} makes no electrons: its light runs from {white.wavelength_nm[0]:g} to {white.wavelength_nm[-1]:g} nm, the sensor sees {seen[0]:g} to {seen[1]:g} nm; give a light with power there"
     )
-
-
-def _check_saturation(electrons: FloatArray, camera: CameraModel, exposure: Exposure) -> None:
-    lowest, full = float(electrons.min()), capacity_e(camera, exposure.gain_db)
-    if lowest >= full:
-        raise InputError(
-            f"an exposure of {exposure.exposure_s:g} s saturates every pixel: the darkest collects {lowest:.4g} e, above the limit of {full:.4g} e; expose for less than {exposure.exposure_s * full / lowest:.3g} s"
-        )
 
 
 def _record(
@@ -393,7 +385,7 @@ def options_of(values: Mapping[str, Any]) -> SimulateOptions:
     try:
         return SimulateOptions.model_validate(values)
     except ValidationError as error:
-        raise InputError(f"{_line(error)}; correct it") from error
+        raise InputError(_line(error)) from error
 
 
 def parameters_of(given: Sequence[str]) -> dict[str, float]:

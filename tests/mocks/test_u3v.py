@@ -268,7 +268,7 @@ def test_nothing_hidden_can_be_read_from_it(host: Host) -> None:
     model = camera.model
     secrets = [model.conversion_gain_dn_per_e, model.read_noise_e, model.full_well_e, model.black_level_dn]
     secrets += [*camera.geometry.camera_matrix[0], *camera.geometry.distortion]
-    secrets += [value for effect in camera.effects for value in effect.model_dump().values()]
+    secrets += [value for e in camera.effects for value in e.model_dump().values() if value is not None]
     for secret in secrets:
         if secret in (0.0, 1.0):
             continue
