@@ -620,9 +620,8 @@ def _traced_image(
     image = np.zeros((camera.rows, camera.cols))
     ground, over, pictures = _pictures_by_rank(camera, table, scene, effects, grid)
     for channel, light in zip(camera.channels, ground, strict=True):
-        even = scatter.illumination(table, light, frame)
         for row0, col0 in phases[channel]:
-            image[row0::period, col0::period] += even[row0::period, col0::period]
+            image[row0::period, col0::period] += scatter.illumination(table, light, frame, (row0, col0), period)
     blurs = [effect for effect in _blurring(effects) if type(effect).transfer is not Effect.transfer]
     tiles: list[scatter.Tile] | None = None
     for weight, picture in zip(over, pictures, strict=True):

@@ -40,7 +40,7 @@ Float32Array = NDArray[np.float32]
 DEGREE = 3
 _NODES = np.arange(DEGREE + 1) / DEGREE
 #: Sides (px) of the largest and the smallest tiles: they are cut in four until the polynomial's error is below the limit.
-LARGEST_TILE_PX, SMALLEST_TILE_PX = 128, 24
+LARGEST_TILE_PX, SMALLEST_TILE_PX = 128, 12
 #: Relative rms error of a function half way between nodes, and relative error of its light before that is put right.
 KERNEL_ERROR = 2e-3
 LIGHT_ERROR = 1e-4
@@ -49,8 +49,8 @@ SAMPLES_PER_PERIOD = 3.0
 #: Functions are cut off around the highest frequency of the drawing's samples, by a cosine so wide either way of it (as a share),
 #: and reach so many samples at least, for what that makes ring.
 ROLL_OFF = 0.3
-LEAST_REACH = 6.0
-HEIGHTS_REFINED = 4
+LEAST_REACH = 8.0
+HEIGHTS_REFINED = 8
 #: Pixels of a row that are summed at once.
 BLOCK_PX = 16
 #: Half the side, px, of the squares on which what lies beyond the table's window is spread.
@@ -421,19 +421,10 @@ class Kernels:
             turn, columns = np.zeros(x_um.size), table.grid_shape[1]
         _sample(sampled, down, across, columns, np.cos(turn), np.sin(turn), offset, self.samples, self.first_um,
                 self.sample_um, self.reach_um)  # fmt: skip
-        for _ in range(2 if self.box > 1 else 0):  # down, then across
-            wide = np.zeros((*sampled.shape[:2], sampled.shape[3], self.size), np.float32)
-            for k in range(self.box):
-                wide[..., k : k + size] += np.swapaxes(sampled, 2, 3)
-            sampled = wide
-        sampled *= np.float32((self.step_um / self.box) ** 2)
         # Sampling leaves 1e-5 of the light; each channel gets its own, where its function has any.
-        held = self.held(x_um, y_um).T
-        weight = np.abs(sampled)
-        short = held - np.sum(sampled, axis=(2, 3), dtype=float)
-        total = np.maximum(np.sum(weight, axis=(2, 3), dtype=float), 1e-300)
-        sampled += (short / total).astype(np.float32)[..., None, None] * weight
-        return sampled
+        functions = np.zeros((x_um.size, self.channels, self.size, self.size), np.float32)
+        _finish(sampled, self.box, (self.step_um / self.box) ** 2, self.held(x_um, y_um), functions)
+        return functions
 
     def at_nodes(self, tile: Tile) -> Float32Array:
         """Functions at a tile's nodes, (4, 4, C, size, size). Those that `tiles` found good enough are handed out once."""
@@ -799,6 +790,35 @@ def _sample(  # type: ignore[no-untyped-def]  # noqa: PLR0912
                         )
                 for c in range(channels):
                     raw[n, c, i, j] = value[c]
+
+
+@njit(cache=True)
+def _finish(sampled, box, scale, light, out):  # type: ignore[no-untyped-def]
+    """Functions times `scale`, summed over box x box samples, and with the `light` (C, N) that they are to have."""
+    size = sampled.shape[2]
+    across = np.empty((size, out.shape[2]), np.float32)
+    for n in range(sampled.shape[0]):
+        for c in range(sampled.shape[1]):
+            across[:] = 0.0
+            for i in range(size):
+                for k in range(box):
+                    for j in range(size):
+                        across[i, j + k] += sampled[n, c, i, j]
+            for i in range(size):
+                for k in range(box):
+                    for j in range(out.shape[3]):
+                        out[n, c, i + k, j] += across[i, j]
+            held, weight = 0.0, 0.0
+            for i in range(out.shape[2]):
+                for j in range(out.shape[3]):
+                    value = np.float32(scale) * out[n, c, i, j]
+                    out[n, c, i, j] = value
+                    held += value
+                    weight += abs(value)
+            share = np.float32((light[c, n] - held) / max(weight, 1e-300))
+            for i in range(out.shape[2]):
+                for j in range(out.shape[3]):
+                    out[n, c, i, j] += share * abs(out[n, c, i, j])
 
 
 @njit(cache=True, inline="always")
