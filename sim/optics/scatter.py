@@ -386,6 +386,8 @@ class Kernels:
         self.size = int(np.ceil(2.0 * reach))
         if (self.size - oversample) % 2:  # a pixel's centre has as many samples on either side
             self.size += 1
+        # Sources farther than this from the frame don't reach it.
+        self.halo_px = -(-((self.size - oversample) // 2) // oversample)
         self._undo = 5 if carried else 1
         self._kept: dict[Tile, Float32Array] = {}
 
@@ -436,7 +438,7 @@ class Kernels:
     def error(self, tile: Tile, at_nodes: Float32Array) -> float:
         """Error of a tile's polynomials half way between nodes, as a share of what is allowed: the worst of a few places."""
         nodes, worst = at_nodes.reshape(_NODES.size**2, -1), 0.0
-        down, across = (np.array(a) / DEGREE for a in ((0.5, 1.5, 2.5, 0.5, 2.5), (0.5, 1.5, 0.5, 2.5, 2.5)))
+        down, across = (np.array(a) / DEGREE for a in ((0.5, 2.5, 0.5, 2.5), (0.5, 0.5, 2.5, 2.5)))
         wanted = self.at(*self.frame.um(*tile.place(down, across)))
         share = np.einsum("ip,jp->pij", lagrange(down), lagrange(across)).reshape(down.size, -1).astype(np.float32)
         off = (share @ nodes).reshape(wanted.shape) - wanted
@@ -447,11 +449,10 @@ class Kernels:
         return worst
 
     def tiles(self, grid: Grid) -> list[Tile]:
-        """Tiles that cover a grid, as large as the polynomials are good enough in them."""
+        """Tiles that cover what reaches the frame, as large as the polynomials are good enough in them."""
+        margin = min(grid.margin_px, self.halo_px)
         bounds = (
-            np.linspace(
-                -grid.margin_px, n + grid.margin_px, max(1, round((n + 2 * grid.margin_px) / LARGEST_TILE_PX)) + 1
-            )
+            np.linspace(-margin, n + margin, max(1, round((n + 2 * margin) / LARGEST_TILE_PX)) + 1)
             for n in (grid.rows, grid.cols)
         )
         rows, cols = (edge.round().astype(int).tolist() for edge in bounds)
@@ -489,7 +490,7 @@ def scatter(
     """
     frame, s = kernels.frame, grid.oversample
     half = (kernels.size - s) // 2  # samples before a pixel's first
-    halo = -(-half // s)
+    halo = kernels.halo_px
     if grid.margin_px < halo:
         raise ValueError(
             f"the margin of {grid.margin_px} px is below the limit of {halo} px that the lens's window of {2 * kernels.radius_um:g} um asks for: take a wider margin"
