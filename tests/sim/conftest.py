@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
@@ -79,7 +81,10 @@ class SyntheticLens:
         return (1.0 + self.k * h * h + extra) * (1.0 + 3.0 * self.k * h * h + extra)
 
     def table(self) -> LensTable:
-        """The lens as a table of 21 heights, or of 15 x 17 fields as a lens without symmetry has it."""
+        """The lens as a table of 21 heights, or of 15 x 17 fields as a lens without symmetry has it; made once a session."""
+        return _table(self.corner_um, self.k, self.colour, self.grid)
+
+    def made(self) -> LensTable:
         heights = np.linspace(0.0, self.corner_um, 21)
         x, y = np.zeros(21), heights
         shape: tuple[int, ...] = (21,)
@@ -121,6 +126,11 @@ class SyntheticLens:
             warnings=(),
             content_hash=f"synthetic {self.corner_um} {self.k} {self.colour} {self.grid}",
         )
+
+
+@lru_cache
+def _table(corner_um: float, k: float, colour: float, grid: bool) -> LensTable:
+    return SyntheticLens(corner_um, k, colour, grid).made()
 
 
 @pytest.fixture(scope="session")
