@@ -54,6 +54,8 @@ TRIES = 14
 def in_thread(call: Callable[[], T]) -> Future[T]:
     """Run a blocking call in a daemon thread: one that never returns must not keep the process from ending."""
     future: Future[T] = Future()
+    # From here on it can't be cancelled, as little as the call can: whoever gives up on it just doesn't look any more.
+    future.set_running_or_notify_cancel()
 
     def work() -> None:
         try:

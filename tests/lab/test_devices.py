@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import InstrumentError, NoAnswer
-from lab.devices import Status, level_of
+from lab.devices import Status, in_thread, level_of
 from lab.recording import Camera
 
 
@@ -53,3 +53,12 @@ def test_a_callback_added_late_is_called_at_once() -> None:
     status.add_callback(called.append)
     assert called == [status]
     assert status.success
+
+
+def test_a_call_that_nobody_waits_for_any_more_ends_quietly() -> None:
+    """A session that is aborted cancels what it waits for; the thread goes on, and has to find a future that takes its result."""
+    go = threading.Event()
+    future = in_thread(lambda: go.wait(10.0))
+    assert not future.cancel()
+    go.set()
+    assert future.result(10.0)

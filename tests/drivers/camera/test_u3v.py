@@ -158,14 +158,22 @@ def bench() -> Bench:
     return bench
 
 
-def camera_of(device: U3vDevice, **settings: object) -> U3vCamera:
+def camera_of(device: U3vDevice, timeout_s: float = 10.0, **settings: object) -> U3vCamera:
+    """Patient, for a busy machine, but where a fault is to be waited for."""
     found = usb.core.find(backend=InProcessBackend([device]))
-    return U3vCamera("usb://mock", device=found, timeout_s=0.5, **settings)  # type: ignore[arg-type]
+    return U3vCamera("usb://mock", device=found, timeout_s=timeout_s, **settings)  # type: ignore[arg-type]
 
 
 @pytest.fixture
 def device(bench: Bench) -> U3vDevice:
     return U3vDevice(bench, "left", "CB-1")
+
+
+@pytest.fixture
+def impatient(device: U3vDevice) -> Iterator[U3vCamera]:
+    with camera_of(device, timeout_s=0.5) as camera:
+        camera.configure(0.002)
+        yield camera
 
 
 @pytest.fixture
@@ -260,20 +268,20 @@ def test_calls_out_of_order(device: U3vDevice) -> None:
     ],
 )
 def test_faults_are_told_and_got_over(
-    camera: U3vCamera, device: U3vDevice, fault: str, error: type[Exception], message: str
+    impatient: U3vCamera, device: U3vDevice, fault: str, error: type[Exception], message: str
 ) -> None:
-    camera.capture()
+    impatient.capture()
     device.inject(fault)
     began = time.monotonic()
     with pytest.raises(error, match=message) as caught:
-        camera.capture()
+        impatient.capture()
     assert "\n" not in str(caught.value)
-    assert time.monotonic() - began < 3.0
+    assert time.monotonic() - began < 10.0  # its time-out, not a hang
     if fault == "unplug":
         device.plug()
     if fault == "late":
         time.sleep(0.6)  # let it come, to be thrown away
-    frame = camera.capture()
+    frame = impatient.capture()
     assert frame.raw.mean() > 500
 
 
