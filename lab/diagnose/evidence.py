@@ -123,7 +123,9 @@ class Evidence:
         noise, kinship = self._parts[key]
         mean = self.mean(effects)
         free = self._free(effects)[where]
-        covariance = noise + free @ free.T
+        covariance = noise.copy()
+        freed = np.flatnonzero(np.any(free != 0.0, axis=1))  # edges, the most of all numbers, have no free quantity
+        covariance[np.ix_(freed, freed)] += free[freed] @ free[freed].T
         ends = np.cumsum([int(where[at].sum()) for at in self.slices])
         for i, effect in enumerate(effects):
             change = mean - self.mean((*effects[:i], *effects[i + 1 :]))

@@ -120,10 +120,21 @@ class Wavefront:
     @cached_property
     def range_um(self) -> float:
         """Highest less lowest path over the pupil."""
-        x = np.linspace(-1.0, 1.0, 41)
-        xs, ys = np.meshgrid(x, x)
-        pupil = np.hypot(xs, ys) <= 1.0
-        return float(np.ptp(self(xs[pupil], ys[pupil])))
+        return _range_um(self)
+
+
+@lru_cache(maxsize=1)
+def _places() -> tuple[FloatArray, FloatArray]:
+    """Points (x, y) all over the pupil."""
+    x = np.linspace(-1.0, 1.0, 41)
+    xs, ys = np.meshgrid(x, x)
+    pupil = np.hypot(xs, ys) <= 1.0
+    return xs[pupil], ys[pupil]
+
+
+@lru_cache(maxsize=64)
+def _range_um(path: Wavefront) -> float:
+    return float(np.ptp(path(*_places())))
 
 
 @lru_cache(maxsize=256)
@@ -341,6 +352,15 @@ def _mean_of_any(
     return ratio
 
 
+@lru_cache(maxsize=16)
+def _to_series(count: int) -> FloatArray:
+    """From values at Chebyshev's nodes to the coefficients of the polynomial through them, (count, count)."""
+    angle = np.pi * (np.arange(count) + 0.5) / count
+    table = 2.0 / count * np.cos(np.arange(count)[:, None] * angle)
+    table[0] *= 0.5
+    return np.asarray(table)
+
+
 @lru_cache(maxsize=256)
 def _series(angle: float, wavelength_um: float, bend: Wavefront) -> ComplexArray:
     """Chebyshev's expansion of the ratio in one direction over the share of the cutoff: smooth, so that few terms do."""
@@ -349,7 +369,7 @@ def _series(angle: float, wavelength_um: float, bend: Wavefront) -> ComplexArray
         node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
         cos, sin = np.full(count, np.cos(angle)), np.full(count, np.sin(angle))
         value = _mean(0.5 * (node + 1.0), cos, sin, wavelength_um, bend)
-        series = np.asarray(chebyshev.chebfit(node, value, count - 1), complex)
+        series = np.asarray(_to_series(count) @ value, complex)
         if np.max(np.abs(series[-3:])) < SETTLED or count >= 512:
             return series
         count *= 2
@@ -377,7 +397,7 @@ def _polar_table(bend: Wavefront, wavelength_um: float) -> ComplexArray:
         share, angle = (a.ravel() for a in np.meshgrid(0.5 * (node + 1.0), turn, indexing="ij"))
         first = _mean(share, np.cos(angle), np.sin(angle), wavelength_um, bend).reshape(radii, -1)
         value = np.concatenate([first, np.conj(first)], axis=1)
-        series = np.fft.fft(chebyshev.chebfit(node, value, radii - 1), axis=1) / angles
+        series = np.fft.fft(_to_series(radii) @ value, axis=1) / angles
         loose_radii = np.max(np.abs(series[-3:])) > SETTLED and radii < 128
         middle = angles // 2
         loose_angles = np.max(np.abs(series[:, middle - 1 : middle + 2])) > SETTLED and angles < 256
