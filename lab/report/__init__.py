@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -16,6 +15,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from lab.errors import InputError
+from lab.rawfile import replacing
 from lab.recording import RecordingSet
 from lab.report import charts, geometry, words
 from lab.report.emva import data_sheets
@@ -258,17 +258,15 @@ def write_report(
     """
     file = Path(out)
     page = render_report(recordings, fit, validation, diagnosis, provenance or provenance_of(recordings))
+    return write_page(file, page)
+
+
+def write_page(file: Path, page: str) -> Path:
+    """Write a page completely, or not at all. Raises InputError where it can't be written."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        handle, partial = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(page)
-            Path(partial).chmod(0o644)
-            Path(partial).replace(file)
-        except BaseException:
-            Path(partial).unlink(missing_ok=True)
-            raise
+        with replacing(file) as partial:
+            partial.write_text(page, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{file}: can't be written ({error.strerror}); choose another place with --out") from error
+        raise InputError(f"{file}: can't be written ({error.strerror}); name a place that is yours") from error
     return file

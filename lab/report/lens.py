@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -13,9 +11,8 @@ import numpy as np
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from lab.errors import InputError
 from lab.lens import LensResult, TracedPrescription
-from lab.report import page_environment
+from lab.report import page_environment, write_page
 from lab.report.charts import Figure, Trace, axis, layout
 from lab.report.pictures import kernel_picture
 from sim.optics import rays as rt
@@ -280,19 +277,4 @@ def render_lens(traced: TracedPrescription) -> str:
 
 def write_lens_report(folder: Path, traced: TracedPrescription) -> Path:
     """Write `folder`/lens.html, one self-contained page: completely, or not at all. InputError where it can't be written."""
-    file = folder / "lens.html"
-    page = render_lens(traced)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, partial = tempfile.mkstemp(prefix=".lens.", dir=folder)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(page)
-            Path(partial).chmod(0o644)
-            Path(partial).replace(file)
-        except BaseException:
-            Path(partial).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise InputError(f"{file}: can't be written ({error.strerror}); name a folder that is yours") from error
-    return file
+    return write_page(folder / "lens.html", render_lens(traced))
