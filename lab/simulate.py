@@ -183,17 +183,11 @@ def _distorting(content: CameraFile) -> CameraFile:
     return replace(content, effects=(*content.effects, Distortion(geometry=camera.geometry)))
 
 
-def capacity_e(camera: CameraModel, gain_db: float = 0.0) -> float:
-    """Electrons at which a pixel saturates: at its full well, or at the converter's end where that comes first."""
-    gain = sensor.gain_dn_per_e(camera, gain_db)
-    return min(camera.full_well_e, (camera.white_level_dn - camera.black_level_dn) / gain)
-
-
 def automatic_exposure_s(electrons_per_s: FloatArray, camera: CameraModel, gain_db: float = 0.0) -> float:
     """The exposure that brings the brightest 1 % of the pixels to 70 % of what they hold, to three digits."""
     bright = float(np.percentile(electrons_per_s, 100.0 - BRIGHTEST_PERCENT))
     bright = bright if bright > 0 else float(electrons_per_s.max())
-    seconds = AUTO_SHARE * capacity_e(camera, gain_db) / bright
+    seconds = AUTO_SHARE * sensor.capacity_e(camera, gain_db) / bright
     if not SHORTEST_S <= seconds <= LONGEST_S:
         raise InputError(
             f"the brightest pixels collect {bright:.3g} e/s: an exposure of {seconds:.3g} s would be needed, beyond the limits of {SHORTEST_S:g} and {LONGEST_S:g} s; give --exposure-s, or another light"
@@ -241,7 +235,7 @@ def _record(
     camera: CameraModel,
     magnification: float,
 ) -> SimulationRecord:
-    full = capacity_e(camera, exposure.gain_db)
+    full = sensor.capacity_e(camera, exposure.gain_db)
     level = np.array([[float(np.mean(electrons))]])
     mean, variance = sensor.dn_moments(level, camera, exposure.gain_db)
     imaging = camera.lens.imaging

@@ -275,8 +275,7 @@ def check_not_saturated(camera: CameraModel, exposure: Exposure, electrons: Floa
     `electrons`: of `expected_electrons`. The limit is the full well, or what the converter reads at the gain. (The physics of
     clipping is in `expected` and `sample` all the same: whoever simulates calls this first.)
     """
-    room_dn = camera.white_level_dn - camera.black_level_dn
-    limit = min(camera.full_well_e, room_dn / sensor.gain_dn_per_e(camera, exposure.gain_db))
+    limit = sensor.capacity_e(camera, exposure.gain_db)
     darkest = float(np.min(electrons))
     if darkest >= limit:
         raise ValueError(

@@ -79,6 +79,12 @@ def gain_dn_per_e(camera: CameraModel, gain_db: float) -> float:
     return camera.conversion_gain_dn_per_e * 10.0 ** (gain_db / 20.0)
 
 
+def capacity_e(camera: CameraModel, gain_db: float = 0.0) -> float:
+    """Electrons at which a pixel saturates: at its full well, or at the converter's end where that comes first."""
+    gain = gain_dn_per_e(camera, gain_db)
+    return min(camera.full_well_e, (camera.white_level_dn - camera.black_level_dn) / gain)
+
+
 def clipped_moments(
     mean: FloatArray, variance: FloatArray, lower: float, upper: float, skewness: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:

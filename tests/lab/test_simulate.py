@@ -15,11 +15,12 @@ import rawpy
 from lab import cli
 from lab.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.recording import load_frame
-from lab.simulate import SimulateOptions, automatic_exposure_s, capacity_e, preview, simulate
+from lab.simulate import SimulateOptions, automatic_exposure_s, preview, simulate
 from sim.camera import CameraModel, Cfa, Geometry, Lens
 from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupil
 from sim.parameters import Quantity, declared
 from sim.scene.catalogue import SCENES, NamedScene
+from sim.sensor.electrons import capacity_e
 from sim.spectrum import Spectrum
 
 LENSES = Path(__file__).parents[2].parent / "shared" / "data" / "lenses"
