@@ -19,8 +19,8 @@ class Skipped(Frozen):
     side: Side | None = None
 
 
-class NoiseFit(Frozen):
-    """Photon transfer, by the definitions of EMVA 1288 release 4.0; of the whole sensor (`channels` apart)."""
+class ChannelNoise(Frozen):
+    """Photon transfer of one colour channel alone."""
 
     conversion_gain_dn_per_e: float | None = None
     conversion_gain_dn_per_e_std: float | None = None
@@ -38,6 +38,11 @@ class NoiseFit(Frozen):
     full_well_e_std: float | None = None
     linearity_error_percent: float | None = None
     linearity_error_percent_std: float | None = None
+
+
+class NoiseFit(ChannelNoise):
+    """Photon transfer, by the definitions of EMVA 1288 release 4.0; of the whole sensor (`channels` apart)."""
+
     #: Of a mono camera whose flats state `photons_per_pixel`: EMVA's total quantum efficiency.
     quantum_efficiency: float | None = None
     quantum_efficiency_std: float | None = None
@@ -71,27 +76,6 @@ class NoiseFit(Frozen):
     photon_transfer: PhotonTransfer | None = None
     #: What the recordings show of the rig, in sentences ("the lamp drifted by ...").
     remarks: tuple[str, ...] = ()
-
-
-class ChannelNoise(Frozen):
-    """What `NoiseFit` says of the sensor, of one colour channel alone."""
-
-    conversion_gain_dn_per_e: float | None = None
-    conversion_gain_dn_per_e_std: float | None = None
-    read_noise_e: float | None = None
-    read_noise_e_std: float | None = None
-    black_level_dn: float | None = None
-    black_level_dn_std: float | None = None
-    dark_current_e_per_s: float | None = None
-    dark_current_e_per_s_std: float | None = None
-    dsnu_e: float | None = None
-    dsnu_e_std: float | None = None
-    prnu_percent: float | None = None
-    prnu_percent_std: float | None = None
-    full_well_e: float | None = None
-    full_well_e_std: float | None = None
-    linearity_error_percent: float | None = None
-    linearity_error_percent_std: float | None = None
 
 
 class DarkCurrentTemperature(Frozen):
