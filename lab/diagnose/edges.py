@@ -76,6 +76,7 @@ def edge_block(study: Study) -> Block:
         labels=tuple(Label(float(f), e.channel, f"{e.part[0].angle_deg if e.part[0].angle_deg is not None else e.measured.angle_deg:.3g} deg",
                            tuple(c.id for c in e.part), e.held_out) for e in edges for f in MTF_FREQUENCIES),
         hooks=frozenset({"transfer", "transmittance"}), predict=predict, scale=np.ones(len(value)),
+        conditions="orientation", conditions_words="edges at",
     )  # fmt: skip
 
 

@@ -94,7 +94,7 @@ class Evidence:
             condition = np.array([label.condition for label in block.labels])
             near = np.exp(-0.5 * ((x[:, None] - x) / block.reach) ** 2)
             near = near * np.where(channel[:, None] == channel, 1.0, 0.7)
-            if block.measurement == "slanted_edge":
+            if block.conditions and not block.places:
                 near = near * np.where(condition[:, None] == condition, 1.0, 0.7)
             kin[at, at] = near
         return kin

@@ -16,6 +16,8 @@ from sim.spectrum import FloatArray
 SIGNIFICANT = 0.005
 #: Systematic parts of the covariance are known to about this share: chi2 is divided by (1 + SLACK)^2.
 SLACK = 0.15
+#: Different places on an axis from which on its quarters are looked at by themselves.
+FEWEST_QUARTERED = 8
 
 
 @dataclass(frozen=True)
@@ -81,14 +83,13 @@ def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str,
             for c in sorted(set(channel))
             if (use & (channel == c)).any()
         ]
-    if block.measurement in {"slanted_edge", "screen"} and len(set(condition)) > 1:
-        axis = "orientation" if block.measurement == "slanted_edge" else "pattern"
+    if block.conditions and len(set(condition)) > 1:
         found += [
-            (block, axis, c, index[use & (condition == c)])
+            (block, block.conditions, c, index[use & (condition == c)])
             for c in sorted(set(condition))
             if (use & (condition == c)).any()
         ]
-    if block.measurement in {"slanted_edge", "narrowband", "photon_transfer", "noise", "flat_field"}:
+    if not block.places and len(set(x[use])) >= FEWEST_QUARTERED:
         cuts = np.quantile(x[use], [0, 0.25, 0.5, 0.75, 1.0])
         for low, high in pairwise(cuts):
             part = use & (x >= low) & (x <= high)
@@ -98,8 +99,8 @@ def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str,
 
 
 def _range(block: Block, x: FloatArray) -> str:
-    if block.measurement in {"chart", "screen"} or len(x) == 0:
-        return "patches" if block.measurement == "chart" else "dark squares"
+    if block.places or len(x) == 0:
+        return block.places
     low, high = float(np.min(x)), float(np.max(x))
     return f"{low:.4g}..{high:.4g} {block.unit}"
 
@@ -123,14 +124,13 @@ def describe(evidence: Evidence, model: Gaussian, part: Slice) -> tuple[str, tup
     every = sorted({label.channel for label in block.labels})
     conditions = list(dict.fromkeys(label.condition for label in labels))
     words = []
-    if block.measurement == "chart":
-        words.append("patches " + ", ".join(conditions[:6]) + (" and others" if len(conditions) > 6 else ""))
-    elif block.measurement == "screen":
-        words.append("dark squares of " + ", ".join(conditions))
+    listed = ", ".join(conditions[:6]) + (" and others" if len(conditions) > 6 else "")
+    if block.places:
+        words.append(f"{block.places}: {listed}")
     else:
         words.append(_range(block, np.array([label.x for label in labels])))
-        if block.measurement == "slanted_edge":
-            words.append("edges at " + ", ".join(conditions))
+        if block.conditions:
+            words.append(f"{block.conditions_words or block.conditions} {listed}")
     words.append("all channels" if channels == every else "channel " + ", ".join(channels))
     captures = sorted({c for label in labels for c in label.captures})
     return ", ".join(words), tuple(captures)

@@ -122,6 +122,7 @@ def chart_block(study: Study) -> Block:
         hooks=(UNIFORM_HOOKS - {"drift"}) | SPECTRAL_HOOKS | {"veil"},
         predict=predict,
         scale=signal,
+        places="patches",
     )
 
 
@@ -292,6 +293,7 @@ def screen_block(study: Study) -> Block:
         measurement="screen", axis="level", unit="DN", reach=1e9, value=value, covariance=covariance,
         labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
         hooks=frozenset({"veil", "response"}), predict=predict, scale=np.array([p.white for p in points]),
+        conditions="pattern", places="dark squares",
     )  # fmt: skip
 
 

@@ -67,6 +67,12 @@ class Block:
     predict: Callable[[Effects], Prediction]
     scale: FloatArray  # size of a discrepancy of 1, (n,)
     along: FloatArray | None = None  # where smoothness isn't along x: logarithms of levels, (n,)
+    #: What conditions are an axis of ("orientation", "pattern"): slices and curves are by condition, too. "": of none.
+    conditions: str = ""
+    #: Words before the conditions where the report lists them ("edges at"); "": the axis' name.
+    conditions_words: str = ""
+    #: What the points are called where x only numbers them and conditions name them ("patches"); "": x is a quantity.
+    places: str = ""
 
     @property
     def position(self) -> FloatArray:

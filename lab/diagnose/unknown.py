@@ -43,11 +43,11 @@ def discrepancy(evidence: Evidence, model: Gaussian, index: int) -> Discrepancy:
     kinds = {"shared": np.zeros_like(by_channel)}
     if len(set(channel)) > 1:
         kinds["by channel"] = by_channel
-    if block.measurement == "slanted_edge" and len(set(condition)) > 1:
-        kinds["by orientation"] = by_condition
-        kinds["by channel and orientation"] = by_both
-    if block.measurement in {"chart", "screen"}:
-        kinds = {"by patch": by_condition, "by patch and channel": by_both}
+    if block.conditions and len(set(condition)) > 1:
+        kinds[f"by {block.conditions}"] = by_condition
+        kinds[f"by channel and {block.conditions}"] = by_both
+    if block.places:
+        kinds = {"each place by itself": by_condition, "each place and channel by itself": by_both}
         x = np.zeros_like(x)
     lower = cholesky(covariance, lower=True)
     white = solve_triangular(lower, residual, lower=True)
