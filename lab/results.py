@@ -641,6 +641,7 @@ class ResidualCurve(Frozen):
     channel: str
     axis: str
     x: tuple[float, ...]
+    names: tuple[str, ...] = ()  # of the points, where x only numbers them
     measured: tuple[float, ...]
     measured_std: tuple[float, ...]
     before: tuple[float, ...]  # prediction of the baseline

@@ -45,7 +45,7 @@ def run_case(folder: Path) -> CaseRun:
     wall, cpu = time.perf_counter(), time.process_time()
     found, error = None, None
     try:
-        found = diagnose(recording.read(folder)).model_copy(update={"curves": (), "source": folder.name})
+        found = diagnose(recording.read(folder), at_once=False).model_copy(update={"curves": (), "source": folder.name})
     except Exception as caught:  # whatever it is, it is this case's result
         at = traceback.extract_tb(caught.__traceback__)[-1]
         error = f"{type(caught).__name__}: {' '.join(str(caught).split())} ({Path(at.filename).name}:{at.lineno})"

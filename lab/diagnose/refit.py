@@ -64,6 +64,7 @@ class Fit:
     log_likelihood: float
     weight: float
     tangents: FloatArray  # (n, parameters), slopes of the prediction
+    final: bool = True  # whether it was carried to convergence
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,7 +89,9 @@ def likelihood(evidence: Evidence, effects: Effects) -> float:
     return log_likelihood(evidence.seen_value - model.mean, model.covariance)
 
 
-def refit(evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluations: int = 12) -> Fit:
+def refit(
+    evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluations: int = 12, final: bool = True
+) -> Fit:
     """Maximum a posteriori of all parameters of `start`, by Gauss-Newton with bounds; the prior is three times as wide as
     the declared one, as a camera at hand needn't be typical. Standard uncertainties follow from the slopes and hold the form
     tolerance, as the covariance does."""
@@ -144,10 +147,10 @@ def refit(evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluatio
         jacobian = result.jac[: -len(coords)]
         if turn and np.all(np.abs(u - before) < 1e-3 * scale):
             break
-    final = moved(effects, coords, u)
+    best = moved(effects, coords, u)
     curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)
     covariance = np.linalg.pinv(curvature)
-    std: list[dict[str, float | None]] = [{} for _ in final]
+    std: list[dict[str, float | None]] = [{} for _ in best]
     for k, c in enumerate(coords):
         su = float(np.sqrt(max(covariance[k, k], 0.0)))
         power = c.quantity.slope_power
@@ -156,10 +159,10 @@ def refit(evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluatio
         std[c.index][c.name] = (
             su if power == 1 else min(su / max(power * away ** (power - 1), 1e-12), su ** (1.0 / power))
         )
-    value = likelihood(evidence, final)
+    value = likelihood(evidence, best)
     prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
-    tangents = _tangents(evidence, final, coords, u, scale, high)
-    return Fit(final, tuple(std), value, value + prior - PARAMETER_NATS * len(coords), tangents)
+    tangents = _tangents(evidence, best, coords, u, scale, high)
+    return Fit(best, tuple(std), value, value + prior - PARAMETER_NATS * len(coords), tangents, final)
 
 
 def _tangents(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -26,6 +27,14 @@ class Score:
 
 
 @dataclass(frozen=True)
+class Pair:
+    """The same statistic of two effects together."""
+
+    value: float
+    starts: tuple[Effect, Effect]
+
+
+@dataclass(frozen=True)
 class Signatures:
     """Whitened signatures of all candidates about one model."""
 
@@ -39,6 +48,32 @@ class Signatures:
             if effect.name not in best or value > best[effect.name].value:
                 best[effect.name] = Score(effect, value, _combined(effect, prototypes, share))
         return sorted(best.values(), key=lambda s: -s.value)
+
+    def pairs(self, count: int) -> list[Pair]:
+        """The best pairs of two effects by what their signatures take together, highest first.
+
+        Of two effects that act on the same numbers neither may be the best alone. Small tables: only the signatures' span matters.
+        """
+        best: dict[str, tuple[float, tuple[Effect, ...], FloatArray]] = {}
+        for effect, prototypes, table in self.columns:
+            value, _ = _cone(table, self.white)
+            if effect.name not in best or value > best[effect.name][0]:
+                best[effect.name] = value, prototypes, table
+        if len(best) < 2:
+            return []
+        basis = _span(np.concatenate([table for _, _, table in best.values()], axis=1))
+        white = basis.T @ self.white
+        members = [(prototypes, basis.T @ table) for _, prototypes, table in best.values()]
+        found = []
+        for (first, one), (second, two) in combinations(members, 2):
+            value, share = _cone(np.concatenate([one, two], axis=1), white)
+            found.append((value, first, share[: len(first)], second, share[len(first) :]))
+        found.sort(key=lambda pair: -pair[0])
+        return [
+            Pair(value, (_combined(type(first[0]), first, mine), _combined(type(second[0]), second, other)))
+            for value, first, mine, second, other in found[:count]
+            if mine.any() and other.any()
+        ]
 
     def threshold(self, rng: np.random.Generator, quantile: float, draws: int = 400) -> float:
         """The quantile of the largest score over a bootstrap of the model: noise drawn as the covariance says.

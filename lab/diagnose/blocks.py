@@ -1,0 +1,59 @@
+"""What is looked at: the list of measurements, and one side's evidence made of those that its recordings allow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from lab.diagnose.edges import edge_block
+from lab.diagnose.evidence import Evidence
+from lab.diagnose.patches import chart_block, screen_block
+from lab.diagnose.summaries import Block, Study
+from lab.diagnose.uniform import dark_block, linearity_block, narrowband_block, shading_block, variance_block
+from lab.errors import NotDetermined
+from lab.predict import assumptions, camera_model
+from lab.recording import RecordingSet
+from lab.results import CameraFit, FitResult, Skipped
+from sim.camera import Side
+
+#: Makers of blocks, in the order of the report; one that a recording set doesn't allow is left out with a reason.
+BLOCKS: tuple[Callable[[Study], Block], ...] = (
+    dark_block,
+    linearity_block,
+    variance_block,
+    shading_block,
+    narrowband_block,
+    chart_block,
+    edge_block,
+    screen_block,
+)
+
+#: Of the full well: from here on pixels of a noisy level are cut off.
+_NEAR_FULL = 0.985
+
+
+def evidence_of(
+    recordings: RecordingSet, side: Side, fit: FitResult | None = None
+) -> tuple[Evidence | None, tuple[Skipped, ...]]:
+    """One side's measurements against its baseline, and what couldn't be looked at; None where nothing could."""
+    camera_fit = fit.cameras.get(side) if fit is not None else None
+    camera = camera_model(recordings, side, camera_fit, maker_curves=True)
+    skipped = [
+        Skipped(step=f"diagnose {a.quantity}", reason=f"neither stated nor fitted; taken as {a.value}", side=side)
+        for a in assumptions(recordings.camera(side))
+    ]
+    study = Study(recordings, side, camera, _saturation_dn(camera_fit))
+    blocks = []
+    for make in BLOCKS:
+        try:
+            blocks.append(make(study))
+        except NotDetermined as refused:
+            skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
+    blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]
+    return (Evidence(tuple(blocks), study.camera) if blocks else None), tuple(skipped)
+
+
+def _saturation_dn(fit: CameraFit | None) -> float | None:
+    noise = fit.noise if fit is not None else None
+    if noise is None or noise.full_well_e is None or noise.conversion_gain_dn_per_e is None:
+        return None
+    return (noise.black_level_dn or 0.0) + _NEAR_FULL * noise.full_well_e * noise.conversion_gain_dn_per_e

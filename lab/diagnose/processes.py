@@ -1,0 +1,104 @@
+"""The sides of a recording set at the same time, each in a process of its own, for Python computes in one thread at a time.
+
+A process is a plain `python -m lab.diagnose`. It is handed its work through its standard input, and says through its
+standard output how far it is and what it found. Unlike a pool's workers it needs nothing of the caller's main module, may be
+started by a pool's worker, and ends when whoever started it is gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+from lab.diagnose.side import SideFindings
+from lab.errors import InputError
+from lab.recording import RecordingSet
+from lab.results import FitResult
+from sim.camera import Side
+
+#: How often (s) a waiting main thread wakes to let Python run signal handlers.
+WAKE_S = 0.2
+#: Two processes on two cores: a library's own threads would only get into each other's way.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+def in_processes(
+    recordings: RecordingSet, fit: FitResult | None, report: Callable[[Side, str], None]
+) -> list[SideFindings]:
+    """What every side shows, in the order of the sides. `report` is called in the caller's thread; what it raises, or what a
+    process raised, ends all of them. Raises InputError where a process was ended from outside."""
+    said: queue.SimpleQueue[tuple[Side, Any]] = queue.SimpleQueue()
+    found: dict[Side, SideFindings] = {}
+    with contextlib.ExitStack() as stack:
+        for side in recordings.sides:
+            stack.enter_context(_Process(recordings, side, fit, said))
+        while len(found) < len(recordings.sides):
+            try:
+                side, what = said.get(timeout=WAKE_S)
+            except queue.Empty:
+                continue
+            if isinstance(what, BaseException):
+                raise what
+            if isinstance(what, SideFindings):
+                found[side] = what
+            else:
+                report(side, what)
+    return [found[side] for side in recordings.sides]
+
+
+class _Process:
+    """One side's process, with a thread that listens to it. Leaving the block ends both."""
+
+    def __init__(
+        self, recordings: RecordingSet, side: Side, fit: FitResult | None, said: queue.SimpleQueue[tuple[Side, Any]]
+    ) -> None:
+        self._side, self._said = side, said
+        self._task = recordings, side, fit
+
+    def __enter__(self) -> _Process:
+        # Of its own session: Ctrl-C is for the caller, who ends this process.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "lab.diagnose"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | ONE_THREAD,
+            start_new_session=True,
+        )
+        self._listener = threading.Thread(target=self._listen, name=f"diagnose-{self._side}", daemon=True)
+        self._listener.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if kind is not None:
+            self._process.kill()
+        self._process.wait()
+        self._listener.join()
+
+    def _listen(self) -> None:
+        """Hand over the task, and put what the process says into the queue until it has said all."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError), self._process.stdin as to:
+            pickle.dump(self._task, to, pickle.HIGHEST_PROTOCOL)
+        with self._process.stdout as heard:
+            try:
+                while True:
+                    what = pickle.load(heard)
+                    self._said.put((self._side, what))
+                    if not isinstance(what, str):
+                        return
+            except (EOFError, pickle.UnpicklingError):
+                ended = self._process.wait()
+                by = f"signal {-ended}" if ended < 0 else f"exit code {ended}"
+                self._said.put((self._side, InputError(
+                    f"diagnose: the process for the {self._side} side ended with {by}; where memory was short, free about 1 GB a side "
+                    "and start again"
+                )))  # fmt: skip

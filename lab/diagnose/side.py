@@ -1,0 +1,217 @@
+"""One side's diagnosis: the chain of `decide.py` on its evidence, and what is told of it. What is told can be sent between
+processes; evidence, which holds functions, can't."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lab.diagnose.blocks import evidence_of
+from lab.diagnose.decide import Candidate, Verdict, decide
+from lab.diagnose.evidence import Evidence
+from lab.diagnose.locate import describe
+from lab.diagnose.summaries import Block
+from lab.diagnose.unknown import with_discrepancy
+from lab.recording import RecordingSet
+from lab.results import FitResult, HeldOut, Mismatch, ResidualCurve, Skipped, Unexplained
+from sim.camera import Side
+from sim.effects.base import Effect
+
+#: Called with what is being done.
+Report = Callable[[str], None]
+SEED = 1288  # of the bootstrap behind the threshold: the same recordings give the same diagnosis
+
+
+@dataclass(frozen=True)
+class Named:
+    """A named effect, and the measurements in which its change stands out of the noise."""
+
+    candidate: Candidate
+    shown_in: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SideFindings:
+    """What one side shows."""
+
+    side: Side
+    skipped: tuple[Skipped, ...]
+    is_judged: bool = False  # whether anything could be looked at
+    threshold: float | None = None  # None: no effect acts on what was looked at
+    mismatches: tuple[Mismatch, ...] = ()
+    named: tuple[Named, ...] = ()
+    abstained: tuple[Candidate, ...] = ()
+    unexplained: tuple[Unexplained, ...] = ()
+    held_out: HeldOut | None = None
+    curves: tuple[ResidualCurve, ...] = ()
+
+
+def diagnose_side(recordings: RecordingSet, side: Side, fit: FitResult | None, report: Report) -> SideFindings:
+    """Everything that is told of one side."""
+    report("summarising the recordings")
+    evidence, skipped = evidence_of(recordings, side, fit)
+    if evidence is None:
+        return SideFindings(side, skipped)
+    report("scoring the effects")
+    verdict = decide(evidence, np.random.default_rng(SEED), report)
+    return SideFindings(
+        side=side,
+        skipped=skipped,
+        is_judged=True,
+        threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
+        mismatches=tuple(_mismatches(side, verdict)),
+        named=tuple(Named(c, _shown_in(verdict, c)) for c in verdict.named),
+        abstained=verdict.abstained,
+        unexplained=tuple(_unexplained(side, verdict)),
+        held_out=_held_out(verdict),
+        curves=tuple(_curves(side, verdict)),
+    )
+
+
+def _mismatches(side: Side, verdict: Verdict) -> list[Mismatch]:
+    """The most significant slice of every measurement; where only an effect's score tells, the measurement that shows it most."""
+    evidence = verdict.evidence
+    baseline = evidence.gaussian()
+    found, seen = [], set()
+    for part in verdict.before:
+        if part.block.measurement in seen:
+            continue
+        seen.add(part.block.measurement)
+        where, captures = describe(evidence, baseline, part)
+        found.append(
+            Mismatch(
+                side=side,
+                measurement=part.block.measurement,
+                axis=part.axis,
+                where=where,
+                significance_sigma=round(part.significance_sigma, 2),
+                captures=captures,
+            )
+        )
+    for candidate in (*verdict.named, *verdict.abstained):
+        touched = [b for b in evidence.blocks if b.touched_by(type(candidate.effect))]
+        if touched and not any(b.measurement in seen for b in touched):
+            block = max(touched, key=lambda b: _pull(evidence, verdict, candidate.effect, b))
+            seen.add(block.measurement)
+            at = evidence.slices[evidence.blocks.index(block)]
+            found.append(
+                Mismatch(
+                    side=side,
+                    measurement=block.measurement,
+                    axis=block.axis,
+                    where=f"along the whole axis, as {candidate.effect.name}",
+                    significance_sigma=round(float(np.sqrt(max(2.0 * candidate.gain, 0.0))), 2),
+                    captures=evidence.captures(False, _mask(evidence, at)),
+                )
+            )
+    return found
+
+
+def _mask(evidence: Evidence, at: slice) -> np.ndarray:
+    mask = np.zeros(len(evidence.value), bool)
+    mask[at] = True
+    return mask
+
+
+def _pull(evidence: Evidence, verdict: Verdict, effect: Effect, block: Block) -> float:
+    at = evidence.slices[evidence.blocks.index(block)]
+    others = tuple(e for e in verdict.effects if e.name != effect.name)
+    change = (evidence.mean((*others, effect)) - evidence.mean(others))[at]
+    return float(np.sum(np.square(change) / np.diag(block.covariance)))
+
+
+def _shown_in(verdict: Verdict, candidate: Candidate) -> tuple[str, ...]:
+    """Measurements in which the effect's change stands out of the noise."""
+    evidence = verdict.evidence
+    pulls = {
+        b.measurement: _pull(evidence, verdict, candidate.effect, b)
+        for b in evidence.blocks
+        if b.touched_by(type(candidate.effect))
+    }
+    strongest = max(pulls.values(), default=0.0)
+    strong = tuple(m for m, p in pulls.items() if p > 25.0 and p > 0.02 * strongest)
+    return strong or (max(pulls, key=lambda m: pulls[m]),)
+
+
+def _unexplained(side: Side, verdict: Verdict) -> list[Unexplained]:
+    evidence = verdict.evidence
+    model = evidence.gaussian(verdict.effects)
+    found = []
+    for gap in verdict.unknown:
+        block, at = evidence.blocks[gap.index], evidence.slices[gap.index]
+        part = next((s for s in verdict.after if s.block is block), None)
+        index = np.arange(at.start, at.stop)[evidence.seen[at]]
+        only = np.ix_(index, index)
+        residual = (evidence.value - model.mean)[index]
+        before = float(residual @ np.linalg.solve(model.covariance[only], residual))
+        after = float(residual @ np.linalg.solve(with_discrepancy(evidence, model, gap).covariance[only], residual))
+        where = describe(evidence, model, part)[0] if part is not None else "along the whole axis"
+        families = [
+            f"{c.effect.name} ({100 * c.probability:.0f} %)"
+            + "".join(f", {n} ({100 * p:.0f} %)" for n, p in c.rivals[:3])
+            for c in verdict.abstained
+            if block.touched_by(type(c.effect))
+        ]
+        family = (
+            f"; nearest of the library, none of them likely enough to be named: {'; '.join(families)}"
+            if families
+            else ""
+        )
+        found.append(
+            Unexplained(
+                side=side,
+                measurement=block.measurement,
+                axis=part.axis if part is not None else block.axis,
+                where=where,
+                shape=f"smooth over {gap.reach:.3g} {block.unit}, {gap.kinship}, of relative size {gap.amplitude:.2g}{family}"
+                if gap.gain > 0
+                else f"irregular: no smooth process describes it{family}",
+                significance_sigma=round(part.significance_sigma, 2) if part is not None else 0.0,
+                chi2_before=before,
+                chi2_after=after,
+                n=len(index),
+            )
+        )
+    return found
+
+
+def _held_out(verdict: Verdict) -> HeldOut | None:
+    """Over the measurements that the named effects act on; over all where none is named."""
+    evidence, effects = verdict.evidence, verdict.effects
+    where = np.any([evidence.touched(type(e)) for e in effects], axis=0) if effects else None
+    before, n = evidence.held_out((), where)
+    after, _ = evidence.held_out(effects, where)
+    return HeldOut(captures=evidence.captures(True, where), chi2_before=before, chi2_after=after, n=n) if n else None
+
+
+def _curves(side: Side, verdict: Verdict) -> list[ResidualCurve]:
+    evidence = verdict.evidence
+    before, after = evidence.levelled(), evidence.levelled(verdict.effects)
+    found = []
+    for block, at in zip(evidence.blocks, evidence.slices, strict=True):
+        std = np.sqrt(np.diag(block.covariance))
+        groups: dict[tuple[str, str, bool], list[int]] = {}
+        for i, label in enumerate(block.labels):
+            condition = label.condition if block.conditions else ""
+            groups.setdefault((condition, label.channel, label.held_out), []).append(i)
+        for (condition, channel, held_out), members in groups.items():
+            order = sorted(members, key=lambda i: block.labels[i].x)
+            found.append(
+                ResidualCurve(
+                    side=side,
+                    measurement=block.measurement,
+                    label=condition or block.measurement,
+                    channel=channel,
+                    axis=block.places or f"{block.axis.replace('_', ' ')}, {block.unit}",
+                    names=tuple(block.labels[i].condition for i in order) if block.places else (),
+                    x=tuple(block.labels[i].x for i in order),
+                    measured=tuple(float(block.value[i]) for i in order),
+                    measured_std=tuple(float(std[i]) for i in order),
+                    before=tuple(float(before[at][i]) for i in order),
+                    after=tuple(float(after[at][i]) for i in order),
+                    held_out=held_out,
+                )
+            )
+    return found
