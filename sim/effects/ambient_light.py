@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
@@ -10,7 +10,7 @@ from sim.parameters import Quantity
 
 
 class AmbientLight(Effect):
-    """Electrons a second added while the shutter is open, alike in all channels."""
+    """Electrons a second added while the shutter is open: e in green (and in a camera without colour), e sqrt(c) in red, e / sqrt(c) in blue."""
 
     name: ClassVar[str] = "ambient_light"
     stage: ClassVar[Stage] = Stage.RIG
@@ -18,6 +18,7 @@ class AmbientLight(Effect):
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband", "flat", "chart"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"red_over_blue"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {"veiling_glare", "black_level_drift", "exposure_offset", "nonlinearity", "stray_light"}
     )
@@ -38,5 +39,22 @@ class AmbientLight(Effect):
         ),
     ] = 0.0
 
+    red_over_blue: Annotated[
+        float,
+        Quantity(
+            "1",
+            "electrons in red over those in blue: the room's colour",
+            lower=0.05,
+            upper=20.0,
+            prior=(1.0, 1.0),
+            absent=1.0,
+        ),
+    ] = 1.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        colours = (1.0,) if camera.cfa == "MONO" else (1.0, 3.0, 0.4)
+        return tuple((cls(rate_e_per_s=15.0, red_over_blue=c),) for c in colours)
+
     def ambient_e_per_s(self, channel: str, camera: CameraModel) -> float:
-        return self.rate_e_per_s
+        return self.rate_e_per_s * self.red_over_blue ** {"R": 0.5, "B": -0.5}.get(channel, 0.0)

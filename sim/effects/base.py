@@ -74,6 +74,8 @@ class Effect(Frozen):
         """
         steps: list[Self] = []
         for field, quantity in cls.quantities().items():
+            if field in cls.shapes:
+                continue
             absent = quantity.absent or 0.0
             size = quantity.prior[1] if quantity.prior is not None else 1.0
             for sign in (1.0, -1.0):
@@ -117,15 +119,15 @@ class Effect(Frozen):
 
         fx runs along columns (x, to the right), fy along rows (y, down). May be complex. An effect of the pupil is an
         `Aberration`: it returns the aberrated pupil's ratio to the perfect one's, and adds up with others of its kind.
-        An effect that has `charge` too acts through that on whole frames; its `transfer` is for edges and kernels of one
-        channel, where there's no mosaic to move charge on (see `moves_charge`).
+        An effect that has `charge` or `processing` too acts through that on whole frames; its `transfer` is for edges and
+        kernels of one channel, where there's no mosaic to move charge on (see `acts_on_frames`).
         """
         return None
 
     @classmethod
-    def moves_charge(cls) -> bool:
-        """Whether the effect acts on whole frames through `charge`, and so not through `transfer`: never through both."""
-        return cls.charge is not Effect.charge
+    def acts_on_frames(cls) -> bool:
+        """Whether the effect acts on whole frames through `charge` or `processing`, and so not through `transfer`: never twice."""
+        return cls.charge is not Effect.charge or cls.processing is not Effect.processing
 
     def image_shift_um(
         self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
@@ -174,6 +176,11 @@ class Effect(Frozen):
         """CHARGE or ELECTRONICS: temporal variance of a pixel in e^2 at a mean signal in electrons."""
         return noise_e2
 
+    def neighbour_correlation(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
+        """CHARGE: correlation of a pixel's shot noise with that of each of its four neighbours, of the same mean signal in
+        electrons; between 0 and 1/4. `noise_e2` has the variance that this leaves."""
+        return 0.0
+
     def added(self, shape: tuple[int, ...], rng: np.random.Generator, camera: CameraModel) -> FloatArray | None:
         """ELECTRONICS: electrons that one frame's read-out adds to the pixels, drawn anew in each, or None for none; they
         broadcast to the frame's `shape`. Of mean `added_e` and variance `added_e2`."""
@@ -190,3 +197,8 @@ class Effect(Frozen):
     def codes(self, dn: FloatArray, camera: CameraModel) -> FloatArray:
         """ELECTRONICS: what the converter makes of a level in DN before it rounds (ideal: the same)."""
         return dn
+
+    def processing(self, camera: CameraModel) -> FloatArray | None:
+        """ELECTRONICS: kernel (odd, odd) of sum 1 of the linear filter that the chip runs over each colour's plane, signal and
+        noise alike, before its codes are rounded; None for none."""
+        return None

@@ -13,7 +13,8 @@ from sim.spectrum import FloatArray
 
 
 class NonUniformIllumination(Effect):
-    """Light factor 1 + gx x + gy y, x and y from -1 to 1 across the frame."""
+    """Light factor 1 + s + k s^2 / g, s = gx x + gy y and g = |(gx, gy)|, x and y from -1 to 1 across the frame: a slope, with a bow along
+    it as a lamp beside the axis leaves it."""
 
     name: ClassVar[str] = "non_uniform_illumination"
     stage: ClassVar[Stage] = Stage.RIG
@@ -21,6 +22,7 @@ class NonUniformIllumination(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"bow"})
     rivals: ClassVar[frozenset[str]] = frozenset({"vignetting", "vignetting_decentre"})
     sentence: ClassVar[str] = (
         "The illumination is not uniform: flat fields slope across the frame, alike in all channels."
@@ -45,8 +47,17 @@ class NonUniformIllumination(Effect):
         ),
     ] = 0.0
 
+    bow: Annotated[
+        float,
+        Quantity(
+            "1", "bend along the slope, in parts of the slope", lower=-1.0, upper=1.0, prior=(0.0, 0.15), absent=0.0
+        ),
+    ] = 0.0
+
     def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
         half_x, half_y = 0.5 * camera.cols * camera.pixel_pitch_um, 0.5 * camera.rows * camera.pixel_pitch_um
-        return np.asarray(
-            1.0 + self.gradient_x_percent / 100.0 * x_um / half_x + self.gradient_y_percent / 100.0 * y_um / half_y
-        )
+        slope = self.gradient_x_percent / 100.0 * x_um / half_x + self.gradient_y_percent / 100.0 * y_um / half_y
+        steepest = float(np.hypot(self.gradient_x_percent, self.gradient_y_percent)) / 100.0
+        if self.bow == 0.0 or steepest == 0.0:
+            return np.asarray(1.0 + slope)
+        return np.asarray(1.0 + slope + self.bow * slope**2 / steepest)

@@ -25,7 +25,15 @@ class Nonlinearity(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "orientation", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart"})
     rivals: ClassVar[frozenset[str]] = frozenset(
-        {"exposure_offset", "source_drift", "black_level_drift", "ambient_light", "brighter_fatter", "veiling_glare"}
+        {
+            "exposure_offset",
+            "source_drift",
+            "black_level_drift",
+            "ambient_light",
+            "brighter_fatter",
+            "veiling_glare",
+            "radiometer_nonlinearity",
+        }
     )
     sentence: ClassVar[str] = (
         "The response bends: the signal a photon leaves depends on the level, alike in all channels and exposures."

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
+import numpy as np
+
+from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 
+#: Longer than any session: a drift in proportion to the time.
+SETTLES_NEVER_MIN = 1e4
+
 
 class SourceDrift(Effect):
-    """Radiance factor 1 + a t."""
+    """Radiance factor 1 + a T (1 - exp(-t / T)): in proportion to the time at first, settled after a few T. 1 + a t for long T."""
 
     name: ClassVar[str] = "source_drift"
     stage: ClassVar[Stage] = Stage.RIG
@@ -17,6 +23,7 @@ class SourceDrift(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "orientation"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"settling_min"})
     rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity", "exposure_offset"})
     sentence: ClassVar[str] = "The source drifts: signals follow the time of the capture and not the level."
 
@@ -33,5 +40,25 @@ class SourceDrift(Effect):
         ),
     ] = 0.0
 
+    settling_min: Annotated[
+        float,
+        Quantity(
+            "min",
+            "time after which a warm-up has settled by 63 %; none: it goes on",
+            lower=0.5,
+            upper=SETTLES_NEVER_MIN,
+            absent=SETTLES_NEVER_MIN,
+        ),
+    ] = SETTLES_NEVER_MIN
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple(
+            (cls(drift_percent_per_min=0.1, settling_min=t), cls(drift_percent_per_min=-0.1, settling_min=t))
+            for t in (SETTLES_NEVER_MIN, 30.0, 8.0, 2.0)
+        )
+
     def drift(self, elapsed_s: float) -> float:
-        return 1.0 + self.drift_percent_per_min / 100.0 * elapsed_s / 60.0
+        minutes = elapsed_s / 60.0
+        settled = self.settling_min * -np.expm1(-minutes / self.settling_min)
+        return float(1.0 + self.drift_percent_per_min / 100.0 * settled)

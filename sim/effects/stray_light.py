@@ -21,7 +21,14 @@ class StrayLight(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
     rivals: ClassVar[frozenset[str]] = frozenset(
-        {"ambient_light", "black_level_drift", "veiling_glare", "crosstalk", "infrared_cut_filter"}
+        {
+            "ambient_light",
+            "black_level_drift",
+            "veiling_glare",
+            "crosstalk",
+            "infrared_cut_filter",
+            "second_order_light",
+        }
     )
     sentence: ClassVar[str] = (
         "The monochromator leaks light of all wavelengths: channels answer where they should be blind, in proportion to the lamp."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
@@ -11,17 +11,22 @@ from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
+#: Powers of the radius that are tried first.
+EXPONENTS = (1.0, 2.0, 4.0)
+
 
 class Vignetting(Effect):
-    """Light factor 1 - v (r / r_corner)^2."""
+    """Light factor 1 - v (r / r_corner)^p: p = 2 where the exit pupil shrinks, about 1 where a stop in front or behind cuts it (two discs
+    that part), 4 and more where a mount's rim only reaches the corners."""
 
     name: ClassVar[str] = "vignetting"
     stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "ISO 17957:2015"
-    form_tolerance: ClassVar[float] = 0.1
+    form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"non_uniform_illumination"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"exponent"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"non_uniform_illumination", "vignetting_decentre"})
     sentence: ClassVar[str] = (
         "The lens vignettes: flat fields fall towards the corners more than the cosine law says, alike in all channels."
     )
@@ -39,6 +44,20 @@ class Vignetting(Effect):
         ),
     ] = 0.0
 
+    exponent: Annotated[
+        float,
+        Quantity(
+            "1", "power of the radius with which the light falls", lower=0.7, upper=8.0, prior=(2.0, 1.0), absent=2.0
+        ),
+    ] = 2.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple(
+            (cls(corner_loss_percent=1.0, exponent=p), cls(corner_loss_percent=-1.0, exponent=p)) for p in EXPONENTS
+        )
+
     def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
         corner2 = 0.25 * (camera.cols**2 + camera.rows**2) * camera.pixel_pitch_um**2
-        return np.asarray(1.0 - self.corner_loss_percent / 100.0 * (x_um**2 + y_um**2) / corner2)
+        share = ((x_um**2 + y_um**2) / corner2) ** (0.5 * self.exponent)
+        return np.asarray(1.0 - self.corner_loss_percent / 100.0 * share)

@@ -1,0 +1,48 @@
+"""Radiometer nonlinearity: strong light is read low, or high, against weak light."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+#: W sr^-1 m^-2 nm^-1 at which the reading is right: that of a lamp in a sphere. Any other level is a factor on everything, which the
+#: scale of the sensitivity takes.
+RIGHT_AT = 0.01
+
+
+class RadiometerNonlinearity(Effect):
+    """What was read as narrowband radiance L of peak P is L (P / 0.01)^a: a detector's response that isn't quite proportional."""
+
+    name: ClassVar[str] = "radiometer_nonlinearity"
+    stage: ClassVar[Stage] = Stage.RIG
+    reference: ClassVar[str] = "CIE 214:2014; S. Yang, I. Vayshenker, X. Li, T. R. Scott, NIST J. Res. 99, 1 (1994)"
+    form_tolerance: ClassVar[float] = 0.15
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "orientation", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity"})
+    sentence: ClassVar[str] = (
+        "The radiometer isn't linear: the sensitivity that is measured follows the level of the light and not its wavelength, alike in all channels."
+    )
+
+    exponent_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "true light grows with the reading to the power of 1 + this",
+            lower=-30.0,
+            upper=30.0,
+            prior=(0.0, 1.0),
+            absent=0.0,
+        ),
+    ] = 0.0
+
+    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+        peak = float(np.max(radiance))
+        if self.exponent_percent == 0.0 or kind != "narrowband" or peak <= 0.0:
+            return radiance
+        return np.asarray(radiance * (peak / RIGHT_AT) ** (0.01 * self.exponent_percent))
