@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
+from scipy.signal import convolve2d
 
 from sim.camera import CameraModel
 from sim.effects.aberration import Aberration
@@ -135,6 +136,44 @@ def optical_transfer(
     for node, part in zip(nodes, share, strict=True):
         total = total + part * _transfer_at(camera, float(node), fx, fy, effects)
     return np.asarray(total * aperture_otf(fx, fy, camera.fill_factor), complex)
+
+
+def common_wavelengths(
+    camera: CameraModel,
+    sights: Sequence[tuple[str, Spectrum | None]],
+    effects: Sequence[Effect] = (),
+    kind: str = "slanted_edge",
+    count: int = OTF_WAVELENGTHS,
+) -> tuple[FloatArray, FloatArray]:
+    """Wavelengths (nm), at most `count`, that serve several sights (channel, light) at once, and how much each counts for each
+    of them, (sights, wavelengths): sum 1 over a sight.
+
+    Gauss's nodes for the sights' mean spectral weight; the shares integrate the polynomial through the nodes, so that they may be
+    below 0. Transfers of broad and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's
+    cutoff, which is no polynomial in the wavelength, 5e-4).
+    """
+    found = []
+    for channel, radiance in sights:
+        wavelength_nm, weight = _detected(camera, channel, [(radiance, None)], effects, kind)
+        # a sight without light is that of equal energy
+        found.append(_otf_weight(camera, channel, wavelength_nm, weight[0]))
+    position = np.concatenate([at for at, _ in found])
+    order = np.argsort(position, kind="stable")
+    pooled = np.concatenate([part for _, part in found]) / len(found)
+    nodes, _ = gauss_rule(position[order], pooled[order], count)
+    return nodes, np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
+
+
+def transfer_at(
+    camera: CameraModel,
+    wavelength_nm: float,
+    fx_cy_per_px: FloatArray,
+    fy_cy_per_px: FloatArray,
+    effects: Sequence[Effect] = (),
+) -> FloatArray | ComplexArray:
+    """Transfer of lens, effects and pixel at one wavelength, of the broadcast shape of fx and fy (cy/px)."""
+    transfer = _transfer_at(camera, wavelength_nm, fx_cy_per_px, fy_cy_per_px, effects)
+    return transfer * aperture_otf(fx_cy_per_px, fy_cy_per_px, camera.fill_factor)
 
 
 def edge_profile(
@@ -416,6 +455,9 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
             dn = effect.codes(dn, camera)
         return dn
 
+    def neighbours(electrons: FloatArray) -> FloatArray:
+        return np.asarray(sum((effect.neighbour_correlation(electrons, camera) for effect in effects), 0.0))
+
     def overridden(hook: str) -> bool:
         return any(getattr(type(effect), hook) is not getattr(Effect, hook) for effect in effects)
 
@@ -429,7 +471,19 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
         sum((effect.added_e(shape, camera) for effect in effects), 0.0),
         sum((effect.added_e2(shape, camera) for effect in effects), 0.0),
         codes if overridden("codes") else None,
+        neighbours if overridden("neighbour_correlation") else None,
+        processing_kernel(camera, effects),
     )
+
+
+def processing_kernel(camera: CameraModel, effects: Sequence[Effect]) -> FloatArray | None:
+    """Kernel of all filters that the effects run over each colour's plane, one after the other; None for none."""
+    whole: FloatArray | None = None
+    for effect in effects:
+        kernel = effect.processing(camera)
+        if kernel is not None:
+            whole = kernel if whole is None else np.asarray(convolve2d(whole, kernel))
+    return whole
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------
@@ -498,6 +552,13 @@ def _otf_wavelengths(
     camera: CameraModel, channel: str, wavelength_nm: FloatArray, weight: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """A few wavelengths (nm) and shares (sum 1) over which to average the transfer function for detected light `weight`."""
+    return gauss_rule(*_otf_weight(camera, channel, wavelength_nm, weight), count)
+
+
+def _otf_weight(
+    camera: CameraModel, channel: str, wavelength_nm: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Wavelengths (nm) and how much each counts (sum 1) in a transfer function, for detected light `weight`."""
     total = float(np.sum(weight))
     if not total > 0:
         # No light: any transfer function will do, and that of equal energy is the natural one.
@@ -507,7 +568,7 @@ def _otf_wavelengths(
         raise ValueError(
             f"quantum efficiency x lens transmittance of channel {channel!r} is 0 everywhere: give a curve above 0"
         )
-    return gauss_rule(wavelength_nm, weight / total, count)
+    return wavelength_nm, weight / total
 
 
 def _highest_cy_per_px(
@@ -859,8 +920,8 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
 
 
 def _blurring(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The effects whose `transfer` acts on a whole frame: all but those that do the same by moving its charge."""
-    return tuple(effect for effect in effects if not effect.moves_charge())
+    """The effects whose `transfer` acts on a whole frame: all but those that do the same to its charge or its codes."""
+    return tuple(effect for effect in effects if not effect.acts_on_frames())
 
 
 def _cube_images(

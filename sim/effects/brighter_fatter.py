@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
@@ -11,19 +13,24 @@ from sim.spectrum import FloatArray
 
 
 class BrighterFatter(Effect):
-    """Temporal variance e (1 - a e) while the mean stays: charge already collected repels the next."""
+    """Temporal variance e (1 - a x) while the mean stays, x = e / full well: charge already collected repels the next, which
+    goes to the neighbours and so has them share noise: correlation (b / 4) x with each of the four next ones.
+
+    Where all that a pixel loses goes to these four b is a (charge is conserved: the covariances of all pixels sum up to e). Part of
+    it lands farther away, or in the depth of other pixels, so that both are free.
+    """
 
     name: ClassVar[str] = "brighter_fatter"
     stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "P. Astier et al., A&A 629, A36 (2019)"
-    form_tolerance: ClassVar[float] = 0.1
+    form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
     )
     shown_by: ClassVar[frozenset[str]] = frozenset({"flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity", "on_chip_smoothing"})
     sentence: ClassVar[str] = (
-        "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is on its line."
+        "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is on its line, and what is missing is common to neighbours."
     )
 
     loss_percent: Annotated[
@@ -38,6 +45,26 @@ class BrighterFatter(Effect):
             slope_power=1,
         ),
     ] = 0.0
+    shared_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "covariance with the four next pixels together at full well, of the shot noise's variance",
+            lower=0.0,
+            upper=80.0,
+            prior=(0.0, 5.0),
+            absent=0.0,
+        ),
+    ] = 0.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return ((cls(loss_percent=1.5), cls(loss_percent=1.5, shared_percent=1.5)),)
 
     def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
         return noise_e2 - electrons * (self.loss_percent / 100.0) * electrons / camera.full_well_e
+
+    def neighbour_correlation(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
+        if self.shared_percent == 0.0:
+            return 0.0
+        return 0.25 * (self.shared_percent / 100.0) * np.clip(electrons / camera.full_well_e, 0.0, 1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from scipy.ndimage import convolve
@@ -14,14 +14,15 @@ from sim.spectrum import FloatArray
 
 
 class Crosstalk(Effect):
-    """Kernel (c; c, 1 - 4 c, c; c): colours mix in uniform light, OTF factor 1 - 2 c (2 - cos 2 pi fx p - cos 2 pi fy p)."""
+    """Kernel (c - d; c + d, 1 - 4 c, c + d; c - d): colours mix in uniform light, OTF factor
+    1 - 2 (c + d) (1 - cos 2 pi fx p) - 2 (c - d) (1 - cos 2 pi fy p). Each electron goes its own way: the noise stays white."""
 
     name: ClassVar[str] = "crosstalk"
     stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "K. Hirakawa, Cross-talk explained, ICIP 2008"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time", "field"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband", "chart", "slanted_edge", "bernoulli"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart", "slanted_edge", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {
             "charge_diffusion",
@@ -31,6 +32,8 @@ class Crosstalk(Effect):
             "spherical_aberration",
             "vibration_blur",
             "stray_light",
+            "on_chip_smoothing",
+            "green_imbalance",
         }
     )
     sentence: ClassVar[str] = (
@@ -49,21 +52,45 @@ class Crosstalk(Effect):
             slope_power=1,
         ),
     ] = 0.0
+    row_excess_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "share of each neighbour in the row above their mean, and of each in the column below it",
+            lower=-20.0,
+            upper=20.0,
+            prior=(0.0, 0.5),
+            absent=0.0,
+        ),
+    ] = 0.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        # neither axis gives what it hasn't: all charge along the rows, along the columns
+        return ((cls(share_percent=0.3, row_excess_percent=0.3), cls(share_percent=0.3, row_excess_percent=-0.3)),)
+
+    def shares(self) -> tuple[float, float]:
+        """What goes to each neighbour in the row, and in the column."""
+        c, d = self.share_percent / 100.0, self.row_excess_percent / 100.0
+        return c + d, c - d
 
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
     ) -> FloatArray | None:
-        if self.share_percent == 0.0:
+        along, down = self.shares()
+        if along == down == 0.0:
             return None
-        c, p = self.share_percent / 100.0, camera.pixel_pitch_um
+        p = camera.pixel_pitch_um
         return np.asarray(
-            1.0 - 2.0 * c * (2.0 - np.cos(2.0 * np.pi * fx_cy_per_um * p) - np.cos(2.0 * np.pi * fy_cy_per_um * p))
+            1.0
+            - 2.0 * along * (1.0 - np.cos(2.0 * np.pi * fx_cy_per_um * p))
+            - 2.0 * down * (1.0 - np.cos(2.0 * np.pi * fy_cy_per_um * p))
         )
 
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
-        if self.share_percent == 0.0:
+        along, down = self.shares()
+        if along == down == 0.0:
             return electrons
-        c = self.share_percent / 100.0
-        kernel = np.array([[0.0, c, 0.0], [c, 1.0 - 4.0 * c, c], [0.0, c, 0.0]])
+        kernel = np.array([[0.0, down, 0.0], [along, 1.0 - 2.0 * along - 2.0 * down, along], [0.0, down, 0.0]])
         # "mirror" about the outermost pixels' centres keeps the mosaic's phases
         return np.asarray(convolve(electrons, kernel, mode="mirror"))

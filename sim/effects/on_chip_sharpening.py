@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
-
-import numpy as np
+from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Stage
+from sim.effects.on_chip_filter import OnChipFilter
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
 
 
-class OnChipSharpening(Effect):
-    """OTF factor 1 + k (1 - B), B the transfer of a 3 x 3 binomial blur on the pixels of one colour."""
+class OnChipSharpening(OnChipFilter):
+    """OTF factor 1 + k (1 - B), B the transfer of a mean over the eight pixels of one colour around; the noise with it, so that
+    what neighbours have in common is negative."""
 
     name: ClassVar[str] = "on_chip_sharpening"
     stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "ISO 12233:2023, annex on sharpening"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"corner_share"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli", "flat", "dark"})
     rivals: ClassVar[frozenset[str]] = frozenset({"pixel_aperture"})
     sentence: ClassVar[str] = (
-        "The camera sharpens on the chip: contrast rises above what optics and pixel allow, with overshoot beside edges."
+        "The camera sharpens on the chip: contrast rises above what optics and pixel allow, and the noise of neighbouring pixels is opposed, bright or dark."
     )
 
     strength: Annotated[
@@ -38,14 +38,16 @@ class OnChipSharpening(Effect):
             slope_power=1,
         ),
     ] = 0.0
+    corner_share: Annotated[
+        float,
+        Quantity(
+            "1", "share of the blur's weight across corners", lower=0.0, upper=0.8, prior=(0.33, 0.2), absent=0.33
+        ),
+    ] = 0.33
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        if self.strength == 0.0:
-            return None
-        step = camera.pixel_pitch_um * (1 if camera.cfa == "MONO" else 2)
-        blur = (
-            0.25 * (1.0 + np.cos(2.0 * np.pi * fx_cy_per_um * step)) * (1.0 + np.cos(2.0 * np.pi * fy_cy_per_um * step))
-        )
-        return np.asarray(1.0 + self.strength * (1.0 - blur))
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple((cls(strength=0.05, corner_share=share),) for share in (0.0, 0.33))
+
+    def detail(self) -> tuple[float, float]:
+        return self.strength, self.corner_share

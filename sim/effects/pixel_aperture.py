@@ -27,6 +27,7 @@ class PixelAperture(Effect):
         {
             "charge_diffusion",
             "on_chip_sharpening",
+            "on_chip_smoothing",
             "optical_low_pass_filter",
             "defocus",
             "crosstalk",

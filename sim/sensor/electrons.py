@@ -12,16 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve
 from scipy.special import ndtr
 
-from sim.camera import CameraModel
+from sim.camera import CameraModel, Cfa
+from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
 
 Float32Array = NDArray[np.float32]
+F = TypeVar("F", bound=np.floating[Any])
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,8 @@ class ReadOut:
     """What effects make of the read-out. `response`: mean or noisy electrons -> electrons, point by point; `noise_e2`: (mean
     electrons, their shot noise's variance) -> variance; `added`: (frame's shape, generator) -> electrons that one frame's
     read-out adds, which broadcast to that shape, of mean `added_e` and variance `added_e2`; `codes`: DN before rounding -> DN;
-    `offset_dn` is added to the black level. Defaults: a linear one."""
+    `neighbours`: mean electrons -> correlation of the shot noise with each of four neighbours; `processing`: kernel of a filter
+    of each colour's DN before they are rounded. `offset_dn` is added to the black level. Defaults: a linear one."""
 
     response: Callable[[FloatArray], FloatArray] | None = None
     noise_e2: Callable[[FloatArray, FloatArray], FloatArray] | None = None
@@ -38,6 +42,8 @@ class ReadOut:
     added_e: FloatArray | float = 0.0
     added_e2: FloatArray | float = 0.0
     codes: Callable[[FloatArray], FloatArray] | None = None
+    neighbours: Callable[[FloatArray], FloatArray] | None = None
+    processing: FloatArray | None = None
 
 
 LINEAR = ReadOut()
@@ -233,6 +239,9 @@ def dn_moments(
         bent = read_out.codes(dn)
         dn2 = dn2 * (read_out.codes(dn + 0.5) - read_out.codes(dn - 0.5)) ** 2
         dn = bent
+    if read_out.processing is not None:
+        dn = filtered(dn, read_out.processing, camera.cfa)
+        dn2 = filtered(np.broadcast_to(dn2, dn.shape), np.square(read_out.processing), camera.cfa)
     skewness = np.minimum(electrons / np.maximum(noise_e2, 1e-12) ** 1.5, 1.0)
     return coded_moments(dn, dn2, np.inf if by_charge else camera.white_level_dn, skewness)
 
@@ -263,6 +272,8 @@ def sample_from(
     added = _added_electrons(electrons.shape, camera, rng, read_out)
     gain = np.float32(gain_dn_per_e(camera, gain_db))
     rows = max(1, 32_768 // max(1, electrons.shape[-1]))  # strips that stay in the processor's cache
+    if read_out.neighbours is not None or read_out.processing is not None:
+        rows = len(electrons)  # pixels act on one another
     for start in range(0, len(electrons), rows):
         strip = slice(start, start + rows)
         mean = electrons[strip].astype(np.float32)
@@ -280,6 +291,8 @@ def sample_from(
         charge += np.float32(camera.black_level_dn + read_out.offset_dn)
         if read_out.codes is not None:
             charge = read_out.codes(charge.astype(float)).astype(np.float32)
+        if read_out.processing is not None:
+            charge = filtered(charge, read_out.processing, camera.cfa)
         np.rint(charge, out=charge)
         np.clip(charge, np.float32(0.0), np.float32(camera.white_level_dn), out=charge)
         frame[strip] = charge
@@ -305,6 +318,9 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
     if read_out.noise_e2 is not None:
         wanted = np.maximum(read_out.noise_e2(mean.astype(float), mean.astype(float)), 0.0)
         charge = (mean + (charge - mean) * np.sqrt(wanted / np.maximum(mean, 1e-12))).astype(np.float32)
+    if read_out.neighbours is not None:
+        correlation = read_out.neighbours(mean.astype(float))
+        charge = (mean + shared_departures(charge - mean, mean, correlation)).astype(np.float32)
     np.minimum(charge, np.float32(camera.full_well_e), out=charge)
     if read_out.response is not None:
         charge = read_out.response(charge.astype(float)).astype(np.float32)
@@ -313,6 +329,34 @@ def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generat
         noise *= np.float32(camera.read_noise_e)
         charge += noise
     return charge
+
+
+#: A pixel's four neighbours.
+CROSS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+
+def passed_on(correlation: FloatArray | float) -> FloatArray:
+    """The share g of each neighbour's departure that a pixel takes over, given the correlation r that this leaves between two
+    alike: r = 2 g / (1 + 4 g^2)."""
+    r = np.clip(np.asarray(correlation, float), 0.0, 0.49)
+    return np.asarray(2.0 * r / (2.0 + 2.0 * np.sqrt(1.0 - 4.0 * r * r)))
+
+
+def shared_departures(departure: NDArray[F], mean: NDArray[F], correlation: FloatArray) -> FloatArray:
+    """Departures (rows, cols) of Poisson variables of given means after every pixel has taken over a share of its neighbours',
+    of the same variances as before: d_i + g_i sum d_j, over sqrt(1 + g_i^2 sum v_j / v_i)."""
+    share = passed_on(correlation)
+    spread = convolve(np.asarray(mean, float), CROSS, mode="mirror") / np.maximum(mean, 1e-12)
+    taken = departure + share * convolve(departure, CROSS, mode="mirror")
+    return np.asarray(taken / np.sqrt(1.0 + np.square(share) * spread))
+
+
+def filtered(frame: NDArray[F], kernel: FloatArray, cfa: Cfa) -> NDArray[F]:
+    """Each colour's plane of a frame (rows, cols) run through one filter; mirrored about the outermost pixels."""
+    out = np.array(frame)
+    for plane in planes(out, cfa).values():
+        plane[...] = convolve(plane, kernel, mode="mirror")
+    return out
 
 
 def draw_electrons(mean: Float32Array, rng: np.random.Generator) -> Float32Array:

@@ -79,13 +79,14 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     levels = np.linspace(0.0, 4000.0, 41)
     electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (*after, out.added_e, out.added_e2)]
     codes = levels if out.codes is None else out.codes(levels)
+    shared = np.zeros(41) if out.neighbours is None else np.broadcast_to(out.neighbours(levels), 41)
     full = np.zeros((7, 3))
     full[3, 1] = 2.0 * CAMERA.full_well_e
     for e in acting:
         full = e.overflow(full, CAMERA)
     return np.concatenate(
         [np.real(np.concatenate(otf)), np.array(rates) / max(rates), frame.ravel() / frame.max(), rest]
-        + [values / 100.0 for values in (*electronics, codes, full.ravel())]
+        + [values / 100.0 for values in (*electronics, codes, full.ravel(), 100.0 * shared)]
     )
 
 

@@ -1,0 +1,43 @@
+"""What the effects that process raw data share: a 3 x 3 filter of each colour's plane, which colours the noise with the image."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.spectrum import FloatArray
+
+
+class OnChipFilter(Effect):
+    """plane + k (plane - blurred), the blur a 3 x 3 mean of the pixels of one colour: a share (1 - s) / 4 of each of the four
+    next ones and s / 4 of each of the four across corners, against the pixel itself: s = 0 a cross, 1/3 a binomial, 1/2 a box.
+
+    k > 0 sharpens, k < 0 smooths. Signal, fixed pattern and noise go through it alike: neighbours' noise is correlated in the same
+    proportion at all levels and in the dark.
+    """
+
+    @abstractmethod
+    def detail(self) -> tuple[float, float]:
+        """k and s."""
+
+    def processing(self, camera: CameraModel) -> FloatArray | None:
+        share, corners = self.detail()
+        if share == 0.0:
+            return None
+        next_, across = -0.25 * share * (1.0 - corners), -0.25 * share * corners
+        kernel = np.array([[across, next_, across], [next_, 1.0 + share, next_], [across, next_, across]])
+        return kernel
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray | None:
+        share, corners = self.detail()
+        if share == 0.0:
+            return None
+        step = camera.pixel_pitch_um * (1 if camera.cfa == "MONO" else 2)
+        across, down = np.cos(2.0 * np.pi * fx_cy_per_um * step), np.cos(2.0 * np.pi * fy_cy_per_um * step)
+        blur = 0.5 * (1.0 - corners) * (across + down) + corners * across * down
+        return np.asarray(1.0 + share * (1.0 - blur))

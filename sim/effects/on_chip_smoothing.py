@@ -1,0 +1,53 @@
+"""On-chip smoothing: noise was averaged away before the raw data left the camera."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+from sim.camera import CameraModel
+from sim.effects.base import Stage
+from sim.effects.on_chip_filter import OnChipFilter
+from sim.parameters import Quantity
+
+
+class OnChipSmoothing(OnChipFilter):
+    """OTF factor 1 - k (1 - B), B the transfer of a mean over the eight pixels of one colour around; the noise with it, so that
+    neighbours have noise in common, in the same proportion at all levels."""
+
+    name: ClassVar[str] = "on_chip_smoothing"
+    stage: ClassVar[Stage] = Stage.ELECTRONICS
+    reference: ClassVar[str] = "ISO 15739:2023, annex on noise filtering"
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"corner_share"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli", "flat", "dark"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"brighter_fatter", "crosstalk", "pixel_aperture"})
+    sentence: ClassVar[str] = (
+        "The camera smooths on the chip: contrast falls alike at all apertures, and neighbouring pixels have noise in common, bright or dark."
+    )
+
+    strength: Annotated[
+        float,
+        Quantity(
+            "1",
+            "share of the detail that is taken away",
+            lower=0.0,
+            upper=1.0,
+            prior=(0.0, 0.3),
+            absent=0.0,
+            slope_power=1,
+        ),
+    ] = 0.0
+    corner_share: Annotated[
+        float,
+        Quantity(
+            "1", "share of the blur's weight across corners", lower=0.0, upper=0.8, prior=(0.33, 0.2), absent=0.33
+        ),
+    ] = 0.33
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple((cls(strength=0.05, corner_share=share),) for share in (0.0, 0.33))
+
+    def detail(self) -> tuple[float, float]:
+        return -self.strength, self.corner_share
