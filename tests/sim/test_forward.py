@@ -26,6 +26,7 @@ from sim.scene import (
     UniformField,
     Warp,
 )
+from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import FloatArray, Spectrum, photons_from_energy
@@ -600,8 +601,8 @@ def test_a_blur_acts_once_in_a_frame_as_in_an_edges_profile(
     mono_camera: CameraModel, lamp: Spectrum, one: Effect
 ) -> None:
     """What an effect changes in a MONO frame across an edge is what it changes in the edge's profile, whether the frame is drawn
-    or taken from the profile, and whether the effect blurs the image or moves the charge. The drawing's own error, and its
-    other end, change by 2 % of what the effect does."""
+    or taken from the profile, and whether the effect blurs the image, moves the charge or filters the codes. The drawing's own
+    error, and its other end, change by 2 % of what the effect does."""
     camera = mono_camera.model_copy(
         update={"dark_current_e_per_s": 0.0, "lens": Lens(f_number=4.0, focal_length_mm=5000.0)}
     )
@@ -610,11 +611,13 @@ def test_a_blur_acts_once_in_a_frame_as_in_an_edges_profile(
     with_it, without = (edge_profile(camera, "Y", lamp, 0.0, distance, acting) for acting in ((one,), ()))
     wanted = with_it - without
     assert np.abs(wanted).max() > 3e-3  # it does act
+    processing = forward.processing_kernel(camera, (one,))
     for scene in _two_cells(lamp):
         with_it, without = (
             forward.expected_electrons(camera, Exposure(scene, 1.0), acting, oversample=6) / level
             for acting in ((one,), ())
         )
+        with_it = with_it if processing is None else sensor.filtered(with_it, processing, camera.cfa)
         np.testing.assert_allclose((with_it - without)[36, 8:-8], wanted[8:-8], atol=0.03 * np.abs(wanted).max())
 
 
