@@ -1,0 +1,76 @@
+"""A correction without a name: what recordings show beside the model, and no effect of the library accounts for."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.optics.illumination import from_axis_um
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+Along = Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"]
+
+
+class NamelessCorrection(Effect):
+    """A factor 1 + strength (f(x) - 1) on one stage: f linear between `at`, held beyond.
+
+    `along` says on what, and what x is: `frequency_cy_per_um`, on the transfer function, alike in all directions; `radius_um`, on
+    the light by the distance from the optical axis; `signal_e`, on the mean signal; `variance_signal_e`, on the temporal variance by
+    the mean signal. It describes and predicts; it explains nothing, so that a diagnosis never looks for it.
+    """
+
+    name: ClassVar[str] = "nameless_correction"
+    stage: ClassVar[Stage] = Stage.ELECTRONICS  # or earlier, as `along` says
+    reference: ClassVar[str] = "M. C. Kennedy and A. O'Hagan, J. R. Statist. Soc. B 63, 425 (2001)"
+    form_tolerance: ClassVar[float] = 0.2
+    sentence: ClassVar[str] = (
+        "Recordings depart from the model here by more than their noise, and no effect of the library says why: a smooth factor "
+        "without a name stands for it."
+    )
+
+    along: Annotated[Along, Field(description="stage and axis")] = "frequency_cy_per_um"
+    at: Annotated[tuple[float, ...], Field(min_length=2, description="places on the axis, ascending, in its unit")] = (
+        0.0,
+        0.1,
+    )
+    factor: Annotated[tuple[float, ...], Field(description="factor at each of them, above 0")] = (1.0, 0.9)
+    strength: Annotated[
+        float, Quantity("1", "share of the correction that acts", lower=0.0, upper=2.0, prior=(0.0, 1.0), absent=0.0)
+    ] = 0.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.at) != len(self.factor):
+            raise ValueError(f"{len(self.at)} places and {len(self.factor)} factors: give as many of both")
+        if any(b <= a for a, b in zip(self.at, self.at[1:], strict=False)) or any(f <= 0 for f in self.factor):
+            raise ValueError("places have to ascend and factors to be above 0: sort them, and leave out what is below")
+        return self
+
+    def _factor(self, along: Along, x: FloatArray) -> FloatArray | None:
+        if self.along != along or self.strength == 0.0:
+            return None
+        return 1.0 + self.strength * (np.interp(x, self.at, self.factor) - 1.0)
+
+    def transfer(
+        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
+    ) -> FloatArray | None:
+        factor = self._factor("frequency_cy_per_um", np.hypot(fx_cy_per_um, fy_cy_per_um))
+        return None if factor is None else factor / (1.0 + self.strength * (np.interp(0.0, self.at, self.factor) - 1.0))
+
+    def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
+        x, y, _ = from_axis_um(x_um, y_um, camera)
+        factor = self._factor("radius_um", np.hypot(x, y))
+        return super().illumination(x_um, y_um, camera) if factor is None else factor
+
+    def response(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
+        factor = self._factor("signal_e", electrons)
+        return electrons if factor is None else electrons * factor
+
+    def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
+        factor = self._factor("variance_signal_e", electrons)
+        return noise_e2 if factor is None else noise_e2 * factor
