@@ -39,8 +39,11 @@ from lab.fit import fit_recording_set
 from lab.recording import RecordingError, RecordingSet
 from lab.report.figures import by_side, measured, stereo_figures
 from lab.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
+from sim.camera import Side
 
 if TYPE_CHECKING:
+    from lab.camera_file import CameraFile
+    from lab.diagnose import Diagnosis
     from lab.lens import LensResult
     from lab.store import Store
 
@@ -72,6 +75,10 @@ StoreFolder = Annotated[
 ]
 Resume = Annotated[str, typer.Option(metavar="SESSION", help="go on with this session")]
 BENCH_START_S, BENCH_END_S = 60.0, 10.0
+Model = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="DIR", help="take the cameras of DIR/SIDE.toml, with their effects, as they are"),
+]
 FitFile = Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="a fit's JSON, in place of fitting again")]
 Result = TypeVar("Result", bound=BaseModel)
 
@@ -179,18 +186,59 @@ def _fitted(recordings: RecordingSet, fit_file: Path | None) -> FitResult:
         return fit_recording_set(recordings, advance)
 
 
-def _validated(recordings: RecordingSet, fit: FitResult) -> ValidationResult:
+def _validated(
+    recordings: RecordingSet, fit: FitResult, models: dict[Side, CameraFile] | None = None
+) -> ValidationResult:
     from lab.validate import validate
 
     with _bar("validate"):
-        return validate(recordings, fit)
+        return validate(recordings, fit, models=models)
 
 
-def _diagnosed(recordings: RecordingSet, fit: FitResult) -> DiagnosisResult:
-    from lab.diagnose import diagnose
+def _examined(recordings: RecordingSet, fit: FitResult, baseline: dict[Side, CameraFile] | None = None) -> Diagnosis:
+    from lab.diagnose import examine
 
     with _bar("diagnose") as advance:
-        return diagnose(recordings, fit, advance)
+        return examine(recordings, fit, advance, baseline=baseline)
+
+
+def _camera_path(recordings: RecordingSet, side: Side, path: Path) -> Path:
+    """Where a side's camera file lies: `path` itself where that is a file's name, else SIDE.toml in it."""
+    if path.suffix != ".toml":
+        return path / f"{side}.toml"
+    if len(recordings.sides) > 1:
+        raise InputError(f"{path}: is one file, and there are {len(recordings.sides)} cameras; name a folder")
+    return path
+
+
+def _read_models(recordings: RecordingSet, path: Path | None) -> dict[Side, CameraFile]:
+    """Cameras that `--save` or `--write-cameras` wrote; none where no path is given."""
+    from lab.camera_file import read_camera
+
+    if path is None:
+        return {}
+    return {side: read_camera(_camera_path(recordings, side, path)) for side in recordings.sides}
+
+
+def _save_models(recordings: RecordingSet, diagnosis: Diagnosis, path: Path) -> None:
+    """Write the improved models, and say what each has that the baseline hasn't."""
+    from lab.camera_file import write_camera
+
+    for side, content in diagnosis.improved.items():
+        file = _camera_path(recordings, side, path)
+        _make_folder(file.parent)
+        write_camera(file, content)
+        acting = ", ".join(one.name for one in content.effects) or "no effect beside the baseline"
+        err.print(escape(f"camera: {file}: {acting}"))
+    for item in diagnosis.result.unexplained:
+        err.print(escape(f"{item.side}: {item.correction}"))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be made ({error.strerror}); name a folder that is yours") from error
 
 
 # --- what is printed ---------------------------------------------------------------------------------------------------
@@ -308,10 +356,7 @@ def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) ->
     from lab.camera_file import fitted_camera, write_camera
     from lab.predict import assumptions
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: can't be made ({error.strerror}); name a folder that is yours") from error
+    _make_folder(folder)
     for side, fitted in result.cameras.items():
         write_camera(folder / f"{side}.toml", fitted_camera(recordings, side, fitted))
         taken = "; ".join(f"{one.quantity} taken as {one.value}" for one in assumptions(recordings.camera(side)))
@@ -320,11 +365,11 @@ def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) ->
 
 
 @app.command()
-def validate(source: Source, json: Json = None, fit_file: FitFile = None) -> None:
+def validate(source: Source, json: Json = None, fit_file: FitFile = None, model: Model = None) -> None:
     """Predicted against measured, for what the fit didn't use. Exit code 4 where a check falls short."""
     _check_writable(json)
     recordings = _recordings(source)
-    result = _validated(recordings, _fitted(recordings, fit_file))
+    result = _validated(recordings, _fitted(recordings, fit_file), _read_models(recordings, model))
     if str(json) != "-":
         _print_validation(result)
     _write_json(result, json)
@@ -333,14 +378,28 @@ def validate(source: Source, json: Json = None, fit_file: FitFile = None) -> Non
 
 
 @app.command()
-def diagnose(source: Source, json: Json = None, fit_file: FitFile = None) -> None:
+def diagnose(
+    source: Source,
+    json: Json = None,
+    fit_file: FitFile = None,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", metavar="DIR", help="write each camera with what was found as DIR/SIDE.toml"),
+    ] = None,
+    model: Model = None,
+) -> None:
     """Name the physics that the model left out, where the recordings show any."""
     _check_writable(json)
     recordings = _recordings(source)
-    result = _diagnosed(recordings, _fitted(recordings, fit_file))
+    if save is not None:
+        _camera_path(recordings, recordings.sides[0], save)
+    baseline = _read_models(recordings, model)
+    found = _examined(recordings, _fitted(recordings, fit_file), baseline)
     if str(json) != "-":
-        _print_diagnosis(result)
-    _write_json(result, json)
+        _print_diagnosis(found.result)
+    _write_json(found.result, json)
+    if save is not None:
+        _save_models(recordings, found, save)
 
 
 @app.command()
@@ -350,6 +409,9 @@ def compare(
     json: Json = None,
     check: Annotated[bool, typer.Option("--check", help="exit code 4 where anything changed")] = False,
     every: Annotated[bool, typer.Option("--all", help="list what didn't change, too")] = False,
+    report_folder: Annotated[
+        Path | None, typer.Option("--report", metavar="DIR", help="write DIR/compare.html, one page with pictures")
+    ] = None,
 ) -> None:
     """Two calibrations: what changed beyond its uncertainty."""
     from lab.compare import compare as compared
@@ -359,6 +421,10 @@ def compare(
     if str(json) != "-":
         _print_comparison(result, every)
     _write_json(result, json)
+    if report_folder is not None:
+        from lab.report.compare import write_comparison
+
+        err.print(f"report: {escape(str(write_comparison(report_folder, result)))}")
     if check and result.changed:
         raise typer.Exit(EXIT_CHECK)
 
@@ -415,7 +481,7 @@ def report(
     _check_writable(out_file)
     recordings = _recordings(source)
     fitted = _fitted(recordings, fit_file)
-    validation, diagnosis = _validated(recordings, fitted), _diagnosed(recordings, fitted)
+    validation, diagnosis = _validated(recordings, fitted), _examined(recordings, fitted).result
     provenance = provenance_of(recordings, _instruments(source))
     out.print(f"report: {write_report(out_file, recordings, fitted, validation, diagnosis, provenance)}")
 
@@ -623,8 +689,10 @@ def run(
     _warn(recordings.warnings)
     fitted = _fitted(recordings, None)
     validation = _validated(recordings, fitted)
-    diagnosis = _diagnosed(recordings, fitted)
+    examined = _examined(recordings, fitted)
+    diagnosis = examined.result
     folder = store.folder(session_id)
+    _save_models(recordings, examined, folder / "cameras")
     for kind, result in (("fit", fitted), ("validate", validation), ("diagnose", diagnosis)):
         store.add_result(kind, session_id, result.model_dump(mode="json"))
         _write_json(result, folder / f"{kind}.json")

@@ -19,6 +19,7 @@ from lab.report.figures import measured
 from lab.report.pictures import png_data_uri
 from lab.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
 from sim.camera import Side
+from sim.spectrum import FloatArray
 
 ARROWS = 0.025  # of the frame's width: how long the residual that 95 % don't reach is drawn
 SCALES = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
@@ -47,6 +48,11 @@ def _shape(geometry: GeometryFit) -> tuple[float, float]:
 
 def _height(shape: tuple[float, float]) -> int:
     return int(110 + 500 * min(shape[0] / shape[1], 1.2))
+
+
+def frame_layout(shape: tuple[float, float]) -> dict[str, Any]:
+    """The layout of a chart over a frame of `shape` (rows, cols)."""
+    return layout(_height(shape), **_frame_axes(shape))
 
 
 def coverage(geometry: GeometryFit) -> Figure | None:
@@ -85,7 +91,37 @@ def coverage(geometry: GeometryFit) -> Figure | None:
             }
         )
     shape = _shape(geometry)
-    return {"data": data, "layout": layout(_height(shape), **_frame_axes(shape))}
+    return {"data": data, "layout": frame_layout(shape)}
+
+
+def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, float], name: str) -> list[Trace]:
+    """Vectors (n, 2) at places (n, 2) of a frame of `shape` (rows, cols), all x, y in px, as lines, enlarged by a round number."""
+    usual = max(float(np.percentile(np.linalg.norm(vector, axis=1), 95)), 1e-9)
+    wanted = ARROWS * shape[1] / usual
+    scale = max([one for one in SCALES if one <= wanted], default=SCALES[0])
+    ends = at + scale * vector
+    lines = np.stack([at, ends, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
+    return [
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": f"{name}, {scale:g} times enlarged",
+            "x": lines[:, 0].tolist(),
+            "y": lines[:, 1].tolist(),
+            "line": {"color": "#d1495b", "width": 1},
+            "hoverinfo": "skip",
+            "showlegend": True,
+        },
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "x": at[:, 0].tolist(),
+            "y": at[:, 1].tolist(),
+            "marker": {"color": "@fg", "size": 2},
+            "hoverinfo": "skip",
+            "showlegend": False,
+        },
+    ]
 
 
 def residual_vectors(geometry: GeometryFit) -> Figure | None:
@@ -95,35 +131,7 @@ def residual_vectors(geometry: GeometryFit) -> Figure | None:
     at = np.array([(x, y) for view in geometry.residuals for x, y in zip(view.x_px, view.y_px, strict=True)])
     rest = np.array([(x, y) for view in geometry.residuals for x, y in zip(view.dx_px, view.dy_px, strict=True)])
     shape = _shape(geometry)
-    usual = max(float(np.percentile(np.linalg.norm(rest, axis=1), 95)), 1e-9)
-    wanted = ARROWS * shape[1] / usual
-    scale = max([one for one in SCALES if one <= wanted], default=SCALES[0])
-    ends = at + scale * rest
-    lines = np.stack([at, ends, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
-    return {
-        "data": [
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "name": f"residual, {scale:g} times enlarged",
-                "x": lines[:, 0].tolist(),
-                "y": lines[:, 1].tolist(),
-                "line": {"color": "#d1495b", "width": 1},
-                "hoverinfo": "skip",
-                "showlegend": True,
-            },
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "x": at[:, 0].tolist(),
-                "y": at[:, 1].tolist(),
-                "marker": {"color": "@fg", "size": 2},
-                "hoverinfo": "skip",
-                "showlegend": False,
-            },
-        ],
-        "layout": layout(_height(shape), **_frame_axes(shape)),
-    }
+    return {"data": lines_of_vectors(at, rest, shape, "residual"), "layout": frame_layout(shape)}
 
 
 def _map(

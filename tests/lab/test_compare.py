@@ -202,5 +202,10 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert "noise read_noise_e" in said and "yes" in said
     assert ComparisonResult.model_validate_json((tmp_path / "out.json").read_text()).changed
     assert main(["compare", str(files[0]), str(files[2]), "--check"]) == 4
+    capsys.readouterr()
+    assert main(["compare", str(files[0]), str(files[2]), "--json", "-", "--report", str(tmp_path / "page")]) == 0
+    said = capsys.readouterr()
+    assert ComparisonResult.model_validate_json(said.out).changed  # the page's place goes to stderr
+    assert "compare.html" in said.err and (tmp_path / "page" / "compare.html").stat().st_size > 10_000
     assert main(["compare", str(files[0]), str(tmp_path / "out.json")]) == 2
     assert main(["compare", str(files[0]), str(tmp_path / "nothing")]) == 2

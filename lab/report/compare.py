@@ -1,0 +1,107 @@
+"""The page of two calibrations compared: what changed, how far beyond its uncertainty, and how the cameras project otherwise."""
+
+from __future__ import annotations
+
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from lab.report import page_environment, write_page
+from lab.report.charts import AFTER, BEFORE, Figure, axis, layout
+from lab.report.figures import measured
+from lab.report.geometry import frame_layout, lines_of_vectors
+from lab.results import Change, ComparisonResult, ProjectionChange
+
+SHOWN = 40  # rows of the chart: those that changed, and the most significant of the rest
+LEAST_SIGMA = 0.02  # where a logarithmic axis ends
+
+
+def _label(row: Change) -> str:
+    return " ".join(part for part in (row.side, row.name, row.where) if part)
+
+
+def most_significant(comparison: ComparisonResult) -> tuple[Change, ...]:
+    """The rows that are drawn, most significant first."""
+    return tuple(sorted(comparison.changes, key=lambda row: -row.significance_sigma)[:SHOWN])
+
+
+def significances(comparison: ComparisonResult) -> Figure | None:
+    """By how many standard deviations each number differs, with the limit that an unchanged rig passes as rarely as is stated."""
+    rows = most_significant(comparison)[::-1]
+    if not rows:
+        return None
+    bars = {
+        "type": "bar",
+        "orientation": "h",
+        "x": [max(row.significance_sigma, LEAST_SIGMA) for row in rows],
+        "y": [_label(row) for row in rows],
+        "marker": {"color": [BEFORE if row.changed else AFTER for row in rows]},
+        "hoverinfo": "x+y",
+        "showlegend": False,
+    }
+    limit = comparison.threshold_sigma
+    high = max(limit, *(row.significance_sigma for row in rows))
+    return {
+        "data": [bars],
+        "layout": layout(
+            70 + 17 * len(rows),
+            xaxis=axis(
+                "significance, sigma", type="log", range=[float(np.log10(LEAST_SIGMA)), float(np.log10(1.3 * high))]
+            ),
+            yaxis=axis("", automargin=True, tickfont={"size": 10}),
+            shapes=[
+                {
+                    "type": "line",
+                    "x0": limit,
+                    "x1": limit,
+                    "yref": "paper",
+                    "y0": 0,
+                    "y1": 1,
+                    "line": {"color": "@fg", "width": 1, "dash": "dash"},
+                }
+            ],
+        ),
+    }
+
+
+def projection_vectors(item: ProjectionChange) -> Figure:
+    """Where B projects what A does, over the frame, as lines from A's place, enlarged by a round number."""
+    x, y = np.meshgrid(item.x_px, item.y_px)
+    at = np.stack([x.ravel(), y.ravel()], axis=1)
+    shape = (item.y_px[-1] + 1, item.x_px[-1] + 1)
+    traces = lines_of_vectors(at, np.array(item.vectors_px, float).reshape(-1, 2), shape, "B less A")
+    return {"data": traces, "layout": frame_layout(shape)}
+
+
+def render_comparison(comparison: ComparisonResult) -> str:
+    """The page as HTML text."""
+    number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
+    total = len(comparison.changes) + len(comparison.projection)
+    context: dict[str, Any] = {
+        "version": metadata.version("calibench"),
+        "comparison": comparison,
+        "headline": f"{number} of {total} changed" if number else f"None of {total} changed",
+        "rows": [
+            {
+                "change": row,
+                "a": measured(row.a, row.a_std),
+                "b": measured(row.b, row.b_std),
+                "difference": measured(row.difference, row.difference_std),
+            }
+            for row in sorted(comparison.changes, key=lambda row: -row.significance_sigma)
+        ],
+        "significances": significances(comparison),
+        "shown": min(SHOWN, len(comparison.changes)),
+        "projections": [(item, projection_vectors(item)) for item in comparison.projection],
+        "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+    }
+    return page_environment().get_template("compare.html").render(context)
+
+
+def write_comparison(folder: Path, comparison: ComparisonResult) -> Path:
+    """Write `folder`/compare.html, one self-contained page: completely, or not at all. InputError where it can't be written."""
+    return write_page(folder / "compare.html", render_comparison(comparison))
