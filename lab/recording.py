@@ -517,6 +517,17 @@ class RecordingSet:
             and (kind is None or (capture.kind == kind if isinstance(kind, str) else isinstance(capture, kind)))
         ]
 
+    def without(self, ids: Container[str]) -> RecordingSet:
+        """The same set less the captures of these ids; frames, spectra and targets are shared."""
+        kept = tuple(c for c in self.manifest.captures if c.id not in ids)
+        return RecordingSet(
+            self.manifest.model_copy(update={"captures": kept}),
+            source=self.source,
+            warnings=self.warnings,
+            store=self._store,
+            cache_bytes=self.cache_bytes,
+        )
+
     def capture(self, id: str) -> AnyCapture:
         """The capture called `id`; InputError where there is none."""
         for capture in self.manifest.captures:

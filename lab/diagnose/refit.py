@@ -77,7 +77,7 @@ def coordinates(effects: Effects) -> list[Coordinate]:
 
 def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tuple[Effect, ...]:
     """The same effects at other values of their coordinates."""
-    values: list[dict[str, float]] = [{} for _ in effects]
+    values = [{name: getattr(e, name) for name in type(e).model_fields} for e in effects]
     for c, at in zip(coords, u, strict=True):
         values[c.index][c.name] = c.back(float(at))
     return tuple(type(e)(**v) for e, v in zip(effects, values, strict=True))

@@ -148,10 +148,9 @@ def _cone(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray]:
 def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray) -> Effect:
     """The prototypes scaled in their slope coordinates by the shares found, within bounds."""
     likest = prototypes[int(np.argmax(share))]
-    values: dict[str, float] = {}
+    values = {name: getattr(likest, name) for name in effect.model_fields}
     for name, quantity in effect.quantities().items():
         if name in effect.shapes:
-            values[name] = float(getattr(likest, name))
             continue
         absent = quantity.absent or 0.0
         total = 0.0

@@ -7,10 +7,12 @@ covariance (`evidence.py`). A block that the recordings don't allow is left out 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from scipy import ndimage
@@ -23,13 +25,17 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
 Effects = Sequence[Effect]
+T = TypeVar("T")
 
 # --- what doesn't average out: floors that the covariance carries beside noise ---------------------------------------------
 LAMP_FLOOR = 1.0e-4  # of a level, common to the channels of a capture
 BLACK_FLOOR_DN = 0.01  # of a frame's mean: rounding of a quiet camera
-NARROWBAND_FLOOR = 5e-4  # of a level, each channel by itself
+NARROWBAND_FLOOR = 1e-4  # of a level, each channel by itself, one for its repeats
 TAIL_STD = 0.1  # of the light that the baseline's point spread itself sends into dark squares
 CLIPPED_SHARE = 2e-4
+USUAL_JITTER_DN = 0.02  # of a dark frame's mean, from repeat to repeat
+ALIKE_C = 2.0  # dark captures whose temperatures are that close count as of one
+NOISELESS_DN = 0.5  # a frame of less standard deviation may be like another by chance
 LEVEL_REACH = 0.8  # of a level's logarithm: over a factor of 2 a smooth departure from a line may change
 
 
@@ -90,10 +96,11 @@ UNIFORM_HOOKS = frozenset({"drift", "exposure", "illumination", "ambient_e_per_s
 
 @dataclass(frozen=True)
 class Levels:
-    """Means of one capture: DN by channel over the unclipped plane; None where it clips. Variance of that mean by noise."""
+    """Means of one capture: DN by channel over the unclipped plane, None where it clips; over the plane as it is; its pixels."""
 
     mean: dict[str, float | None]
     pixels: dict[str, int]
+    whole: dict[str, float]
 
 
 class Study:
@@ -102,15 +109,23 @@ class Study:
     def __init__(
         self, recordings: RecordingSet, side: Side, camera: CameraModel, saturation_dn: float | None = None
     ) -> None:
-        self.recordings, self.side, self.camera = recordings, side, camera
+        #: What isn't looked at, as it wasn't taken: (capture's id, why), each in one line.
+        self.stale: tuple[tuple[str, str], ...] = stale(recordings, side)
+        left_out = {name for name, _ in self.stale}
+        self.recordings = recordings.without(left_out) if left_out else recordings
+        self.side, self.camera = side, camera
         #: Pixels from here on say nothing of the light: the converter's highest code, or the full well where that comes first.
         self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)
         self.stated: Camera = recordings.camera(side)
         self.channels = camera.channels
         self._levels: dict[str, Levels] = {}
+        self._made: dict[Any, Any] = {}
         self._spectra: dict[str, Spectrum] = {}
         times = [c.time for c in recordings.captures(side=side) if c.time is not None]
         self._start = min(times) if times else None
+        warm = [c.temperature_c for c in recordings.captures(side=side) if c.temperature_c is not None]
+        #: The sensor's, at most captures; None where none is stated.
+        self.temperature_c = float(np.median(warm)) if warm else None
         self.field = Field.of(camera)
         if saturation_dn is None:
             self.saturation_dn = _saturation(self)
@@ -122,6 +137,9 @@ class Study:
                 "dark_current_e_per_s": self.noise.dark_dn_per_s / self.noise.gain,
                 "read_noise_e": self.noise.read_dn / self.noise.gain,
                 "full_well_e": (self.saturation_dn - self.noise.black) / self.noise.gain,
+                "dark_current_reference_c": camera.dark_current_reference_c
+                if self.temperature_c is None
+                else self.temperature_c,
             }
         )
 
@@ -150,13 +168,14 @@ class Study:
         if capture.id not in self._levels:
             frame = self.recordings.frame(capture)
             mean: dict[str, float | None] = {}
-            pixels = {}
+            pixels, whole = {}, {}
             for channel in self.channels:
                 values = self.pixels_of(frame, channel)
                 clipped = float(np.mean(values >= self.saturation_dn))
-                mean[channel] = float(values.mean()) if clipped < CLIPPED_SHARE else None
+                whole[channel] = float(values.mean())
+                mean[channel] = whole[channel] if clipped < CLIPPED_SHARE else None
                 pixels[channel] = values.size
-            self._levels[capture.id] = Levels(mean, pixels)
+            self._levels[capture.id] = Levels(mean, pixels, whole)
         return self._levels[capture.id]
 
     @cached_property
@@ -196,6 +215,38 @@ class Study:
 
     # --- parts that several blocks share ---
 
+    def once(self, make: Callable[[Study], T]) -> T:
+        """What `make` finds, made once: several blocks read different numbers off it."""
+        if make not in self._made:
+            self._made[make] = make(self)
+        return cast(T, self._made[make])
+
+    @cached_property
+    def _before(self) -> dict[str, Capture]:
+        """The capture before each, in the order of their times where all have one, else in the manifest's."""
+        order: list[Capture] = list(self.recordings.captures(side=self.side))
+        if all(c.time is not None for c in order):
+            order.sort(key=self.elapsed_s)
+        return {c.id: before for before, c in pairwise(order)}
+
+    def carried_e(self, capture: Capture, channel: str, effects: Effects) -> float:
+        """By how many electrons a channel's mean changes where charge is left behind, given what was read of it and of the capture
+        before: read is y_t = (1 - q) x_t + q y_(t-1), of which q (y_(t-1) - y_t) is new. The first one follows empty pixels."""
+        lagging = [e for e in effects if type(e).left_behind is not Effect.left_behind]
+        if not lagging:
+            return 0.0
+        before = self._before.get(capture.id)
+        read, left = (
+            max(self.levels(c).whole[channel] - self.noise.black, 0.0) / self.noise.gain if c is not None else 0.0
+            for c in (capture, before)
+        )
+        return float(
+            sum(
+                np.mean(e.left_behind(np.array([left]), self.camera) - e.left_behind(np.array([read]), self.camera))
+                for e in lagging
+            )
+        )
+
     def offset(self, capture: Capture, effects: Effects) -> float:
         elapsed = self.elapsed_s(capture)
         return sum(e.offset_dn(elapsed, capture.temperature_c, self.camera) for e in effects)
@@ -203,8 +254,8 @@ class Study:
     def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
         """Slopes by black level and dark current, whose priors are a few of their first guess's uncertainties."""
         return {
-            "black": np.full(len(exposures), 1.0),
-            "dark": exposures * max(0.2 * self.noise.dark_dn_per_s, 0.5),
+            "black": np.full(len(exposures), self.noise.black_std),
+            "dark": exposures * self.noise.dark_std,
         }
 
 
@@ -219,6 +270,8 @@ class NoiseGuess:
     prnu: float
     jitter_dn: float  # of a dark frame's mean
     jitter_lamp: float  # of a flat frame's mean, relative
+    black_std: float  # of the guess
+    dark_std: float  # DN/s, of the guess
 
 
 def _saturation(study: Study) -> float:
@@ -258,29 +311,67 @@ def _saturation(study: Study) -> float:
     return min(white, top - 3.0 * max(float(np.median([w for _, w in below])), 2.0))
 
 
+def stale(recordings: RecordingSet, side: Side) -> tuple[tuple[str, str], ...]:
+    """(id, why) of every capture whose frame is bit for bit that of an earlier one, noise and all: it wasn't taken.
+
+    Frames without noise are alike by nature: one code nearly throughout, or recordings of which most repeats are the same.
+    """
+    first: dict[bytes, Capture] = {}
+    found: list[tuple[str, str]] = []
+    repeats, alike = 0, 0
+    before: Capture | None = None
+    for capture in recordings.captures(side=side):
+        frame = recordings.frame(capture)
+        settings = (capture.kind, capture.exposure_s, capture.gain_db)
+        is_repeat = before is not None and settings == (before.kind, before.exposure_s, before.gain_db)
+        repeats += is_repeat
+        before = capture
+        if frame.std(dtype=np.float32) < NOISELESS_DN:
+            continue
+        mark = hashlib.blake2b(frame.tobytes(), digest_size=16).digest()
+        twin = first.setdefault(mark, capture)
+        if twin is not capture and twin.frame != capture.frame:
+            alike += is_repeat
+            found.append(
+                (
+                    capture.id,
+                    f"the frame of capture {capture.id} ({capture.kind}) is bit for bit that of {twin.id} ({twin.kind}), noise and all: it wasn't taken anew and is left out; take it again",
+                )
+            )
+    return () if 2 * alike > repeats > 0 else tuple(found)
+
+
 def noise_guess(study: Study) -> NoiseGuess:
     recordings, stated = study.recordings, study.stated
     black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
     dark, read, jitter = 0.0, 1.0, BLACK_FLOOR_DN
+    black_std, dark_std = 1.0 if stated.black_level_dn is not None else 0.05 * study.camera.white_level_dn, 0.5
     darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
     if darks:
-        t = np.array([g[0].exposure_s for g in darks])
+        # at one temperature, at which most captures were taken: what the others change isn't the baseline's
+        off = [0.0 if study.temperature_c is None or g[0].temperature_c is None else abs(g[0].temperature_c - study.temperature_c) for g in darks]  # fmt: skip
         frames_mean = [np.array([float(recordings.frame(c).mean()) for c in g]) for g in darks]
-        level = np.array([m.mean() for m in frames_mean])
+        near = [i for i, away in enumerate(off) if away <= min(off) + ALIKE_C]
+        t = np.array([darks[i][0].exposure_s for i in near])
+        level = np.array([frames_mean[i].mean() for i in near])
+        black_std, dark_std = 1.0, 0.5
         if len(t) > 1 and np.ptp(t) > 0:
             dark, black = (float(v) for v in np.polyfit(t, level, 1))
             dark = max(dark, 0.0)
+            dark_std = max(0.2 * dark, dark_std)
         else:
             black = float(level[0])
-        spread = [m.std(ddof=1) for m in frames_mean if len(m) > 1]
-        jitter = max(float(np.sqrt(np.mean(np.square(spread)))) if spread else 0.05, BLACK_FLOOR_DN)
-        first = min(darks, key=lambda g: g[0].exposure_s)
+            # the dark current is anything: within reason, what a data sheet says or some tens of electrons
+            expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
+            dark_std = max(expected * (stated.conversion_gain_dn_per_e or 1.0), dark_std)
+            black_std += dark_std * float(t[0])
+        jitter = max(_jitter(study, darks, frames_mean), BLACK_FLOOR_DN)
+        first = min((darks[i] for i in near), key=lambda g: g[0].exposure_s)
         if len(first) > 1:
             read = float(np.sqrt(pair_variance([recordings.frame(c) for c in first[:4]])))
     gain = stated.conversion_gain_dn_per_e
     prnu, lamp = 0.008, 3e-4
     signal, variance = [], []
-    scatter = []
     for group in study.flat_levels():
         if len(group) < 2:
             continue
@@ -289,12 +380,8 @@ def noise_guess(study: Study) -> NoiseGuess:
             planes = [study.pixels_of(f, channel) for f in frames]
             if any(np.mean(p >= study.saturation_dn) >= CLIPPED_SHARE for p in planes):
                 continue
-            means = np.array([p.mean() for p in planes])
-            signal.append(means.mean() - black)
+            signal.append(float(np.mean([p.mean() for p in planes])) - black)
             variance.append(pair_variance(planes))
-            scatter.append(
-                np.var(means / (means.mean() - black), ddof=1) - variance[-1] / planes[0].size / signal[-1] ** 2
-            )
             if 0.3 < signal[-1] / (study.saturation_dn - black) < 0.8:
                 first_plane = np.mean(frames, axis=0)[mosaic.phases(study.camera.cfa)[channel][0][0] :: mosaic.step(study.camera.cfa),
                                                       mosaic.phases(study.camera.cfa)[channel][0][1] :: mosaic.step(study.camera.cfa)]  # fmt: skip
@@ -308,10 +395,60 @@ def noise_guess(study: Study) -> NoiseGuess:
         low = s < 0.5 * (study.saturation_dn - black)
         use = low if low.sum() > 2 else np.ones_like(low)
         gain = float(np.sum(weight[use] * s[use] * (v[use] - read**2)) / np.sum(weight[use] * s[use] ** 2))
-        lamp = float(np.sqrt(max(np.mean(scatter), 0.0)))
+        lamp = level_scatter(study, black, gain, read)
     if gain is None or gain <= 0:
         gain = 1.0
-    return NoiseGuess(black, dark, gain, read, prnu, jitter, max(lamp, LAMP_FLOOR))
+    return NoiseGuess(black, dark, gain, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
+
+
+def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray]) -> float:
+    """Standard deviation of the repeats' means, less what changes evenly with time in all groups alike: that is a drift.
+
+    Of few repeats it is pulled towards what is usual: `USUAL_JITTER_DN` counts as two repeats.
+    """
+    away, elapsed, freedom = [], [], 0
+    for group, mean in zip(groups, means, strict=True):
+        if len(group) > 1:
+            time = np.array([study.elapsed_s(c) for c in group])
+            away.append(mean - mean.mean())
+            elapsed.append(time - time.mean())
+            freedom += len(group) - 1
+    if freedom == 0:
+        return 0.05
+    rest, time = np.concatenate(away), np.concatenate(elapsed)
+    if freedom > 2 and np.any(time):
+        rest = rest - time * float(time @ rest) / float(time @ time)
+        freedom -= 1
+    return float(np.sqrt((rest @ rest + 2.0 * USUAL_JITTER_DN**2) / (freedom + 2.0)))
+
+
+def level_scatter(study: Study, black: float, gain: float, read_dn: float) -> float:
+    """Relative scatter of repeated flat frames' levels beyond shot and read noise, a common trend with time taken out: a lamp that
+    drifts doesn't scatter. Groups count by the inverse of their noise's variance; DN and DN/e."""
+    found = []
+    for group in study.flat_levels():
+        planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
+        if len(group) < 2 or not planes:
+            continue
+        size = np.array([study.levels(group[0]).pixels[c] for c in planes], float)
+        levels = np.array([[study.levels(k).mean[c] or 0.0 for c in planes] for k in group]) - black
+        total = levels @ size
+        if total.mean() <= 0:
+            continue
+        noise = float(((gain * levels.mean(0) + read_dn**2) * size).sum()) / total.mean() ** 2
+        elapsed = np.array([study.elapsed_s(k) for k in group])
+        found.append((total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
+    if not found:
+        return 0.0
+    weight = [1.0 / (noise + LAMP_FLOOR**2) for *_, noise in found]
+    moved = sum(w * float(t @ t) for w, (_, t, _) in zip(weight, found, strict=True))
+    trend = sum(w * float(t @ x) for w, (x, t, _) in zip(weight, found, strict=True)) / moved if moved > 0 else 0.0
+    left = sum(
+        w * (float(np.sum(np.square(x - trend * t))) - (len(x) - 1) * n)
+        for w, (x, t, n) in zip(weight, found, strict=True)
+    )
+    free = sum(w * (len(x) - 1) for w, (x, _, _) in zip(weight, found, strict=True))
+    return float(np.sqrt(max(left / free, 0.0)))
 
 
 def pair_variance(frames: Sequence[Any]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+
+Corner = Literal["top_left", "top_right", "bottom_left", "bottom_right"]
 
 
 class AmplifierGlow(Effect):
@@ -28,16 +30,23 @@ class AmplifierGlow(Effect):
     )
 
     glow_e_per_s: Annotated[
-        float, Quantity("e/s", "electrons a second in that corner", lower=0.0, upper=1e6, prior=(0.0, 20.0), absent=0.0)
+        float,
+        Quantity("e/s", "electrons a second in that corner", lower=0.0, upper=1e6, prior=(0.0, 100.0), absent=0.0),
     ] = 0.0
     reach_mm: Annotated[
-        float, Quantity("mm", "distance over which it falls to 1/e", lower=0.01, upper=100.0, absent=1.0)
+        float,
+        Quantity("mm", "distance over which it falls to 1/e", lower=0.01, upper=100.0, prior=(1.0, 1.0), absent=1.0),
     ] = 1.0
-    corner: Literal["top_left", "top_right", "bottom_left", "bottom_right"] = "top_left"
+    corner: Corner = "top_left"
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        return ((cls(glow_e_per_s=6.0),),)
+        half_mm = 0.5 * float(np.hypot(camera.rows, camera.cols)) * camera.pixel_pitch_um * 1e-3
+        return tuple(
+            (cls(glow_e_per_s=6.0, reach_mm=float(np.clip(share * half_mm, 0.011, 90.0)), corner=corner),)
+            for corner in get_args(Corner)
+            for share in (0.1, 0.3, 0.7)
+        )
 
     def dark_current(
         self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel

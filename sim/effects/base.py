@@ -7,7 +7,7 @@ forward model. Every hook's default changes nothing, so a model without effects 
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import ClassVar, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from sim.camera import CameraModel
 from sim.parameters import Frozen, Quantity, declared
 from sim.spectrum import FloatArray
+
+#: Lines of pixels that may share a disturbance.
+Lines = Literal["rows", "columns"]
 
 
 class Stage(StrEnum):
@@ -108,6 +111,19 @@ class Effect(Frozen):
         """RIG: electrons a second that reach a pixel beside the source while the shutter is open."""
         return 0.0
 
+    def screen(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
+        """RIG: light of a screen, 0..1 of its lit state, where a pattern asks for `share`; by place on the sensor (um from its centre)."""
+        return share
+
+    def scene_gain(self) -> float:
+        """RIG or ELECTRONICS: factor on the right camera's signal over the left one's in a scene that both see, against what their
+        own captures of uniform light say."""
+        return 1.0
+
+    def capture_delay_s(self) -> float:
+        """RIG: by how much the right camera of a pair captures later than the left one."""
+        return 0.0
+
     def transmittance(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
         """OPTICS: factor on the light, by wavelength and sine of the chief ray's angle at the sensor."""
         return np.ones(np.broadcast_shapes(np.shape(wavelength_nm), np.shape(sin_theta)))
@@ -123,6 +139,11 @@ class Effect(Frozen):
         kernels of one channel, where there's no mosaic to move charge on (see `acts_on_frames`).
         """
         return None
+
+    def at_place(self, x_um: float, y_um: float, camera: CameraModel) -> Self:
+        """OPTICS: the effect whose `transfer` an edge at one place of the sensor shows (um from its centre, x along columns, y along
+        rows): of most effects the same everywhere."""
+        return self
 
     @classmethod
     def acts_on_frames(cls) -> bool:
@@ -192,6 +213,25 @@ class Effect(Frozen):
 
     def added_e2(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
         """ELECTRONICS: temporal variance (e^2) of what `added` draws, pixel by pixel."""
+        return 0.0
+
+    def odd_dark_current(self) -> tuple[FloatArray, FloatArray] | None:
+        """CHARGE: which dark current `dark_current` gives to pixels that are unlike the others: their shares of all pixels (k,) and
+        additional e/s (k,), nodes of its distribution; None for none."""
+        return None
+
+    def odd_jumps(self) -> tuple[FloatArray, FloatArray] | None:
+        """ELECTRONICS: by how much `added` lets pixels that are unlike the others jump between two levels: their shares of all
+        pixels (k,) and the levels' distances in e (k,), nodes of its distribution; None for none."""
+        return None
+
+    def line_spectrum_e2(self, frequency_cy_per_px: FloatArray, lines: Lines, fixed: bool) -> FloatArray | float:
+        """ELECTRONICS: power spectrum over the rows (or columns) of what `added` gives to all pixels of a row (column) alike, anew
+        in every frame or, `fixed`, the same in all; e^2, its mean over -0.5..0.5 cy/px is the variance."""
+        return 0.0
+
+    def line_parity_e(self, lines: Lines) -> float:
+        """ELECTRONICS: by how many electrons odd rows (or columns) are read above even ones; not in `line_spectrum_e2`."""
         return 0.0
 
     def codes(self, dn: FloatArray, camera: CameraModel) -> FloatArray:

@@ -21,7 +21,7 @@ class BlackLevelDrift(Effect):
     )
     shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat", "narrowband", "chart"})
     rivals: ClassVar[frozenset[str]] = frozenset(
-        {"ambient_light", "veiling_glare", "nonlinearity", "exposure_offset", "stray_light"}
+        {"ambient_light", "dark_current_temperature", "exposure_offset", "nonlinearity", "stray_light", "veiling_glare"}
     )
     sentence: ClassVar[str] = (
         "The black level drifts: all captures carry an additional offset that grows with time or temperature and not with light."
@@ -29,7 +29,7 @@ class BlackLevelDrift(Effect):
 
     drift_dn_per_min: Annotated[
         float,
-        Quantity("DN/min", "change with time", lower=-50.0, upper=50.0, prior=(0.0, 0.05), absent=0.0, slope_power=1),
+        Quantity("DN/min", "change with time", lower=-50.0, upper=50.0, prior=(0.0, 0.5), absent=0.0, slope_power=1),
     ] = 0.0
     drift_dn_per_c: Annotated[
         float,

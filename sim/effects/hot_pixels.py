@@ -7,12 +7,13 @@ from typing import Annotated, ClassVar, Self
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
-from sim.sensor.defects import exponential_excess
+from sim.sensor.defects import odd_sizes, size_nodes
 from sim.spectrum import FloatArray
 
 
 class HotPixels(Effect):
-    """A share of the pixels, `pattern_seed` says which, has additional dark current, exponentially distributed about its mean."""
+    """A share of the pixels, `pattern_seed` says which, has additional dark current, gamma distributed about its mean: a relative
+    spread of 1 is an exponential distribution, 0 are pixels that are all alike."""
 
     name: ClassVar[str] = "hot_pixels"
     stage: ClassVar[Stage] = Stage.CHARGE
@@ -23,7 +24,7 @@ class HotPixels(Effect):
     )
     shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
     rivals: ClassVar[frozenset[str]] = frozenset({"random_telegraph_noise"})
-    shapes: ClassVar[frozenset[str]] = frozenset({"share_ppm"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"share_ppm", "relative_spread"})
     sentence: ClassVar[str] = (
         "A few pixels are hot: always the same ones, they collect dark charge that grows with the exposure and stands far above the rest."
     )
@@ -35,23 +36,53 @@ class HotPixels(Effect):
             "mean additional dark current of the hot pixels",
             lower=0.0,
             upper=1e6,
-            prior=(0.0, 200.0),
+            prior=(0.0, 1000.0),
             absent=0.0,
         ),
     ] = 0.0
     share_ppm: Annotated[
-        float, Quantity("ppm", "share of the pixels that are hot, one at least", lower=0.0, upper=1e5, absent=200.0)
+        float,
+        Quantity(
+            "ppm",
+            "share of the pixels that are hot, one at least",
+            lower=0.0,
+            upper=1e5,
+            prior=(200.0, 1000.0),
+            absent=200.0,
+        ),
     ] = 200.0
+    relative_spread: Annotated[
+        float,
+        Quantity(
+            "1",
+            "standard deviation of the hot pixels' dark current, relative to its mean",
+            lower=0.0,
+            upper=3.0,
+            prior=(1.0, 0.5),
+            absent=1.0,
+        ),
+    ] = 1.0
     pattern_seed: int = 0
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        return ((cls(excess_e_per_s=60.0),),)
+        return tuple(
+            (cls(excess_e_per_s=excess, share_ppm=share, relative_spread=spread),)
+            for excess in (15.0, 50.0, 150.0, 500.0, 2000.0)
+            for share in (20.0, 200.0, 2000.0)
+            for spread in (1.0, 0.3)
+        )
 
     def dark_current(
         self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
     ) -> FloatArray | float:
         if self.excess_e_per_s == 0.0:
             return e_per_s
-        excess = exponential_excess((camera.rows, camera.cols), self.share_ppm * 1e-6, self.pattern_seed)
+        excess = odd_sizes((camera.rows, camera.cols), self.share_ppm * 1e-6, self.pattern_seed, self.relative_spread)
         return e_per_s + self.excess_e_per_s * excess
+
+    def odd_dark_current(self) -> tuple[FloatArray, FloatArray] | None:
+        if self.excess_e_per_s == 0.0:
+            return None
+        weights, sizes = size_nodes(self.relative_spread)
+        return self.share_ppm * 1e-6 * weights, self.excess_e_per_s * sizes

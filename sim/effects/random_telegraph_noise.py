@@ -9,13 +9,14 @@ import numpy as np
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
-from sim.sensor.defects import odd_pixels
+from sim.sensor.defects import odd_pixels, odd_sizes, size_nodes
 from sim.spectrum import FloatArray
 
 
 class RandomTelegraphNoise(Effect):
     """A share of the pixels, `pattern_seed` says which, is read with +A/2 or -A/2, each half of the time and anew in every frame
-    (traps much faster than the frame rate): mean 0, variance A^2 / 4, two peaks in a pixel's histogram."""
+    (traps much faster than the frame rate): mean 0, variance A^2 / 4, two peaks in a pixel's histogram. A is the same in all
+    (relative spread 0), or gamma distributed about its mean."""
 
     name: ClassVar[str] = "random_telegraph_noise"
     stage: ClassVar[Stage] = Stage.ELECTRONICS
@@ -26,37 +27,71 @@ class RandomTelegraphNoise(Effect):
     )
     shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
     rivals: ClassVar[frozenset[str]] = frozenset({"hot_pixels"})
-    shapes: ClassVar[frozenset[str]] = frozenset({"share_percent"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"share_percent", "relative_spread"})
     sentence: ClassVar[str] = (
         "A few pixels blink: always the same ones jump between two levels, with far more temporal noise than their neighbours."
     )
 
     amplitude_e: Annotated[
         float,
-        Quantity("e", "distance of the two levels", lower=0.0, upper=1e4, prior=(0.0, 20.0), absent=0.0, slope_power=2),
+        Quantity(
+            "e",
+            "distance of the two levels, mean over these pixels",
+            lower=0.0,
+            upper=1e4,
+            prior=(0.0, 60.0),
+            absent=0.0,
+            slope_power=2,
+        ),
     ] = 0.0
     share_percent: Annotated[
-        float, Quantity("%", "share of the pixels that blink, one at least", lower=0.0, upper=100.0, absent=0.2)
+        float,
+        Quantity(
+            "%", "share of the pixels that blink, one at least", lower=0.0, upper=100.0, prior=(0.2, 1.0), absent=0.2
+        ),
     ] = 0.2
+    relative_spread: Annotated[
+        float,
+        Quantity(
+            "1",
+            "standard deviation of the distances, relative to their mean",
+            lower=0.0,
+            upper=3.0,
+            prior=(0.5, 0.5),
+            absent=0.0,
+        ),
+    ] = 0.0
     pattern_seed: int = 0
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        return ((cls(amplitude_e=6.0),),)
+        return tuple(
+            (cls(amplitude_e=amplitude, share_percent=share, relative_spread=spread),)
+            for amplitude in (5.0, 12.0, 30.0, 80.0)
+            for share in (0.02, 0.2, 2.0)
+            for spread in (0.0, 1.0)
+        )
 
     def _pixels(self, shape: tuple[int, ...]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
         return odd_pixels(shape, self.share_percent / 100.0, self.pattern_seed)
+
+    def _amplitudes_e(self, shape: tuple[int, ...]) -> FloatArray:
+        return self.amplitude_e * odd_sizes(shape, self.share_percent / 100.0, self.pattern_seed, self.relative_spread)
 
     def added(self, shape: tuple[int, ...], rng: np.random.Generator, camera: CameraModel) -> FloatArray | None:
         if self.amplitude_e == 0.0:
             return None
         jump, pixels = np.zeros(shape), self._pixels(shape)
-        jump.flat[pixels] = self.amplitude_e * (rng.integers(0, 2, pixels.size) - 0.5)
+        jump.flat[pixels] = self._amplitudes_e(shape).flat[pixels] * (rng.integers(0, 2, pixels.size) - 0.5)
         return jump
 
     def added_e2(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
         if self.amplitude_e == 0.0:
             return 0.0
-        variance = np.zeros(shape)
-        variance.flat[self._pixels(shape)] = self.amplitude_e**2 / 4.0
-        return variance
+        return self._amplitudes_e(shape) ** 2 / 4.0
+
+    def odd_jumps(self) -> tuple[FloatArray, FloatArray] | None:
+        if self.amplitude_e == 0.0:
+            return None
+        weights, sizes = size_nodes(self.relative_spread)
+        return self.share_percent / 100.0 * weights, self.amplitude_e * sizes

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammainc, gammaincinv
 
 from sim.spectrum import FloatArray
 
@@ -20,11 +21,36 @@ def odd_pixels(shape: tuple[int, ...], share: float, seed: int) -> NDArray[np.in
     return chosen
 
 
+#: Below this relative standard deviation all odd pixels are alike.
+ALIKE = 0.02
+
+
 @lru_cache(maxsize=8)
-def exponential_excess(shape: tuple[int, ...], share: float, seed: int) -> FloatArray:
-    """(shape): exponential variables of mean 1 in `odd_pixels`, 0 elsewhere."""
-    excess = np.zeros(shape)
+def odd_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float = 1.0) -> FloatArray:
+    """(shape): variables of mean 1 and standard deviation `spread` in `odd_pixels`, gamma distributed (1: exponential), 0 elsewhere."""
+    sizes = np.zeros(shape)
     chosen = odd_pixels(shape, share, seed)
-    excess.flat[chosen] = np.random.default_rng([seed, 2]).exponential(1.0, chosen.size)
-    excess.flags.writeable = False
-    return excess
+    drawn = np.random.default_rng([seed, 2]).exponential(1.0, chosen.size)
+    if spread < ALIKE:
+        drawn = np.ones(chosen.size)
+    elif spread != 1.0:
+        k = spread**-2
+        drawn = gammaincinv(k, -np.expm1(-drawn)) / k
+    sizes.flat[chosen] = drawn
+    sizes.flags.writeable = False
+    return sizes
+
+
+@lru_cache(maxsize=256)
+def size_nodes(spread: float, count: int = 24) -> tuple[FloatArray, FloatArray]:
+    """(weights, sizes), (count,) each, of the distribution that `odd_sizes` draws from: means over parts of it, thinner ones
+    towards the tail; weights sum to 1, weighted sizes too."""
+    if spread < ALIKE:
+        return np.ones(1), np.ones(1)
+    k = spread**-2
+    below = 1.0 - np.linspace(1.0, 0.0, count + 1) ** 2
+    at = gammaincinv(k, below[:-1])
+    # the mean over a part of a gamma distribution is by the distribution of the next order
+    held = np.append(gammainc(k + 1.0, at), 1.0)
+    weights = np.diff(below)
+    return weights, np.diff(held) / weights
