@@ -36,7 +36,6 @@ class ColumnNoise(Effect):
             upper=1e4,
             prior=(0.0, 5.0),
             absent=0.0,
-            slope_power=2,
         ),
     ] = 0.0
     odd_even_e: Annotated[

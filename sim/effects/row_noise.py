@@ -54,7 +54,6 @@ class RowNoise(Effect):
             upper=1e4,
             prior=(0.0, 5.0),
             absent=0.0,
-            slope_power=2,
         ),
     ] = 0.0
     pattern_seed: int = 0
