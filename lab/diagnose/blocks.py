@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from lab.diagnose.edges import edge_block
 from lab.diagnose.evidence import Evidence
+from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
 from lab.diagnose.summaries import Block, Study
 from lab.diagnose.uniform import dark_block, linearity_block, narrowband_block, shading_block, variance_block
@@ -20,6 +21,7 @@ BLOCKS: tuple[Callable[[Study], Block], ...] = (
     dark_block,
     linearity_block,
     variance_block,
+    neighbour_block,
     shading_block,
     narrowband_block,
     chart_block,

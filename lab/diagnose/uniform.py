@@ -1,4 +1,4 @@
-"""Uniform light and none: dark frames, linearity and noise of flat fields, their shading, narrowband signals."""
+"""Uniform light and none: dark frames, linearity of flat fields, their shading, narrowband signals."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lab.diagnose.curves import CurveSlopes
+from lab.diagnose.neighbours import held_out_flats
 from lab.diagnose.summaries import (
     BLACK_FLOOR_DN,
     LEVEL_REACH,
@@ -20,7 +21,6 @@ from lab.diagnose.summaries import (
     Study,
     held_out_of,
     overrides,
-    pair_variance,
     wide_contrast,
 )
 from lab.errors import NotDetermined
@@ -31,7 +31,6 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 LEVEL_FLOOR = 1.0e-4  # of a level: non-linearity below what a linear camera may have, and rounding
-VARIANCE_FLOOR = 0.003  # of a variance
 RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels
 SHADING_FLOOR = 5e-4
 AXIS_STD, AXIS_STD_KNOWN = 0.01, 0.004  # of the frame's diagonal: the optical axis without and with a fitted geometry
@@ -132,69 +131,14 @@ def linearity_block(study: Study) -> Block:
 def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:
     """(capture, channel, mean DN, held out) of every flat frame's unclipped channels."""
     points = []
-    for i, group in enumerate(groups):
-        out = held_out_of(group, i, 0)
+    out = study.once(held_out_flats)
+    for group in groups:
         for capture in group:
             for channel in study.channels:
                 mean = study.levels(capture).mean[channel]
                 if mean is not None:
                     points.append((capture, channel, mean, capture.id in out))
     return points
-
-
-def variance_block(study: Study) -> Block:
-    """Temporal variance of flats by channel against their mean: gain and read noise are free, the line isn't."""
-    groups = [g for g in study.flat_levels() if len(g) > 1]
-    points = []
-    for i, group in enumerate(groups):
-        for channel in study.channels:
-            levels = [study.levels(c).mean[channel] for c in group]
-            if any(level is None for level in levels):
-                continue
-            planes = [study.pixels_of(study.recordings.frame(c), channel) for c in group]
-            mean = float(np.mean([level for level in levels if level is not None]))
-            variance = pair_variance(planes)
-            std = variance * np.sqrt(2.0 / ((len(group) - 1) * planes[0].size))
-            points.append((group, channel, mean - study.noise.black, variance, std, i % 3 == 1))
-    if len(points) < 4:
-        raise NotDetermined(
-            "noise", "fewer than two repeats of unclipped flat captures: temporal noise isn't determined"
-        )
-    signal = np.array([p[2] for p in points])
-    value = np.array([p[3] for p in points])
-    covariance = np.diag(np.array([p[4] for p in points]) ** 2 + (VARIANCE_FLOOR * value) ** 2)
-    noise = study.noise
-
-    def predict(effects: Effects) -> Prediction:
-        camera = study.camera
-        # electrons behind the measured level: the effects' response undone by two fixed-point steps
-        e = np.maximum(signal / noise.gain, 1e-3)
-        target = e.copy()
-        slope = np.ones_like(e)
-        for _ in range(2):
-            out = e
-            for effect in effects:
-                out = effect.response(out, camera)
-            e = np.maximum(e * target / np.maximum(out, 1e-6), 1e-3)
-        step = 1e-3 * e
-        high, low = e + step, e - step
-        for effect in effects:
-            high, low = effect.response(high, camera), effect.response(low, camera)
-        slope = (high - low) / (2 * step)
-        shot = e * slope**2
-        total = shot + (noise.read_dn / noise.gain) ** 2
-        for effect in effects:
-            total = effect.noise_e2(e, total, camera)
-        mean = noise.gain**2 * total
-        return Prediction(
-            mean, {"gain": 0.05 * noise.gain**2 * shot, "read": np.full(len(e), 0.3 * noise.read_dn**2 + 0.05)}
-        )
-
-    return Block(
-        measurement="noise", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
-        labels=tuple(Label(float(p[2]), p[1], f"{p[0][0].exposure_s:.4g} s", tuple(c.id for c in p[0]), p[5]) for p in points),
-        hooks=frozenset({"response", "noise_e2"}), predict=predict, scale=value,
-    )  # fmt: skip
 
 
 def narrowband_block(study: Study) -> Block:

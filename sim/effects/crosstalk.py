@@ -34,6 +34,7 @@ class Crosstalk(Effect):
             "stray_light",
             "on_chip_smoothing",
             "green_imbalance",
+            "inter_pixel_capacitance",
         }
     )
     sentence: ClassVar[str] = (

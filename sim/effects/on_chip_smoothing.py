@@ -21,7 +21,9 @@ class OnChipSmoothing(OnChipFilter):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"corner_share"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli", "flat", "dark"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"brighter_fatter", "crosstalk", "pixel_aperture"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {"brighter_fatter", "crosstalk", "inter_pixel_capacitance", "pixel_aperture"}
+    )
     sentence: ClassVar[str] = (
         "The camera smooths on the chip: contrast falls alike at all apertures, and neighbouring pixels have noise in common, bright or dark."
     )

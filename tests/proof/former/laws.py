@@ -920,7 +920,7 @@ class InterPixelCapacitance(Law):
     """Neighbours share voltages after the noise was made (a sibling of crosstalk)."""
 
     name, unit, nominal, limits = "inter_pixel_capacitance", "%", 0.8, (0.02, 6.0)
-    accepts = frozenset({"crosstalk"})
+    accepts = frozenset({"crosstalk", "inter_pixel_capacitance"})
 
     def collected(self, electrons: Array, mean: Array) -> Array:
         c = self.s / 100

@@ -1,0 +1,36 @@
+"""Inter-pixel capacitance: neighbouring pixels share their voltages, after the noise was made."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.base import Stage
+from sim.effects.crosstalk import Crosstalk
+from sim.spectrum import FloatArray
+
+
+class InterPixelCapacitance(Crosstalk):
+    """The kernel of `Crosstalk` on what the pixels hold, noise and all: the image and its colours mix as by charge that goes
+    astray, and neighbours' shot noise is correlated, 2 c / (1 - 4 c) at all levels of light; read noise comes after."""
+
+    name: ClassVar[str] = "inter_pixel_capacitance"
+    stage: ClassVar[Stage] = Stage.CHARGE
+    reference: ClassVar[str] = "A. C. Moore, Z. Ninkov, W. J. Forrest, Optical Engineering 45, 076402 (2006)"
+    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart", "slanted_edge", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"crosstalk", "on_chip_smoothing", "brighter_fatter"})
+    sentence: ClassVar[str] = (
+        "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is common to neighbours at all levels of light, but not in the dark."
+    )
+
+    def neighbour_correlation(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
+        along, down = self.shares()
+        own, mean = 1.0 - 2.0 * along - 2.0 * down, 0.5 * (along + down)
+        return 2.0 * own * mean / (own * own + 4.0 * mean * mean)
+
+    def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
+        along, down = self.shares()
+        own = 1.0 - 2.0 * along - 2.0 * down
+        if own == 1.0:
+            return noise_e2
+        return noise_e2 - electrons * (1.0 - own * own - 2.0 * along * along - 2.0 * down * down)
