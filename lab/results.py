@@ -621,6 +621,7 @@ class Unexplained(Frozen):
     chi2_before: float
     chi2_after: float
     n: int
+    correction: str = ""  # what stands for it in the improved model, in words
 
 
 class HeldOut(Frozen):

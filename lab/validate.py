@@ -5,13 +5,14 @@ The model is the fitted camera with its fitted sensitivities and, if wanted, eff
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from lab.camera_file import CameraFile
 from lab.diagnose.evidence import chi2
 from lab.diagnose.patches import Patch as PatchLevel
 from lab.diagnose.patches import patch_covariance, patch_levels
@@ -37,9 +38,9 @@ KERNEL_FLOOR = 0.002  # of the kernel's maximum
 
 
 def validate(
-    recordings: RecordingSet, fit: FitResult, effects: dict[Side, tuple[Effect, ...]] | None = None
+    recordings: RecordingSet, fit: FitResult, models: Mapping[Side, CameraFile] | None = None
 ) -> ValidationResult:
-    """Checks of every side: `colorchecker`, `mtf`, `psf`; `effects` (side -> effects that a diagnosis named) improve the model.
+    """Checks of every side: `colorchecker`, `mtf`, `psf`. `models`: cameras with their effects, in place of the fitted ones.
 
     A check passes where chi2 lies within its 99.9 % quantile. What the recordings don't allow stands in `skipped`.
     """
@@ -47,8 +48,9 @@ def validate(
     skipped: list[Skipped] = []
     for side in recordings.sides:
         camera_fit = fit.cameras.get(side, CameraFit())
-        model = camera_model(recordings, side, camera_fit)
-        with_effects = (effects or {}).get(side, ())
+        improved = (models or {}).get(side)
+        model = improved.camera if improved else camera_model(recordings, side, camera_fit)
+        with_effects = improved.effects if improved else ()
         for name, check in (("colorchecker", _charts), ("mtf", _edges), ("psf", _kernels)):
             try:
                 checks += check(recordings, side, camera_fit, model, with_effects)

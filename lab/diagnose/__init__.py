@@ -9,8 +9,10 @@ findings.py   all sides in one result
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
+from lab.camera_file import CameraFile
 from lab.diagnose.blocks import BLOCKS
 from lab.diagnose.findings import merged
 from lab.diagnose.processes import in_processes
@@ -19,9 +21,17 @@ from lab.recording import RecordingSet
 from lab.results import DiagnosisResult, FitResult
 from sim.camera import Side
 
-__all__ = ["BLOCKS", "Progress", "diagnose"]
+__all__ = ["BLOCKS", "Diagnosis", "Progress", "diagnose", "examine"]
 #: Called with what is being done and the share of the work that is done, 0..1.
 Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found, and each side's model with it: the cameras of sides that could be judged."""
+
+    result: DiagnosisResult
+    improved: dict[Side, CameraFile]
 
 
 def diagnose(
@@ -31,13 +41,27 @@ def diagnose(
     *,
     at_once: bool = True,
 ) -> DiagnosisResult:
+    """What `examine` finds, without the improved models."""
+    return examine(recordings, fit, progress, at_once=at_once).result
+
+
+def examine(
+    recordings: RecordingSet,
+    fit: FitResult | None = None,
+    progress: Progress | None = None,
+    *,
+    baseline: Mapping[Side, CameraFile] | None = None,
+    at_once: bool = True,
+) -> Diagnosis:
     """Diagnose every side. `fit` gives the geometry and, where the maker states no curves, the sensitivities; None: neither.
 
     Noise and levels are taken from the recordings anew, as free quantities of the same model. What the recordings don't
-    determine is not judged, and stands in `skipped`. Several sides are worked on at the same time, each in a process of its
-    own; one side, or with `at_once` False each in its turn, in this one. `progress` is called in the caller's thread.
+    determine is not judged, and stands in `skipped`. `baseline`: cameras with their effects, in place of the maker's word and the
+    fit, for the sides that it has. Several sides are worked on at the same time, each in a process of its own; one side, or with
+    `at_once` False each in its turn, in this one. `progress` is called in the caller's thread.
     """
     shares = dict.fromkeys(recordings.sides, 0.0)
+    cameras = baseline or {}
 
     def report(side: Side, text: str) -> None:
         shares[side] = 1.0 - 0.8 * (1.0 - shares[side])
@@ -45,12 +69,13 @@ def diagnose(
             progress(f"{text} ({side})", sum(shares.values()) / len(shares))
 
     def alone(side: Side) -> SideFindings:
-        return diagnose_side(recordings, side, fit, lambda text: report(side, text))
+        return diagnose_side(recordings, side, fit, cameras.get(side), lambda text: report(side, text))
 
     if at_once and len(shares) > 1:
-        found = in_processes(recordings, fit, report)
+        found = in_processes(recordings, fit, cameras, report)
     else:
         found = [alone(side) for side in recordings.sides]
     if progress is not None:
         progress("done", 1.0)
-    return merged(recordings.source, found)
+    improved = {findings.side: findings.improved for findings in found if findings.improved is not None}
+    return Diagnosis(merged(recordings.source, found), improved)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
+from lab.camera_file import CameraFile
 from lab.diagnose.edges import edge_block
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
-from lab.diagnose.summaries import Block, Study
+from lab.diagnose.summaries import Block, Effects, Prediction, Study
 from lab.diagnose.uniform import dark_block, linearity_block, narrowband_block, shading_block
 from lab.errors import NotDetermined
 from lab.predict import assumptions, camera_model
@@ -34,11 +37,14 @@ _NEAR_FULL = 0.985
 
 
 def evidence_of(
-    recordings: RecordingSet, side: Side, fit: FitResult | None = None
+    recordings: RecordingSet, side: Side, fit: FitResult | None = None, baseline: CameraFile | None = None
 ) -> tuple[Evidence | None, tuple[Skipped, ...]]:
-    """One side's measurements against its baseline, and what couldn't be looked at; None where nothing could."""
+    """One side's measurements against its baseline, and what couldn't be looked at; None where nothing could.
+
+    `baseline`: a camera with its effects in place of the maker's word and the fit.
+    """
     camera_fit = fit.cameras.get(side) if fit is not None else None
-    camera = camera_model(recordings, side, camera_fit, maker_curves=True)
+    camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
     skipped = [
         Skipped(step=f"diagnose {a.quantity}", reason=f"neither stated nor fitted; taken as {a.value}", side=side)
         for a in assumptions(recordings.camera(side))
@@ -51,7 +57,14 @@ def evidence_of(
         except NotDetermined as refused:
             skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
     blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]
+    if baseline is not None and baseline.effects:
+        blocks = [replace(b, predict=partial(_predicted, b, baseline.effects)) for b in blocks]
     return (Evidence(tuple(blocks), study.camera) if blocks else None), tuple(skipped)
+
+
+def _predicted(block: Block, always: Effects, effects: Effects) -> Prediction:
+    """With the baseline's own effects, which stand first: they act first."""
+    return block.predict((*(e for e in always if block.touched_by(type(e))), *effects))
 
 
 def _saturation_dn(fit: CameraFit | None) -> float | None:

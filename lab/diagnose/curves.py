@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ CURVE_SCALE_STD = 0.2  # of the sensitivity: holds gain, aperture and lens too
 CURVE_TILT_STD = 0.05  # per 100 nm
 CURVE_BEND_STD = 0.01  # per (100 nm)^2
 CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
+CURVE_STEP_NM = 2.5  # of a curve that is written out
 
 
 class CurveSlopes:
@@ -49,17 +50,7 @@ class CurveSlopes:
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
         )
         self._kept: dict[tuple[Effect, ...], tuple[FloatArray, FloatArray]] = {}
-        knots = np.arange(380.0, 781.0, 20.0)
-        cov = CURVE_ROUGH_STD**2 * np.exp(-0.5 * ((knots[:, None] - knots) / CURVE_ROUGH_NM) ** 2)
-        size, vector = np.linalg.eigh(cov)
-        keep = size > 1e-3 * size.max()
-        modes = [
-            np.full_like(knots, CURVE_SCALE_STD),
-            CURVE_TILT_STD * (knots - 560.0) / 100.0,
-            CURVE_BEND_STD * ((knots - 560.0) / 100.0) ** 2,
-        ]
-        modes += [vector[:, i] * np.sqrt(size[i]) for i in np.flatnonzero(keep)[::-1]]
-        self._modes = np.array([np.interp(self.wavelength, knots, mode) for mode in modes])
+        self._modes = curve_modes(self.wavelength)
         between = {c: _between_samples(q, self.wavelength) for c, q in camera.quantum_efficiency.items()}
         self._between = np.array([between[c] for _, c, *_ in items])
 
@@ -112,6 +103,35 @@ class CurveSlopes:
                 for i in range(table.shape[1]):
                     named[f"curve:{channel}:{i}"] = np.where(mine, table[:, i], 0.0)
         return named
+
+
+def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
+    """What is free of every curve: relative changes of one prior standard deviation each, (modes, wavelengths)."""
+    knots = np.arange(380.0, 781.0, 20.0)
+    cov = CURVE_ROUGH_STD**2 * np.exp(-0.5 * ((knots[:, None] - knots) / CURVE_ROUGH_NM) ** 2)
+    size, vector = np.linalg.eigh(cov)
+    keep = size > 1e-3 * size.max()
+    modes = [
+        np.full_like(knots, CURVE_SCALE_STD),
+        CURVE_TILT_STD * (knots - 560.0) / 100.0,
+        CURVE_BEND_STD * ((knots - 560.0) / 100.0) ** 2,
+    ]
+    modes += [vector[:, i] * np.sqrt(size[i]) for i in np.flatnonzero(keep)[::-1]]
+    return np.array([np.interp(wavelength_nm, knots, mode) for mode in modes])
+
+
+def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) -> Spectrum:
+    """A maker's curve with what is free of it at `quantities` (as `CurveSlopes.slopes` names them, in prior standard deviations); the
+    same curve where none is among them."""
+    names = [name for name in quantities if name.startswith(f"curve:{channel}:")]
+    if not names:
+        return curve
+    low, high = curve.wavelength_nm[0], curve.wavelength_nm[-1]
+    grid = np.union1d(np.array(curve.wavelength_nm), np.arange(np.ceil(low), high, CURVE_STEP_NM))
+    relative = np.vstack([curve_modes(grid), _between_samples(curve, grid)]) * curve.at(grid)
+    changes = np.vstack([relative, np.full_like(grid, LEAK_STD * max(curve.value))])
+    value = curve.at(grid) + sum(quantities[name] * changes[int(name.rsplit(":", 1)[1])] for name in names)
+    return Spectrum.of(grid, np.clip(value, 0.0, 1.0))
 
 
 def _between_samples(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:

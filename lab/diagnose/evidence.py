@@ -71,18 +71,18 @@ class Evidence:
         """Prediction of everything, (n,)."""
         return np.concatenate([self._prediction(i, effects).mean for i in range(len(self.blocks))])
 
+    def _columns(self, effects: Effects) -> dict[str, FloatArray]:
+        """Slopes by every free quantity, (n,) each, per prior standard deviation; one that several blocks share is one column."""
+        columns: dict[str, FloatArray] = {}
+        for index, at in enumerate(self.slices):
+            for name, column in self._prediction(index, effects).slopes.items():
+                columns.setdefault(name, np.zeros(len(self.value)))[at] = column
+        return columns
+
     def _free(self, effects: Effects) -> FloatArray:
-        """Slopes by all free quantities, (n, k), per prior standard deviation; one that several blocks share is one column."""
-        names: dict[str, int] = {}
-        parts = [self._prediction(i, effects).slopes for i in range(len(self.blocks))]
-        for part in parts:
-            for name in part:
-                names.setdefault(name, len(names))
-        table = np.zeros((len(self.value), len(names)))
-        for part, at in zip(parts, self.slices, strict=True):
-            for name, column in part.items():
-                table[at, names[name]] = column
-        return table
+        """The same as a table, (n, k)."""
+        columns = self._columns(effects)
+        return np.column_stack(list(columns.values())) if columns else np.zeros((len(self.value), 0))
 
     @cached_property
     def _kinship(self) -> FloatArray:
@@ -136,13 +136,18 @@ class Evidence:
                     covariance[here, here] += error[:, None] * kinship[here, here] * error
         return Gaussian(mean[where], covariance)
 
+    def quantities(self, effects: Effects = ()) -> dict[str, float]:
+        """Where the seen numbers put the free quantities, by name, in prior standard deviations from their first guess."""
+        model = self.seen_gaussian(effects)
+        inside = cho_factor(model.covariance, lower=True)
+        free = self._free(effects)[self.seen]
+        found = free.T @ cho_solve(inside, self.seen_value - model.mean)
+        return dict(zip(self._columns(effects), found.tolist(), strict=True))
+
     def levelled(self, effects: Effects = ()) -> FloatArray:
-        """Prediction of everything with the free quantities where the seen numbers put them, (n,)."""
-        model = self.gaussian(effects)
-        inside = cho_factor(model.covariance[np.ix_(self.seen, self.seen)], lower=True)
-        free = self._free(effects)
-        quantities = free[self.seen].T @ cho_solve(inside, (self.value - model.mean)[self.seen])
-        return np.asarray(model.mean + free @ quantities)
+        """Prediction of everything with the free quantities there, (n,)."""
+        found = np.array(list(self.quantities(effects).values()))
+        return np.asarray(self.mean(effects) + self._free(effects) @ found)
 
     def touched(self, effect: type[Effect]) -> np.ndarray:
         """Numbers that an effect may change."""

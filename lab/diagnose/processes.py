@@ -14,10 +14,11 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any
 
+from lab.camera_file import CameraFile
 from lab.diagnose.side import SideFindings
 from lab.errors import InputError
 from lab.recording import RecordingSet
@@ -31,7 +32,10 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 
 def in_processes(
-    recordings: RecordingSet, fit: FitResult | None, report: Callable[[Side, str], None]
+    recordings: RecordingSet,
+    fit: FitResult | None,
+    baseline: Mapping[Side, CameraFile],
+    report: Callable[[Side, str], None],
 ) -> list[SideFindings]:
     """What every side shows, in the order of the sides. `report` is called in the caller's thread; what it raises, or what a
     process raised, ends all of them. Raises InputError where a process was ended from outside."""
@@ -39,7 +43,8 @@ def in_processes(
     found: dict[Side, SideFindings] = {}
     with contextlib.ExitStack() as stack:
         for side in recordings.sides:
-            stack.enter_context(_Process(recordings, side, fit, said))
+            # registered before it starts: an interrupt in between must find it
+            stack.enter_context(_Process(side, (recordings, side, fit, baseline.get(side)), said)).start()
         while len(found) < len(recordings.sides):
             try:
                 side, what = said.get(timeout=WAKE_S)
@@ -57,13 +62,16 @@ def in_processes(
 class _Process:
     """One side's process, with a thread that listens to it. Leaving the block ends both."""
 
-    def __init__(
-        self, recordings: RecordingSet, side: Side, fit: FitResult | None, said: queue.SimpleQueue[tuple[Side, Any]]
-    ) -> None:
-        self._side, self._said = side, said
-        self._task = recordings, side, fit
+    def __init__(self, side: Side, task: tuple[Any, ...], said: queue.SimpleQueue[tuple[Side, Any]]) -> None:
+        self._side, self._task, self._said = side, task, said
+
+        self._process: subprocess.Popen[bytes] | None = None
+        self._listener = threading.Thread(target=self._listen, name=f"diagnose-{side}", daemon=True)
 
     def __enter__(self) -> _Process:
+        return self
+
+    def start(self) -> None:
         # Of its own session: Ctrl-C is for the caller, who ends this process.
         self._process = subprocess.Popen(
             [sys.executable, "-m", "lab.diagnose"],
@@ -72,18 +80,20 @@ class _Process:
             env=os.environ | ONE_THREAD,
             start_new_session=True,
         )
-        self._listener = threading.Thread(target=self._listen, name=f"diagnose-{self._side}", daemon=True)
         self._listener.start()
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._process is None:
+            return
         if kind is not None:
             self._process.kill()
         self._process.wait()
-        self._listener.join()
+        if self._listener.is_alive():
+            self._listener.join()
 
     def _listen(self) -> None:
         """Hand over the task, and put what the process says into the queue until it has said all."""
+        assert self._process is not None
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError), self._process.stdin as to:

@@ -3,14 +3,16 @@ processes; evidence, which holds functions, can't."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from lab.camera_file import CameraFile
 from lab.diagnose.blocks import evidence_of
 from lab.diagnose.decide import Candidate, Verdict, decide
 from lab.diagnose.evidence import Evidence
+from lab.diagnose.improved import Correction, improved_model
 from lab.diagnose.locate import describe
 from lab.diagnose.summaries import Block
 from lab.diagnose.unknown import with_discrepancy
@@ -46,16 +48,20 @@ class SideFindings:
     unexplained: tuple[Unexplained, ...] = ()
     held_out: HeldOut | None = None
     curves: tuple[ResidualCurve, ...] = ()
+    improved: CameraFile | None = None  # the model with what was found
 
 
-def diagnose_side(recordings: RecordingSet, side: Side, fit: FitResult | None, report: Report) -> SideFindings:
+def diagnose_side(
+    recordings: RecordingSet, side: Side, fit: FitResult | None, baseline: CameraFile | None, report: Report
+) -> SideFindings:
     """Everything that is told of one side."""
     report("summarising the recordings")
-    evidence, skipped = evidence_of(recordings, side, fit)
+    evidence, skipped = evidence_of(recordings, side, fit, baseline)
     if evidence is None:
         return SideFindings(side, skipped)
     report("scoring the effects")
     verdict = decide(evidence, np.random.default_rng(SEED), report)
+    improved, corrections = improved_model(recordings, side, fit, baseline, evidence, verdict.effects, verdict.unknown)
     return SideFindings(
         side=side,
         skipped=skipped,
@@ -64,9 +70,10 @@ def diagnose_side(recordings: RecordingSet, side: Side, fit: FitResult | None, r
         mismatches=tuple(_mismatches(side, verdict)),
         named=tuple(Named(c, _shown_in(verdict, c)) for c in verdict.named),
         abstained=verdict.abstained,
-        unexplained=tuple(_unexplained(side, verdict)),
+        unexplained=tuple(_unexplained(side, verdict, corrections)),
         held_out=_held_out(verdict),
         curves=tuple(_curves(side, verdict)),
+        improved=improved,
     )
 
 
@@ -135,11 +142,11 @@ def _shown_in(verdict: Verdict, candidate: Candidate) -> tuple[str, ...]:
     return strong or (max(pulls, key=lambda m: pulls[m]),)
 
 
-def _unexplained(side: Side, verdict: Verdict) -> list[Unexplained]:
+def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]) -> list[Unexplained]:
     evidence = verdict.evidence
     model = evidence.gaussian(verdict.effects)
     found = []
-    for gap in verdict.unknown:
+    for gap, correction in zip(verdict.unknown, corrections, strict=True):
         block, at = evidence.blocks[gap.index], evidence.slices[gap.index]
         part = next((s for s in verdict.after if s.block is block), None)
         index = np.arange(at.start, at.stop)[evidence.seen[at]]
@@ -172,6 +179,7 @@ def _unexplained(side: Side, verdict: Verdict) -> list[Unexplained]:
                 chi2_before=before,
                 chi2_after=after,
                 n=len(index),
+                correction=correction.said,
             )
         )
     return found

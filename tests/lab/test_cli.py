@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lab import cli, recording
+from lab.diagnose import Diagnosis
 from lab.errors import DeviceError
 from lab.recording import Manifest, RecordingSet
 from lab.results import CameraFit, Check, DiagnosisResult, FitResult, NoiseFit, Skipped, ValidationResult
@@ -186,7 +187,7 @@ def test_a_check_that_falls_short(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passed: bool, code: int
 ) -> None:
     check = Check(name="mtf", side="left", capture="edge-1", n=10, chi2=11.0, rms_relative_percent=1.0, passed=passed)
-    monkeypatch.setattr(cli, "_validated", lambda recordings, fit: ValidationResult(source="x", checks=(check,)))
+    monkeypatch.setattr(cli, "_validated", lambda *_: ValidationResult(source="x", checks=(check,)))
     assert cli.main(["validate", str(flats), "--json", str(tmp_path / "v.json")]) == code
     assert ValidationResult.model_validate_json((tmp_path / "v.json").read_text()).checks == (check,)
 
@@ -197,7 +198,7 @@ def test_diagnosis_with_a_stored_fit(
     assert cli.main(["fit", str(flats), "--json", str(tmp_path / "fit.json")]) == 0
     monkeypatch.setattr(cli, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
     result = DiagnosisResult(source="x", verdict="no_mismatch", skipped=(Skipped(step="mtf", reason="no [edges]"),))
-    monkeypatch.setattr(cli, "_diagnosed", lambda recordings, fit: result)
+    monkeypatch.setattr(cli, "_examined", lambda recordings, fit, baseline: Diagnosis(result, {}))
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 0
     shown = capsys.readouterr().out
     assert "verdict: no_mismatch" in shown
@@ -280,7 +281,7 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
     monkeypatch.setattr(cli, "_captured", lambda *_: "session-1")
     monkeypatch.setattr(cli, "_fitted", lambda *_: fit)
     monkeypatch.setattr(cli, "_validated", lambda *_: ValidationResult(source="s", checks=()))
-    monkeypatch.setattr(cli, "_diagnosed", lambda *_: diagnosis)
+    monkeypatch.setattr(cli, "_examined", lambda *_: Diagnosis(diagnosis, {}))
     assert cli.main(["run"]) == 0
     shown = capsys.readouterr().out
     for words in (

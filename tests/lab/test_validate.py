@@ -3,6 +3,9 @@ model mends it."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from lab.camera_file import fitted_camera
 from lab.fit import fit_recording_set
 from lab.recording import RecordingSet
 from lab.results import FitResult, ValidationResult
@@ -35,7 +38,8 @@ def test_a_concealed_filter_shows_in_edges_and_kernels_and_its_model_mends_it() 
     recordings, fit = _fitted(concealed_laws.OpticalLowPassFilter(DISPLACEMENT_UM))
     assert _passed(validate(recordings, fit)) == {"colorchecker": True, "mtf": False, "psf": False}
     known = OpticalLowPassFilter(displacement_x_um=DISPLACEMENT_UM, displacement_y_um=DISPLACEMENT_UM)
-    mended = validate(recordings, fit, {"left": (known,)})
+    camera = fitted_camera(recordings, "left", fit.cameras["left"])
+    mended = validate(recordings, fit, {"left": replace(camera, effects=(known,))})
     before = {c.capture: c.chi2 for c in validate(recordings, fit).checks if c.name == "mtf"}
     for check in mended.checks:
         if check.name == "mtf":
