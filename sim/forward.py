@@ -11,7 +11,7 @@ result is the baseline bit for bit. Frequencies are cy/px, fx along columns (to 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -30,8 +30,8 @@ from sim.optics.illumination import sin_theta as sin_theta_at
 from sim.optics.imaging import DiffractionLimited, TracedLens
 from sim.optics.pupil import Wavefront
 from sim.optics.table import LensTable
-from sim.scene.render import Grid, Layer, Light, cell_means, draw
-from sim.scene.scenes import Darkness, KnifeEdge, Scene, SpectralImage, UniformField
+from sim.scene.render import Drawing, Grid, Layer, Light, cell_means, draw
+from sim.scene.scenes import Darkness, KnifeEdge, Scene, ScreenPattern, SpectralImage, UniformField
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
 from sim.sensor.electrons import FixedPattern, ReadOut
@@ -867,6 +867,8 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
     differences to the ground are transformed.
     """
     drawing = draw(scene, grid)
+    if isinstance(scene, ScreenPattern):
+        drawing = _shown(drawing, grid, camera, effects)
     lights: list[Light] = [drawing.ground, *(layer.light for layer in drawing.layers)]
     m = grid.margin_px
     ny, nx = grid.shape
@@ -917,6 +919,21 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
             image *= field[0](sin_theta_at(camera, row, col) ** 2)
         images[channel] = image
     return images
+
+
+def _shown(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
+    """A screen's pattern as the screen shows it, given what was asked for."""
+    acting = [effect for effect in effects if type(effect).screen is not Effect.screen]
+    if not acting:
+        return drawing
+    row, col = grid.axes_px()
+    y_um = (row[:, None] - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
+    x_um = (col[None, :] - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
+    (lit,) = drawing.layers
+    share = lit.coverage
+    for effect in acting:
+        share = effect.screen(share, x_um, y_um, camera)
+    return replace(drawing, layers=(replace(lit, coverage=share),))
 
 
 def _blurring(effects: Sequence[Effect]) -> tuple[Effect, ...]:

@@ -821,7 +821,7 @@ class _Drawn:
         at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
         fine_y, fine_x = np.arange(oversample * rows) / oversample, np.arange(oversample * cols) / oversample
         cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(fine_y, fine_x) for k in (0, 1))
-        picture = _area_drawn(target, cell_x, cell_y)
+        picture = area_drawn(target, cell_x, cell_y)
         # The squares of drawing and of the kernel's grid, a sample each, are taken out again
         taps = _taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
         for axis in (0, 1):
@@ -928,7 +928,7 @@ class _Drawn:
         )
 
 
-def _area_drawn(target: Array, cell_x: Array, cell_y: Array) -> Array:
+def area_drawn(target: Array, cell_x: Array, cell_y: Array) -> Array:
     """Mean of the pattern over a sample's square around points at `cell_x`, `cell_y` (cells); dark outside. The square is
     taken as aligned with the cells: its turn counts in second order only. A square may hold any number of cells."""
     rows, cols = target.shape

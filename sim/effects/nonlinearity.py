@@ -33,6 +33,7 @@ class Nonlinearity(Effect):
             "brighter_fatter",
             "veiling_glare",
             "radiometer_nonlinearity",
+            "screen_gamma",
         }
     )
     sentence: ClassVar[str] = (

@@ -1,0 +1,737 @@
+"""Patterns on a screen: how much contrast a random pattern keeps at every frequency, what its rims lack, what lies over it
+turned about the axis, where each colour's copy of it lands, and the grid of the screen's own pixels.
+
+The Bernoulli pattern is drawn where the checkerboard says that it is (`lab.fit.screen`) and passed through the baseline's
+transfer function. Band by band of frequency and orientation its picture is split, and what is seen is a sum of these parts:
+
+    seen = sum over bands of c_b P_b + rim P (1 - P) + turned T + even + shifts . gradient P + P beyond the bands
+
+by least squares over each channel's own pixels. Under the baseline every c_b is 1 and all the rest 0. Drawn and seen by the
+same pixels, aliasing is in both, so that a band holds its own frequencies alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage, stats
+from scipy.interpolate import CubicSpline, RectBivariateSpline
+
+from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of
+from lab.errors import NotDetermined
+from lab.fit.psf import area_drawn
+from lab.fit.screen import ScreenWarp, register
+from lab.recording import Bernoulli, Black, Capture, Checkerboard, White
+from sim.effects.base import Effect
+from sim.forward import optical_transfer
+from sim.optics.diffraction import aperture_otf
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray, Spectrum
+
+OVERSAMPLE = 4
+LARGEST_PX = 320  # a side of the part that is looked at: enough for a band's contrast to 1e-3
+RIM_PX = 12  # of the frame and of that part: drawings there lack what lies beyond
+PATTERN_RIM_CELLS = 2.0
+RINGS_CY_PER_PX = (0.0, 0.03, 0.08, 0.14, 0.2, 0.27, 0.34, 0.42, 0.5)
+SECTORS = 4  # orientations of a half turn: about 0, 45, 90, 135 degrees
+NODES = (4, 3)  # of a band, in radius and angle, at which an effect's transfer is taken
+LARGEST_STD = 0.04  # of a band's contrast: beyond, it says nothing
+TURNED_BLUR_PX = 3.0
+REFINEMENTS = 2
+LEAST_PIXELS = 1500
+FEWEST_CELLS = 400
+
+# --- what doesn't average out, and what is free ---
+CONTRAST_FLOOR = 0.0015  # of a band's contrast: drawing and registration
+CONTRAST_SCALE_STD = 0.01  # levels of screens are free: each channel of each part of the repeats
+SCREEN_BLUR_PX = 0.08  # a target's rims needn't be sharp: standard deviation of a Gaussian
+RIM_FLOOR = 0.0015
+TURNED_FLOOR = 1.5e-4
+COLOUR_FLOOR_PX = 0.003  # aliasing that the corners' and the pattern's drawing leave
+GRID_DETREND_PX = 8.0  # what is wider is shading
+GRID_LOWEST = 0.12  # cycles a sample: below, what was taken off as shading still tells
+GRID_LARGEST = 512  # samples a side
+GRID_OF_CAMERA = 12.0  # of a flat's mean power: a line that flats have, too, is the camera's
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A Bernoulli pattern of one pose, in one channel, in one part of its repeats: coefficients and their covariance."""
+
+    captures: tuple[str, ...]
+    held_out: bool
+    channel: str
+    bands: tuple[Band, ...]
+    value: FloatArray  # (bands + MORE,)
+    shown: FloatArray  # covariance by what differs from repeat to repeat
+    common: FloatArray  # ... and by what white, black and drawing share
+    greys: FloatArray  # (bands + MORE,) what the coefficients become where every grey v is shown as v^2
+    levels_e: tuple[float, float]  # electrons of black and of white
+    light: Spectrum | None
+    reach: float  # largest distance from the frame's middle in half diagonals
+
+
+#: Coefficients behind the bands': rim, turned, even, shift x, shift y, radial, radial^3, across.
+MORE = 8
+RIM, TURNED, EVEN, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 5, 6, 7
+
+
+@dataclass(frozen=True)
+class Band:
+    """A ring's sector: the mean frequency and orientation of the pattern's power in it, and nodes with their shares of it."""
+
+    frequency: float
+    angle_deg: float
+    fx: FloatArray
+    fy: FloatArray
+    share: FloatArray
+
+
+_KEPT: WeakKeyDictionary[Study, list[list[Pattern]] | NotDetermined] = WeakKeyDictionary()
+
+
+def patterns(study: Study) -> list[list[Pattern]]:
+    """Every Bernoulli pattern by channel and part; a list for each (pose, target), which share the light of white and black."""
+    if study not in _KEPT:
+        try:
+            _KEPT[study] = _patterns(study)
+        except NotDetermined as refused:
+            _KEPT[study] = refused
+    found = _KEPT[study]
+    if isinstance(found, NotDetermined):
+        raise found
+    return found
+
+
+def _patterns(study: Study) -> list[list[Pattern]]:
+    if study.stated.f_number is None or study.stated.pixel_pitch_um is None:
+        raise NotDetermined("bernoulli", "f-number or pixel pitch isn't stated: no diffraction to draw patterns with")
+    captures: Any = study.recordings.captures
+    groups = study.groups(Bernoulli, lambda c: (c.screen.pose, c.target))
+    if not groups:
+        raise NotDetermined("bernoulli", "no bernoulli captures")
+    found, reason = [], ""
+    for i, group in enumerate(groups):
+        pose = group[0].screen.pose
+        whites, blacks, boards = (
+            [c for c in captures(k, study.side) if c.screen.pose == pose] for k in (White, Black, Checkerboard)
+        )
+        missing = [n for n, some in (("white", whites), ("black", blacks), ("checkerboard", boards)) if not some]
+        if missing:
+            reason = f"pose {pose} lacks {' and '.join(missing)} captures"
+            continue
+        out = held_out_of(group, i, 0) if len(group) > 1 else set()
+        try:
+            found.append(_measured(study, group, whites, blacks, boards, out))
+        except NotDetermined as refused:
+            reason = refused.reason
+    if not found:
+        raise NotDetermined("bernoulli", reason)
+    return found
+
+
+def _rate(study: Study, captures: Sequence[Capture]) -> FloatArray:
+    """Mean of the frames above black and dark current, DN a second of exposure."""
+    recordings, noise = study.recordings, study.noise
+    total = np.zeros((study.camera.rows, study.camera.cols))
+    for capture in captures:
+        frame = recordings.frame(capture)
+        clipped = float(np.mean(frame >= study.saturation_dn))
+        if clipped > 0.001:
+            raise NotDetermined("bernoulli", f"{capture.id}: {100 * clipped:.1f} % of the frame is saturated")
+        total += (frame - noise.black) / max(capture.exposure_s, 1e-12) - noise.dark_dn_per_s
+    return total / len(captures)
+
+
+def _measured(
+    study: Study,
+    group: Sequence[Any],
+    whites: Sequence[Any],
+    blacks: Sequence[Any],
+    boards: Sequence[Any],
+    out: set[str],
+) -> list[Pattern]:
+    camera = study.camera
+    white, black = _rate(study, whites), _rate(study, blacks)
+    contrast = white - black
+    for plane in mosaic.planes(contrast, camera.cfa).values():
+        plane[plane < 0.2 * np.quantile(plane, 0.98)] = np.nan  # where the screen isn't
+    boards = [c for c in boards if c.target == boards[0].target]
+    cells = study.recordings.target(group[0].target)
+    if cells.size < FEWEST_CELLS or not 0.02 < float(np.mean(cells > 0)) < 0.98:
+        raise NotDetermined("bernoulli", f"{group[0].target} holds no random pattern of {FEWEST_CELLS} cells or more")
+    target = np.asarray(cells, float) / float(cells.max())
+    parts = [p for p in ([c for c in group if c.id not in out], [c for c in group if c.id in out]) if p]
+    seen = [(_rate(study, part) - black) / contrast for part in parts]
+    whole = np.average(seen, axis=0, weights=[len(p) for p in parts])
+    warp = register(
+        (_rate(study, boards) - black) / contrast, whole, study.recordings.target(boards[0].target),
+        (target > 0.5).astype(np.uint8), group[0].screen.cell_camera_px,
+    )  # fmt: skip
+    light = study.spectrum(group[0].screen.radiance) if group[0].screen.radiance else None
+    window = _window(whole, warp, target.shape)
+    reference = "Y" if camera.cfa == "MONO" else "G"
+    for _ in range(REFINEMENTS):
+        warp = _refined(study, whole, target, warp, window, reference, light)
+    canvas = _Canvas.of(target, warp, window)
+    turned = ndimage.gaussian_filter(np.nan_to_num(whole), TURNED_BLUR_PX)[::-1, ::-1]
+    found = []
+    for channel in camera.channels:
+        design = _Design.of(study, canvas, channel, light, whole, turned)
+        area = contrast[window][design.mask]
+        exposure = group[0].exposure_s
+        levels = (
+            float(np.nanmean(black[window][design.mask])) * exposure / study.noise.gain,
+            float(np.nanmean(white[window][design.mask])) * exposure / study.noise.gain,
+        )
+        for part, picture in zip(parts, seen, strict=True):
+            dn = np.maximum(picture[window][design.mask] * area + black[window][design.mask], 0.0) * exposure
+            temporal = (study.noise.gain * dn + study.noise.read_dn**2) / len(part) / (area * exposure) ** 2
+            value, shown, common = design.solved(picture[window][design.mask], temporal)
+            found.append(
+                Pattern(
+                    captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
+                    value=value, shown=shown, common=common, greys=design.greys, levels_e=levels, light=light,
+                    reach=design.reach,
+                )
+            )  # fmt: skip
+    return found
+
+
+def _window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """The part of the frame that is looked at: the pattern's middle, even numbers of rows and columns."""
+    row, col = (np.arange(0, n, 4) for n in seen.shape)
+    x, y = np.meshgrid(col, row)
+    cells = warp.cells(np.column_stack([x.ravel(), y.ravel()]).astype(float)).reshape(*x.shape, 2)
+    inside = (cells[..., 0] > 0) & (cells[..., 0] < shape[1]) & (cells[..., 1] > 0) & (cells[..., 1] < shape[0])
+    if not inside.any():
+        raise NotDetermined("bernoulli", "the pattern lies outside the frame")
+    slices = []
+    for at, length in ((y[inside], seen.shape[0]), (x[inside], seen.shape[1])):
+        low, high = max(int(at.min()) - RIM_PX, 0), min(int(at.max()) + RIM_PX + 4, length)
+        size = 2 * (min(high - low, LARGEST_PX) // 2)
+        low += (high - low - size) // 2
+        low -= low % 2  # mosaics keep their phase
+        slices.append(slice(low, low + size))
+    return slices[0], slices[1]
+
+
+@dataclass(frozen=True)
+class _Canvas:
+    """The pattern drawn by area on a window of the frame, `OVERSAMPLE` samples a pixel."""
+
+    warp: ScreenWarp
+    window: tuple[slice, slice]
+    fine: FloatArray
+    inside: NDArray[np.bool_]  # pixels well inside the pattern
+
+    @staticmethod
+    def of(target: FloatArray, warp: ScreenWarp, window: tuple[slice, slice]) -> _Canvas:
+        y, x = (np.arange(w.start - 16.0, w.stop + 24.0, 8.0) for w in window)
+        at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
+        row, col = (w.start + (np.arange(OVERSAMPLE * (w.stop - w.start)) + 0.5) / OVERSAMPLE - 0.5 for w in window)
+        cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(row, col) for k in (0, 1))
+        inside = np.ones((window[0].stop - window[0].start, window[1].stop - window[1].start), bool)
+        for cell, count in ((cell_x, target.shape[1]), (cell_y, target.shape[0])):
+            middle = cell[OVERSAMPLE // 2 :: OVERSAMPLE, OVERSAMPLE // 2 :: OVERSAMPLE]
+            inside &= (middle > PATTERN_RIM_CELLS) & (middle < count - PATTERN_RIM_CELLS)
+        inside[:RIM_PX] = inside[-RIM_PX:] = False
+        inside[:, :RIM_PX] = inside[:, -RIM_PX:] = False
+        return _Canvas(warp, window, np.asarray(area_drawn(target, cell_x, cell_y), float), inside)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of the window, px."""
+        return self.inside.shape[0], self.inside.shape[1]
+
+    def transform(self, fine: FloatArray) -> NDArray[np.complex128]:
+        """Of a fine picture, at frequencies below half a cycle a pixel: (rows, cols / 2 + 1), as of the window's own pixels."""
+        rows, cols = self.shape
+        whole = fft.rfft2(fine)[:, : cols // 2 + 1] / OVERSAMPLE**2
+        low = np.concatenate([whole[: rows // 2], whole[len(whole) - rows // 2 :]])
+        fy, fx = self.frequencies
+        # a sample is a mean over its square; a pixel's centre lies between samples
+        turn = np.exp(1j * np.pi * (fx + fy) * (1.0 - 1.0 / OVERSAMPLE))
+        return np.asarray(low * turn / (np.sinc(fx / OVERSAMPLE) * np.sinc(fy / OVERSAMPLE)))
+
+    @property
+    def frequencies(self) -> tuple[FloatArray, FloatArray]:
+        """fy (rows, 1) and fx (1, cols / 2 + 1), cy/px."""
+        return fft.fftfreq(self.shape[0])[:, None], fft.rfftfreq(self.shape[1])[None, :]
+
+    def picture(self, spectrum: NDArray[np.complex128]) -> FloatArray:
+        """Back to the window's pixels."""
+        return np.asarray(fft.irfft2(spectrum, self.shape))
+
+    def beyond(self, otf: CubicSpline, fill_factor: float, fine: FloatArray) -> FloatArray:
+        """What the lens passes of a fine picture above half a cycle a pixel, at the pixels."""
+        rows, cols = (OVERSAMPLE * n for n in self.shape)
+        fy, fx = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[:, None], fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
+        high = fft.rfft2(fine)
+        high[np.broadcast_to((np.abs(fy) < 0.5) & (fx < 0.5), high.shape)] = 0.0
+        reach = float(otf.x[-1])
+        where = np.hypot(fy, fx) < reach
+        high *= np.where(where, otf(np.minimum(np.hypot(fy, fx), reach)), 0.0) * aperture_otf(fx, fy, fill_factor)
+        high *= np.exp(1j * np.pi * fx * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fx / OVERSAMPLE)
+        high *= np.exp(1j * np.pi * fy * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fy / OVERSAMPLE)
+        folded = fft.ifft(high.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE, axis=0)
+        return np.asarray(fft.irfft(folded, cols, axis=1)[:, ::OVERSAMPLE])
+
+
+def _lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:
+    """The baseline's transfer without the pixel's aperture: it looks the same all around the axis."""
+    f = np.linspace(0.0, 2.0, 101)
+    whole = np.real(optical_transfer(study.camera, channel, light, f, 0.0 * f, (), "bernoulli"))
+    return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
+
+
+def _refined(
+    study: Study,
+    seen: FloatArray,
+    target: FloatArray,
+    warp: ScreenWarp,
+    window: tuple[slice, slice],
+    channel: str,
+    light: Spectrum | None,
+) -> ScreenWarp:
+    """The registration from the corners, improved by the pattern itself: a step of Gauss and Newton's method."""
+    canvas, otf = _Canvas.of(target, warp, window), _lens_otf(study, channel, light)
+    fy, fx = canvas.frequencies
+    spectrum = canvas.transform(canvas.fine) * otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, study.camera.fill_factor)
+    mask = _pixels(study, canvas, channel, seen)
+    picture, across, down = (
+        canvas.picture(part * spectrum)[mask] for part in (_below(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
+    )
+    picture = picture + canvas.beyond(otf, study.camera.fill_factor, canvas.fine)[mask]
+    row, col = np.nonzero(mask)
+    terms = warp.basis(np.column_stack([col + window[1].start, row + window[0].start]).astype(float))
+    columns = np.concatenate([across * terms, down * terms, [picture, np.ones_like(picture)]])
+    step = np.linalg.lstsq(columns @ columns.T, columns @ (seen[window][mask] - picture), rcond=1e-12)[0]
+    return warp.displaced(step[:-2].reshape(2, -1))
+
+
+def _pixels(study: Study, canvas: _Canvas, channel: str, seen: FloatArray) -> NDArray[np.bool_]:
+    mask = canvas.inside & np.isfinite(seen[canvas.window])
+    step = mosaic.step(study.camera.cfa)
+    own = np.zeros_like(mask)
+    for row, col in mosaic.phases(study.camera.cfa)[channel]:
+        own[row::step, col::step] = True
+    mask &= own
+    if mask.sum() < LEAST_PIXELS:
+        raise NotDetermined(
+            "bernoulli", f"only {mask.sum()} pixels of channel {channel} see the pattern, {LEAST_PIXELS} needed"
+        )
+    return mask
+
+
+@dataclass(frozen=True)
+class _Design:
+    """What a channel's pixels are explained by: columns (coefficients, pixels), and what isn't free, (pixels,)."""
+
+    mask: NDArray[np.bool_]
+    bands: tuple[Band, ...]
+    columns: FloatArray
+    fixed: FloatArray
+    inverse: FloatArray  # of the normal matrix
+    greys: FloatArray
+    reach: float
+
+    @staticmethod
+    def of(
+        study: Study, canvas: _Canvas, channel: str, light: Spectrum | None, seen: FloatArray, turned: FloatArray
+    ) -> _Design:
+        camera = study.camera
+        fy, fx = canvas.frequencies
+        radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
+        otf = _lens_otf(study, channel, light)
+        passed = otf(radius) * aperture_otf(fx, fy, camera.fill_factor)
+        spectrum = canvas.transform(canvas.fine) * passed
+        mask = _pixels(study, canvas, channel, seen)
+        power = np.abs(spectrum) ** 2
+        bands, columns = [], []
+        low_part = np.zeros(canvas.shape)
+        for i, (low, high) in enumerate(pairwise(RINGS_CY_PER_PX)):
+            ring = (radius >= low) & (radius < high)
+            for k in range(SECTORS if i else 1):
+                middle = k * np.pi / SECTORS
+                away = np.mod(angle - middle + 0.5 * np.pi, np.pi) - 0.5 * np.pi
+                part = ring & (np.abs(away) <= 0.5 * np.pi / SECTORS) if i else ring
+                if not part.any():
+                    continue
+                picture = canvas.picture(np.where(part, spectrum, 0.0))
+                low_part += picture
+                columns.append(picture[mask])
+                bands.append(_band(part, radius, away, middle, power, (low, high), whole=not i))
+        fixed = (
+            canvas.beyond(otf, camera.fill_factor, canvas.fine)
+            + canvas.picture(np.where((radius >= RINGS_CY_PER_PX[-1]) & _below(canvas), spectrum, 0.0))
+        )[mask]
+        picture = low_part[mask] + fixed
+        across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
+        row, col = np.nonzero(mask)
+        half = 0.5 * float(np.hypot(camera.rows, camera.cols))
+        u = (col + canvas.window[1].start - 0.5 * (camera.cols - 1)) / half
+        v = (row + canvas.window[0].start - 0.5 * (camera.rows - 1)) / half
+        r2 = u * u + v * v
+        # light that lands further out by s has the picture of a place nearer by s
+        outwards, around = -(u * across + v * down), -(u * down - v * across)
+        grey = np.clip(picture, 0.0, 1.0)
+        more = [
+            grey * (1.0 - grey),
+            turned[canvas.window][mask],
+            np.ones_like(picture),
+            across,
+            down,
+            outwards,
+            r2 * outwards,
+            around,
+        ]
+        table = np.array(columns + more)
+        scale = np.sqrt(np.mean(table**2, axis=1))
+        normal = (table / scale[:, None]) @ (table / scale[:, None]).T
+        inverse = np.linalg.inv(normal) / np.outer(scale, scale)
+        bent = canvas.transform(canvas.fine**2) * passed
+        lost = canvas.picture(bent - spectrum)[mask]
+        return _Design(mask, tuple(bands), table, fixed, inverse, inverse @ (table @ lost), float(np.sqrt(r2.max())))
+
+    def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Coefficients; their covariance by `temporal`, the variance (pixels,) that repeats average out; and by the rest.
+
+        Pixels scatter unequally: the covariance is that of the residuals as they are (White 1980).
+        """
+        value = self.inverse @ (self.columns @ (seen - self.fixed))
+        left = seen - self.fixed - value @ self.columns
+        spread = self.inverse @ ((self.columns * left**2) @ self.columns.T) @ self.inverse
+        shown = self.inverse @ ((self.columns * temporal) @ self.columns.T) @ self.inverse
+        share = max(1.0 - float(temporal.mean() / np.mean(left**2)), 0.0)
+        return value, shown, share * spread
+
+
+def _below(canvas: _Canvas) -> NDArray[np.bool_]:
+    """Frequencies below half a cycle a pixel along both axes."""
+    fy, fx = canvas.frequencies
+    return np.asarray((np.abs(fy) < 0.5) & (fx < 0.5))
+
+
+def _band(
+    part: NDArray[np.bool_],
+    radius: FloatArray,
+    away: FloatArray,
+    middle: float,
+    power: FloatArray,
+    ends: tuple[float, float],
+    *,
+    whole: bool,
+) -> Band:
+    """Nodes where the band's power is: its cells, gathered by radius and angle."""
+    r, a, p = radius[part], away[part], power[part]
+    span = np.pi if whole else np.pi / SECTORS
+    i = np.minimum(((r - ends[0]) / (ends[1] - ends[0]) * NODES[0]).astype(int), NODES[0] - 1)
+    j = np.clip(((a / span + 0.5) * NODES[1]).astype(int), 0, NODES[1] - 1)
+    cell = i * NODES[1] + j
+    p = np.where(r > 0, p, 0.0)  # the mean isn't blurred
+    total = np.bincount(cell, p, NODES[0] * NODES[1])
+    keep = total > 0
+    at_r = np.bincount(cell, p * r, len(total))[keep] / total[keep]
+    at_a = middle + np.bincount(cell, p * a, len(total))[keep] / total[keep]
+    share = total[keep] / total.sum()
+    return Band(float(share @ at_r), float(np.rad2deg(middle)), at_r * np.cos(at_a), at_r * np.sin(at_a), share)
+
+
+# --- blocks ----------------------------------------------------------------------------------------------------------------
+
+
+def contrast_block(study: Study) -> Block:
+    """Contrast that a random pattern keeps, over the baseline's, by frequency, orientation and channel."""
+    found = patterns(study)
+    labels: list[Label] = []
+    places: list[tuple[int, Pattern, int]] = []
+    for number, group in enumerate(found):
+        for p in group:
+            spread = np.sqrt(np.diag(p.shown + p.common))
+            for b, band in enumerate(p.bands):
+                if spread[b] < LARGEST_STD and b > 0:  # the lowest band is the levels'
+                    places.append((number, p, b))
+                    labels.append(Label(band.frequency, p.channel, f"{band.angle_deg:.0f} deg", p.captures, p.held_out))
+    if not places:
+        raise NotDetermined("bernoulli", "the patterns are too noisy, or too few of their cells are in view")
+    value = np.array([p.value[b] for _, p, b in places])
+    frequency = np.array([label.x for label in labels])
+    covariance = _joint(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
+    scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.ones(len(places))
+        if effects:
+            kept: dict[tuple[str, Spectrum | None, int], FloatArray] = {}
+            for k, (number, p, b) in enumerate(places):
+                key = p.channel, p.light, number
+                if key not in kept:
+                    kept[key] = _contrasts(study, p, effects)
+                mean[k] = kept[key][b]
+                if not np.isfinite(mean[k]):
+                    mean[k] = 1.0
+        slopes = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
+        for name in dict.fromkeys(scales):
+            slopes[name] = CONTRAST_SCALE_STD * mean * np.array([s == name for s in scales])
+        return Prediction(mean, slopes)
+
+    return Block(
+        measurement="bernoulli", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=covariance,
+        labels=tuple(labels), hooks=frozenset({"transfer", "transmittance", "screen"}), predict=predict,
+        scale=np.ones(len(value)), conditions="orientation", conditions_words="patterns' parts at",
+    )  # fmt: skip
+
+
+def _joint(places: Sequence[tuple[int, Pattern, int]], study: Study) -> FloatArray:
+    """Covariance of coefficients: parts of one pattern in one channel share white, black and drawing."""
+    n = len(places)
+    table = np.zeros((n, n))
+    for i, (g, p, b) in enumerate(places):
+        for j in range(i, n):
+            h, q, c = places[j]
+            if g != h or p.channel != q.channel:
+                continue
+            both = p.common[b, c] if p is q else 0.5 * (p.common[b, c] + q.common[b, c])
+            table[i, j] = table[j, i] = both + (p.shown[b, c] if p is q else 0.0)
+    return table
+
+
+def _contrasts(study: Study, p: Pattern, effects: Effects) -> FloatArray:
+    """Contrast in every band with the effects over that without."""
+    fx, fy = np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])
+    plain = np.real(optical_transfer(study.camera, p.channel, p.light, fx, fy, (), "bernoulli"))
+    changed = np.real(optical_transfer(study.camera, p.channel, p.light, fx, fy, effects, "bernoulli"))
+    ratio = changed / np.where(np.abs(plain) > 1e-3, plain, np.inf)
+    ends = np.cumsum([len(b.fx) for b in p.bands])
+    parts = [float(b.share @ ratio[e - len(b.fx) : e]) for b, e in zip(p.bands, ends, strict=True)]
+    return np.array(parts) + _greyness(effects, study) * p.greys[: len(p.bands)]
+
+
+def _greyness(effects: Effects, study: Study) -> float:
+    """By how much the screen darkens greys, over what squaring them would do: rims' mean light decides."""
+    grey = np.linspace(0.0, 1.0, 41)
+    shown = grey
+    for effect in effects:
+        shown = effect.screen(shown, np.zeros(41), np.zeros(41), study.camera)
+    return float(np.trapezoid(grey - shown, grey) / np.trapezoid(grey - grey**2, grey))
+
+
+def rim_block(study: Study) -> Block:
+    """What rims between lit and dark cells lack or have too much of: greys that screen or camera show otherwise."""
+    found = patterns(study)
+    points = [(g, p, len(p.bands) + RIM) for g, group in enumerate(found) for p in group]
+    value = np.array([p.value[b] for _, p, b in points])
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(points))
+        bent = any(type(e).response is not Effect.response for e in effects)
+        for k, (_, p, b) in enumerate(points):
+            mean[k] = _greyness(effects, study) * p.greys[b]
+            if bent:
+                low, high = p.levels_e
+                out = np.array([low, 0.5 * (low + high), high])
+                for effect in effects:
+                    out = effect.response(out, study.camera)
+                # a bend a y (1 - y) lifts the middle by a / 4
+                mean[k] += 4.0 * float((out[1] - out[0]) / (out[2] - out[0]) - 0.5)
+        return Prediction(mean, {})
+
+    return Block(
+        measurement="screen_rims", axis="level", unit="1", reach=1e9, value=value,
+        covariance=_joint(points, study) + np.diag(np.full(len(value), RIM_FLOOR**2)),
+        labels=tuple(Label(float(i), p.channel, "rims of cells", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
+        hooks=frozenset({"screen", "response"}), predict=predict, scale=np.ones(len(value)), places="rims",
+    )  # fmt: skip
+
+
+def colour_block(study: Study) -> Block:
+    """How far out red and blue detail of a pattern lies against green, at two distances from the frame's middle, and its turn."""
+    if "G" not in study.channels:
+        raise NotDetermined("lateral_colour", "one channel: nothing to hold it against")
+    points: list[tuple[Pattern, Pattern]] = []
+    for group in patterns(study):
+        for p in group:
+            if p.channel != "G":
+                green = next(q for q in group if q.channel == "G" and q.held_out == p.held_out)
+                points.append((p, green))
+    values, labels, places = [], [], []
+    n = len(points)
+    covariance = np.zeros((3 * n, 3 * n))
+    for i, (p, green) in enumerate(points):
+        near, far = 0.5 * p.reach, p.reach
+        table = np.array([[near, near**3, 0.0], [far, far**3, 0.0], [0.0, 0.0, far]])
+        at = np.array([len(p.bands) + k for k in (RADIAL, RADIAL3, ACROSS)])
+        values.append(table @ (p.value[at] - green.value[at]))
+        for j, (q, other) in enumerate(points):
+            if p.channel != q.channel or p.light is not q.light:
+                continue
+            both = sum((a.common + b.common)[np.ix_(at, at)] for a, b in ((p, q), (green, other))) / 2.0
+            if i == j:
+                both = both + (p.shown + green.shown)[np.ix_(at, at)]
+            covariance[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = table @ both @ table.T
+        for k, (distance, way) in enumerate(((near, "outwards"), (far, "outwards"), (far, "around"))):
+            labels.append(Label(distance, p.channel, way, p.captures, p.held_out))
+            places.append((p, distance, k < 2))
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(places))
+        if effects:
+            for k, (p, distance, outwards) in enumerate(places):
+                if outwards:
+                    mean[k] = colour_shift_px(study, p.channel, distance, p.light, effects)
+        return Prediction(mean, {})
+
+    return Block(
+        measurement="lateral_colour", axis="field", unit="half diagonals", reach=0.5, value=np.concatenate(values),
+        covariance=covariance + np.diag(np.full(3 * n, COLOUR_FLOOR_PX**2)), labels=tuple(labels),
+        hooks=frozenset({"image_shift_um"}), predict=predict, scale=np.ones(3 * n), conditions="direction",
+    )  # fmt: skip
+
+
+def colour_shift_px(
+    study: Study, channel: str, distance: float, light: Spectrum | None, effects: Effects, kind: str = "bernoulli"
+) -> float:
+    """How far a channel's detail lands outside of green's, px, at a distance from the middle in half diagonals: the mean of four
+    directions, by the light that each channel detects."""
+    camera = study.camera
+    wavelength = np.arange(400.0, 721.0, 10.0)
+    half_um = 0.5 * float(np.hypot(camera.rows, camera.cols)) * camera.pixel_pitch_um
+    turn = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
+    x, y = distance * half_um * np.cos(turn), distance * half_um * np.sin(turn)
+    outwards = np.zeros(len(wavelength))
+    for i, w in enumerate(wavelength):
+        for effect in effects:
+            shift = effect.image_shift_um(x, y, float(w), camera)
+            if shift is not None:
+                outwards[i] += float(np.mean(shift[0] * np.cos(turn) + shift[1] * np.sin(turn)))
+    if not outwards.any():
+        return 0.0
+    radiance = np.ones_like(wavelength) if light is None else light.at(wavelength)
+    for effect in effects:
+        radiance = effect.radiance(wavelength, radiance, kind) * effect.transmittance(wavelength, 0.0)
+    seen = [radiance * wavelength * camera.quantum_efficiency[c].at(wavelength) for c in (channel, "G")]
+    own, green = (float(s @ outwards / max(s.sum(), 1e-300)) for s in seen)
+    return (own - green) / camera.pixel_pitch_um
+
+
+# --- the screen's own pixels -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Line:
+    """The strongest line in a lit screen's spectrum, over what noise leaves anywhere."""
+
+    channel: str
+    captures: tuple[str, ...]
+    cycles_per_px: float
+    power: float  # over the noise's mean
+    per_amplitude: float  # power of a line that a grid of amplitude 1 gives
+    places: int
+
+    def normal(self, power: float) -> float:
+        """The standard normal number that is as rare as the largest of `places` exponential numbers being `power`."""
+        rare = np.log(self.places) - power  # logarithm of the probability, far out
+        if rare < -600.0:
+            return float(np.sqrt(-2.0 * rare))
+        return float(stats.norm.isf(-np.expm1(-np.exp(rare))))
+
+
+def grid_block(study: Study) -> Block:
+    """The strongest line in the spectrum of the lit screen by channel, as a standard normal number: rows' and columns' lines, and
+    lines that uniform light shows as well, are the camera's and don't count."""
+    groups = study.groups(White, lambda c: (c.screen.pose, c.exposure_s))
+    if not groups:
+        raise NotDetermined("screen_grid", "no white captures")
+    found: list[_Line] = []
+    reason = ""
+    for group in groups:
+        for channel in study.channels:
+            try:
+                found.append(_line(study, group, channel))
+            except NotDetermined as refused:
+                reason = refused.reason
+    if not found:
+        raise NotDetermined("screen_grid", reason)
+    half = np.arange(48) * 0.37 * study.camera.pixel_pitch_um
+    x, y = np.meshgrid(half, half)
+
+    def predict(effects: Effects) -> Prediction:
+        shown = np.ones_like(x)
+        for effect in effects:
+            shown = effect.screen(shown, x, y, study.camera)
+        size = 2.0 * float(np.std(shown)) / float(np.mean(shown))
+        return Prediction(
+            np.array(
+                [max(line.normal(size**2 * line.per_amplitude + 1.0), 0.0) if size > 0 else 0.0 for line in found]
+            ),
+            {},
+        )
+
+    return Block(
+        measurement="screen_grid", axis="spatial_frequency", unit="cy/px", reach=1e9,
+        value=np.array([line.normal(line.power) for line in found]), covariance=np.eye(len(found)),
+        labels=tuple(Label(line.cycles_per_px, line.channel, "lit screen", line.captures, False) for line in found),
+        hooks=frozenset({"screen"}), predict=predict, scale=np.ones(len(found)),
+    )  # fmt: skip
+
+
+def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
+    step = mosaic.step(study.camera.cfa)
+    row, col = mosaic.phases(study.camera.cfa)[channel][0]
+    plane = _rate(study, group)[row::step, col::step]
+    bright = plane > 0.5 * np.quantile(plane, 0.98)
+    box = _box(bright)
+    power, noise, window = _power(plane[box], step)
+    fy, fx = fft.fftfreq(window.shape[0])[:, None], fft.rfftfreq(window.shape[1])[None, :]
+    count = (fx > 2.5 / window.shape[1]) & (np.abs(fy) > 2.5 / window.shape[0]) & (np.hypot(fx, fy) > GRID_LOWEST)
+    flats = study.flat_levels()
+    if flats:
+        lit = [study.recordings.frame(c)[row::step, col::step] - study.noise.black for c in flats[len(flats) // 2]]
+        of_flats, level, _ = _power(np.mean(lit, axis=0)[box], step)
+        count &= ndimage.maximum_filter(of_flats / level, 3) < GRID_OF_CAMERA
+    relative = np.where(count, power / noise, 0.0)
+    i, j = np.unravel_index(int(np.argmax(relative)), relative.shape)
+    # a cos a cos is four lines of a quarter each
+    unit = (0.25 * window.sum()) ** 2 / noise[i, j]
+    return _Line(
+        channel, tuple(c.id for c in group), float(np.hypot(fy[i, 0], fx[0, j])) / step, float(relative[i, j]), float(unit), int(0.6 * count.sum())
+    )  # fmt: skip
+
+
+def _box(bright: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """A rectangle well inside the lit part."""
+    slices = []
+    for axis in (0, 1):
+        share = bright.mean(axis=1 - axis)
+        use = np.flatnonzero(share > 0.9 * share.max())
+        low, high = int(use[0]) + 4, int(use[-1]) - 3
+        spare = max(high - low - GRID_LARGEST, 0) // 2
+        slices.append(slice(low + spare, high - spare))
+    box = slices[0], slices[1]
+    if min(s.stop - s.start for s in box) < 24 or bright[box].mean() < 0.98:
+        raise NotDetermined("screen_grid", "the lit screen fills too little of the frame")
+    return box
+
+
+def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Power spectrum of a plane over its smooth part, the mean that noise has at every frequency, and the window."""
+    smooth = ndimage.gaussian_filter(plane, GRID_DETREND_PX / step, mode="nearest")
+    window = np.outer(np.hanning(plane.shape[0]), np.hanning(plane.shape[1]))
+    relative = plane / np.maximum(smooth, 1e-12) - 1.0
+    # one pixel that is far off is no line
+    relative = np.clip(relative, *np.quantile(relative, [0.0005, 0.9995]))
+    power = np.abs(fft.rfft2(relative * window)) ** 2
+    fy, fx = fft.fftfreq(plane.shape[0])[:, None], fft.rfftfreq(plane.shape[1])[None, :]
+    ring = np.minimum((np.hypot(fy, fx) * 20.0).astype(int), 13)
+    noise = np.ones_like(power)
+    for k in range(14):
+        if np.any(ring == k):
+            noise[ring == k] = np.median(power[ring == k]) / np.log(2.0)
+    return power, np.maximum(noise, 1e-300), window

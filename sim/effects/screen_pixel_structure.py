@@ -1,0 +1,47 @@
+"""The grid of a screen's own pixels, seen through the lens."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+
+class ScreenPixelStructure(Effect):
+    """Factor 1 + a cos(2 pi x / p) cos(2 pi y / p) on a lit screen's light, x and y from the frame's centre, p the period at the
+    sensor: the grid's first harmonic, which is what a lens passes. Where it is finer than half the pixels it beats."""
+
+    name: ClassVar[str] = "screen_pixel_structure"
+    stage: ClassVar[Stage] = Stage.RIG
+    reference: ClassVar[str] = "I. Amidror, The Theory of the Moire Phenomenon, Springer 2009"
+    form_tolerance: ClassVar[float] = 0.3
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"white"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"period_px"})
+    rivals: ClassVar[frozenset[str]] = frozenset()
+    sentence: ClassVar[str] = (
+        "The screen's own pixels are resolved: a fine grid lies over everything that it shows, and over nothing else."
+    )
+
+    amplitude_percent: Annotated[
+        float,
+        Quantity("%", "amplitude before the lens", lower=0.0, upper=100.0, prior=(0.0, 10.0), absent=0.0),
+    ] = 0.0
+    period_px: Annotated[
+        float, Quantity("px", "period in camera pixels", lower=1.0, upper=30.0, prior=(3.5, 1.0), absent=3.5)
+    ] = 3.5
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return ((cls(amplitude_percent=20.0),),)
+
+    def screen(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
+        if self.amplitude_percent == 0.0:
+            return share
+        turns = 2.0 * np.pi / (self.period_px * camera.pixel_pitch_um)
+        return np.asarray(share * (1.0 + 0.01 * self.amplitude_percent * np.cos(turns * x_um) * np.cos(turns * y_um)))

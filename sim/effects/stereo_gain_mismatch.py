@@ -1,0 +1,38 @@
+"""Stereo gain mismatch: one side of a pair answers a scene more strongly than its own calibration says."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+
+
+class StereoGainMismatch(Effect):
+    """I_right = (1 + a) I_left in every scene that both see, beyond what either side's captures of uniform light say.
+
+    What both sides' sensitivities differ by is each camera's own and no mismatch: this is what changes between calibration and
+    use, an automatic gain, an iris that was turned, a window before one side.
+    """
+
+    name: ClassVar[str] = "stereo_gain_mismatch"
+    stage: ClassVar[Stage] = Stage.RIG
+    reference: ClassVar[str] = "H. Hirschmueller and D. Scharstein, IEEE Trans. PAMI 31, 1582 (2009)"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset(
+        {"exposure", "wavelength", "field", "level", "orientation", "time"}
+    )
+    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco", "white", "chart"})
+    rivals: ClassVar[frozenset[str]] = frozenset()
+    sentence: ClassVar[str] = (
+        "In the same scene the right camera answers otherwise, beside the left one, than both do to uniform light: by one factor "
+        "over the whole scene."
+    )
+
+    gain_percent: Annotated[
+        float,
+        Quantity("%", "right over left, beyond both calibrations", lower=-60.0, upper=150.0, prior=(0.0, 3.0), absent=0.0),
+    ] = 0.0  # fmt: skip
+
+    def scene_gain(self) -> float:
+        return 1.0 + 0.01 * self.gain_percent
