@@ -1,4 +1,4 @@
-"""What is free of the maker's sensitivity curves: a scale, a tilt, a bend and a smooth few per mille."""
+"""What is free of the maker's sensitivity curves: a scale, a tilt, a bend, a smooth few per mille, and a little everywhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from sim.effects.base import Effect
 from sim.forward import electron_rate
 from sim.spectrum import FloatArray, Spectrum
 
-LEAK_STD = 2.0e-4  # of the curve's peak: blindness that a data sheet rounds away
+LEAK_STD = 2.0e-4  # of the curve's peak, alike at all wavelengths: blindness that isn't quite
+MOST_DECIMALS = 6  # of a curve's values; with fewer they are rounded
 CURVE_SCALE_STD = 0.2  # of the sensitivity: holds gain, aperture and lens too
 CURVE_TILT_STD = 0.05  # per 100 nm
 CURVE_BEND_STD = 0.01  # per (100 nm)^2
@@ -24,8 +25,8 @@ CURVE_STEP_NM = 2.5  # of a curve that is written out
 class CurveSlopes:
     """Electron rates of a list of (light, channel), and their slopes by what is free of the maker's curves.
 
-    Per channel: scale, tilt, bend, a rough part on knots with a squared-exponential prior, and what the curve does between the
-    samples that the maker gives. The slope by a factor
+    Per channel: scale, tilt, bend, a rough part on knots with a squared-exponential prior, a leak, and what the curve does between
+    the samples that the maker gives. The slope by a factor
     (1 + d(w)) on the curve is the rate with the curve times d: exact, as the rate is linear in the curve. The baseline's rates
     are `sim.forward`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
     """
@@ -39,54 +40,71 @@ class CurveSlopes:
         high = max(light.arrays[0][-1] for light in lights.values())
         self.wavelength = np.arange(np.floor(low), np.ceil(high) + 1.0)
         self.radiance = {path: light.at(self.wavelength) for path, light in lights.items()}
-        curve = {c: q.at(self.wavelength) * self.wavelength for c, q in camera.quantum_efficiency.items()}
+        curve = {c: q.at(self.wavelength) for c, q in camera.quantum_efficiency.items()}
         ones = np.ones_like(self.wavelength)
-        self._curve = np.array(
-            [curve[c] * (r.at(self.wavelength) if r is not None else ones) for _, c, _, _, r in items]
-        )
-        self._weight = np.array([self.radiance[path] for path, *_ in items]) * self._curve
+        photons = np.array([self.wavelength * (r.at(self.wavelength) if r is not None else ones) for *_, r in items])
+        self._curve = photons * np.array([curve[c] for _, c, *_ in items])
+        # of a sensitivity that is the same at all wavelengths
+        self._level = photons * np.array([[LEAK_STD * max(camera.quantum_efficiency[c].value)] for _, c, *_ in items])
+        self._all_radiance = np.array([self.radiance[path] for path, *_ in items])
+        self._weight = self._all_radiance * self._curve
         self._total = self._weight.sum(1)
         self._rate = np.array(
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
         )
+        self._per_weight = {
+            c: max(
+                (
+                    rate / total
+                    for rate, total, item in zip(self._rate, self._total, items, strict=True)
+                    if item[1] == c and total > 0
+                ),
+                default=0.0,
+            )
+            for c in curve
+        }
         self._kept: dict[tuple[Effect, ...], tuple[FloatArray, FloatArray]] = {}
         self._modes = curve_modes(self.wavelength)
         between = {c: _between_samples(q, self.wavelength) for c, q in camera.quantum_efficiency.items()}
         self._between = np.array([between[c] for _, c, *_ in items])
 
     @cached_property
-    def blind(self) -> FloatArray:
-        """Electrons that a flat sensitivity of LEAK_STD of the curve's peak would leave, (n,)."""
+    def rounding(self) -> FloatArray:
+        """Standard deviation of the electrons a second that the rounding of the curves' values leaves open, (n,): each value by itself."""
         found = []
-        for path, channel, exposure, _, reflectance in self.items:
-            curve = self.study.camera.quantum_efficiency[channel]
-            flat = self.study.camera.model_copy(
-                update={
-                    "quantum_efficiency": {channel: Spectrum.of((300.0, 1100.0), (LEAK_STD * max(curve.value),) * 2)}
-                }
+        for i, (path, channel, *_) in enumerate(self.items):
+            samples, value = self.study.camera.quantum_efficiency[channel].arrays
+            share = self.radiance[path] * self._level[i] / (LEAK_STD * value.max())
+            at = np.clip(np.searchsorted(samples, self.wavelength) - 1, 0, len(samples) - 2)
+            upper = np.clip((self.wavelength - samples[at]) / (samples[at + 1] - samples[at]), 0.0, 1.0)
+            each = np.bincount(at, share * (1 - upper), len(samples)) + np.bincount(at + 1, share * upper, len(samples))
+            found.append(
+                _last_place(value) / np.sqrt(12.0) * self._per_weight[channel] * float(np.sqrt(np.sum(each**2)))
             )
-            found.append(electron_rate(flat, channel, self.study.spectrum(path), reflectance=reflectance) * exposure)
         return np.array(found)
 
     def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
         """Rates (n,) and the modes' shares in them (n, modes)."""
         spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
         if spectral not in self._kept:
-            weight = self._weight
+            weight, level = self._weight, self._all_radiance * self._level
             if any(type(e).radiance is not Effect.radiance for e in spectral):
                 lit = dict(self.radiance)
                 for effect in spectral:
                     lit = {path: effect.radiance(self.wavelength, value, self.kind) for path, value in lit.items()}
-                weight = np.array([lit[path] for path, *_ in self.items]) * self._curve
+                changed = np.array([lit[path] for path, *_ in self.items])
+                weight, level = changed * self._curve, changed * self._level
             for effect in spectral:
-                weight = weight * effect.transmittance(self.wavelength, np.asarray(0.0))
+                through = effect.transmittance(self.wavelength, np.asarray(0.0))
+                weight, level = weight * through, level * through
             total = weight.sum(1)
             rate = self._rate * total / np.maximum(self._total, 1e-300)
             table = np.column_stack([weight @ self._modes.T, (weight * self._between).sum(1)])
             shares = table / np.maximum(total, 1e-300)[:, None]
             if len(self._kept) > 500:
                 self._kept.clear()
-            self._kept[spectral] = rate, rate[:, None] * shares
+            leak = level.sum(1) * np.array([self._per_weight[c] for _, c, *_ in self.items])
+            self._kept[spectral] = rate, np.column_stack([rate[:, None] * shares, leak])
         return self._kept[spectral]
 
     def rates(self, effects: Effects) -> FloatArray:
@@ -132,6 +150,14 @@ def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) 
     changes = np.vstack([relative, np.full_like(grid, LEAK_STD * max(curve.value))])
     value = curve.at(grid) + sum(quantities[name] * changes[int(name.rsplit(":", 1)[1])] for name in names)
     return Spectrum.of(grid, np.clip(value, 0.0, 1.0))
+
+
+def _last_place(value: FloatArray) -> float:
+    """The step in which a curve's values are given: 10^-d for d decimals."""
+    for decimals in range(1, MOST_DECIMALS):
+        if np.all(np.abs(value * 10**decimals - np.round(value * 10**decimals)) < 1e-3):
+            return float(10.0**-decimals)
+    return float(10.0**-MOST_DECIMALS)
 
 
 def _between_samples(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:

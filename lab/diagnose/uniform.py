@@ -30,8 +30,10 @@ from sim.forward import electron_rate
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-LEVEL_FLOOR = 1.0e-4  # of a level: non-linearity below what a linear camera may have, and rounding
-RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels
+LEVEL_FLOOR = 1.0e-4  # of a level, one for its repeats: non-linearity below what a linear camera may have, and rounding
+RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels, where too few readings say less
+READING_STD = 1e-4  # what readings scatter at least
+_READINGS = 8  # wavelengths from which on their own scatter tells
 SHADING_FLOOR = 5e-4
 AXIS_STD, AXIS_STD_KNOWN = 0.01, 0.004  # of the frame's diagonal: the optical axis without and with a fitted geometry
 
@@ -85,10 +87,7 @@ def linearity_block(study: Study) -> Block:
         low = mine & (signal < 0.6 * (study.saturation_dn - noise.black))
         use = low if low.sum() > 1 else mine
         rate[pair] = float(np.sum(signal[use]) / np.sum(scaled[use])) / noise.gain / float(study.field.light.mean())
-    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
-    covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels + (LEVEL_FLOOR * signal) ** 2)
-    same = np.array([[a[0].id == b[0].id for b in points] for a in points])
-    covariance += same * (np.outer(signal, signal) * noise.jitter_lamp**2 + noise.jitter_dn**2)
+    covariance = _level_covariance(study, groups, points, signal)
 
     def predict(effects: Effects) -> Prediction:
         camera = study.camera
@@ -128,6 +127,48 @@ def linearity_block(study: Study) -> Block:
     )  # fmt: skip
 
 
+def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
+    """Of flat frames' levels: shot and read noise, the lamp's scatter (one for a frame's channels), and what is one for repeats."""
+    noise = study.noise
+    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
+    group_of = {c.id: i for i, group in enumerate(groups) for c in group}
+    group = np.array([group_of[c.id] for c, *_ in points])
+    channel_of = np.array([channel for _, channel, *_ in points])
+    repeats = (group[:, None] == group) & (channel_of[:, None] == channel_of)
+    covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels)
+    covariance += repeats * np.outer(signal, signal) * LEVEL_FLOOR**2
+    same = np.array([[a[0].id == b[0].id for b in points] for a in points])
+    scatter = signal * _scatter(study, groups)[group]
+    covariance += same * (np.outer(scatter, scatter) + noise.jitter_dn**2)
+    return np.asarray(covariance)
+
+
+#: Repeats' worth of trust in the scatter of all flat frames beside that of one setting's.
+_COMMON_REPEATS = 4
+
+
+def _scatter(study: Study, groups: list[list[Any]]) -> FloatArray:
+    """Relative scatter of a frame's level by group: all flat frames', or more where a setting's own repeats scatter more, as in a
+    flickering light that short exposures don't average."""
+    noise = study.noise
+    found = np.full(len(groups), noise.jitter_lamp)
+    for i, group in enumerate(groups):
+        channels = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
+        if len(group) < 2 or not channels:
+            continue
+        size = np.array([study.levels(group[0]).pixels[c] for c in channels], float)
+        levels = np.array([[study.levels(k).mean[c] or 0.0 for c in channels] for k in group]) - noise.black
+        total = levels @ size
+        if total.mean() <= 0:
+            continue
+        shot = float(((noise.gain * levels.mean(0) + noise.read_dn**2) * size).sum()) / total.mean() ** 2
+        free = len(group) - 1
+        own = max(float(np.var(total / total.mean(), ddof=1)) - shot, 0.0)
+        pooled = (_COMMON_REPEATS * noise.jitter_lamp**2 + free * own) / (_COMMON_REPEATS + free)
+        found[i] = np.sqrt(max(pooled, noise.jitter_lamp**2))
+    return found
+
+
 def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:
     """(capture, channel, mean DN, held out) of every flat frame's unclipped channels."""
     points = []
@@ -163,18 +204,22 @@ def narrowband_block(study: Study) -> Block:
     noise = study.noise
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 0.0)
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
-    same = np.array([[a[0].id == b[0].id for b in points] for a in points])
     curves = CurveSlopes(study, [(c.radiance, channel, c.exposure_s, "narrowband", None) for c, channel, *_ in points])
     every = list(dict.fromkeys(c.radiance for c, *_ in points))
     known = [c for c in study.channels if c in study.camera.quantum_efficiency]
     whole = CurveSlopes(study, [(path, c, 1.0, "narrowband", None) for path in every for c in known])
-    blind = (
-        curves.blind * float(study.field.light.mean()) * noise.gain
-    )  # DN that a curve at LEAK_STD of its peak would leave
-    covariance = np.diag(
-        (noise.gain * signal + noise.read_dn**2) / pixels + (NARROWBAND_FLOOR * signal) ** 2 + blind**2
-    )
-    covariance += same * (np.outer(signal, signal) * RADIOMETER_STD**2 + noise.jitter_dn**2)
+    rounded = curves.rounding * exposures * float(study.field.light.mean()) * noise.gain
+    shot = (noise.gain * signal + noise.read_dn**2) / pixels
+    frame = np.array([c.id for c, *_ in points])
+    setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
+    reading = np.array([c.radiance for c, *_ in points])
+    own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2)
+    expected = curves.rates(()) * exposures
+    radiometer = signal * _reading_std(points, signal, shot, expected)
+    covariance = np.diag(shot) + (setting[:, None] == setting) * np.outer(own, own)
+    covariance += (reading[:, None] == reading) * np.outer(radiometer, radiometer)
+    scatter = signal * noise.jitter_lamp
+    covariance += (frame[:, None] == frame) * (np.outer(scatter, scatter) + noise.jitter_dn**2)
 
     def predict(effects: Effects) -> Prediction:
         camera = study.camera
@@ -204,6 +249,35 @@ def narrowband_block(study: Study) -> Block:
         labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
         hooks=UNIFORM_HOOKS | SPECTRAL_HOOKS, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
+
+
+def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expected: FloatArray) -> float:
+    """Relative scatter of a radiometer's readings that all channels share, from the second differences between neighbouring
+    wavelengths; at most RADIOMETER_STD, so that no structure of the light's or the filters' passes for scatter.
+
+    Neighbours u_1, u_2, u_3 in relative deviation: u_2 - (u_1 + u_3) / 2 has variance 1.5 s^2 beside that of the noise; the median of
+    the magnitudes keeps a few odd wavelengths out.
+    """
+    deviation: dict[str, tuple[float, float, float]] = {}
+    by_frame: dict[str, list[int]] = {}
+    for i, (capture, *_) in enumerate(points):
+        by_frame.setdefault(capture.id, []).append(i)
+    strong = signal > 0.05 * signal.max()
+    for frame, members in by_frame.items():
+        use = [i for i in members if strong[i] and expected[i] > 0]
+        if use:
+            weight = np.square(signal[use]) / shot[use]
+            ratio = np.log(signal[use] / expected[use])
+            place = points[use[0]][0].wavelength_nm
+            deviation[frame] = place, float(np.sum(weight * ratio) / weight.sum()), float(1.0 / weight.sum())
+    found = sorted(deviation.values())
+    if len(found) < _READINGS:
+        return RADIOMETER_STD
+    u, v = np.array([f[1] for f in found]), np.array([f[2] for f in found])
+    bend = u[1:-1] - 0.5 * (u[:-2] + u[2:])
+    noise = float(np.median(v[1:-1] + 0.25 * (v[:-2] + v[2:])))
+    spread = float(np.median(np.abs(bend))) / 0.6745
+    return float(np.sqrt(np.clip((spread**2 - noise) / 1.5, READING_STD**2, RADIOMETER_STD**2)))
 
 
 def shading_block(study: Study) -> Block:
