@@ -435,6 +435,28 @@ class _Memory:
         return path
 
 
+class _Overlaid:
+    """Another store with some of its frames replaced."""
+
+    def __init__(self, below: Store, frames: Mapping[str, NDArray[Any]]) -> None:
+        self._below, self._above = below, _Memory(frames, {}, {})
+
+    def file(self, path: str) -> Path | None:
+        return self._below.file(path)
+
+    def frame(self, path: str, camera: Camera) -> Frame:
+        return (self._above if path in self._above.frames else self._below).frame(path, camera)
+
+    def spectrum(self, path: str) -> Spectrum:
+        return self._below.spectrum(path)
+
+    def target(self, path: str) -> Target:
+        return self._below.target(path)
+
+    def where(self, path: str) -> str:
+        return self._below.where(path)
+
+
 # --- the set -----------------------------------------------------------------------------------------------------------
 
 
@@ -516,6 +538,16 @@ class RecordingSet:
             if (side is None or capture.side == side)
             and (kind is None or (capture.kind == kind if isinstance(kind, str) else isinstance(capture, kind)))
         ]
+
+    def with_frames(self, frames: Mapping[str, NDArray[Any]]) -> RecordingSet:
+        """The same set with other frames (uint16) at some of its paths."""
+        return RecordingSet(
+            self.manifest,
+            source=self.source,
+            warnings=self.warnings,
+            store=_Overlaid(self._store, frames),
+            cache_bytes=self.cache_bytes,
+        )
 
     def without(self, ids: Container[str]) -> RecordingSet:
         """The same set less the captures of these ids; frames, spectra and targets are shared."""
