@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 
 from lab.camera_file import CameraFile
 from lab.diagnose.edges import edge_block
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
-from lab.diagnose.summaries import Block, Effects, Prediction, Study
+from lab.diagnose.summaries import Block, Study
 from lab.diagnose.uniform import dark_block, linearity_block, narrowband_block, shading_block
 from lab.errors import NotDetermined
 from lab.predict import assumptions, camera_model
@@ -57,14 +55,8 @@ def evidence_of(
         except NotDetermined as refused:
             skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
     blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]
-    if baseline is not None and baseline.effects:
-        blocks = [replace(b, predict=partial(_predicted, b, baseline.effects)) for b in blocks]
-    return (Evidence(tuple(blocks), study.camera) if blocks else None), tuple(skipped)
-
-
-def _predicted(block: Block, always: Effects, effects: Effects) -> Prediction:
-    """With the baseline's own effects, which stand first: they act first."""
-    return block.predict((*(e for e in always if block.touched_by(type(e))), *effects))
+    always = baseline.effects if baseline is not None else ()
+    return (Evidence(tuple(blocks), study.camera, always) if blocks else None), tuple(skipped)
 
 
 def _saturation_dn(fit: CameraFit | None) -> float | None:

@@ -31,10 +31,12 @@ class Gaussian:
 
 @dataclass
 class Evidence:
-    """The blocks of one side, in one vector. Predictions are kept, as most effects act on a few blocks only."""
+    """The blocks of one side, in one vector. Predictions are kept, as most effects act on a few blocks only. `always`: effects that
+    the baseline has; they act first, and their laws may be wrong like those of others."""
 
     blocks: tuple[Block, ...]
     camera: CameraModel
+    always: tuple[Effect, ...] = ()
     _kept: dict[tuple[int, tuple[Effect, ...]], Prediction] = field(default_factory=dict)
 
     @cached_property
@@ -58,9 +60,9 @@ class Evidence:
             covariance[at, at] = block.covariance
         return covariance
 
-    def _prediction(self, index: int, effects: Effects) -> Prediction:
+    def _prediction(self, index: int, acting: Effects) -> Prediction:
         block = self.blocks[index]
-        key = index, tuple(e for e in effects if block.touched_by(type(e)))
+        key = index, tuple(e for e in acting if block.touched_by(type(e)))
         if key not in self._kept:
             if len(self._kept) > 20000:
                 self._kept.clear()
@@ -69,13 +71,16 @@ class Evidence:
 
     def mean(self, effects: Effects = ()) -> FloatArray:
         """Prediction of everything, (n,)."""
-        return np.concatenate([self._prediction(i, effects).mean for i in range(len(self.blocks))])
+        return self._mean_of((*self.always, *effects))
+
+    def _mean_of(self, acting: Effects) -> FloatArray:
+        return np.concatenate([self._prediction(i, acting).mean for i in range(len(self.blocks))])
 
     def _columns(self, effects: Effects) -> dict[str, FloatArray]:
         """Slopes by every free quantity, (n,) each, per prior standard deviation; one that several blocks share is one column."""
         columns: dict[str, FloatArray] = {}
         for index, at in enumerate(self.slices):
-            for name, column in self._prediction(index, effects).slopes.items():
+            for name, column in self._prediction(index, (*self.always, *effects)).slopes.items():
                 columns.setdefault(name, np.zeros(len(self.value)))[at] = column
         return columns
 
@@ -127,8 +132,9 @@ class Evidence:
         freed = np.flatnonzero(np.any(free != 0.0, axis=1))  # edges, the most of all numbers, have no free quantity
         covariance[np.ix_(freed, freed)] += free[freed] @ free[freed].T
         ends = np.cumsum([int(where[at].sum()) for at in self.slices])
-        for i, effect in enumerate(effects):
-            change = mean - self.mean((*effects[:i], *effects[i + 1 :]))
+        acting = (*self.always, *effects)
+        for i, effect in enumerate(acting):
+            change = mean - self._mean_of((*acting[:i], *acting[i + 1 :]))
             for at, end in zip(self.slices, ends, strict=True):
                 error = effect.form_tolerance * change[at][where[at]]
                 if error.any():
@@ -136,12 +142,19 @@ class Evidence:
                     covariance[here, here] += error[:, None] * kinship[here, here] * error
         return Gaussian(mean[where], covariance)
 
-    def quantities(self, effects: Effects = ()) -> dict[str, float]:
+    def pull(self, effects: Effects = (), process: FloatArray | None = None) -> FloatArray:
+        """C^-1 (y - m) of the seen numbers, nil at the others, (n,): what any part J P J' of C, times this, has of the residual.
+        `process` (n, n): a discrepancy's covariance, on top."""
+        model = self.gaussian(effects)
+        covariance = model.covariance if process is None else model.covariance + process
+        inside = cho_factor(covariance[np.ix_(self.seen, self.seen)], lower=True)
+        found = np.zeros(len(self.value))
+        found[self.seen] = cho_solve(inside, (self.value - model.mean)[self.seen])
+        return found
+
+    def quantities(self, effects: Effects = (), process: FloatArray | None = None) -> dict[str, float]:
         """Where the seen numbers put the free quantities, by name, in prior standard deviations from their first guess."""
-        model = self.seen_gaussian(effects)
-        inside = cho_factor(model.covariance, lower=True)
-        free = self._free(effects)[self.seen]
-        found = free.T @ cho_solve(inside, self.seen_value - model.mean)
+        found = self._free(effects).T @ self.pull(effects, process)
         return dict(zip(self._columns(effects), found.tolist(), strict=True))
 
     def levelled(self, effects: Effects = ()) -> FloatArray:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from lab.camera_file import CameraFile
 from lab.diagnose.curves import freed_curve
@@ -63,7 +62,9 @@ def improved_model(
     if fit is None and baseline is None:
         camera = evidence.camera
     # what is measured is electrons times gain: of another gain, the curves take up the difference
-    quantities = evidence.quantities(effects)
+    applied, process = _applied(evidence, unknown)
+    quantities = evidence.quantities(effects, process)
+    pull = evidence.pull(effects, process)
     share = evidence.camera.conversion_gain_dn_per_e / camera.conversion_gain_dn_per_e
     curves = {
         channel: _scaled(freed, share if freed is not curve else 1.0)
@@ -72,29 +73,19 @@ def improved_model(
     }
     corrections: list[Correction] = []
     acting: list[Effect] = [*always, *effects]
-    used: set[Applied] = set()
-    for gap in unknown:
+    for gap, (kind, why) in zip(unknown, applied, strict=True):
         block = evidence.blocks[gap.index]
-        kind = _place_for(block)
         name = block.measurement.replace("_", " ")
-        if kind is None or gap.gain <= 0 or kind in used:
-            why = (
-                "no smooth process describes it"
-                if gap.gain <= 0
-                else "another correction acts there already"
-                if kind is not None
-                else "the model has no place for one there"
-            )
-            corrections.append(
-                Correction(block.measurement, None, f"{name}: no correction in the improved model; {why}")
-            )
+        if kind is None:
+            said = f"{name}: no correction in the improved model; {why}"
+            corrections.append(Correction(block.measurement, None, said))
             continue
-        used.add(kind)
-        x, factor, each = _factor(evidence, effects, gap)
+        at = evidence.slices[gap.index]
+        x, factor, each = _factor(block, gap.kernel @ pull[at], evidence.levelled(effects)[at])
         if kind == "sensitivity":
-            for channel, (at, by) in each.items():
+            for channel, (wavelength_nm, by) in each.items():
                 if channel in curves:
-                    curves[channel] = _multiplied(curves[channel], at, by)
+                    curves[channel] = _multiplied(curves[channel], wavelength_nm, by)
             said = f"{name}: in the sensitivity curves, by wavelength and channel"
         else:
             acting.append(_correction(kind, block, x, factor, camera))
@@ -105,6 +96,25 @@ def improved_model(
     return CameraFile(f"{recordings.manifest.name} {side}".strip(), improved, tuple(acting)), tuple(corrections)
 
 
+def _applied(evidence: Evidence, unknown: Sequence[Discrepancy]) -> tuple[list[tuple[Applied | None, str]], FloatArray]:
+    """What each discrepancy is applied as, or why it isn't, and the joint covariance of those that are."""
+    process = np.zeros((len(evidence.value), len(evidence.value)))
+    found: list[tuple[Applied | None, str]] = []
+    for gap in unknown:
+        kind = _place_for(evidence.blocks[gap.index])
+        if gap.gain <= 0:
+            found.append((None, "no smooth process describes it"))
+        elif kind is None:
+            found.append((None, "the model has no place for one there"))
+        elif any(kind == other for other, _ in found):
+            found.append((None, "another correction acts there already"))
+        else:
+            found.append((kind, ""))
+            at = evidence.slices[gap.index]
+            process[at, at] += gap.kernel
+    return found, process
+
+
 def _place_for(block: Block) -> Applied | None:
     """The stage that a smooth factor along the measurement's axis can act on."""
     if block.places:
@@ -113,20 +123,12 @@ def _place_for(block: Block) -> Applied | None:
 
 
 def _factor(
-    evidence: Evidence, effects: Sequence[Effect], gap: Discrepancy
+    block: Block, mean: FloatArray, predicted: FloatArray
 ) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, FloatArray]]]:
-    """x and the factor on the prediction there, the mean over channels and conditions; and the same channel by channel.
-
-    The process's mean, given the seen numbers: K (K + C)^-1 r, beside the levelled prediction.
-    """
-    block, at = evidence.blocks[gap.index], evidence.slices[gap.index]
-    model = evidence.gaussian(effects)
-    seen = evidence.seen[at]
-    residual = (evidence.value - model.mean)[at]
-    inside = cho_factor(model.covariance[at, at][np.ix_(seen, seen)] + gap.kernel[np.ix_(seen, seen)], lower=True)
-    mean = gap.kernel[:, seen] @ cho_solve(inside, residual[seen])
+    """x and the factor on the prediction there, the mean over channels and conditions; and the same channel by channel. `mean`: of
+    the process, given the seen numbers."""
     # of the signal that the factor acts on: its scale where that is one, else the prediction
-    whole = block.scale if np.ptp(block.scale) > 0 else evidence.levelled(effects)[at]
+    whole = block.scale if np.ptp(block.scale) > 0 else predicted
     usable = whole > LEAST_CONTRAST * float(np.max(whole))
     x = np.array([label.x for label in block.labels])
     channel = np.array([label.channel for label in block.labels])
@@ -147,7 +149,9 @@ def _correction(
     """The factor on its stage, its places in the unit that the stage has."""
     gain = camera.conversion_gain_dn_per_e
     if kind == "transfer":
-        return _of("frequency_cy_per_um", x / camera.pixel_pitch_um, factor)
+        from_zero = x > 0.0  # where a transfer function is 1
+        at = np.append(0.0, x[from_zero] / camera.pixel_pitch_um)
+        return _of("frequency_cy_per_um", at, np.append(1.0, factor[from_zero]))
     if kind == "illumination":
         return _of("radius_um", x * 1e3, factor)
     if kind == "noise":
