@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from lab.camera_file import CameraFile
+from lab.diagnose.darks import DARK_BLOCKS
 from lab.diagnose.edges import edge_block
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
 from lab.diagnose.summaries import Block, Study
-from lab.diagnose.uniform import dark_block, linearity_block, narrowband_block, shading_block
+from lab.diagnose.uniform import linearity_block, narrowband_block, shading_block
 from lab.errors import NotDetermined
 from lab.predict import assumptions, camera_model
 from lab.recording import RecordingSet
@@ -19,7 +20,7 @@ from sim.camera import Side
 
 #: Makers of blocks, in the order of the report; one that a recording set doesn't allow is left out with a reason.
 BLOCKS: tuple[Callable[[Study], Block], ...] = (
-    dark_block,
+    *DARK_BLOCKS,
     linearity_block,
     variance_block,
     neighbour_block,
@@ -48,6 +49,7 @@ def evidence_of(
         for a in assumptions(recordings.camera(side))
     ]
     study = Study(recordings, side, camera, _saturation_dn(camera_fit))
+    skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for _, reason in study.stale]
     blocks = []
     for make in BLOCKS:
         try:

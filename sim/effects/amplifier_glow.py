@@ -48,7 +48,7 @@ class AmplifierGlow(Effect):
             for share in (0.1, 0.3, 0.7)
         )
 
-    def dark_current(
+    def even_dark_current(
         self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
     ) -> FloatArray | float:
         if self.glow_e_per_s == 0.0:

@@ -157,6 +157,11 @@ class Effect(Frozen):
         the effect is absent, whatever the wavelength. Places are in um from the sensor's centre, x along columns, y along rows, and broadcast."""
         return None
 
+    def image(self, irradiance: FloatArray, camera: CameraModel) -> FloatArray:
+        """OPTICS: irradiance of a channel's whole image (rows, cols), in any unit, with what the lens makes of it as a whole, such as
+        a reflection of it; linear in it."""
+        return irradiance
+
     def veil(self) -> float:
         """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""
         return 0.0
@@ -170,6 +175,12 @@ class Effect(Frozen):
     ) -> FloatArray | float:
         """CHARGE: mean dark current, of all pixels or of each (rows, cols), given what the camera model says for that
         temperature of the sensor."""
+        return self.even_dark_current(e_per_s, temperature_c, camera)
+
+    def even_dark_current(
+        self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
+    ) -> FloatArray | float:
+        """CHARGE: the same of effects that treat neighbours alike; of those that pick single pixels `odd_dark_current` tells."""
         return e_per_s
 
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:

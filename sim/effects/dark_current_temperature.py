@@ -29,7 +29,7 @@ class DarkCurrentTemperature(Effect):
         Quantity("1/C", "doublings of the dark current a degree", lower=-0.5, upper=0.5, prior=(0.0, 0.05), absent=0.0),
     ] = 0.0
 
-    def dark_current(
+    def even_dark_current(
         self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
     ) -> FloatArray | float:
         if self.doublings_per_c == 0.0 or temperature_c is None:
