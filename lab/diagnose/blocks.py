@@ -8,6 +8,7 @@ from lab.camera_file import CameraFile
 from lab.diagnose.darks import DARK_BLOCKS
 from lab.diagnose.edges import edge_block
 from lab.diagnose.evidence import Evidence
+from lab.diagnose.flicker import flicker_block
 from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
 from lab.diagnose.summaries import Block, Study
@@ -22,6 +23,7 @@ from sim.camera import Side
 BLOCKS: tuple[Callable[[Study], Block], ...] = (
     *DARK_BLOCKS,
     linearity_block,
+    flicker_block,
     variance_block,
     neighbour_block,
     shading_block,

@@ -11,6 +11,9 @@ from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
+#: Times from row to row that are tried first: those of rolling shutters from 2000 rows in 10 ms to 200 in 40 ms.
+LINE_TIMES_US = (5.0, 8.0, 12.0, 18.0, 27.0, 40.0, 60.0, 90.0, 140.0, 200.0)
+
 
 class LightFlicker(Effect):
     """Light x (1 + m sinc(f T) cos(2 pi f (t + T / 2))), T the exposure and t its begin: the frame's, and a line time later for each
@@ -47,7 +50,12 @@ class LightFlicker(Effect):
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        return ((cls(modulation_percent=1.5),),)
+        return tuple(
+            (cls(modulation_percent=depth, frequency_hz=frequency, line_time_us=line),)
+            for depth in (1.5, 15.0)
+            for frequency in (100.0, 120.0)
+            for line in LINE_TIMES_US
+        )
 
     def lit(self, electrons: FloatArray, exposure_s: float, elapsed_s: float, camera: CameraModel) -> FloatArray:
         if self.modulation_percent == 0.0:
