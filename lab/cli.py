@@ -33,7 +33,7 @@ from rich.table import Table
 
 from lab import recording
 from lab.challenge.command import commands as challenge
-from lab.errors import DeviceError, InputError
+from lab.errors import DeviceError, InputError, NotDetermined
 from lab.fit import Progress as Advance
 from lab.fit import fit_recording_set
 from lab.recording import RecordingError, RecordingSet
@@ -339,6 +339,14 @@ def fit(
     cameras: Annotated[
         Path | None, typer.Option("--write-cameras", metavar="DIR", help="write each fitted camera as DIR/SIDE.toml")
     ] = None,
+    maps: Annotated[
+        Path | None,
+        typer.Option(
+            "--maps",
+            metavar="DIR",
+            help="write every pixel's offset, dark current and gain, and which are defective, into DIR/SIDE (.npy and .png)",
+        ),
+    ] = None,
 ) -> None:
     """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
     _check_writable(json)
@@ -349,6 +357,22 @@ def fit(
     _write_json(result, json)
     if cameras is not None:
         _write_cameras(recordings, result, cameras)
+    if maps is not None:
+        _write_maps(recordings, maps)
+
+
+def _write_maps(recordings: RecordingSet, folder: Path) -> None:
+    """Maps of every side's pixels; a side without darks is said."""
+    from lab.fit.pixels import pixel_maps
+    from lab.report.maps import write_maps
+
+    for side in recordings.sides:
+        try:
+            names = write_maps(folder / side, pixel_maps(recordings, side))
+        except NotDetermined as refused:
+            err.print(escape(f"maps ({side}): none: {refused.reason}"))
+        else:
+            err.print(escape(f"maps: {folder / side}: {', '.join(n for n in names if n.endswith('.npy'))}"))
 
 
 def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -155,10 +154,6 @@ class PixelMaps:
     gain: FloatArray | None
     gain_std: FloatArray | None
     defective: BoolArray
-
-    def save(self, path: Path) -> None:
-        """As an .npz with the fields' names; what is None is left out."""
-        np.savez_compressed(path, **{name: value for name, value in vars(self).items() if value is not None})
 
 
 def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:

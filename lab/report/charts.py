@@ -167,9 +167,41 @@ def linearity(noise: NoiseFit) -> Figure | None:
     }
 
 
+def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Shapes and annotations of the bands in which the curves part from the maker's: a strip along the top for each channel, with the
+    difference in percent."""
+    shapes: list[dict[str, Any]] = []
+    notes: list[dict[str, Any]] = []
+    channels = list(spectral.quantum_efficiency)
+    for one in spectral.maker_departures:
+        colour = CHANNEL.get(one.channel, "#888888")
+        half = 0.5 * float(np.median(np.diff(spectral.wavelength_nm)))
+        bottom = 0.95 - 0.055 * channels.index(one.channel)
+        at = {"x0": one.from_nm - half, "x1": one.to_nm + half}
+        look = {"type": "rect", "fillcolor": _faded(colour), "line": {"width": 0}, "layer": "below"}
+        shapes.append(look | at | {"yref": "paper", "y0": bottom, "y1": bottom + 0.05})
+        shapes.append(look | at | {"yref": "paper", "y0": 0.0, "y1": bottom, "fillcolor": _faded(colour, 0.07)})
+        size = "new" if one.difference_percent is None else f"{one.difference_percent:+.1f} %"
+        notes.append(
+            {
+                "x": 0.5 * (one.from_nm + one.to_nm),
+                "y": bottom + 0.025,
+                "yref": "paper",
+                "yanchor": "middle",
+                "text": size,
+                "showarrow": False,
+                "font": {"size": 10, "color": colour},
+                "hovertext": f"{one.channel}, {one.from_nm:g} to {one.to_nm:g} nm: {size}, {one.significance_sigma:.1f} sigma",
+            }
+        )
+    return shapes, notes
+
+
 def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Side) -> Figure:
-    """Quantum efficiency with its band (one standard uncertainty, expanded by the fit's coverage factor) and the maker's."""
+    """Quantum efficiency with its band (one standard uncertainty, expanded by the fit's coverage factor) and the maker's, times the
+    factor between them where one was found; where the two part."""
     data: list[Trace] = []
+    scale = spectral.maker_scale or 1.0
     for channel, values in spectral.quantum_efficiency.items():
         colour = CHANNEL.get(channel, "#888888")
         std = spectral.quantum_efficiency_std.get(channel)
@@ -193,19 +225,26 @@ def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Si
             {
                 "type": "scatter",
                 "mode": "lines",
-                "name": f"{channel}, maker",
+                "name": f"{channel}, maker" + (f" x {scale:.3f}" if spectral.maker_scale else ""),
                 "x": list(curve.wavelength_nm),
-                "y": list(curve.value),
+                "y": [scale * value for value in curve.value],
                 "line": {"color": CHANNEL.get(channel, "#888888"), "width": 1.2, "dash": "dot"},
             }
         )
     span = [min(spectral.wavelength_nm) - 10, max(spectral.wavelength_nm) + 10]
+    shapes, notes = _departures(spectral)
+    # Room above the curves for the strips, where there are any.
+    top = 1.05 * max(max(values) for values in spectral.quantum_efficiency.values()) / (0.8 if shapes else 1.0)
     return {
         "data": data,
         "layout": layout(
             340,
             xaxis=axis("wavelength, nm", range=span),
-            yaxis=axis("quantum efficiency, e/photon", rangemode="tozero"),
+            yaxis=axis("quantum efficiency, e/photon", range=[0.0, top])
+            if shapes
+            else axis("quantum efficiency, e/photon", rangemode="tozero"),
+            shapes=shapes,
+            annotations=notes,
         ),
     }
 

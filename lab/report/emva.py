@@ -15,7 +15,8 @@ from lab.fit.pixels import pixel_maps, taken
 from lab.recording import Dark, Flat, RecordingSet
 from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, layout
 from lab.report.figures import NOISE, measured
-from lab.report.pictures import png_data_uri
+from lab.report.maps import MAPS
+from lab.report.pictures import map_picture, png_data_uri
 from lab.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
 from sim.camera import Side
 from sim.sensor.mosaic import planes
@@ -479,21 +480,12 @@ def _maps(recordings: RecordingSet, side: Side) -> Iterator[tuple[str, str, str]
         maps = pixel_maps(recordings, side)
     except NotDetermined:
         return
-    for title, values, unit in (
-        ("Offset", maps.offset_dn, "DN"),
-        ("Dark current", maps.dark_dn_per_s, "DN/s"),
-        ("Gain, shading taken out", maps.gain, "of the neighbourhood"),
-    ):
+    for name, (title, unit) in MAPS.items():
+        values = getattr(maps, name)
         if values is None:
             continue
-        low, high = np.percentile(values, [1.0, 99.0])
-        grey = np.clip((values - low) / max(float(high - low), 1e-12), 0.0, 1.0)
-        scale = MAP_WIDTH_PX / grey.shape[1]
-        if scale < 1:
-            grey = cv2.resize(grey, (MAP_WIDTH_PX, round(grey.shape[0] * scale)), interpolation=cv2.INTER_AREA)
-        coloured = cv2.applyColorMap((255 * grey).round().astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-        picture = png_data_uri(np.ascontiguousarray(coloured[..., ::-1], dtype=np.uint8))
-        yield title, picture, f"from {low:.4g} (dark) to {high:.4g} (bright) {unit}"
+        picture, low, high = map_picture(values, MAP_WIDTH_PX)
+        yield title, png_data_uri(picture), f"from {low:.4g} (dark) to {high:.4g} (bright) {unit}"
 
 
 # --- spatial plots -----------------------------------------------------------------------------------------------------

@@ -16,11 +16,16 @@ from sim.sensor.mosaic import planes
 DISPLAY_GAMMA = 2.2
 
 
-def png_data_uri(image: NDArray[np.uint8]) -> str:
-    """An image (rows, cols) or (rows, cols, 3: R, G, B) as the text of a PNG data URI."""
+def png(image: NDArray[np.uint8]) -> bytes:
+    """An image (rows, cols) or (rows, cols, 3: R, G, B) as a PNG file's content."""
     pixels = image if image.ndim == 2 else image[..., ::-1]
     _, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
-    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return data.tobytes()
+
+
+def png_data_uri(image: NDArray[np.uint8]) -> str:
+    """The same as the text of a PNG data URI."""
+    return "data:image/png;base64," + base64.b64encode(png(image)).decode("ascii")
 
 
 def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
@@ -31,6 +36,18 @@ def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
     scaled = np.sqrt(np.clip(values / peak, 0.0, 1.0))
     coloured = cv2.applyColorMap((255 * scaled).round().astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     return png_data_uri(np.ascontiguousarray(coloured[..., ::-1], dtype=np.uint8))
+
+
+def map_picture(values: ArrayLike, width_px: int | None = None) -> tuple[NDArray[np.uint8], float, float]:
+    """A map (rows, cols) in colours (rows, cols, 3: R, G, B) from its 1st percentile (dark) to its 99th (bright), and these two;
+    averaged down to `width_px` columns where it has more."""
+    given = np.asarray(values, float)
+    low, high = (float(limit) for limit in np.percentile(given, [1.0, 99.0]))
+    share = np.clip((given - low) / max(high - low, 1e-12), 0.0, 1.0)
+    if width_px is not None and (scale := width_px / share.shape[1]) < 1:
+        share = cv2.resize(share, (width_px, round(share.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+    coloured = cv2.applyColorMap((255 * share).round().astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    return np.ascontiguousarray(coloured[..., ::-1], dtype=np.uint8), low, high
 
 
 def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> str:

@@ -24,7 +24,7 @@ from lab.report.pictures import (
     png_data_uri,
     trimmed_margin,
 )
-from lab.results import CameraFit, FitResult, Patch, Unexplained
+from lab.results import CameraFit, FitResult, MakerDeparture, Patch, SpectralFit, Unexplained
 
 MadeUp = Callable[..., Any]
 
@@ -284,3 +284,32 @@ def test_patch_colours_are_balanced_on_the_measured_white() -> None:
     assert colours["white"] == (f"#{level:02x}" + f"{level:02x}" * 2,) * 2
     assert colours["red"][0].endswith("0000")
     assert len(set(re.findall("..", colours["red"][1][1:]))) == 1  # the prediction is grey
+
+
+def test_departures_from_the_makers_curves_are_drawn_where_they_are(small_set: Callable[..., RecordingSet]) -> None:
+    recordings = small_set()
+    departure = MakerDeparture(
+        channel="G",
+        from_nm=540.0,
+        to_nm=560.0,
+        difference=-0.04,
+        difference_std=0.005,
+        difference_percent=-8.0,
+        significance_sigma=7.0,
+    )
+    wave = tuple(np.arange(400.0, 701.0, 10.0))
+    fit = SpectralFit(
+        wavelength_nm=wave,
+        quantum_efficiency={c: (0.5,) * len(wave) for c in "RGB"},
+        quantum_efficiency_std={c: (0.01,) * len(wave) for c in "RGB"},
+        maker_scale=0.98,
+        maker_departures=(departure,),
+    )
+    drawn = charts.quantum_efficiency(fit, recordings, "left")["layout"]
+    # Half a step to either side: the band's outer wavelengths belong to it.
+    assert {(shape["x0"], shape["x1"]) for shape in drawn["shapes"]} == {(535.0, 565.0)}
+    (note,) = drawn["annotations"]
+    assert note["text"] == "-8.0 %" and note["x"] == 550.0 and "7.0 sigma" in note["hovertext"]
+    assert drawn["yaxis"]["range"][1] > 0.5 / 0.85  # room for the strips
+    plain = charts.quantum_efficiency(fit.model_copy(update={"maker_departures": ()}), recordings, "left")["layout"]
+    assert plain["shapes"] == [] and plain["annotations"] == []

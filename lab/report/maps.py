@@ -1,0 +1,65 @@
+"""Maps of single pixels as files: arrays to correct frames by, and pictures of them to look at."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.errors import InputError
+from lab.fit.pixels import PixelMaps
+from lab.rawfile import replacing
+from lab.report.pictures import map_picture, png
+
+#: Field of `PixelMaps` -> (title, unit).
+MAPS = {
+    "offset_dn": ("Offset", "DN"),
+    "dark_dn_per_s": ("Dark current", "DN/s"),
+    "gain": ("Gain, shading taken out", "of the neighbourhood"),
+}
+
+
+def _npy(values: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
+
+
+def _files(maps: PixelMaps) -> Iterator[tuple[str, bytes]]:
+    """Names and contents: arrays in single precision, pictures of as many pixels, and what the pictures' colours mean."""
+    stated: dict[str, dict[str, object]] = {}
+    for name, (title, unit) in MAPS.items():
+        values = getattr(maps, name)
+        if values is None:
+            continue
+        yield f"{name}.npy", _npy(np.asarray(values, np.float32))
+        yield f"{name}_std.npy", _npy(np.asarray(getattr(maps, f"{name}_std"), np.float32))
+        picture, low, high = map_picture(values)
+        yield f"{name}.png", png(picture)
+        stated[name] = {"shows": title, "unit": unit, "picture_from": low, "picture_to": high}
+    yield "defective.npy", _npy(maps.defective)
+    # A single pixel of a large picture isn't seen: each is drawn 3 px wide.
+    yield "defective.png", png(cv2.dilate(255 * maps.defective.astype(np.uint8), np.ones((3, 3), np.uint8)))
+    stated["defective"] = {"shows": "Pixels out of line in the longest dark", "pixels": int(maps.defective.sum())}
+    yield "maps.json", (json.dumps(stated, indent=1) + "\n").encode()
+
+
+def write_maps(folder: Path, maps: PixelMaps) -> tuple[str, ...]:
+    """Write `offset_dn`, `dark_dn_per_s`, `gain`, each with `_std`, as .npy (rows, cols) and as .png, `defective` likewise, and what
+    they are as maps.json, into `folder`; what isn't determined is left out. The names written. InputError where that can't be."""
+    names = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in _files(maps):
+            with replacing(folder / name) as partial:
+                partial.write_bytes(content)
+            names.append(name)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be written ({error.strerror}); name a folder that is yours") from error
+    return tuple(names)
