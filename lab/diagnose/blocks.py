@@ -11,8 +11,9 @@ from lab.diagnose.evidence import Evidence
 from lab.diagnose.flicker import flicker_block
 from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
+from lab.diagnose.shading import shading_block
 from lab.diagnose.summaries import Block, Study
-from lab.diagnose.uniform import linearity_block, narrowband_block, shading_block
+from lab.diagnose.uniform import linearity_block, narrowband_block
 from lab.errors import NotDetermined
 from lab.predict import assumptions, camera_model
 from lab.recording import RecordingSet

@@ -94,10 +94,10 @@ class Evidence:
         """How alike the error of a law is at two points: smooth along the axis, less so between channels and conditions."""
         kin = np.zeros((len(self.value), len(self.value)))
         for block, at in zip(self.blocks, self.slices, strict=True):
-            x = block.position
+            x = block.position.reshape(len(block.value), -1)
             channel = np.array([label.channel for label in block.labels])
             condition = np.array([label.condition for label in block.labels])
-            near = np.exp(-0.5 * ((x[:, None] - x) / block.reach) ** 2)
+            near = np.exp(-0.5 * np.square((x[:, None] - x) / block.reach).sum(-1))
             near = near * np.where(channel[:, None] == channel, 1.0, 0.7)
             if block.conditions and not block.places:
                 near = near * np.where(condition[:, None] == condition, 1.0, 0.7)

@@ -72,7 +72,7 @@ class Block:
     hooks: frozenset[str]  # hooks of an effect that can change the prediction
     predict: Callable[[Effects], Prediction]
     scale: FloatArray  # size of a discrepancy of 1, (n,)
-    along: FloatArray | None = None  # where smoothness isn't along x: logarithms of levels, (n,)
+    along: FloatArray | None = None  # where smoothness isn't along x: logarithms of levels (n,), places on the sensor (n, 2)
     #: What conditions are an axis of ("orientation", "pattern"): slices and curves are by condition, too. "": of none.
     conditions: str = ""
     #: Words before the conditions where the report lists them ("edges at"); "": the axis' name.
@@ -82,7 +82,7 @@ class Block:
 
     @property
     def position(self) -> FloatArray:
-        """Along which errors of laws and unknown discrepancies are smooth, (n,)."""
+        """Along which errors of laws and unknown discrepancies are smooth, (n,) or (n, d)."""
         return np.array([label.x for label in self.labels]) if self.along is None else self.along
 
     def touched_by(self, effect: type[Effect]) -> bool:

@@ -1,4 +1,4 @@
-"""Uniform light and none: dark frames, linearity of flat fields, their shading, narrowband signals."""
+"""Uniform light: linearity of flat fields, narrowband signals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from lab.diagnose.curves import CurveSlopes
 from lab.diagnose.neighbours import held_out_flats
 from lab.diagnose.summaries import (
-    BLACK_FLOOR_DN,
     LEVEL_REACH,
     NARROWBAND_FLOOR,
     SPECTRAL_HOOKS,
@@ -21,43 +20,17 @@ from lab.diagnose.summaries import (
     Study,
     held_out_of,
     overrides,
-    wide_contrast,
 )
 from lab.errors import NotDetermined
-from lab.predict import Field, collected_electrons, mean_dn
+from lab.predict import collected_electrons, mean_dn
 from lab.recording import Narrowband
 from sim.forward import electron_rate
-from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 LEVEL_FLOOR = 1.0e-4  # of a level, one for its repeats: non-linearity below what a linear camera may have, and rounding
 RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels, where too few readings say less
 READING_STD = 1e-4  # what readings scatter at least
 _READINGS = 8  # wavelengths from which on their own scatter tells
-SHADING_FLOOR = 5e-4
-AXIS_STD, AXIS_STD_KNOWN = 0.01, 0.004  # of the frame's diagonal: the optical axis without and with a fitted geometry
-
-
-def dark_block(study: Study) -> Block:
-    """Mean of every dark frame: black level and dark current are free; what remains is time and temperature."""
-    groups = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
-    if not groups:
-        raise NotDetermined("dark", "no dark captures")
-    captures = [(c, c.id in held_out_of(g, i, len(groups))) for i, g in enumerate(groups) for c in g]
-    value = np.array([float(study.recordings.frame(c).mean()) for c, _ in captures])
-    exposures = np.array([c.exposure_s for c, _ in captures])
-    base = study.noise.black + study.noise.dark_dn_per_s * exposures
-
-    def predict(effects: Effects) -> Prediction:
-        shift = np.array([study.offset(c, effects) for c, _ in captures])
-        return Prediction(base + shift, study.free_offsets(exposures))
-
-    return Block(
-        measurement="dark", axis="exposure", unit="s", reach=float(max(np.ptp(exposures), 1e-3)), value=value,
-        covariance=np.diag(np.full(len(value), study.noise.jitter_dn**2 + BLACK_FLOOR_DN**2)),
-        labels=tuple(Label(c.exposure_s, "all", f"{c.exposure_s:g} s", (c.id,), out) for c, out in captures),
-        hooks=frozenset({"offset_dn"}), predict=predict, scale=np.ones(len(value)),
-    )  # fmt: skip
 
 
 def linearity_block(study: Study) -> Block:
@@ -278,93 +251,3 @@ def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expect
     noise = float(np.median(v[1:-1] + 0.25 * (v[:-2] + v[2:])))
     spread = float(np.median(np.abs(bend))) / 0.6745
     return float(np.sqrt(np.clip((spread**2 - noise) / 1.5, READING_STD**2, RADIOMETER_STD**2)))
-
-
-def shading_block(study: Study) -> Block:
-    """Flat fields in cells against cos^4, each channel relative to its mean."""
-    if study.stated.focal_length_mm is None:
-        raise NotDetermined("flat_field", "the focal length isn't stated: the fall-off of the light isn't known")
-    flats = [
-        c
-        for c in study.recordings.captures("flat", study.side)
-        if all(m is not None for m in study.levels(c).mean.values())
-    ]
-    if not flats:
-        raise NotDetermined("flat_field", "no unclipped flat captures")
-    rows, cols = 6, 8
-    camera, noise = study.camera, study.noise
-    best = sorted(flats, key=lambda c: -sum(m or 0.0 for m in study.levels(c).mean.values()))
-    picked = best[: max(2, min(6, len(best)))]
-    out = {c.id for c in picked[1::2]}
-    points = []
-    step = mosaic.step(camera.cfa)
-    for part in ([c for c in picked if c.id not in out], [c for c in picked if c.id in out]):
-        if not part:
-            continue
-        frame = np.mean(
-            [study.recordings.frame(c).astype(float) - noise.black - noise.dark_dn_per_s * c.exposure_s for c in part],
-            axis=0,
-        )
-        for channel in study.channels:
-            phase = mosaic.phases(camera.cfa)[channel]
-            plane = np.mean([frame[r::step, c::step] for r, c in phase], axis=0)
-            cells = _cells(plane, rows, cols)
-            points.append(
-                (
-                    part,
-                    channel,
-                    cells / cells.mean(),
-                    plane.size / cells.size * len(phase),
-                    float(cells.mean()),
-                    part[0].id in out,
-                )
-            )
-    row = (np.arange(rows) + 0.5) / rows * camera.rows - 0.5
-    col = (np.arange(cols) + 0.5) / cols * camera.cols - 0.5
-    grid_row, grid_col = np.meshgrid(row, col, indexing="ij")
-    place = Field.at(camera, grid_row.ravel(), grid_col.ravel())
-    # where the optical axis meets the sensor is known to a share of the frame's diagonal: the fall-off may be centred there
-    off_px = (AXIS_STD_KNOWN if camera.geometry is not None else AXIS_STD) * float(np.hypot(camera.rows, camera.cols))
-    moved = {
-        "axis:row": Field.at(camera, grid_row.ravel() - off_px, grid_col.ravel()),
-        "axis:col": Field.at(camera, grid_row.ravel(), grid_col.ravel() - off_px),
-    }
-    value = np.concatenate([p[2].ravel() for p in points])
-    n = rows * cols
-    std = np.concatenate([np.full(n, np.sqrt((noise.gain / p[4] / len(p[0]) + noise.prnu**2) / p[3])) for p in points])
-
-    def predict(effects: Effects) -> Prediction:
-        base = _shaded(points, place, effects, study)
-        slopes = {name: _shaded(points, off, effects, study) - base for name, off in moved.items()}
-        return Prediction(base, slopes)
-
-    radius = np.hypot(place.x_um, place.y_um) * 1e-3
-    return Block(
-        measurement="flat_field", axis="field", unit="mm", reach=0.5 * float(np.ptp(radius)), value=value,
-        covariance=np.diag(std**2 + SHADING_FLOOR**2),
-        labels=tuple(Label(float(r), p[1], f"cell {k // cols},{k % cols}", tuple(c.id for c in p[0]), p[5]) for p in points for k, r in enumerate(radius)),
-        hooks=frozenset({"illumination", "response", "veil"}), predict=predict, scale=np.ones(len(value)),
-    )  # fmt: skip
-
-
-def _shaded(points: list[Any], place: Field, effects: Effects, study: Study) -> FloatArray:
-    """Cells of every (captures, channel) relative to their mean, (cells x points,)."""
-    light = place.light
-    for effect in effects:
-        light = light * effect.illumination(place.x_um, place.y_um, study.camera)
-    # a veil evens out what the lens's fall-off leaves
-    contrast = wide_contrast(effects)
-    light = contrast * light + (1.0 - contrast) * light.mean()
-    means = []
-    for p in points:
-        electrons = light / light.mean() * p[4] / study.noise.gain
-        for effect in effects:
-            electrons = effect.response(electrons, study.camera)
-        means.append(electrons / electrons.mean())
-    return np.concatenate(means)
-
-
-def _cells(plane: FloatArray, rows: int, cols: int) -> FloatArray:
-    r = np.linspace(0, plane.shape[0], rows + 1).astype(int)
-    c = np.linspace(0, plane.shape[1], cols + 1).astype(int)
-    return np.add.reduceat(np.add.reduceat(plane, r[:-1], 0), c[:-1], 1) / np.outer(np.diff(r), np.diff(c))

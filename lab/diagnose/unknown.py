@@ -72,10 +72,10 @@ def discrepancy(evidence: Evidence, model: Gaussian, index: int) -> Discrepancy:
 
 def _smooth(x: FloatArray, reach: float) -> FloatArray:
     """Factor B of the squared-exponential kernel, exp(-(x_i - x_j)^2 / (2 reach^2)) = B B' to 1e-9: few columns, as it is smooth."""
-    place, which = np.unique(x, return_inverse=True)
-    size, vectors = eigh(np.exp(-0.5 * ((place[:, None] - place) / reach) ** 2))
+    place, which = np.unique(x.reshape(len(x), -1), axis=0, return_inverse=True)
+    size, vectors = eigh(np.exp(-0.5 * np.square((place[:, None] - place) / reach).sum(-1)))
     kept = size > 1e-10 * size[-1]
-    return np.asarray((vectors[:, kept] * np.sqrt(size[kept]))[which])
+    return np.asarray((vectors[:, kept] * np.sqrt(size[kept]))[which.ravel()])
 
 
 def _by_group(factor: FloatArray, group: NDArray[np.intp]) -> FloatArray:
