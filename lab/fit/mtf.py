@@ -6,9 +6,10 @@ wider ones in the tails, fitted by weighted least squares together with the illu
 the Fourier transform of the spline's derivative, in closed form. (A hat basis in place of the spline leaves a ripple of
 h^2 E'' / 12 that an uneven spread of the samples turns into a bias of 0.1 % of MTF50.)
 
-What the samples leave open is filled by a Gaussian process of the line spread, chosen by evidence (`_prior_precision`): noise
-that no line spread makes is kept out, the uncertainty is that of the truth given the data, and the tail of diffraction, 1 % of
-the contrast of which lies beyond any region, is followed by its law.
+What the samples leave open is filled by a prior of the line spread (`_under_priors`): a Gaussian and, about it, a Gaussian
+process, over the strength and smoothness of which the evidence averages. Noise that no line spread makes is kept out, the
+uncertainty is that of the truth given the data, and the tail of diffraction, 1 % of the contrast of which lies beyond any
+region, is followed by its law.
 
 Everything after the edge is found is linear in the pixel values. An `EdgeGeometry` keeps that linear operator, so that a
 *predicted* edge profile goes through the same estimator as the recording (`EdgeMtf.predict`), which takes the estimator's
@@ -30,8 +31,8 @@ import cv2
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, ndimage, sparse
-from scipy.interpolate import BSpline
+from scipy import linalg, ndimage, sparse, special
+from scipy.interpolate import BSpline, CubicSpline
 
 from lab.errors import NotDetermined
 from lab.recording import RecordingSet, SlantedEdge
@@ -41,22 +42,25 @@ from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period
 
 Array = NDArray[np.floating[Any]]
+_Point = tuple[int, int, int, int]  # of the grid of priors: smoothness, length, strength, tail's amplitude
 Region = tuple[int, int, int, int]  # row0, col0, row1, col1, end excluded
 
 KNOT_SPACING_PX = 0.25  # in the core; a cubic spline of this spacing passes 1 cy/px with an error of 1e-4
 TAIL_GROWTH = 1.6  # ratio of neighbouring knot spacings outside the core: few knots, and the tail is smooth
 TAIL_REACH_PX = 9.0
-OUTER_ZONE_PX = 24.0  # beyond: levels, the tail's law and the illumination's gradient
-PRIOR_LENGTHS = (0.5, 1.2, 3.0, 7.0)  # of the line spread's correlation (Matern 3/2), in blur widths
-PRIOR_STRENGTHS = (0.5, 1.0, 2.0, 4.0)  # relative to the envelope
+OUTER_ZONE_PX = 36.0  # beyond: levels, the tail's law and the illumination's gradient
+# Of the prior of the line spread, in blur widths and in units of its envelope: by evidence
+PRIOR_LENGTHS = (0.5, 1.2, 3.0)
+PRIOR_STRENGTHS = (0.12, 0.25, 0.5, 1.0, 2.0, 4.0)
 # Of the line spread's tail, amplitude / distance^2: 4 / (pi^3 cutoff) of a diffracting lens, px
-FAR_AMPLITUDES_PX = (0.003, 0.1, 0.3)
-_PRIOR_GRID = (PRIOR_LENGTHS, PRIOR_STRENGTHS, FAR_AMPLITUDES_PX)
-_PRIOR_STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-ENVELOPE_WIDTHS, ENVELOPE_FLOOR = (
-    1.0,
-    1e-3,
-)  # the line spread's envelope: over how many blur widths, and its least value
+FAR_AMPLITUDES_PX = (0.001, 0.1, 0.3)
+GAUSSIAN_STD = (1.0, 1.0, 1.0, 0.1, 0.1)  # of the Gaussian part: its height, place, width, skewness, peakedness
+WARP = 2.0  # blur widths from the edge, beyond which the correlation's length grows with the distance
+LEAST_WEIGHT, LEAST_EVIDENCE = (
+    0.01,
+    4.0,
+)  # of a prior that counts; how far, in logarithms, the evidence falls before the search ends
+ENVELOPE_WIDTHS, ENVELOPE_FLOOR = 0.8, 1e-3  # over how many blur widths the estimate is averaged; its least value
 FAR_PX = 150.0  # to where the profile is followed, by its law where there are no samples
 FAR_LENGTH, FAR_ALIKE = 4.0, 0.98  # of the tail's correlation, in the distance's logarithm; between both sides
 MOST_REACH_PX = 60.0
@@ -164,8 +168,9 @@ class EdgeGeometry:
     weight: Array
     spline: Spline
     gradients: Array  # (g, n): the illumination's gradient along and across, as seen at the samples
-    normal: Array  # (k + g, k + g): inverse of the normal matrix = covariance of the solution about the truth
+    normal: Array  # (k + g, k + g): from A^T W values to the solution; inverse of the normal matrix with its prior
     scatter: Array  # (k + g, k + g): its covariance over repeats, which the prior makes smaller
+    gram: Array  # (k + g + 1, k + g + 1): A^T W A, A the spline's columns, the gradients and the values: all that the samples say
 
     @property
     def reach_px(self) -> float:
@@ -658,18 +663,21 @@ def _measure(
     variance = np.ones_like(value)
     used = np.ones(len(value), dtype=bool)
     esf = np.clip(0.5 + distance, 0.0, 1.0)
-    solution, chosen = np.zeros(0), (1, 1, 1)
-    for _ in range(PASSES):
+    start, solution = (1, 1, 3, 0), np.zeros(size)
+    for turn in range(PASSES):
         weight = np.where(used, 1.0 / variance, 0.0)
         gradients = _gradients(distance, foot * edge.half_length, esf + offset, room)
         gram = placed.gram(np.concatenate([gradients, value[None]]), weight)
-        matrix, right = gram[:-1, :-1].copy(), gram[:-1, -1]
-        if not len(solution):
-            precision = spline.roughness(SMOOTHING * np.trace(matrix[:size, :size]) / size)
+        matrix, right = gram[:-1, :-1], gram[:-1, -1]
+        if turn == 0:
+            bridged = matrix.copy()
+            bridged[:size, :size] += spline.roughness(SMOOTHING * np.trace(matrix[:size, :size]) / size)
+            normal = np.linalg.inv(bridged)
         else:
-            precision, chosen = _prior_precision(spline, solution[:size], matrix, right, width, outer, chosen)
-        matrix[:size, :size] += precision
-        normal = np.linalg.inv(matrix)
+            priors = _Priors.of(spline, solution[:size], width, outer)
+            normal, covariance, start = _under_priors(
+                priors, matrix, right, start, LEAST_EVIDENCE if turn == PASSES - 1 else 0.0
+            )
         solution = normal @ right
         esf = placed.values(solution[:size])
         residual = value - esf - solution[size:] @ gradients
@@ -695,11 +703,13 @@ def _measure(
         gradients=gradients,
         normal=normal,
         scatter=normal @ gram[:-1, :-1] @ normal,
+        gram=gram,
     )
     freedom = max(np.count_nonzero(used) - len(solution) - len(edge.poly), 1)
     return _described(
         geometry,
         solution[:size],
+        covariance[:size, :size],
         frequency,
         levels=(dark_level, light_level),
         noise=(std_dark * contrast, std_light * contrast),
@@ -707,88 +717,190 @@ def _measure(
     )
 
 
-def _prior_precision(
-    spline: Spline,
-    coefficients: Array,
-    matrix: Array,
-    right: Array,
-    width: float,
-    reach: float,
-    best: tuple[int, int, int],
-) -> tuple[Array, tuple[int, int, int]]:
-    """Inverse covariance of the ESF's coefficients, (size, size), with nothing said of its levels; and where
-    it stands on the grid of lengths, strengths and amplitudes, on which the search for it begins at `best`.
+def _under_priors(
+    priors: _Priors, matrix: Array, right: Array, start: _Point, least_evidence: float
+) -> tuple[Array, Array, _Point]:
+    """Inverse of the normal matrix under the line spread's prior, (k + g, k + g); the covariance of the solution about the
+    truth; and the best of the priors, the search for which begins at `start` (`_weighed`).
 
-    The line spread's mass between knots is a Gaussian process of two parts. Near the edge: envelope x correlation x envelope,
-    the envelope from the estimate itself, strength and length by evidence given the normal equations, as for kernels
-    (`lab.fit.psf`). Far from it: amplitude / distance^2, as any aperture diffracts, much alike on both sides; it carries what
-    is seen of the tail to beyond the samples (a diffraction-limited profile has 1 % of its contrast there).
+    The line spread's mass between knots is the sum of three: a Gaussian of free height, place and width, a little skew and
+    peaked; near it a Gaussian process, envelope x correlation x envelope, the envelope from the estimate itself, smoother the
+    farther from the edge; and far from it amplitude / distance^2, as any aperture diffracts, much alike on both sides, which
+    carries what is seen of the tail to beyond the samples (a diffraction-limited profile has 1 % of its contrast there).
+    The process's smoothness, length and strength and the tail's amplitude are averaged over by evidence, not chosen: where
+    several explain the data the solution lies between theirs, and the covariance holds how far they differ. Nothing is said
+    of levels and gradients.
     """
-    size = spline.size
-    knots = np.concatenate([[spline.knot_px[0]] * 2, spline.knot_px, [spline.knot_px[-1]] * 2])
-    place = (knots[:-2] + knots[1:-1] + knots[2:]) / 3.0
-    at, pitch = 0.5 * (place[1:] + place[:-1]), np.diff(place)
-    scale = max(width, KNOT_SPACING_PX)
-    density = np.where(np.abs(at) < reach, np.abs(np.diff(coefficients)) / pitch, 0.0)
-    share = pitch * np.exp(-0.5 * ((at[:, None] - at) / (ENVELOPE_WIDTHS * scale)) ** 2)
-    local = share @ density / share.sum(axis=1)
-    decay = 1.0 / (1.0 + (at / (4.0 * scale)) ** 2)
-    envelope = pitch * np.maximum(local * (np.abs(at) < 0.5 * reach), ENVELOPE_FLOOR * local.max() * decay)
+    masses = len(priors.envelope)
+    size = masses + 1
+    free = 1 + len(matrix) - size
+    # Unknowns: the dark level, the gradients, the masses
+    turn = np.zeros((len(matrix), len(matrix)))
+    turn[:size, 0] = 1.0
+    turn[size:, 1:free] = np.eye(free - 1)
+    turn[:size, free:] = np.tril(np.ones((size, masses)), -1)
+    turned, turned_right = turn.T @ matrix @ turn, turn.T @ right
+    free_covariance = np.linalg.inv(turned[:free, :free])
+    pull = free_covariance @ turned[:free, free:]
+    power, waves = np.linalg.eigh(turned[free:, free:] - turned[free:, :free] @ pull)
+    seen = power > 1e-14 * power[-1]
+    pulled_right = turned_right[free:] - pull.T @ turned_right[:free]
+    # What the data say of the masses, with unit noise: data = eye @ masses + noise
+    eye = np.sqrt(power[seen])[:, None] * waves[:, seen].T
+    data = waves[:, seen].T @ pulled_right / np.sqrt(power[seen])
 
-    side = np.where(np.sign(at)[:, None] == np.sign(at), 1.0, FAR_ALIKE)
-    order = np.log(np.maximum(np.abs(at), 1.0))
-    far = pitch * at**2 / (at**2 + (3.0 * scale) ** 2) / np.maximum(at**2, 1e-6)
-    tails = np.outer(far, far) * side * _matern(np.abs(order[:, None] - order) / FAR_LENGTH)
+    weights, best = _weighed(priors, eye, data, start, least_evidence)
+    information = eye.T @ eye
+    posterior = np.zeros((masses, masses))
+    means = []
+    for at, weight in weights.items():
+        root = _root(priors.at(at))
+        inner = root.T @ information @ root
+        inner[np.diag_indices_from(inner)] += 1.0
+        factor, _ = linalg.lapack.dpotrf(inner, lower=1)
+        half, _ = linalg.lapack.dtrtrs(factor, root.T, lower=1)
+        one = half.T @ half
+        posterior += weight * one
+        means.append(one @ pulled_right)
+    shares = np.array(list(weights.values()))
+    apart = (np.array(means) - shares @ np.array(means)) * np.sqrt(shares)[:, None]
+    whole = turn @ np.concatenate([-pull, np.eye(masses)])
+    normal = whole @ posterior @ whole.T + turn[:, :free] @ free_covariance @ turn[:, :free].T
+    apart = apart @ whole.T
+    return normal, normal + apart.T @ apart, best
 
-    tried: dict[tuple[int, int, int], tuple[float, Array]] = {}
 
-    def value(at_grid: tuple[int, int, int]) -> float:
-        """Logarithm of the evidence, but for a constant, at a point of the grid of lengths, strengths and amplitudes."""
-        if not all(0 <= i < len(steps) for i, steps in zip(at_grid, _PRIOR_GRID, strict=True)):
+def _weighed(
+    priors: _Priors, eye: Array, data: Array, start: _Point, least_evidence: float
+) -> tuple[dict[_Point, float], _Point]:
+    """The evidence's share of every prior that counts, and the best of them; data = eye @ masses + unit noise.
+
+    Uphill on the grid of priors from `start`, then around the summit as far as the evidence is within `least_evidence`.
+    """
+    fixed, far = (eye @ part @ eye.T for part in (priors.gaussian, priors.tails))
+    near: dict[tuple[int, int], Array] = {}
+    tried: dict[_Point, float] = {}
+
+    def evidence(at: _Point) -> float:
+        """Its logarithm, but for a constant."""
+        if not all(0 <= i < count for i, count in zip(at, _PRIOR_GRID, strict=True)):
             return -np.inf
-        if at_grid not in tried:
-            length, strength, amplitude = (steps[i] for i, steps in zip(at_grid, _PRIOR_GRID, strict=True))
-            near = np.outer(envelope, envelope) * _matern(np.abs(at[:, None] - at) / (length * scale))
-            inverse, half_log = _inverse(strength**2 * near + amplitude**2 * tails)
-            # differences^T inverse differences
-            wide = np.zeros((size + 1, size + 1))
-            wide[1:-1, 1:-1] = inverse
-            precision = np.diff(np.diff(wide, axis=0), axis=1)
-            full = matrix.copy()
-            full[:size, :size] += precision
-            factor, info = linalg.lapack.dpotrf(full, lower=1)
-            evidence = -np.inf
-            if not info:
-                half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
-                evidence = float(0.5 * half @ half - np.log(np.diag(factor)).sum()) - half_log
-            tried[at_grid] = evidence, precision
-        return tried[at_grid][0]
+        if at not in tried:
+            kind, length, strength, amplitude = at
+            if (kind, length) not in near:
+                near[kind, length] = eye @ priors.near(kind, length) @ eye.T
+            spread = (
+                PRIOR_STRENGTHS[strength] ** 2 * near[kind, length] + FAR_AMPLITUDES_PX[amplitude] ** 2 * far + fixed
+            )
+            spread[np.diag_indices_from(spread)] += 1.0
+            factor, _ = linalg.lapack.dpotrf(spread, lower=1)
+            white, _ = linalg.lapack.dtrtrs(factor, data, lower=1)
+            tried[at] = float(-0.5 * white @ white - np.log(np.diag(factor)).sum())
+        return tried[at]
 
+    best = start
     while True:
-        around = [(best[0] + i, best[1] + j, best[2] + k) for i, j, k in _PRIOR_STEPS]
-        uphill = max(around, key=value)
-        if value(uphill) <= value(best):
-            return tried[best][1], best
+        uphill = max(_beside(best), key=evidence)
+        if evidence(uphill) <= evidence(best):
+            break
         best = uphill
+    candidates, waiting = {best}, [best]
+    while waiting:
+        for at in _beside(waiting.pop()):
+            if at not in candidates and evidence(at) > evidence(best) - least_evidence:
+                candidates.add(at)
+                waiting.append(at)
+    top = max(evidence(at) for at in candidates)
+    weights = {at: float(np.exp(evidence(at) - top)) for at in candidates}
+    least = LEAST_WEIGHT * sum(weights.values())
+    total = sum(weight for weight in weights.values() if weight > least)
+    return {at: weight / total for at, weight in weights.items() if weight > least}, best
 
 
-def _matern(apart: Array) -> Array:
-    """Correlation at distances in units of its length: once differentiable, so that kinks are no surprise."""
+def _root(covariance: Array) -> Array:
+    """R with covariance R R^T."""
+    scale = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(scale, scale)
+    correlation[np.diag_indices_from(correlation)] += 1e-12
+    factor, _ = linalg.lapack.dpotrf(correlation, lower=1, clean=1)
+    return np.asarray(scale[:, None] * factor)
+
+
+@dataclass(frozen=True)
+class _Priors:
+    """Covariances of the line spread's masses between knots: `gaussian`, `tails`, and `near` at a point of the grid."""
+
+    envelope: Array
+    warped: Array  # distance in blur widths, pressed together far from the edge
+    gaussian: Array
+    tails: Array
+
+    @staticmethod
+    def of(spline: Spline, coefficients: Array, width: float, reach: float) -> _Priors:
+        knots = np.concatenate([[spline.knot_px[0]] * 2, spline.knot_px, [spline.knot_px[-1]] * 2])
+        place = (knots[:-2] + knots[1:-1] + knots[2:]) / 3.0
+        at, pitch = 0.5 * (place[1:] + place[:-1]), np.diff(place)
+        scale = max(width, KNOT_SPACING_PX)
+        density = np.where(np.abs(at) < reach, np.diff(coefficients) / pitch, 0.0)
+        share = pitch * np.exp(-0.5 * ((at[:, None] - at) / (ENVELOPE_WIDTHS * scale)) ** 2)
+        local = np.abs(share @ density) / share.sum(axis=1)
+        decay = 1.0 / (1.0 + (at / (4.0 * scale)) ** 2)
+        envelope = pitch * np.maximum(local * (np.abs(at) < 0.5 * reach), ENVELOPE_FLOOR * local.max() * decay)
+
+        x = place / scale
+        bell = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
+        shapes = np.stack([special.ndtr(x), bell, x * bell, (x * x - 1.0) * bell, (x**3 - 3.0 * x) * bell])
+        columns = np.diff(np.linalg.solve(spline.design(place).toarray(), shapes.T), axis=0) * np.array(GAUSSIAN_STD)
+
+        side = np.where(np.sign(at)[:, None] == np.sign(at), 1.0, FAR_ALIKE)
+        order = np.log(np.maximum(np.abs(at), 1.0))
+        far = pitch * at**2 / (at**2 + (3.0 * scale) ** 2) / np.maximum(at**2, 1e-6)
+        return _Priors(
+            envelope=envelope,
+            warped=WARP * np.arcsinh(at / (WARP * scale)),
+            gaussian=columns @ columns.T,
+            tails=np.outer(far, far) * side * _matern_3(np.abs(order[:, None] - order) / FAR_LENGTH),
+        )
+
+    def near(self, kind: int, length: int) -> Array:
+        """The process about the Gaussian, of unit strength."""
+        apart = np.abs(self.warped[:, None] - self.warped) / PRIOR_LENGTHS[length]
+        return np.outer(self.envelope, self.envelope) * _CORRELATIONS[kind](apart)
+
+    def at(self, point: _Point) -> Array:
+        """All of it, at a point of the grid."""
+        kind, length, strength, amplitude = point
+        near = PRIOR_STRENGTHS[strength] ** 2 * self.near(kind, length)
+        return near + FAR_AMPLITUDES_PX[amplitude] ** 2 * self.tails + self.gaussian
+
+
+def _beside(at: _Point) -> list[_Point]:
+    """Neighbours on the grid of priors."""
+    kind, length, strength, amplitude = at
+    return [
+        (kind + i, length + j, strength + k, amplitude + m)
+        for i, j, k, m in (*np.eye(4, dtype=int).tolist(), *(-np.eye(4, dtype=int)).tolist())
+    ]
+
+
+def _matern_3(apart: Array) -> Array:
+    """Correlation (Matern 3/2) at distances in units of its length: once differentiable, so that kinks are no surprise."""
     return np.asarray((1.0 + np.sqrt(3.0) * apart) * np.exp(-np.sqrt(3.0) * apart))
 
 
-def _inverse(covariance: Array) -> tuple[Array, float]:
-    """Of a covariance; and half the logarithm of its determinant."""
-    scale = np.sqrt(np.diag(covariance))
-    factor, _ = linalg.lapack.dpotrf(covariance / np.outer(scale, scale), lower=1)
-    inverse, _ = linalg.lapack.dpotri(factor, lower=1)
-    inverse = np.tril(inverse) + np.tril(inverse, -1).T
-    return inverse / np.outer(scale, scale), float(np.log(np.diag(factor)).sum() + np.log(scale).sum())
+def _matern_5(apart: Array) -> Array:
+    """The same of a smoother process, twice differentiable."""
+    return np.asarray((1.0 + np.sqrt(5.0) * apart + 5.0 / 3.0 * apart * apart) * np.exp(-np.sqrt(5.0) * apart))
+
+
+_CORRELATIONS = (_matern_3, _matern_5)
+_PRIOR_GRID = (len(_CORRELATIONS), len(PRIOR_LENGTHS), len(PRIOR_STRENGTHS), len(FAR_AMPLITUDES_PX))
 
 
 def _described(
     geometry: EdgeGeometry,
     esf: Array,
+    covariance_of_esf: Array,
     frequency: Array,
     *,
     levels: tuple[float, float],
@@ -797,7 +909,6 @@ def _described(
 ) -> EdgeMtf:
     """Transfer function, its covariance and MTF50 of the ESF's coefficients."""
     spline = geometry.spline
-    covariance_of_esf = geometry.normal[: spline.size, : spline.size]
     otf, slopes = _transfer_and_slopes(geometry, esf, frequency)
     across = np.abs(otf)
     phase = np.where(across > 0, otf / np.maximum(across, 1e-300), 1.0)
@@ -860,24 +971,25 @@ def _falls_to(
     where the curve there is no higher than its noise."""
     grid = 1.5 * (np.arange(2, 81) / 80.0) ** 2
     mtf = np.abs(geometry.optical_transfer(esf, grid))
-    found: list[tuple[float | None, float | None]] = []
-    for level in levels:
-        below = np.flatnonzero(mtf < level)
-        if not len(below) or below[0] == 0:
-            found.append((None, None))
-            continue
-        low, high = grid[below[0] - 1], grid[below[0]]
-        for _ in range(3):  # secant steps on a smooth curve, each cuts the bracket to a tenth
-            pair = np.abs(geometry.optical_transfer(esf, np.array([low, high])))
-            crossing = float(low + (level - pair[0]) * (high - low) / (pair[1] - pair[0]))
-            width = 0.05 * (high - low)
-            low, high = crossing - width, crossing + width
-        slope = (pair[1] - pair[0]) / (20.0 * width)
-        otf, slopes = _transfer_and_slopes(geometry, esf, np.array([crossing]))
-        by_esf = (slopes[0] * otf[0].conj() / abs(otf[0])).real
-        std = float(np.sqrt(by_esf @ covariance @ by_esf))
-        found.append((crossing, std / abs(slope)) if std < 0.3 * level else (None, None))
-    return found
+    # the first of the grid below each level; 0 where the curve doesn't fall so far
+    first = [int(np.argmax(mtf < level)) for level in levels]
+    spans = np.array([np.linspace(grid[k - 1], grid[k], 9) for k in first if k])
+    if not len(spans):
+        return [(None, None) for _ in levels]
+    curves = np.abs(geometry.optical_transfer(esf, spans.ravel())).reshape(spans.shape)
+    fallen = [level for level, k in zip(levels, first, strict=True) if k]
+    # smooth between the grid's points: by a spline through nine
+    splines = [CubicSpline(span, curve - level) for span, curve, level in zip(spans, curves, fallen, strict=True)]
+    crossings = np.array([float(f.roots(extrapolate=False)[0]) for f in splines])
+    otf, slopes = _transfer_and_slopes(geometry, esf, crossings)
+    by_esf = (slopes * (otf.conj() / np.abs(otf))[:, None]).real
+    stds = np.sqrt(np.einsum("fi,fi->f", by_esf @ covariance, by_esf))
+    found = {
+        level: (float(at), float(std / abs(f(at, 1))))
+        for level, at, std, f in zip(fallen, crossings, stds, splines, strict=True)
+        if std < 0.3 * level
+    }
+    return [found.get(level, (None, None)) for level in levels]
 
 
 def _gradients(distance: Array, along_px: Array, light: Array, room: bool) -> Array:
