@@ -11,6 +11,7 @@ from lab.diagnose.evidence import Evidence
 from lab.diagnose.flicker import flicker_block
 from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
+from lab.diagnose.pattern import green_block, line_block
 from lab.diagnose.shading import shading_block
 from lab.diagnose.summaries import Block, Study
 from lab.diagnose.uniform import linearity_block, narrowband_block
@@ -27,6 +28,8 @@ BLOCKS: tuple[Callable[[Study], Block], ...] = (
     flicker_block,
     variance_block,
     neighbour_block,
+    green_block,
+    line_block,
     shading_block,
     narrowband_block,
     chart_block,

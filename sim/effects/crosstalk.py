@@ -1,4 +1,4 @@
-"""Crosstalk: a share of each pixel's charge ends up in its four neighbours."""
+"""Crosstalk: a share of each pixel's charge ends up in its neighbours."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from sim.spectrum import FloatArray
 
 
 class Crosstalk(Effect):
-    """Kernel (c - d; c + d, 1 - 4 c, c + d; c - d): colours mix in uniform light, OTF factor
-    1 - 2 (c + d) (1 - cos 2 pi fx p) - 2 (c - d) (1 - cos 2 pi fy p). Each electron goes its own way: the noise stays white."""
+    """A share c (1 + r) of each pixel's charge goes to each neighbour in its row, c (1 - r) to each in its column, c k to each across a
+    corner: colours mix in uniform light, and the OTF factor is the kernel's cosine sum. Each electron goes its own way: the noise
+    stays white."""
 
     name: ClassVar[str] = "crosstalk"
     stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "K. Hirakawa, Cross-talk explained, ICIP 2008"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time", "field"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"row_excess", "corner_share"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart", "slanted_edge", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {
@@ -45,7 +47,7 @@ class Crosstalk(Effect):
         float,
         Quantity(
             "%",
-            "share of the charge that goes to each of the four neighbours",
+            "share of the charge that goes to each of the four next neighbours, their mean",
             lower=0.0,
             upper=20.0,
             prior=(0.0, 1.5),
@@ -53,45 +55,53 @@ class Crosstalk(Effect):
             slope_power=1,
         ),
     ] = 0.0
-    row_excess_percent: Annotated[
+    row_excess: Annotated[
         float,
         Quantity(
-            "%",
-            "share of each neighbour in the row above their mean, and of each in the column below it",
-            lower=-20.0,
-            upper=20.0,
-            prior=(0.0, 0.5),
+            "1",
+            "share of each neighbour in the row over the mean of both kinds, less 1: 1 is none to those in the column",
+            lower=-1.0,
+            upper=1.0,
+            prior=(0.0, 0.2),
+            absent=0.0,
+        ),
+    ] = 0.0
+    corner_share: Annotated[
+        float,
+        Quantity(
+            "1",
+            "share of each of the four neighbours across corners, over that mean",
+            lower=0.0,
+            upper=1.0,
+            prior=(0.0, 0.2),
             absent=0.0,
         ),
     ] = 0.0
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        # neither axis gives what it hasn't: all charge along the rows, along the columns
-        return ((cls(share_percent=0.3, row_excess_percent=0.3), cls(share_percent=0.3, row_excess_percent=-0.3)),)
+        return ((cls(share_percent=0.3),),)
 
-    def shares(self) -> tuple[float, float]:
-        """What goes to each neighbour in the row, and in the column."""
-        c, d = self.share_percent / 100.0, self.row_excess_percent / 100.0
-        return c + d, c - d
+    def kernel(self) -> FloatArray:
+        """Where the charge of a pixel ends up, (3, 3) of sum 1."""
+        c = self.share_percent / 100.0
+        along, down, across = c * (1.0 + self.row_excess), c * (1.0 - self.row_excess), c * self.corner_share
+        own = 1.0 - 2.0 * along - 2.0 * down - 4.0 * across
+        return np.array([[across, down, across], [along, own, along], [across, down, across]])
 
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
     ) -> FloatArray | None:
-        along, down = self.shares()
-        if along == down == 0.0:
+        if self.share_percent == 0.0:
             return None
-        p = camera.pixel_pitch_um
+        p, kernel = camera.pixel_pitch_um, self.kernel()
+        right, below = np.cos(2.0 * np.pi * fx_cy_per_um * p), np.cos(2.0 * np.pi * fy_cy_per_um * p)
         return np.asarray(
-            1.0
-            - 2.0 * along * (1.0 - np.cos(2.0 * np.pi * fx_cy_per_um * p))
-            - 2.0 * down * (1.0 - np.cos(2.0 * np.pi * fy_cy_per_um * p))
+            kernel[1, 1] + 2.0 * kernel[1, 0] * right + 2.0 * kernel[0, 1] * below + 4.0 * kernel[0, 0] * right * below
         )
 
     def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
-        along, down = self.shares()
-        if along == down == 0.0:
+        if self.share_percent == 0.0:
             return electrons
-        kernel = np.array([[0.0, down, 0.0], [along, 1.0 - 2.0 * along - 2.0 * down, along], [0.0, down, 0.0]])
         # "mirror" about the outermost pixels' centres keeps the mosaic's phases
-        return np.asarray(convolve(electrons, kernel, mode="mirror"))
+        return np.asarray(convolve(electrons, self.kernel(), mode="mirror"))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+
 from sim.camera import CameraModel
 from sim.effects.base import Stage
 from sim.effects.crosstalk import Crosstalk
@@ -24,13 +26,11 @@ class InterPixelCapacitance(Crosstalk):
     )
 
     def neighbour_correlation(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
-        along, down = self.shares()
-        own, mean = 1.0 - 2.0 * along - 2.0 * down, 0.5 * (along + down)
-        return 2.0 * own * mean / (own * own + 4.0 * mean * mean)
+        kernel = self.kernel()
+        own, mean = kernel[1, 1], 0.5 * (kernel[0, 1] + kernel[1, 0])
+        return float(2.0 * own * mean / (own * own + 4.0 * mean * mean))
 
     def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
-        along, down = self.shares()
-        own = 1.0 - 2.0 * along - 2.0 * down
-        if own == 1.0:
+        if self.share_percent == 0.0:
             return noise_e2
-        return noise_e2 - electrons * (1.0 - own * own - 2.0 * along * along - 2.0 * down * down)
+        return noise_e2 - electrons * (1.0 - float(np.sum(np.square(self.kernel()))))
