@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from lab.camera_file import CameraFile
     from lab.diagnose import Diagnosis
     from lab.lens import LensResult
+    from lab.sequences.calibration import Calibration
     from lab.store import Store
 
 EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
@@ -703,6 +704,12 @@ def run(
     out_folder: DataFolder = None,
     name: Annotated[str, typer.Option(help="what the session is called")] = "",
     resume: Resume = "",
+    resolve: Annotated[
+        bool,
+        typer.Option(
+            "--resolve", help="where rivals are left, take the capture that tells them apart, and decide again"
+        ),
+    ] = False,
 ) -> None:
     """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench."""
     from lab.report import provenance_of, words, write_report
@@ -714,6 +721,8 @@ def run(
     fitted = _fitted(recordings, None)
     validation = _validated(recordings, fitted)
     examined = _examined(recordings, fitted)
+    if resolve:
+        examined = _resolved(store, station, recordings, fitted, examined)
     diagnosis = examined.result
     folder = store.folder(session_id)
     _save_models(recordings, examined, folder / "cameras")
@@ -759,7 +768,46 @@ def export(
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
-def _captured(store: Store, station_file: Path | None, quick: bool, name: str, resume: str) -> str:
+def _resolved(
+    store: Store, station: Path | None, recordings: RecordingSet, fitted: FitResult, examined: Diagnosis
+) -> Diagnosis:
+    """Take the best capture that the station can take by itself, and decide again with it; as it was where there is none."""
+    from dataclasses import replace
+
+    from lab.diagnose.next_capture import WORTH_TAKING
+    from lab.results import Resolution
+
+    best = next((p for p in examined.proposals if p.plan is not None and p.capture.distance >= WORTH_TAKING), None)
+    if best is None:
+        why = (
+            "no capture that the station takes by itself tells the rivals apart"
+            if examined.proposals
+            else "no rivals are left"
+        )
+        out.print(f"resolve: {why}")
+        return examined
+    capture = best.capture
+    out.print(escape(f"resolve: {capture.capture}, to tell {' from '.join(capture.rivals)}"))
+    session_id = _captured(store, station, False, f"{recordings.manifest.name} resolve".strip(), "", best.plan)
+    joined = recordings.joined(_stored_recordings(store, session_id), "resolve")
+    again = _examined(joined, fitted)
+    before = Resolution(
+        capture=capture.capture,
+        session=session_id,
+        verdict_before=examined.result.verdict,
+        effects_before=examined.result.effects,
+    )
+    return replace(again, result=again.result.model_copy(update={"resolution": before}))
+
+
+def _captured(
+    store: Store,
+    station_file: Path | None,
+    quick: bool,
+    name: str,
+    resume: str,
+    calibration: Calibration | None = None,
+) -> str:
     """Run a new session, or what is left of the session `resume`; its id. On the mock bench where there is no station."""
     from lab.session import CaptureSession
     from lab.session import Progress as Standing
@@ -790,7 +838,7 @@ def _captured(store: Store, station_file: Path | None, quick: bool, name: str, r
             session = CaptureSession(store, resume, on_progress=tell)
             session.station = station  # the instruments may have moved to other addresses
         else:
-            session = CaptureSession.start(store, station, quick=quick, name=name, on_progress=tell)
+            session = CaptureSession.start(store, station, calibration, quick=quick, name=name, on_progress=tell)
         try:
             session.run()
         except KeyboardInterrupt:

@@ -457,6 +457,50 @@ class _Overlaid:
         return self._below.where(path)
 
 
+class _Joined:
+    """A store, and another whose paths begin with `folder`."""
+
+    def __init__(self, first: Store, later: Store, folder: str) -> None:
+        self._first, self._later, self._folder = first, later, f"{folder}/"
+
+    def _of(self, path: str) -> tuple[Store, str]:
+        return (self._later, path.removeprefix(self._folder)) if path.startswith(self._folder) else (self._first, path)
+
+    def file(self, path: str) -> Path | None:
+        store, its = self._of(path)
+        return store.file(its)
+
+    def frame(self, path: str, camera: Camera) -> Frame:
+        store, its = self._of(path)
+        return store.frame(its, camera)
+
+    def spectrum(self, path: str) -> Spectrum:
+        store, its = self._of(path)
+        return store.spectrum(its)
+
+    def target(self, path: str) -> Target:
+        store, its = self._of(path)
+        return store.target(its)
+
+    def where(self, path: str) -> str:
+        store, its = self._of(path)
+        return store.where(its)
+
+
+#: Keys of captures whose values name files or poses, which another set may name alike.
+_NAMING = frozenset({"id", "frame", "radiance", "dark_radiance", "light_radiance", "target", "pose"})
+
+
+def _renamed(told: Any, folder: str) -> Any:
+    """A capture's document with `folder` before its id, its paths and its pose."""
+    if not isinstance(told, dict):
+        return told
+    return {
+        key: f"{folder}/{value}" if key in _NAMING and isinstance(value, str) else _renamed(value, folder)
+        for key, value in told.items()
+    }
+
+
 # --- the set -----------------------------------------------------------------------------------------------------------
 
 
@@ -546,6 +590,18 @@ class RecordingSet:
             source=self.source,
             warnings=self.warnings,
             store=_Overlaid(self._store, frames),
+            cache_bytes=self.cache_bytes,
+        )
+
+    def joined(self, later: RecordingSet, folder: str) -> RecordingSet:
+        """This set with the captures of a later one of the same cameras, whose ids and paths get `folder/` before them."""
+        told = (_renamed(c.model_dump(mode="json", exclude_unset=True), folder) for c in later.manifest.captures)
+        captures = (*self.manifest.captures, *Manifest.model_validate({"cameras": {}, "captures": list(told)}).captures)
+        return RecordingSet(
+            self.manifest.model_copy(update={"captures": captures}),
+            source=self.source,
+            warnings=(*self.warnings, *later.warnings),
+            store=_Joined(self._store, later._store, folder),
             cache_bytes=self.cache_bytes,
         )
 

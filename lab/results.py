@@ -650,6 +650,26 @@ class ResidualCurve(Frozen):
     held_out: bool
 
 
+class NextCapture(Frozen):
+    """A capture that could be taken, and how far it would bring the two nearest rivals apart: `distance` D = 1/2 of their predictions'
+    squared distance in standard deviations of what scatters there, `told_apart` the probability Phi(sqrt(D / 2)) to decide rightly."""
+
+    side: Side
+    capture: str
+    rivals: tuple[str, str]
+    distance: float
+    told_apart: float
+
+
+class Resolution(Frozen):
+    """What was undecided, the capture that was taken to settle it, and where its frames lie; the result itself is the decision after."""
+
+    capture: str
+    session: str
+    verdict_before: Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+    effects_before: tuple[NamedEffect, ...]
+
+
 class DiagnosisResult(Frozen):
     format: Literal["calibench-diagnosis"] = "calibench-diagnosis"
     version: Literal[1] = 1
@@ -660,6 +680,8 @@ class DiagnosisResult(Frozen):
     unexplained: tuple[Unexplained, ...] = ()
     held_out: HeldOut | None = None
     next_capture: str | None = None
+    next_captures: tuple[NextCapture, ...] = ()  # best first, side by side
+    resolution: Resolution | None = None
     threshold: float | None = None
     false_alarm_rate: float | None = None
     curves: tuple[ResidualCurve, ...] = ()

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from lab.camera_file import CameraFile
 from lab.diagnose.blocks import BLOCKS
 from lab.diagnose.findings import merged
+from lab.diagnose.next_capture import Proposal
 from lab.diagnose.processes import in_processes
 from lab.diagnose.side import SideFindings, diagnose_side
 from lab.recording import RecordingSet
@@ -28,10 +29,11 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and each side's model with it: the cameras of sides that could be judged."""
+    """What was found; each side's model with it (of the sides that could be judged); and what to capture next, best first."""
 
     result: DiagnosisResult
     improved: dict[Side, CameraFile]
+    proposals: tuple[Proposal, ...] = ()
 
 
 def diagnose(
@@ -78,4 +80,5 @@ def examine(
     if progress is not None:
         progress("done", 1.0)
     improved = {findings.side: findings.improved for findings in found if findings.improved is not None}
-    return Diagnosis(merged(recordings.source, found), improved)
+    offered = sorted((p for findings in found for p in findings.proposals), key=lambda p: -p.capture.distance)
+    return Diagnosis(merged(recordings.source, found), improved, tuple(offered))

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from lab.diagnose.decide import FALSE_ALARM_RATE
-from lab.diagnose.next_capture import next_capture
+from lab.diagnose.next_capture import SMALLEST_RIVAL, next_sentence
 from lab.diagnose.side import Named, SideFindings
 from lab.results import (
     DiagnosisResult,
@@ -22,8 +22,6 @@ from lab.results import (
 from sim.camera import Side
 from sim.effects.library import effects as library
 
-#: Rivals less likely than this aren't listed.
-SMALLEST_RIVAL = 0.005
 Word = Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
 
 
@@ -38,6 +36,7 @@ def merged(source: str, found: Sequence[SideFindings]) -> DiagnosisResult:
     elif effects:
         verdict = "partly_explained" if unexplained else "explained"
     held_out = _held_out(found)
+    offered = tuple(proposal.capture for f in found for proposal in f.proposals)
     return DiagnosisResult(
         source=source,
         verdict=verdict,
@@ -45,7 +44,8 @@ def merged(source: str, found: Sequence[SideFindings]) -> DiagnosisResult:
         effects=effects,
         unexplained=unexplained,
         held_out=held_out,
-        next_capture=next_capture(found),
+        next_capture=next_sentence(offered, bool(unexplained)),
+        next_captures=offered,
         threshold=max((f.threshold for f in found if f.threshold is not None), default=None),
         false_alarm_rate=FALSE_ALARM_RATE if any(f.is_judged for f in found) else None,
         curves=tuple(c for f in found for c in f.curves),

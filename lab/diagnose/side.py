@@ -14,6 +14,7 @@ from lab.diagnose.decide import Candidate, Verdict, decide
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.improved import Correction, improved_model
 from lab.diagnose.locate import describe
+from lab.diagnose.next_capture import Proposal, proposals
 from lab.diagnose.summaries import Block
 from lab.diagnose.unknown import with_discrepancy
 from lab.recording import RecordingSet
@@ -49,6 +50,7 @@ class SideFindings:
     held_out: HeldOut | None = None
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None  # the model with what was found
+    proposals: tuple[Proposal, ...] = ()  # what to capture next
 
 
 def diagnose_side(
@@ -61,6 +63,7 @@ def diagnose_side(
         return SideFindings(side, skipped)
     report("scoring the effects")
     verdict = decide(evidence, np.random.default_rng(SEED), report)
+    report("looking for the next capture")
     improved, corrections = improved_model(recordings, side, fit, baseline, evidence, verdict.effects, verdict.unknown)
     return SideFindings(
         side=side,
@@ -74,6 +77,7 @@ def diagnose_side(
         held_out=_held_out(verdict),
         curves=tuple(_curves(side, verdict)),
         improved=improved,
+        proposals=proposals(recordings, side, verdict),
     )
 
 

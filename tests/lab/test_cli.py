@@ -13,9 +13,22 @@ import pytest
 
 from lab import cli, recording
 from lab.diagnose import Diagnosis
+from lab.diagnose.next_capture import Proposal
 from lab.errors import DeviceError
 from lab.recording import Manifest, RecordingSet
-from lab.results import CameraFit, Check, DiagnosisResult, FitResult, NoiseFit, Skipped, ValidationResult
+from lab.results import (
+    CameraFit,
+    Check,
+    DiagnosisResult,
+    FitResult,
+    NextCapture,
+    NoiseFit,
+    Resolution,
+    Skipped,
+    ValidationResult,
+)
+from lab.sequences.calibration import Calibration
+from lab.sequences.dark import DarkSequence
 
 
 @pytest.fixture(autouse=True)
@@ -295,6 +308,51 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
     assert shelf.kept == ["fit", "validate", "diagnose"]
     assert DiagnosisResult.model_validate_json((tmp_path / "diagnose.json").read_text()) == diagnosis
     assert (tmp_path / "report.html").stat().st_size > 1e6
+
+
+@pytest.mark.parametrize("settles", [True, False])
+def test_resolve_takes_the_capture_and_decides_again(
+    settles: bool,
+    small_set: Callable[..., RecordingSet],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Only where it would settle something, and what stood before is told."""
+
+    class Shelf:
+        def recording_set(self, session_id: str) -> RecordingSet:
+            return small_set()
+
+    plan = Calibration(dark=DarkSequence(exposures_s=(0.1,), frames=2))
+    capture = NextCapture(
+        side="left",
+        capture="dark frames",
+        rivals=("defocus", "coma"),
+        distance=9.0 if settles else 0.1,
+        told_apart=0.98,
+    )
+    taken: list[Calibration | None] = []
+    captured = lambda *given: taken.append(given[-1]) or "session-2"  # noqa: E731
+    after = Diagnosis(DiagnosisResult(source="s", verdict="explained"), {})
+    monkeypatch.setattr(cli, "_captured", captured)
+    monkeypatch.setattr(
+        cli, "_examined", lambda joined, fit: after if len(joined.captures()) > n else pytest.fail("not joined")
+    )
+    recordings = small_set()
+    n = len(recordings.captures())
+    before = Diagnosis(DiagnosisResult(source="s", verdict="partly_explained"), {}, (Proposal(capture, plan),))
+    found = cli._resolved(Shelf(), None, recordings, FitResult(source="s", cameras={}), before)  # type: ignore[arg-type]
+    if not settles:
+        assert found is before
+        assert not taken
+        return
+    assert taken == [plan]
+    assert found.result.verdict == "explained"
+    assert found.result.resolution == Resolution(
+        capture="dark frames", session="session-2", verdict_before="partly_explained", effects_before=()
+    )
+    assert "dark frames, to tell defocus from coma" in capsys.readouterr().out
 
 
 def test_import_writes_a_set_or_nothing(tmp_path: Path, flats: Path, capsys: pytest.CaptureFixture[str]) -> None:

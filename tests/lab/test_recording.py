@@ -584,3 +584,23 @@ def test_foreign_sets_are_read_and_survive_a_copy(name: str, tmp_path: Path) -> 
     assert after.manifest == before.manifest
     for capture in before.captures():
         np.testing.assert_array_equal(after.frame(capture), before.frame(capture))
+
+
+def test_joined_sets_keep_apart_what_they_name_alike(small_set: Callable[..., RecordingSet]) -> None:
+    """The same set as its own later one, with other frames: ids, paths and poses of the later have the folder before them."""
+    first = small_set()
+    later = first.with_frames({c.frame: np.full_like(first.frame(c), 7) for c in first.captures()})
+    both = first.joined(later, "resolve")
+    n = len(first.captures())
+    assert [c.id for c in both.captures()] == [c.id for c in first.captures()] + [
+        f"resolve/{c.id}" for c in first.captures()
+    ]
+    for old, new in zip(first.captures(), both.captures()[n:], strict=True):
+        np.testing.assert_array_equal(both.frame(both.capture(old.id)), first.frame(old))
+        assert np.all(both.frame(new) == 7)
+        told = old.model_dump(exclude_unset=True)
+        for key in ("radiance", "light_radiance"):
+            if told.get(key) is not None:
+                assert both.spectrum(getattr(new, key)) == first.spectrum(told[key])
+        if "screen" in told:
+            assert new.screen.pose == f"resolve/{old.screen.pose}"
