@@ -39,14 +39,14 @@ LEAST_NOISE_DN = 0.4  # below, codes are too coarse to say what the temporal noi
 CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
 MEDIAN_OF = 5  # frames at most, whose median is looked at for odd pixels
 #: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
-TAIL_EDGES = 4.5, 6.0, 9.0, 15.0, 30.0, 60.0, 120.0
+TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
 #: Of the first edge, which one pixel in 1e5 passes by chance: edges of the bins of temporal variance.
-BLINK_EDGES = 1.0, 1.6, 2.6, 4.5, 9.0, 20.0
+BLINK_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
 BLINK_CHANCE = 1e-5
 SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their noise are taken
 JUMPS = 256  # draws of which frames of a jumping pixel are high
-#: What counts of few pixels may be off by, in roots of a count (about 1 by chance): neighbours that are alike, clusters.
-COUNT_STD = 1.0
+#: What a root of a count may be off by beside chance (about 1 where many are expected): one odd pixel more is no finding.
+COUNT_STD = 0.6
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------------
@@ -806,8 +806,12 @@ def _rooted(counts: FloatArray) -> FloatArray:
 
 
 def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
-    """Chance, and what the expected counts themselves are uncertain by."""
-    return np.diag(COUNT_STD**2 + np.square(_rooted(expected + uncertain) - _rooted(expected)))
+    """Chance (1 where many are expected), and what the expected counts themselves are uncertain by."""
+    number = np.arange(60.0)
+    share = stats.poisson.pmf(number, np.minimum(expected, 20.0)[:, None])
+    mean = share @ _rooted(number)
+    chance = share @ np.square(_rooted(number)) - mean**2
+    return np.diag(chance + COUNT_STD**2 + np.square(_rooted(expected + uncertain) - _rooted(expected)))
 
 
 def odd_pixel_block(study: Study) -> Block:

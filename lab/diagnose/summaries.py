@@ -26,6 +26,7 @@ from sim.spectrum import FloatArray, Spectrum
 
 Effects = Sequence[Effect]
 T = TypeVar("T")
+C = TypeVar("C", bound=Capture)
 
 # --- what doesn't average out: floors that the covariance carries beside noise ---------------------------------------------
 LAMP_FLOOR = 1.0e-4  # of a level, common to the channels of a capture
@@ -72,7 +73,9 @@ class Block:
     hooks: frozenset[str]  # hooks of an effect that can change the prediction
     predict: Callable[[Effects], Prediction]
     scale: FloatArray  # size of a discrepancy of 1, (n,)
-    along: FloatArray | None = None  # where smoothness isn't along x: logarithms of levels (n,), places on the sensor (n, 2)
+    along: FloatArray | None = (
+        None  # where smoothness isn't along x: logarithms of levels (n,), places on the sensor (n, 2)
+    )
     #: What conditions are an axis of ("orientation", "pattern"): slices and curves are by condition, too. "": of none.
     conditions: str = ""
     #: Words before the conditions where the report lists them ("edges at"); "": the axis' name.
@@ -92,6 +95,8 @@ class Block:
 
 SPECTRAL_HOOKS = frozenset({"radiance", "transmittance"})
 UNIFORM_HOOKS = frozenset({"drift", "exposure", "illumination", "ambient_e_per_s", "charge", "response", "offset_dn"})
+#: Of measurements in whose prediction the frame before enters.
+SEQUENCE_HOOKS = frozenset({"left_behind"})
 
 
 @dataclass(frozen=True)
@@ -228,6 +233,13 @@ class Study:
         if all(c.time is not None for c in order):
             order.sort(key=self.elapsed_s)
         return {c.id: before for before, c in pairwise(order)}
+
+    def settled(self, group: Sequence[C]) -> list[C]:
+        """Of repeats those that follow another of them, and so hold nothing of another level that was left behind; all where these
+        are fewer than two."""
+        names = {c.id for c in group}
+        found = [c for c in group if c.id in self._before and self._before[c.id].id in names]
+        return found if len(found) > 1 else list(group)
 
     def carried_e(self, capture: Capture, channel: str, effects: Effects) -> float:
         """By how many electrons a channel's mean changes where charge is left behind, given what was read of it and of the capture
@@ -395,7 +407,7 @@ def noise_guess(study: Study) -> NoiseGuess:
         low = s < 0.5 * (study.saturation_dn - black)
         use = low if low.sum() > 2 else np.ones_like(low)
         gain = float(np.sum(weight[use] * s[use] * (v[use] - read**2)) / np.sum(weight[use] * s[use] ** 2))
-        lamp = level_scatter(study, black, gain, read)
+        lamp = level_scatter(repeated_levels(study, black, gain, read))
     if gain is None or gain <= 0:
         gain = 1.0
     return NoiseGuess(black, dark, gain, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
@@ -422,9 +434,18 @@ def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[F
     return float(np.sqrt((rest @ rest + 2.0 * USUAL_JITTER_DN**2) / (freedom + 2.0)))
 
 
-def level_scatter(study: Study, black: float, gain: float, read_dn: float) -> float:
-    """Relative scatter of repeated flat frames' levels beyond shot and read noise, a common trend with time taken out: a lamp that
-    drifts doesn't scatter. Groups count by the inverse of their noise's variance; DN and DN/e."""
+@dataclass(frozen=True)
+class RepeatedLevels:
+    """Frames of one flat setting: their levels less the mean, relative; seconds less the mean; relative variance by pixels' noise."""
+
+    captures: tuple[Capture, ...]
+    away: FloatArray
+    elapsed_s: FloatArray
+    noise: float
+
+
+def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedLevels]:
+    """Of every flat setting with repeats, all unclipped channels together; DN and DN/e."""
     found = []
     for group in study.flat_levels():
         planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
@@ -435,20 +456,23 @@ def level_scatter(study: Study, black: float, gain: float, read_dn: float) -> fl
         total = levels @ size
         if total.mean() <= 0:
             continue
-        noise = float(((gain * levels.mean(0) + read_dn**2) * size).sum()) / total.mean() ** 2
+        noise = float(((gain * np.maximum(levels.mean(0), 0.0) + read_dn**2) * size).sum()) / total.mean() ** 2
         elapsed = np.array([study.elapsed_s(k) for k in group])
-        found.append((total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
-    if not found:
-        return 0.0
-    weight = [1.0 / (noise + LAMP_FLOOR**2) for *_, noise in found]
-    moved = sum(w * float(t @ t) for w, (_, t, _) in zip(weight, found, strict=True))
-    trend = sum(w * float(t @ x) for w, (x, t, _) in zip(weight, found, strict=True)) / moved if moved > 0 else 0.0
-    left = sum(
-        w * (float(np.sum(np.square(x - trend * t))) - (len(x) - 1) * n)
-        for w, (x, t, n) in zip(weight, found, strict=True)
-    )
-    free = sum(w * (len(x) - 1) for w, (x, _, _) in zip(weight, found, strict=True))
-    return float(np.sqrt(max(left / free, 0.0)))
+        found.append(RepeatedLevels(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
+    return found
+
+
+def level_scatter(repeats: Sequence[RepeatedLevels]) -> float:
+    """Relative scatter of repeated flat frames' levels beyond pixels' noise, a common trend with time taken out: a lamp that drifts
+    doesn't scatter. Settings count by the inverse of their noise's variance."""
+    weight = np.array([1.0 / (r.noise + LAMP_FLOOR**2) for r in repeats])
+    moved = sum(w * float(r.elapsed_s @ r.elapsed_s) for w, r in zip(weight, repeats, strict=True))
+    trend = 0.0
+    if moved > 0:
+        trend = sum(w * float(r.elapsed_s @ r.away) for w, r in zip(weight, repeats, strict=True)) / moved
+    left = [float(np.sum(np.square(r.away - trend * r.elapsed_s))) - (len(r.away) - 1) * r.noise for r in repeats]
+    free = float(sum(w * (len(r.away) - 1) for w, r in zip(weight, repeats, strict=True)))
+    return float(np.sqrt(max(float(weight @ left) / free, 0.0))) if free > 0 else 0.0
 
 
 def pair_variance(frames: Sequence[Any]) -> float:

@@ -11,6 +11,7 @@ from lab.diagnose.neighbours import held_out_flats
 from lab.diagnose.summaries import (
     LEVEL_REACH,
     NARROWBAND_FLOOR,
+    SEQUENCE_HOOKS,
     SPECTRAL_HOOKS,
     UNIFORM_HOOKS,
     Block,
@@ -20,6 +21,7 @@ from lab.diagnose.summaries import (
     Study,
     held_out_of,
     overrides,
+    repeated_levels,
 )
 from lab.errors import NotDetermined
 from lab.predict import collected_electrons, mean_dn
@@ -82,7 +84,8 @@ def linearity_block(study: Study) -> Block:
                 )
                 done[capture.id] = mean_dn(camera, collected, effects)
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
-            mean[i] = noise.black + done[capture.id][channel] + study.offset(capture, effects)
+            carried = noise.gain * study.carried_e(capture, channel, effects)
+            mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
         slopes = study.free_offsets(exposures)
         for lamp, channel in rate:
             slopes[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
@@ -96,7 +99,7 @@ def linearity_block(study: Study) -> Block:
     return Block(
         measurement="photon_transfer", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
-        hooks=UNIFORM_HOOKS, predict=predict, scale=signal,
+        hooks=UNIFORM_HOOKS | SEQUENCE_HOOKS, predict=predict, scale=signal,
     )  # fmt: skip
 
 
@@ -125,20 +128,17 @@ def _scatter(study: Study, groups: list[list[Any]]) -> FloatArray:
     flickering light that short exposures don't average."""
     noise = study.noise
     found = np.full(len(groups), noise.jitter_lamp)
-    for i, group in enumerate(groups):
-        channels = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
-        if len(group) < 2 or not channels:
+    place = {group[0].id: i for i, group in enumerate(groups)}
+    for repeats in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
+        moved = float(repeats.elapsed_s @ repeats.elapsed_s)
+        left, free = repeats.away, len(repeats.away) - 1
+        if free > 1 and moved > 0:  # a trend with time is no scatter
+            left, free = left - float(repeats.elapsed_s @ left) / moved * repeats.elapsed_s, free - 1
+        elif moved > 0:
             continue
-        size = np.array([study.levels(group[0]).pixels[c] for c in channels], float)
-        levels = np.array([[study.levels(k).mean[c] or 0.0 for c in channels] for k in group]) - noise.black
-        total = levels @ size
-        if total.mean() <= 0:
-            continue
-        shot = float(((noise.gain * levels.mean(0) + noise.read_dn**2) * size).sum()) / total.mean() ** 2
-        free = len(group) - 1
-        own = max(float(np.var(total / total.mean(), ddof=1)) - shot, 0.0)
+        own = max(float(np.sum(np.square(left))) / free - repeats.noise, 0.0)
         pooled = (_COMMON_REPEATS * noise.jitter_lamp**2 + free * own) / (_COMMON_REPEATS + free)
-        found[i] = np.sqrt(max(pooled, noise.jitter_lamp**2))
+        found[place[repeats.captures[0].id]] = np.sqrt(max(pooled, noise.jitter_lamp**2))
     return found
 
 
@@ -212,7 +212,8 @@ def narrowband_block(study: Study) -> Block:
                     elapsed_s=study.elapsed_s(capture),
                 )
                 done[capture.id] = mean_dn(camera, electrons, effects)
-            mean[i] = noise.black + done[capture.id][channel] + study.offset(capture, effects)
+            carried = noise.gain * study.carried_e(capture, channel, effects)
+            mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
             share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
         slopes = study.free_offsets(exposures) | {k: v * share for k, v in curves.slopes(effects).items()}
         return Prediction(mean, slopes)
@@ -220,7 +221,7 @@ def narrowband_block(study: Study) -> Block:
     return Block(
         measurement="narrowband", axis="wavelength", unit="nm", reach=25.0, value=value, covariance=covariance,
         labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
-        hooks=UNIFORM_HOOKS | SPECTRAL_HOOKS, predict=predict, scale=np.maximum(signal, 1.0),
+        hooks=UNIFORM_HOOKS | SEQUENCE_HOOKS | SPECTRAL_HOOKS, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
 
 
