@@ -21,7 +21,15 @@ class Astigmatism(Aberration):
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset(
-        {"defocus", "optical_low_pass_filter", "vibration_blur", "charge_diffusion", "spherical_aberration"}
+        {
+            "coma",
+            "defocus",
+            "field_curvature",
+            "optical_low_pass_filter",
+            "vibration_blur",
+            "charge_diffusion",
+            "spherical_aberration",
+        }
     )
     sentence: ClassVar[str] = (
         "The lens is astigmatic: horizontal and vertical detail come to focus in different planes, so that their contrasts differ."

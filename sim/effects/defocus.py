@@ -23,6 +23,7 @@ class Defocus(Aberration):
     rivals: ClassVar[frozenset[str]] = frozenset(
         {
             "axial_chromatic_aberration",
+            "field_curvature",
             "spherical_aberration",
             "charge_diffusion",
             "optical_low_pass_filter",

@@ -23,6 +23,7 @@ class SphericalAberration(Aberration):
     rivals: ClassVar[frozenset[str]] = frozenset(
         {
             "axial_chromatic_aberration",
+            "coma",
             "defocus",
             "charge_diffusion",
             "optical_low_pass_filter",

@@ -54,7 +54,7 @@ FREQUENCY = np.linspace(0.0, 1.2, 25)
 def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     """All that hooks can change, in one vector, in units of its own size."""
     otf = [
-        optical_transfer(CAMERA, c, LIGHT, f, g, acting)
+        optical_transfer(CAMERA, c, LIGHT, f, g, [e.at_place(30.0, -20.0, CAMERA) for e in acting])
         for c in "RGB"
         for f, g in ((FREQUENCY, 0 * FREQUENCY), (0.6 * FREQUENCY, 0.8 * FREQUENCY))
     ]
@@ -89,7 +89,15 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     for e in acting:
         full = e.overflow(full, CAMERA)
     return np.concatenate(
-        [np.real(np.concatenate(otf)), np.array(rates) / max(rates), frame.ravel() / frame.max(), rest, shown, pair]
+        [
+            np.real(np.concatenate(otf)),
+            np.imag(np.concatenate(otf)),
+            np.array(rates) / max(rates),
+            frame.ravel() / frame.max(),
+            rest,
+            shown,
+            pair,
+        ]
         + [values / 100.0 for values in (*electronics, codes, full.ravel(), 100.0 * shared)]
     )
 
@@ -158,7 +166,8 @@ def test_prototypes_change_something_and_stay_in_bounds(kind: type[Effect]) -> N
 
 
 def _blurs() -> list[Effect]:
-    return [p for kind in ALL if kind.transfer is not Effect.transfer for p in kind.prototypes(CAMERA)[0]]
+    places = [p for kind in ALL if kind.transfer is not Effect.transfer for p in kind.prototypes(CAMERA)[0]]
+    return [p.at_place(30.0, -20.0, CAMERA) for p in places]
 
 
 @pytest.mark.parametrize("one", _blurs(), ids=lambda e: e.name)

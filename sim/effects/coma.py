@@ -1,0 +1,42 @@
+"""Coma: light of the pupil's rim lands beside that of its middle."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from sim.camera import CameraModel
+from sim.effects.aberration import Aberration
+from sim.effects.base import Stage
+from sim.optics.pupil import Wavefront, seidel
+from sim.parameters import Quantity
+
+
+class Coma(Aberration):
+    """Path error W131 rho^2 (x, y) over the pupil along a direction, alike all over the field, as a decentred element makes it.
+
+    The spread is lopsided, so that the transfer function gets a phase. Its part in proportion to frequency only moves the image; the
+    rest grows in proportion to W131, the loss of contrast as its square.
+    """
+
+    name: ClassVar[str] = "coma"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "V. Mahajan, Optical Imaging and Aberrations, part II, section 4.4"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"astigmatism", "spherical_aberration"})
+    sentence: ClassVar[str] = (
+        "The lens has coma: points have a tail to one side, so that edges are lopsided along one direction and even across it."
+    )
+
+    w131_x_um: Annotated[
+        float,
+        Quantity("um", "path error at the pupil's rim along columns", lower=-5.0, upper=5.0, prior=(0.0, 0.3), absent=0.0),
+    ] = 0.0  # fmt: skip
+    w131_y_um: Annotated[
+        float,
+        Quantity("um", "path error at the pupil's rim along rows", lower=-5.0, upper=5.0, prior=(0.0, 0.3), absent=0.0),
+    ] = 0.0  # fmt: skip
+
+    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
+        return seidel(coma_um=(self.w131_x_um, self.w131_y_um))

@@ -1,0 +1,68 @@
+"""Field curvature and tilt: the image lies on a bowl, or the sensor askew to it."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.aberration import Aberration
+from sim.effects.base import Stage
+from sim.optics.pupil import Wavefront, seidel
+from sim.parameters import Quantity
+
+
+class FieldCurvature(Aberration):
+    """The sensor lies dz = c r^2 + a x + b y from the focus, x, y from its centre in half diagonals: W = dz / (8 N^2) rho^2.
+
+    `transfer` is that of one place, the centre unless `at_place` says another: edges and kernels show it, whole frames are drawn
+    as the centre is.
+    """
+
+    name: ClassVar[str] = "field_curvature"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on aberrations"
+    form_tolerance: ClassVar[float] = 0.05
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"defocus", "astigmatism"})
+    sentence: ClassVar[str] = (
+        "The plane of focus is bowed or tilted against the sensor: the image is sharp in some places and out of focus in others."
+    )
+
+    curvature_um: Annotated[
+        float,
+        Quantity("um", "distance of sensor and focus half a diagonal from the centre, where it grows as the square", lower=-200.0,
+                 upper=200.0, prior=(0.0, 20.0), absent=0.0, slope_power=2),
+    ] = 0.0  # fmt: skip
+    tilt_x_um: Annotated[
+        float,
+        Quantity("um", "the same along columns, where it grows in proportion", lower=-200.0, upper=200.0, prior=(0.0, 20.0),
+                 absent=0.0, slope_power=2),
+    ] = 0.0  # fmt: skip
+    tilt_y_um: Annotated[
+        float,
+        Quantity("um", "the same along rows", lower=-200.0, upper=200.0, prior=(0.0, 20.0), absent=0.0, slope_power=2),
+    ] = 0.0  # fmt: skip
+
+    #: (x, y) of the place whose transfer this is, in half diagonals.
+    place: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        # a defocus that grows from place to place is no small change of the same with the other sign beside another term
+        return tuple(
+            (cls(curvature_um=6.0), cls(tilt_x_um=sign_x * 6.0), cls(tilt_y_um=sign_y * 6.0))
+            for sign_x in (1.0, -1.0)
+            for sign_y in (1.0, -1.0)
+        )
+
+    def at_place(self, x_um: float, y_um: float, camera: CameraModel) -> Self:
+        half_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
+        return self.model_copy(update={"place": (x_um / half_um, y_um / half_um)})
+
+    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
+        x, y = self.place
+        away_um = self.curvature_um * (x * x + y * y) + self.tilt_x_um * x + self.tilt_y_um * y
+        return seidel(defocus_um=away_um / (8.0 * camera.lens.f_number**2))
