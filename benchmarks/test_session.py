@@ -1,0 +1,87 @@
+"""All fits of a whole session, as a user runs them: wall clock, CPU time and memory of `calibench fit`.
+
+Two cameras of 1280 x 960, some 190 frames of each (`benchmarks.big_session`, 1 GB, in a temporary folder), of which all are read and
+looked through. Wanted on two cores: 90 s.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from benchmarks.table import Row, show
+from lab import recording
+from lab.fit.geometry import fit_geometry
+from lab.fit.mtf import fit_mtf
+from lab.fit.noise import fit_noise
+from lab.fit.psf import fit_psf_field
+from lab.fit.spectral import fit_spectral
+
+T = TypeVar("T")
+WANTED_S, WANTED_BYTES = 90.0, 3 << 30
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(7200)]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The session's folder: CALIBENCH_BENCH_SESSION if that names one made before, else a new one."""
+    made = os.environ.get("CALIBENCH_BENCH_SESSION")
+    if made:
+        return Path(made)
+    folder = tmp_path_factory.mktemp("session")
+    subprocess.run([sys.executable, "-m", "benchmarks.big_session", str(folder)], check=True)
+    return folder
+
+
+def test_the_command(session: Path, tmp_path: Path) -> None:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    begun = time.perf_counter()
+    command = [sys.executable, "-m", "lab.cli", "fit", str(session), "--json", str(tmp_path / "fit.json")]
+    subprocess.run(command, check=True, capture_output=True)
+    wall = time.perf_counter() - begun
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    memory = (
+        1024 * after.ru_maxrss
+    )  # the greatest of all processes that have ended: this one's, or a smaller session's making
+    captures = json.loads((session / "manifest.json").read_text())["captures"]
+    frames = len({capture["frame"] for capture in captures})
+    show(
+        f"calibench fit: 2 cameras of 1280 x 960, {frames} frames, {len(captures)} captures",
+        [
+            Row("wall clock, as busy as this machine is", wall, WANTED_S, "s", "wanted on two free cores"),
+            Row("CPU", cpu, 2.0 * WANTED_S, "s", "two cores for as long"),
+            Row("of that in the kernel", after.ru_stime - before.ru_stime, None, "s"),
+            Row("memory", memory / 2**30, WANTED_BYTES / 2**30, "GiB", "wanted"),
+        ],
+    )
+    fit = json.loads((tmp_path / "fit.json").read_text())
+    assert fit["skipped"] == []
+    assert memory < WANTED_BYTES
+
+
+def test_the_steps(session: Path) -> None:
+    rows: list[Row] = []
+
+    def spent(name: str, work: Callable[[], T]) -> T:
+        begun = time.process_time()
+        found = work()
+        rows.append(Row(name, time.process_time() - begun, None, "CPU s"))
+        return found
+
+    recordings = spent("reading and looking through, both cameras", lambda: recording.read(session))
+    noise = spent("noise", lambda: fit_noise(recordings, "left"))
+    spent("spectral", lambda: fit_spectral(recordings, "left", noise))
+    spent("MTF", lambda: fit_mtf(recordings, "left", noise))
+    spent("PSF", lambda: fit_psf_field(recordings, "left"))
+    spent("geometry", lambda: fit_geometry(recordings, "left"))
+    show("the steps, of one camera", rows)
