@@ -30,11 +30,12 @@ TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures are that close are re
 CELLS = 4, 6  # of a frame: rows, columns
 CELL_FLOOR_DN = 0.005
 MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
-BANDS = 8  # of a spectrum over lines
+BANDS = 6  # of a spectrum over lines
 LEVEL_BAND = 0.04, 0.2  # cy/px, along both axes: where a spectrum's level is taken
 POWER_FLOOR = 0.02  # of a band's power: what isn't quite white in a healthy read-out
 VARIANCE_FLOOR = 0.004  # of a temporal variance
 LEAST_COUNTED_DN = 0.6  # the same of single pixels, whose far tail counts
+LEAST_LINE_DN = 0.3  # the same of lines' means
 LEAST_NOISE_DN = 0.4  # below, codes are too coarse to say what the temporal noise is
 CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
 MEDIAN_OF = 5  # frames at most, whose median is looked at for odd pixels
@@ -346,7 +347,7 @@ class _Power:
 
     @property
     def level(self) -> float:
-        return float(self._level.mean())
+        return max(float(self._level.mean()), 1e-12)
 
     def line(self, lines: Lines) -> tuple[FloatArray, FloatArray, float]:
         """(frequency, power over the level) of the lines' means, up to and without 0.5 cy/px; number of the level's modes."""
@@ -412,7 +413,8 @@ def _log_mean_bias(modes: FloatArray | float) -> FloatArray:
 
 
 def _log_mean_variance(modes: FloatArray | float) -> FloatArray:
-    return np.asarray(polygamma(1, modes))
+    # of few modes the logarithm has a long lower tail
+    return np.asarray(polygamma(1, modes) * (1.0 + 1.0 / np.asarray(modes)))
 
 
 # --- level ------------------------------------------------------------------------------------------------------------------
@@ -564,6 +566,23 @@ def dark_noise_block(study: Study) -> Block:
     )  # fmt: skip
 
 
+def _fine(step: str, frames: Sequence[Frames], least_dn: float) -> list[Frames]:
+    """Conditions whose frames differ by at least so much noise; NotDetermined where there are none."""
+    every = [f for f in frames if f.changing]
+    if not every:
+        raise NotDetermined(step, "no two dark frames of the same exposure and temperature")
+    fine = [f for f in every if all(c.variance_dn2 > least_dn**2 for c in f.changing.values())]
+    if not fine:
+        raise NotDetermined(step, _too_coarse(every, least_dn))
+    return fine
+
+
+def _by_part(frames: Sequence[Frames]) -> dict[bool, list[Changing]]:
+    """What changes from frame to frame, of what choice and fit may see and of what is held out; neither if there is none."""
+    parts = {out: [f.changing[out] for f in frames if out in f.changing] for out in (False, True)}
+    return {out: part for out, part in parts.items() if part}
+
+
 def _too_coarse(frames: Sequence[Frames], limit_dn: float) -> str:
     noise = min(np.sqrt(c.variance_dn2) for f in frames for c in f.changing.values())
     return f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse to show how it is distributed; a higher gain would"
@@ -608,10 +627,8 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
     """Spectrum of what all pixels of a row (column) share in one frame and not in the next, over that of single pixels."""
     frames = study.once(dark_frames)
     name = "row_noise" if lines == "rows" else "column_noise"
-    parts = {out: [f.changing[out] for f in frames if out in f.changing] for out in (False, True)}
-    parts = {out: part for out, part in parts.items() if part}
-    if not parts:
-        raise NotDetermined(f"dark_{name}", "no two dark frames of the same exposure and temperature")
+    fine = _fine(f"dark_{name}", frames, LEAST_LINE_DN)
+    parts = _by_part(fine)
     frequency = next(iter(parts.values()))[0].lines[lines][0]
     bands = _Bands.of(frequency, BANDS)
     length = study.camera.cols if lines == "rows" else study.camera.rows
@@ -623,7 +640,7 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
         value.append(np.log(bands.mean(power)) - _log_mean_bias(modes))
         variance.append(_log_mean_variance(modes) + 1.0 / level + POWER_FLOOR**2)
         inverse.append(np.full(len(modes), float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))))
-        ids = tuple(i for f in frames if out in f.changing for i in _captures(f, out))
+        ids = tuple(i for f in fine if out in f.changing for i in _captures(f, out))
         labels += [Label(float(x), "all", "temporal", ids, out) for x in bands.middle]
     over = np.concatenate(inverse) * study.noise.gain**2 * length
     sets = len(parts)
@@ -647,6 +664,10 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     frames = study.once(dark_frames)
     name = "row_pattern" if lines == "rows" else "column_pattern"
     first = next(f for f in frames if f.fixed)
+    if min(part.white_dn2 for part in first.fixed.values()) < 1e-3:
+        raise NotDetermined(
+            f"dark_{name}", "dark frames have no noise and no pattern: codes are too coarse to show one"
+        )
     frequency = next(iter(first.fixed.values())).lines[lines][0]
     bands = _Bands.of(frequency, BANDS)
     length = study.camera.cols if lines == "rows" else study.camera.rows
@@ -707,14 +728,10 @@ def _fixed_share(frames: Frames) -> dict[bool, float]:
 
 def along_block(study: Study) -> Block:
     """Spectrum within rows and columns at low frequencies, over that of the band above: white noise has none to spare."""
-    frames = study.once(dark_frames)
-    parts = {out: [f.changing[out] for f in frames if out in f.changing] for out in (False, True)}
-    parts = {out: part for out, part in parts.items() if part}
-    if not parts:
-        raise NotDetermined("dark_correlation", "no two dark frames of the same exposure and temperature")
+    fine = _fine("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
     value, variance, labels = [], [], []
-    for out, part in parts.items():
-        ids = tuple(i for f in frames if out in f.changing for i in _captures(f, out))
+    for out, part in _by_part(fine).items():
+        ids = tuple(i for f in fine if out in f.changing for i in _captures(f, out))
         weight = np.array([min(c.contrasts, 6) for c in part], float)
         for lines in ("rows", "columns"):
             frequency = part[0].along[lines][0]
@@ -922,15 +939,8 @@ def _upper(z: FloatArray, skew: float) -> FloatArray:
 
 def blinking_block(study: Study) -> Block:
     """How many pixels change from frame to frame far more than their surroundings, all dark frames together."""
-    frames = study.once(dark_frames)
-    every = [f for f in frames if f.changing]
-    if not every:
-        raise NotDetermined("blinking_pixels", "no two dark frames of the same exposure and temperature")
-    fine = [f for f in every if all(c.variance_dn2 > LEAST_COUNTED_DN**2 for c in f.changing.values())]
-    if not fine:
-        raise NotDetermined("blinking_pixels", _too_coarse(every, LEAST_COUNTED_DN))
-    parts = {out: [f for f in fine if out in f.changing] for out in (False, True)}
-    parts = {out: part for out, part in parts.items() if part}
+    fine = _fine("blinking_pixels", study.once(dark_frames), LEAST_COUNTED_DN)
+    parts = {out: [f for f in fine if out in f.changing] for out in _by_part(fine)}
     size = study.camera.rows * study.camera.cols
     value, labels, sums = [], [], []
     for out, part in parts.items():
@@ -941,7 +951,7 @@ def blinking_block(study: Study) -> Block:
         ids = tuple(i for f in part for i in _captures(f, out))
         labels += [Label(float(x), "all", "all exposures", ids, out) for x in edges / freedom]
         sums.append((out, part, freedom, edges))
-    draws = {id(f): _jump_sums(f.condition) for f in frames}
+    draws = {id(f): _jump_sums(f.condition) for f in fine}
 
     def expected(effects: Effects) -> FloatArray:
         found = []

@@ -94,7 +94,7 @@ class Block:
 
 
 SPECTRAL_HOOKS = frozenset({"radiance", "transmittance"})
-UNIFORM_HOOKS = frozenset({"drift", "exposure", "illumination", "ambient_e_per_s", "charge", "response", "offset_dn"})
+UNIFORM_HOOKS = frozenset({"codes", "drift", "exposure", "illumination", "ambient_e_per_s", "charge", "response", "offset_dn"})
 #: Of measurements in whose prediction the frame before enters.
 SEQUENCE_HOOKS = frozenset({"left_behind"})
 
@@ -445,9 +445,10 @@ class RepeatedLevels:
 
 
 def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedLevels]:
-    """Of every flat setting with repeats, all unclipped channels together; DN and DN/e."""
+    """Of every flat setting with repeats, all unclipped channels together, frames that may hold what another level left behind
+    not among them; DN and DN/e."""
     found = []
-    for group in study.flat_levels():
+    for group in map(study.settled, study.flat_levels()):
         planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
         if len(group) < 2 or not planes:
             continue

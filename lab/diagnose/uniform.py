@@ -128,7 +128,7 @@ def _scatter(study: Study, groups: list[list[Any]]) -> FloatArray:
     flickering light that short exposures don't average."""
     noise = study.noise
     found = np.full(len(groups), noise.jitter_lamp)
-    place = {group[0].id: i for i, group in enumerate(groups)}
+    place = {c.id: i for i, group in enumerate(groups) for c in group}
     for repeats in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
         moved = float(repeats.elapsed_s @ repeats.elapsed_s)
         left, free = repeats.away, len(repeats.away) - 1
