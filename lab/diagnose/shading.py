@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ SHADING_FLOOR = 2e-4  # of a cell, alike in its repeats: cos^4 at a cell's point
 AXIS_STD, AXIS_STD_KNOWN = 0.01, 0.004  # of the frame's diagonal: the optical axis without and with a fitted geometry
 MOST_FRAMES, MOST_LEVELS = 6, 2  # brightest levels, seen and held out each
 BLOCK_PX = 4  # of a channel's plane: at this scale its fixed pattern is measured
+ALIKE = 1.5  # times as much of it than of independent pixels' may be left in cells
 #: Beyond noise by this factor repeats' rows scatter by themselves: one healthy set in some thousands.
 SCATTERED = 4.0
 
@@ -98,7 +99,8 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plan
             plane = plane / plane.mean()
             total[channel] = total.get(channel, 0.0) + plane / len(captures)
             bands[channel].append(_cells(plane).mean(1))
-    planes = []
+    planes: list[_Plane] = []
+    scatter = np.zeros((ROWS, ROWS))
     for channel, plane in total.items():
         count = len(mosaic.phases(study.camera.cfa)[channel])
         means = np.array([study.levels(c).mean[channel] or 0.0 for c in captures])
@@ -107,25 +109,32 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plan
         shot = float(single.mean()) / len(captures)
         pixels = plane.size / (ROWS * COLS)
         cells = _cells(plane)
+        # of the light, and so one for all channels
+        scatter = scatter + _row_scatter(np.array(bands[channel]), float(single.mean()) / (pixels * COLS)) / len(total)
         planes.append(
             _Plane(
                 tuple(captures), channel, held_out, (cells / cells.mean()).ravel(), float(levels.mean()) / noise.gain, shot / pixels,
-                max(_pattern_variance(plane, shot), noise.prnu**2 / count) / pixels,
-                _row_scatter(np.array(bands[channel]), float(single.mean()) / (pixels * COLS)),
+                _pattern_variance(plane, shot) / pixels,
+                scatter,
             )
         )  # fmt: skip
-    return planes
+    return [replace(plane, row_scatter=scatter) for plane in planes]
 
 
 def _pattern_variance(plane: FloatArray, shot: float) -> float:
-    """Variance of the fixed pattern, a pixel's worth, from blocks of 4 x 4 of them: neighbours may be alike, so that it averages out
-    less than it does from pixel to pixel. Half the mean square of differences between adjacent blocks, noise taken off."""
-    rows, cols = (n // BLOCK_PX for n in plane.shape)
-    blocks = plane[: rows * BLOCK_PX, : cols * BLOCK_PX].reshape(rows, BLOCK_PX, cols, BLOCK_PX).mean((1, 3))
-    steps = [np.diff(blocks, axis=axis) for axis in (0, 1)]
-    # medians: a speck of dust or the border of a tap is no pattern of the pixels
-    spread = float(np.median(np.concatenate([np.square(s).ravel() for s in steps]))) / 0.4549 / 2.0
-    return max(spread * BLOCK_PX**2 - shot, 0.0)
+    """Variance of the fixed pattern, a pixel's worth where cells average it: from adjacent blocks of 4 x 4 pixels, which may be alike;
+    at least that of adjacent pixels by themselves and at most ALIKE times that, as what is much more alike is no pixels' pattern."""
+    single = _adjacent(plane, 1) - shot
+    return float(np.clip(_adjacent(plane, BLOCK_PX) - shot, max(single, 0.0), ALIKE * max(single, 0.0)))
+
+
+def _adjacent(plane: FloatArray, size: int) -> float:
+    """Half the mean square of differences between adjacent blocks' means, times the pixels of a block."""
+    rows, cols = (n // size for n in plane.shape)
+    blocks = plane[: rows * size, : cols * size].reshape(rows, size, cols, size).mean((1, 3))
+    steps = np.concatenate([np.square(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
+    # the median of squares, 0.4549 of their mean: a speck of dust or the border of a tap is no pattern of the pixels
+    return float(np.median(steps)) / 0.4549 / 2.0 * size**2
 
 
 def _row_scatter(bands: FloatArray, noise: float) -> FloatArray:
@@ -154,7 +163,7 @@ def _covariance(planes: Sequence[_Plane]) -> FloatArray:
             if i == j:
                 part += np.eye(cells) * a.noise
             if a.held_out == b.held_out:
-                part += np.kron(0.5 * (a.row_scatter + b.row_scatter), np.ones((COLS, COLS)))
+                part += np.kron(a.row_scatter, np.ones((COLS, COLS)))
     return covariance
 
 
