@@ -626,10 +626,24 @@ def _light_electron_rate(
     y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
     for effect in effects:
         shade = shade * effect.illumination(x_um, y_um, camera)
+    images = {channel: _reflected(image, camera, effects) for channel, image in images.items()}
     for channel in camera.channels:
         ambient = sum(effect.ambient_e_per_s(channel, camera) for effect in effects)
         images[channel] = images[channel] * shade + ambient
     return mosaic.assemble(images, camera.cfa)
+
+
+def _reflected(image: FloatArray, camera: CameraModel, effects: Sequence[Effect]) -> FloatArray:
+    """A channel's image with what effects make of it as a whole. A traced lens's image is a mosaic already: colour by colour."""
+    acting = [effect for effect in effects if type(effect).image is not Effect.image]
+    if not acting:
+        return image
+    traced = isinstance(camera.lens.imaging, TracedLens)
+    changed = image.copy()
+    for plane in mosaic.planes(changed, camera.cfa).values() if traced else [changed]:
+        for effect in acting:
+            plane[:] = effect.image(plane, camera)
+    return changed
 
 
 def _plain_images(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from lab.camera_file import CameraFile
+from lab.diagnose.board import BOARD_BLOCKS
 from lab.diagnose.darks import DARK_BLOCKS
 from lab.diagnose.edges import edge_block
 from lab.diagnose.evidence import Evidence
@@ -12,7 +13,9 @@ from lab.diagnose.flicker import flicker_block
 from lab.diagnose.neighbours import neighbour_block, variance_block
 from lab.diagnose.patches import chart_block, screen_block
 from lab.diagnose.pattern import green_block, line_block
+from lab.diagnose.screens import SCREEN_BLOCKS
 from lab.diagnose.shading import shading_block
+from lab.diagnose.stereo import STEREO_BLOCKS
 from lab.diagnose.summaries import Block, Study
 from lab.diagnose.uniform import linearity_block, narrowband_block
 from lab.errors import NotDetermined
@@ -35,6 +38,9 @@ BLOCKS: tuple[Callable[[Study], Block], ...] = (
     chart_block,
     edge_block,
     screen_block,
+    *SCREEN_BLOCKS,
+    *BOARD_BLOCKS,
+    *STEREO_BLOCKS,
 )
 
 #: Of the full well: from here on pixels of a noisy level are cut off.

@@ -12,8 +12,9 @@ same pixels, aliasing is in both, so that a band holds its own frequencies alone
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -38,11 +39,14 @@ OVERSAMPLE = 4
 LARGEST_PX = 320  # a side of the part that is looked at: enough for a band's contrast to 1e-3
 RIM_PX = 12  # of the frame and of that part: drawings there lack what lies beyond
 PATTERN_RIM_CELLS = 2.0
+#: ... and what lies beyond, along the larger of both axes: not looked at, but there.
+BEYOND_CY_PER_PX = (0.5, 0.62, 0.8, 4.0)
 RINGS_CY_PER_PX = (0.0, 0.03, 0.08, 0.14, 0.2, 0.27, 0.34, 0.42, 0.5)
 SECTORS = 4  # orientations of a half turn: about 0, 45, 90, 135 degrees
 NODES = (4, 3)  # of a band, in radius and angle, at which an effect's transfer is taken
 LARGEST_STD = 0.04  # of a band's contrast: beyond, it says nothing
 TURNED_BLUR_PX = 3.0
+LEAST_BEYOND = 5e-4  # of the contrast: weaker parts beyond the bands are taken as drawn
 REFINEMENTS = 2
 LEAST_PIXELS = 1500
 FEWEST_CELLS = 400
@@ -53,7 +57,11 @@ CONTRAST_SCALE_STD = 0.01  # levels of screens are free: each channel of each pa
 SCREEN_BLUR_PX = 0.08  # a target's rims needn't be sharp: standard deviation of a Gaussian
 RIM_FLOOR = 0.0015
 TURNED_FLOOR = 1.5e-4
-COLOUR_FLOOR_PX = 0.003  # aliasing that the corners' and the pattern's drawing leave
+COLOUR_FLOOR_PX = (
+    0.012  # cells of whole pixels alias alike everywhere: what a drawing gets wrong there doesn't average out
+)
+CERTAIN = 8.0  # standard deviations
+GRID_STD = 1.3  # of the strongest line's number: the noise's mean is measured, too
 GRID_DETREND_PX = 8.0  # what is wider is shading
 GRID_LOWEST = 0.12  # cycles a sample: below, what was taken off as shading still tells
 GRID_LARGEST = 512  # samples a side
@@ -68,17 +76,19 @@ class Pattern:
     held_out: bool
     channel: str
     bands: tuple[Band, ...]
-    value: FloatArray  # (bands + MORE,)
+    value: FloatArray  # (bands + MORE + parts beyond the bands,)
     shown: FloatArray  # covariance by what differs from repeat to repeat
     common: FloatArray  # ... and by what white, black and drawing share
-    greys: FloatArray  # (bands + MORE,) what the coefficients become where every grey v is shown as v^2
+    greys: FloatArray  # as `value`: what the coefficients become where every grey v is shown as v^2
     levels_e: tuple[float, float]  # electrons of black and of white
     light: Spectrum | None
+    turned: Callable[
+        [Effects], float
+    ]  # the coefficient of the turned picture that effects on the image as a whole make
     reach: float  # largest distance from the frame's middle in half diagonals
 
 
-#: Coefficients behind the bands': rim, turned, even, shift x, shift y, radial, radial^3, across.
-MORE = 8
+#: Coefficients behind the bands', in their order: rim, turned, even, shift x, shift y, radial, radial^3, across.
 RIM, TURNED, EVEN, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 5, 6, 7
 
 
@@ -190,6 +200,7 @@ def _measured(
             float(np.nanmean(black[window][design.mask])) * exposure / study.noise.gain,
             float(np.nanmean(white[window][design.mask])) * exposure / study.noise.gain,
         )
+        turned_by = _turned_by(study, design, whole, window)
         for part, picture in zip(parts, seen, strict=True):
             dn = np.maximum(picture[window][design.mask] * area + black[window][design.mask], 0.0) * exposure
             temporal = (study.noise.gain * dn + study.noise.read_dn**2) / len(part) / (area * exposure) ** 2
@@ -198,10 +209,28 @@ def _measured(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
                     value=value, shown=shown, common=common, greys=design.greys, levels_e=levels, light=light,
-                    reach=design.reach,
+                    turned=turned_by, reach=design.reach,
                 )
             )  # fmt: skip
     return found
+
+
+def _turned_by(
+    study: Study, design: _Design, seen: FloatArray, window: tuple[slice, slice]
+) -> Callable[[Effects], float]:
+    """What effects on the whole image do to the coefficient of the turned picture: pattern and lit screen through them, levelled."""
+    picture, lit = np.nan_to_num(seen), np.isfinite(seen).astype(float)
+    weight = (design.inverse[len(design.bands) + TURNED] @ design.columns).astype(np.float32)
+    before = picture[window][design.mask]
+
+    def coefficient(effects: Effects) -> float:
+        shown, white = picture, lit
+        for effect in effects:
+            shown, white = effect.image(shown, study.camera), effect.image(white, study.camera)
+        after = shown[window][design.mask] / np.maximum(white[window][design.mask], 1e-6)
+        return float(weight @ (after - before))
+
+    return coefficient
 
 
 def _window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -> tuple[slice, slice]:
@@ -250,15 +279,29 @@ class _Canvas:
         """Of the window, px."""
         return self.inside.shape[0], self.inside.shape[1]
 
-    def transform(self, fine: FloatArray) -> NDArray[np.complex128]:
-        """Of a fine picture, at frequencies below half a cycle a pixel: (rows, cols / 2 + 1), as of the window's own pixels."""
+    @cached_property
+    def drawn(self) -> NDArray[np.complex128]:
+        """The picture's transform, at all frequencies of its samples."""
+        return np.asarray(fft.rfft2(self.fine))
+
+    @cached_property
+    def low(self) -> NDArray[np.complex128]:
+        """The picture's transform below half a cycle a pixel: (rows, cols / 2 + 1), as of the window's own pixels."""
+        return self._below(self.drawn)
+
+    @cached_property
+    def bent(self) -> NDArray[np.complex128]:
+        """The same of the picture with all greys squared."""
+        return self._below(np.asarray(fft.rfft2(self.fine**2)))
+
+    def _below(self, whole: NDArray[np.complex128]) -> NDArray[np.complex128]:
         rows, cols = self.shape
-        whole = fft.rfft2(fine)[:, : cols // 2 + 1] / OVERSAMPLE**2
-        low = np.concatenate([whole[: rows // 2], whole[len(whole) - rows // 2 :]])
+        part = whole[:, : cols // 2 + 1] / OVERSAMPLE**2
+        part = np.concatenate([part[: rows // 2], part[len(part) - rows // 2 :]])
         fy, fx = self.frequencies
         # a sample is a mean over its square; a pixel's centre lies between samples
         turn = np.exp(1j * np.pi * (fx + fy) * (1.0 - 1.0 / OVERSAMPLE))
-        return np.asarray(low * turn / (np.sinc(fx / OVERSAMPLE) * np.sinc(fy / OVERSAMPLE)))
+        return np.asarray(part * turn / (np.sinc(fx / OVERSAMPLE) * np.sinc(fy / OVERSAMPLE)))
 
     @property
     def frequencies(self) -> tuple[FloatArray, FloatArray]:
@@ -269,19 +312,35 @@ class _Canvas:
         """Back to the window's pixels."""
         return np.asarray(fft.irfft2(spectrum, self.shape))
 
-    def beyond(self, otf: CubicSpline, fill_factor: float, fine: FloatArray) -> FloatArray:
-        """What the lens passes of a fine picture above half a cycle a pixel, at the pixels."""
+    def beyond(self, otf: CubicSpline, fill_factor: float) -> list[FloatArray]:
+        """What the lens passes above half a cycle a pixel, at the pixels: by ring and by whether it lies nearer to rows or columns.
+
+        Cells of whole pixels repeat their spectrum: what aliases is coherent with what doesn't.
+        """
         rows, cols = (OVERSAMPLE * n for n in self.shape)
-        fy, fx = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[:, None], fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
-        high = fft.rfft2(fine)
-        high[np.broadcast_to((np.abs(fy) < 0.5) & (fx < 0.5), high.shape)] = 0.0
-        reach = float(otf.x[-1])
-        where = np.hypot(fy, fx) < reach
-        high *= np.where(where, otf(np.minimum(np.hypot(fy, fx), reach)), 0.0) * aperture_otf(fx, fy, fill_factor)
+        highest = min(float(otf.x[-1]), 0.5 * OVERSAMPLE)
+        keep = np.abs(fft.fftfreq(rows, 1.0 / OVERSAMPLE)) < highest
+        fy = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[keep, None]
+        fx = fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
+        fx = fx[:, fx[0] < highest]
+        high = (
+            self.drawn[keep][:, : fx.shape[1]]
+            * otf(np.minimum(np.hypot(fy, fx), highest))
+            * aperture_otf(fx, fy, fill_factor)
+        )
         high *= np.exp(1j * np.pi * fx * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fx / OVERSAMPLE)
         high *= np.exp(1j * np.pi * fy * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fy / OVERSAMPLE)
-        folded = fft.ifft(high.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE, axis=0)
-        return np.asarray(fft.irfft(folded, cols, axis=1)[:, ::OVERSAMPLE])
+        largest, across = np.maximum(np.abs(fy), fx), fx >= np.abs(fy)
+        found = []
+        for low, end in pairwise(BEYOND_CY_PER_PX):
+            for side in (across, ~across):
+                part = np.where((largest >= low) & (largest < end) & (np.hypot(fy, fx) < highest) & side, high, 0.0)
+                spread = np.zeros((rows, part.shape[1]), complex)
+                spread[keep] = part
+                folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
+                folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
+                found.append(np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE]))
+        return found
 
 
 def _lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:
@@ -303,12 +362,12 @@ def _refined(
     """The registration from the corners, improved by the pattern itself: a step of Gauss and Newton's method."""
     canvas, otf = _Canvas.of(target, warp, window), _lens_otf(study, channel, light)
     fy, fx = canvas.frequencies
-    spectrum = canvas.transform(canvas.fine) * otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, study.camera.fill_factor)
+    spectrum = canvas.low * otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, study.camera.fill_factor)
     mask = _pixels(study, canvas, channel, seen)
     picture, across, down = (
         canvas.picture(part * spectrum)[mask] for part in (_below(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
     )
-    picture = picture + canvas.beyond(otf, study.camera.fill_factor, canvas.fine)[mask]
+    picture = picture + np.sum(canvas.beyond(otf, study.camera.fill_factor), axis=0)[mask]
     row, col = np.nonzero(mask)
     terms = warp.basis(np.column_stack([col + window[1].start, row + window[0].start]).astype(float))
     columns = np.concatenate([across * terms, down * terms, [picture, np.ones_like(picture)]])
@@ -351,7 +410,7 @@ class _Design:
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
         otf = _lens_otf(study, channel, light)
         passed = otf(radius) * aperture_otf(fx, fy, camera.fill_factor)
-        spectrum = canvas.transform(canvas.fine) * passed
+        spectrum = canvas.low * passed
         mask = _pixels(study, canvas, channel, seen)
         power = np.abs(spectrum) ** 2
         bands, columns = [], []
@@ -368,11 +427,9 @@ class _Design:
                 low_part += picture
                 columns.append(picture[mask])
                 bands.append(_band(part, radius, away, middle, power, (low, high), whole=not i))
-        fixed = (
-            canvas.beyond(otf, camera.fill_factor, canvas.fine)
-            + canvas.picture(np.where((radius >= RINGS_CY_PER_PX[-1]) & _below(canvas), spectrum, 0.0))
-        )[mask]
-        picture = low_part[mask] + fixed
+        beyond = [canvas.picture(np.where((radius >= RINGS_CY_PER_PX[-1]) & _below(canvas), spectrum, 0.0))]
+        beyond += canvas.beyond(otf, camera.fill_factor)
+        picture = (low_part + np.sum(beyond, axis=0))[mask]
         across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
         row, col = np.nonzero(mask)
         half = 0.5 * float(np.hypot(camera.rows, camera.cols))
@@ -392,12 +449,13 @@ class _Design:
             r2 * outwards,
             around,
         ]
-        table = np.array(columns + more)
+        strong = [part[mask] for part in beyond if np.std(part[mask]) > LEAST_BEYOND]
+        fixed = sum((part[mask] for part in beyond if not np.std(part[mask]) > LEAST_BEYOND), np.zeros(len(row)))
+        table = np.array(columns + more + strong)
         scale = np.sqrt(np.mean(table**2, axis=1))
         normal = (table / scale[:, None]) @ (table / scale[:, None]).T
         inverse = np.linalg.inv(normal) / np.outer(scale, scale)
-        bent = canvas.transform(canvas.fine**2) * passed
-        lost = canvas.picture(bent - spectrum)[mask]
+        lost = canvas.picture(canvas.bent * passed - spectrum)[mask]
         return _Design(mask, tuple(bands), table, fixed, inverse, inverse @ (table @ lost), float(np.sqrt(r2.max())))
 
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -551,6 +609,23 @@ def rim_block(study: Study) -> Block:
     )  # fmt: skip
 
 
+def turned_block(study: Study) -> Block:
+    """How much of a pattern lies over it once more, turned by half a turn about the frame's middle."""
+    points = [(g, p, len(p.bands) + TURNED) for g, group in enumerate(patterns(study)) for p in group]
+    value = np.array([p.value[b] for _, p, b in points])
+
+    def predict(effects: Effects) -> Prediction:
+        acting = [e for e in effects if type(e).image is not Effect.image]
+        return Prediction(np.array([p.turned(acting) if acting else 0.0 for _, p, _ in points]), {})
+
+    return Block(
+        measurement="turned_copy", axis="level", unit="1", reach=1e9, value=value,
+        covariance=_joint(points, study) + np.diag(np.full(len(value), TURNED_FLOOR**2)),
+        labels=tuple(Label(float(i), p.channel, "pattern turned over", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
+        hooks=frozenset({"image"}), predict=predict, scale=np.ones(len(value)), places="copies",
+    )  # fmt: skip
+
+
 def colour_block(study: Study) -> Block:
     """How far out red and blue detail of a pattern lies against green, at two distances from the frame's middle, and its turn."""
     if "G" not in study.channels:
@@ -638,9 +713,9 @@ class _Line:
     def normal(self, power: float) -> float:
         """The standard normal number that is as rare as the largest of `places` exponential numbers being `power`."""
         rare = np.log(self.places) - power  # logarithm of the probability, far out
-        if rare < -600.0:
-            return float(np.sqrt(-2.0 * rare))
-        return float(stats.norm.isf(-np.expm1(-np.exp(rare))))
+        normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else float(stats.norm.isf(-np.expm1(-np.exp(rare))))
+        # beyond any doubt what matters is the order of magnitude
+        return normal if normal < CERTAIN else CERTAIN * (1.0 + float(np.log(normal / CERTAIN)))
 
 
 def grid_block(study: Study) -> Block:
@@ -676,7 +751,7 @@ def grid_block(study: Study) -> Block:
 
     return Block(
         measurement="screen_grid", axis="spatial_frequency", unit="cy/px", reach=1e9,
-        value=np.array([line.normal(line.power) for line in found]), covariance=np.eye(len(found)),
+        value=np.array([line.normal(line.power) for line in found]), covariance=GRID_STD**2 * np.eye(len(found)),
         labels=tuple(Label(line.cycles_per_px, line.channel, "lit screen", line.captures, False) for line in found),
         hooks=frozenset({"screen"}), predict=predict, scale=np.ones(len(found)),
     )  # fmt: skip
@@ -735,3 +810,7 @@ def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatA
         if np.any(ring == k):
             noise[ring == k] = np.median(power[ring == k]) / np.log(2.0)
     return power, np.maximum(noise, 1e-300), window
+
+
+#: Makers of blocks, in the order of the report.
+SCREEN_BLOCKS = (contrast_block, rim_block, turned_block, colour_block, grid_block)

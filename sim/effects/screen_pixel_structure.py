@@ -14,7 +14,7 @@ from sim.spectrum import FloatArray
 
 class ScreenPixelStructure(Effect):
     """Factor 1 + a cos(2 pi x / p) cos(2 pi y / p) on a lit screen's light, x and y from the frame's centre, p the period at the
-    sensor: the grid's first harmonic, which is what a lens passes. Where it is finer than half the pixels it beats."""
+    sensor (px), which a drawing has to choose and a fit doesn't ask for: the grid's first harmonic, which is what a lens passes. Where it is finer than half the pixels it beats."""
 
     name: ClassVar[str] = "screen_pixel_structure"
     stage: ClassVar[Stage] = Stage.RIG
@@ -22,7 +22,6 @@ class ScreenPixelStructure(Effect):
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"white"})
-    shapes: ClassVar[frozenset[str]] = frozenset({"period_px"})
     rivals: ClassVar[frozenset[str]] = frozenset()
     sentence: ClassVar[str] = (
         "The screen's own pixels are resolved: a fine grid lies over everything that it shows, and over nothing else."
@@ -32,9 +31,7 @@ class ScreenPixelStructure(Effect):
         float,
         Quantity("%", "amplitude before the lens", lower=0.0, upper=100.0, prior=(0.0, 10.0), absent=0.0),
     ] = 0.0
-    period_px: Annotated[
-        float, Quantity("px", "period in camera pixels", lower=1.0, upper=30.0, prior=(3.5, 1.0), absent=3.5)
-    ] = 3.5
+    period_px: float = 3.5
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:

@@ -20,7 +20,9 @@ class VeilingGlare(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "orientation", "time"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"chart", "checkerboard", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"ambient_light", "black_level_drift", "nonlinearity", "stray_light"})
+    rivals: ClassVar[frozenset[str]] = frozenset(
+        {"ambient_light", "black_level_drift", "ghost", "nonlinearity", "stray_light"}
+    )
     sentence: ClassVar[str] = (
         "Light scattered in the lens veils the frame: dark patches and dark squares are raised by a share of the frame's mean, "
         "while uniform fields stay as they are."

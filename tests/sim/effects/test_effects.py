@@ -83,6 +83,7 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     shown, pair = np.linspace(0.0, 1.0, 5), [1.0, 0.0]
     for e in acting:
         shown = e.screen(shown, place, 0.5 * place, CAMERA)
+        shown = np.ravel(e.image(np.reshape(shown, (1, -1)), CAMERA))
         pair = [pair[0] * e.scene_gain(), pair[1] + e.capture_delay_s()]
     full = np.zeros((7, 3))
     full[3, 1] = 2.0 * CAMERA.full_well_e

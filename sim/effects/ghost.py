@@ -1,0 +1,41 @@
+"""Ghost: light that goes back from the sensor and is reflected again by the lens lies over the image, turned about the axis."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+from scipy import ndimage
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+
+BLUR_PX = 2.0  # a reflection is seldom in focus
+
+
+class Ghost(Effect):
+    """I'(r) = I(r) + q I(-r), r from the frame's middle, the copy blurred by 2 px: two reflections turn the image by half a turn."""
+
+    name: ClassVar[str] = "ghost"
+    stage: ClassVar[Stage] = Stage.OPTICS
+    reference: ClassVar[str] = "E. Oleszko et al., Computer Graphics Forum 36, 165 (2017)"
+    form_tolerance: ClassVar[float] = 0.3
+    invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"bernoulli", "chart"})
+    rivals: ClassVar[frozenset[str]] = frozenset({"veiling_glare"})
+    sentence: ClassVar[str] = (
+        "Light that the sensor sends back is reflected again by the lens: a weak copy of the scene lies over it, turned by half a "
+        "turn about the axis."
+    )
+
+    share_percent: Annotated[
+        float, Quantity("%", "the copy's light over the scene's", lower=0.0, upper=30.0, prior=(0.0, 1.0), absent=0.0)
+    ] = 0.0
+
+    def image(self, irradiance: FloatArray, camera: CameraModel) -> FloatArray:
+        if self.share_percent == 0.0:
+            return irradiance
+        copy = ndimage.gaussian_filter(np.asarray(irradiance, float)[::-1, ::-1], BLUR_PX, mode="nearest")
+        return np.asarray(irradiance + 0.01 * self.share_percent * copy)
