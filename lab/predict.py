@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri
 
 from lab.recording import Camera, RecordingSet
 from lab.results import CameraFit
@@ -17,6 +18,10 @@ from sim.spectrum import FloatArray, Spectrum
 
 #: Where neither fit nor maker gives a sensitivity: (peak, standard deviation in nm), for the colour of edges and screens only.
 TYPICAL_SENSITIVITY_NM = {"R": (600.0, 40.0), "G": (535.0, 40.0), "B": (460.0, 30.0), "Y": (550.0, 90.0)}
+
+
+#: Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1.
+NOISE_NODES = ndtri((np.arange(48) + 0.5) / 48) / np.std(ndtri((np.arange(48) + 0.5) / 48))
 
 
 @dataclass(frozen=True)
@@ -191,13 +196,22 @@ def collected_electrons(
 def mean_dn(
     camera: CameraModel, electrons: Mapping[str, FloatArray], effects: Sequence[Effect] = ()
 ) -> dict[str, float]:
-    """Mean DN above the black level over the points, by channel, after the effects on the read-out."""
+    """Mean DN above the black level over the points, by channel, after the effects on the read-out; those on codes are averaged over
+    shot and read noise."""
     means = {}
+    coding = [effect for effect in effects if type(effect).codes is not Effect.codes]
     for channel, value in electrons.items():
         out = value
         for effect in effects:
             out = effect.response(out, camera)
-        means[channel] = float(np.mean(out)) * camera.conversion_gain_dn_per_e
+        dn = camera.conversion_gain_dn_per_e * out
+        if coding:
+            noise = camera.conversion_gain_dn_per_e * np.sqrt(np.maximum(value, 0.0) + camera.read_noise_e**2)
+            codes = camera.black_level_dn + dn[..., None] + noise[..., None] * NOISE_NODES
+            for effect in coding:
+                codes = effect.codes(codes, camera)
+            dn = codes - camera.black_level_dn
+        means[channel] = float(np.mean(dn))
     return means
 
 

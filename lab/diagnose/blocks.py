@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from lab.camera_file import CameraFile
 from lab.diagnose.board import BOARD_BLOCKS
+from lab.diagnose.converter import code_block
 from lab.diagnose.darks import DARK_BLOCKS
 from lab.diagnose.edges import edge_block
 from lab.diagnose.evidence import Evidence
@@ -31,6 +32,7 @@ BLOCKS: tuple[Callable[[Study], Block], ...] = (
     flicker_block,
     variance_block,
     neighbour_block,
+    code_block,
     green_block,
     line_block,
     shading_block,

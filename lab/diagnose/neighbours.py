@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from lab.diagnose.summaries import CLIPPED_SHARE, LEVEL_REACH, Block, Effects, Label, Prediction, Study, overrides
 from lab.errors import NotDetermined
+from lab.predict import NOISE_NODES
 from sim.camera import Cfa
 from sim.effects.base import Effect
 from sim.forward import processing_kernel
@@ -31,7 +31,7 @@ OUTLIER = 6.0
 #: Values that a level is measured by; frames beyond them cost time and teach nothing.
 ENOUGH = 3_000_000
 LEAST_DN2 = 0.02  # a temporal variance below which nothing but rounding is seen
-NOISE_NODES = ndtri((np.arange(48) + 0.5) / 48) / np.std(ndtri((np.arange(48) + 0.5) / 48))
+
 
 #: Pairs of pixels on the mosaic, by how the report calls them: (rows down, columns to the right).
 PAIRS: dict[str, tuple[tuple[int, int], ...]] = {

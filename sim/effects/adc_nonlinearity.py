@@ -11,13 +11,10 @@ from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
-#: Bits, from the highest, whose weights are off, by turns up and down, each by the root of its weight.
-BITS = 4
-
 
 class AdcNonlinearity(Effect):
-    """A successive-approximation converter: where bit k, counted from the highest, is set the code is off by (-1)^k e 2^(-k/2),
-    e the highest bit's error; offset and gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-4)."""
+    """A successive-approximation converter: where one of the three highest bits is set, the code is off by that bit's error; offset and
+    gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-3)."""
 
     name: ClassVar[str] = "adc_nonlinearity"
     stage: ClassVar[Stage] = Stage.ELECTRONICS
@@ -37,14 +34,24 @@ class AdcNonlinearity(Effect):
         float,
         Quantity("DN", "error of the highest bit's weight", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0),
     ] = 0.0
+    second_dn: Annotated[
+        float,
+        Quantity(
+            "DN", "error of the second-highest bit's weight", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0
+        ),
+    ] = 0.0
+    third_dn: Annotated[
+        float,
+        Quantity(
+            "DN", "error of the third-highest bit's weight", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0
+        ),
+    ] = 0.0
 
     def codes(self, dn: FloatArray, camera: CameraModel) -> FloatArray:
-        if self.error_dn == 0.0:
+        errors = (self.error_dn, self.second_dn, self.third_dn)
+        if not any(errors):
             return dn
         full = 2.0**camera.bit_depth
-        off, ends = np.zeros(np.shape(dn)), 0.0
-        for k in range(BITS):
-            size = self.error_dn * (-1.0) ** k * 2.0 ** (-0.5 * k)
-            off += size * (np.floor(np.clip(dn, 0.0, full - 1.0) * 2.0 ** (k + 1) / full) % 2)
-            ends += size
-        return dn + off - ends * dn / full
+        share = np.clip(dn, 0.0, full - 1.0) / full
+        off = sum(error * (np.floor(share * 2.0 ** (k + 1)) % 2) for k, error in enumerate(errors))
+        return np.asarray(dn + off - sum(errors) * dn / full)

@@ -869,6 +869,25 @@ class DefectInterpolation(Law):
         return np.where(odd, 0.5 * (padded[:, : -2 * step] + padded[:, 2 * step :]), dn)
 
 
+class DigitalGain(Law):
+    """Codes multiplied after the converter: some come twice as often or never (a sibling of converters' nonlinearity)."""
+
+    name, unit, nominal, limits = "digital_gain", "%", 10.0, (1.0, 60.0)
+
+    def processed(self, dn: Array) -> Array:
+        black = self.cam.black
+        return np.floor(black + (np.round(dn) - black) * (1 + self.s / 100))
+
+
+class LossyCodes(Law):
+    """Codes kept in equal steps of their root, as compression with losses does."""
+
+    name, unit, nominal, limits = "lossy_codes", "1", 0.05, (0.003, 0.5)
+
+    def processed(self, dn: Array) -> Array:
+        return np.square(np.round(np.sqrt(np.clip(dn, 0, None)) / self.s) * self.s)
+
+
 class LeakyShutter(Law):
     """Light goes on being collected while rows wait to be read: more of it the later the row (a sibling of exposure_offset)."""
 
@@ -983,6 +1002,6 @@ class JitteredRows(Law):
 
 OUTSIDE: tuple[type[Law], ...] = (
     CoverGlassFringe, AbsorptionBand, RedLeak, PolarisedLight, TapGain, PeriodicBanding, TreeRings, PulsedLight, ResponseTail,
-    CompandingKnee, DefectInterpolation, LeakyShutter, DoubleImage, Motion, Trefoil, Halo, InterPixelCapacitance, PinkNoise,
+    CompandingKnee, DefectInterpolation, DigitalGain, LossyCodes, LeakyShutter, DoubleImage, Motion, Trefoil, Halo, InterPixelCapacitance, PinkNoise,
     DustShadow, LampJump, Smear, JitteredRows,
 )  # fmt: skip

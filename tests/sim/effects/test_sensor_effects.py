@@ -187,18 +187,17 @@ def test_telegraph_pixels_have_two_levels() -> None:
 
 
 def test_the_converters_bits_jump_where_they_stand() -> None:
-    one = AdcNonlinearity(error_dn=3.0)
-    ends = 3.0 * (1 - 2**-0.5 + 0.5 - 2**-1.5)
+    one = AdcNonlinearity(error_dn=3.0, second_dn=-1.0, third_dn=0.5)
     below, above = one.codes(np.array([2047.999, 2048.0]), CAMERA)
-    # at half scale the highest bit comes and the three below it go
-    assert above - below == pytest.approx(3.0 - (ends - 3.0), abs=0.01)
+    # at half scale the highest bit comes and the two below it go
+    assert above - below == pytest.approx(3.0 - (-1.0 + 0.5), abs=0.01)
     assert one.codes(np.array([0.0]), CAMERA)[0] == 0.0
     # nothing changes at code 2^bits: the last code has all bits
     assert one.codes(np.array([4095.999]), CAMERA)[0] == pytest.approx(4095.999, abs=0.01)
     # between jumps, a line
-    step = np.diff(one.codes(np.arange(1024.0, 1280.0), CAMERA))
-    np.testing.assert_allclose(step, 1.0 - ends / 4096.0, atol=1e-9)
-    two = AdcNonlinearity(error_dn=6.0).codes(np.array([3000.0]), CAMERA) - 3000.0
+    step = np.diff(one.codes(np.arange(1024.0, 1536.0), CAMERA))
+    np.testing.assert_allclose(step, 1.0 - 2.5 / 4096.0, atol=1e-9)
+    two = AdcNonlinearity(error_dn=6.0, second_dn=-2.0, third_dn=1.0).codes(np.array([3000.0]), CAMERA) - 3000.0
     assert two[0] == pytest.approx(2.0 * (one.codes(np.array([3000.0]), CAMERA)[0] - 3000.0))
 
 
