@@ -57,6 +57,7 @@ MIN_LEVELS = 3
 #: Planes that a plane's pixels adjoin along rows and columns.
 ADJACENT = {"Y": ("Y",), "R": ("G1", "G2"), "B": ("G1", "G2"), "G1": ("R", "B"), "G2": ("R", "B")}
 ASYMMETRY = 0.002  # difference of opposite edges' light that is worth a remark, of the mean
+DARKER_SHARE = 0.01  # of the range that a flat may lie below the darks: noise and drift are far less
 MIN_SIZE_PX = 16
 
 
@@ -403,6 +404,7 @@ class _Evaluation:
             )
             self.darks = []
         self.lines = self._dark_lines()
+        self._check_darks_are_dark()
         self.saturation, self.saturation_seen = self._saturation()
         self.transfer, self.points = self._transfer(self.darks)
         present = {name for _, name in self.points}
@@ -460,6 +462,19 @@ class _Evaluation:
         if self.black_clipped:
             return 0.0
         raise NotDetermined("noise", "neither darks nor a stated black level: capture darks at the flats' exposures")
+
+    def _check_darks_are_dark(self) -> None:
+        """Flats can't be darker than darks: light reached these, or they are of other settings."""
+        for level in self.flats if self.darks else ():
+            for name in self.names:
+                dark = self.lines[name].at(level.exposure_s)
+                short = dark - level.plane[name].mean
+                if short > max(DARKER_SHARE * (self.white - dark), 1.0):
+                    raise NotDetermined(
+                        "noise",
+                        f"a flat of {level.exposure_s:g} s has {level.plane[name].mean:.0f} DN and is darker than darks of as long, {dark:.0f} DN: "
+                        "capture the darks again, with the cap on and at the flats' settings",
+                    )
 
     def _dark_mean(self, name: str, exposure_s: float) -> float:
         """Mean of a dark frame of that exposure: recorded where there is one, else by the line."""
@@ -539,6 +554,17 @@ class _Evaluation:
         bright_levels = {level.light for level, _ in points if level.lamp != "dark"}
         if len(bright_levels) < MIN_LEVELS:
             repeated = sum(level.repeats > 1 for level in self.flats)
+            alike = [
+                level
+                for level in self.flats
+                if level.repeats > 1 and all(level.plane[name].temporal_variance == 0 for name in self.names)
+            ]
+            if len(alike) == repeated > 0:
+                raise NotDetermined(
+                    "noise",
+                    f"the repeats of all {repeated} flat levels are alike, pixel by pixel: give frames that were captured one by one, not "
+                    "copies, or raise the gain until noise shows",
+                )
             raise NotDetermined(
                 "noise",
                 f"{len(bright_levels)} unsaturated flat levels with repeats (of {len(self.flats)} levels, {repeated} with repeats), "

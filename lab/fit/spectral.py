@@ -44,6 +44,7 @@ FLAT_RANGE = (0.2, 0.9)  # of saturation: flats that may help out
 MIN_LIGHTS = 5
 OUTPUT_STEP_NM = 10.0
 NEGATIVE_LIGHT = 0.05  # of a light's maximum: what a radiometer's noise may go below zero
+SEEN_SIGMA = 5.0  # that one signal at least has to stand above the dark
 MIN_SPECTRA = 3  # lights that differ: a curve with a bend has three points
 CENTROID_MARGIN_NM = 1.0  # beyond the outer lights' centroids that the curve is stated
 STATED_DIGITS = 1e-3  # of the maximum: how finely a maker's curve is stated
@@ -583,11 +584,12 @@ class _Recording:
                     # A saturated mean is a lower limit; 1 % below leaves room for its noise.
                     high.append((light * weights, 0.99 * max(rate for rate, *_ in found)))
             if len(good) < MIN_LIGHTS:
-                raise NotDetermined(
-                    "spectral",
-                    f"only {len(good)} of {len(lights)} lights leave channel {channel} unsaturated, {MIN_LIGHTS} needed: "
-                    + ("expose shorter" if high else "capture narrowband light over the visible by 10 nm or finer"),
+                found_so_many = (
+                    f"only {len(good)} of {len(lights)} lights leave channel {channel} unsaturated, {MIN_LIGHTS} needed: expose shorter"
+                    if high
+                    else f"{len(good)} different lights, {MIN_LIGHTS} needed: capture narrowband light over the visible by 10 nm or finer"
                 )
+                raise NotDetermined("spectral", found_so_many)
             if (different := _different(np.array([g[0] for g in good]))) < MIN_LIGHTS:
                 raise NotDetermined(
                     "spectral",
@@ -710,6 +712,13 @@ class _Recording:
         any_channel = np.flatnonzero(np.any(list(known.values()), axis=0))
         inside = slice(any_channel[0], any_channel[-1] + 1) if any_channel.size else slice(0, 0)
         out = out[inside]
+        highest = max(float(np.max(own.value / own.std)) for own in signals.values())
+        if highest < SEEN_SIGMA and not any(own.has_gaps for own in signals.values()):
+            raise NotDetermined(
+                "spectral",
+                f"the captures show no light: the strongest signal is {highest:.1f} standard uncertainties above the dark, {SEEN_SIGMA:g} "
+                "needed: open the shutter, or expose longer",
+            )
         if out.size < 2:
             raise NotDetermined(
                 "spectral",

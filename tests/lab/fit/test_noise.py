@@ -384,6 +384,24 @@ def test_what_the_flats_do_not_determine_is_said(flats: list[tuple[float, int]],
         fit_noise(recording_set(Sensor(), [(0.001, 2)], flats), "left")
 
 
+def test_copies_are_no_repeats() -> None:
+    recordings = recording_set(Sensor(), [(0.001, 2)], LADDER)
+    flats = recordings.captures("flat")
+    first = {flat.exposure_s: flat for flat in reversed(flats)}
+    frames = {c.frame: recordings.frame(c) for c in recordings.captures()}
+    frames |= {flat.frame: recordings.frame(first[flat.exposure_s]) for flat in flats}
+    with pytest.raises(NotDetermined, match="alike, pixel by pixel"):
+        fit_noise(RecordingSet(recordings.manifest, frames), "left")
+
+
+def test_darks_that_are_lighter_than_flats_are_refused() -> None:
+    recordings = recording_set(Sensor(), [(0.001, 2), (0.5, 2)], LADDER)
+    frames = {c.frame: recordings.frame(c) for c in recordings.captures()}
+    frames |= {c.frame: frames[c.frame] + np.uint16(1500) for c in recordings.captures("dark")}
+    with pytest.raises(NotDetermined, match="darker than darks"):
+        fit_noise(RecordingSet(recordings.manifest, frames), "left")
+
+
 def test_without_darks_the_gain_is_found_and_the_rest_is_not() -> None:
     sensor = Sensor()
     recordings = recording_set(sensor, [], LADDER)

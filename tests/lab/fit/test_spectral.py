@@ -10,7 +10,7 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.fit.noise import fit_noise
-from lab.fit.spectral import compare_curves, estimate_sensitivity, fit_spectral
+from lab.fit.spectral import MIN_LIGHTS, compare_curves, estimate_sensitivity, fit_spectral
 from lab.recording import Camera, Manifest, RecordingSet, read
 from lab.results import NoiseFit, SpectralFit
 from sim.camera import CameraModel, Lens
@@ -383,6 +383,24 @@ def test_no_light_and_too_much_light_are_said() -> None:
         fit_spectral(RecordingSet(darks, frames), "left", NOISE)
     with pytest.raises(NotDetermined, match="unsaturated"):
         fit_spectral(recordings(exposure_s=8.0, step_nm=40.0), "left", NOISE)
+    closed = frames | {c.frame: base.frame(base.captures("dark")[0]) for c in base.captures("narrowband")}
+    spectra = {c.radiance: base.spectrum(c.radiance) for c in base.captures("narrowband")}
+    with pytest.raises(NotDetermined, match="show no light"):
+        fit_spectral(RecordingSet(base.manifest, closed, spectra), "left", NOISE)
+    few = base.manifest.model_copy(
+        update={"captures": (*base.captures("dark"), *base.captures("narrowband")[: MIN_LIGHTS - 1])}
+    )
+    with pytest.raises(NotDetermined, match=f"{MIN_LIGHTS - 1} different lights, {MIN_LIGHTS} needed"):
+        fit_spectral(RecordingSet(few, frames, spectra), "left", NOISE)
+    once = base.manifest.model_copy(
+        update={
+            "captures": tuple(
+                c if c.kind == "dark" else c.model_copy(update={"radiance": "nb560.csv"}) for c in base.captures()
+            )
+        }
+    )
+    with pytest.raises(NotDetermined, match=f"1 different lights, {MIN_LIGHTS} needed"):
+        fit_spectral(RecordingSet(once, frames, spectra), "left", NOISE)
 
 
 def test_unknown_lens_is_said_and_counts_as_part_of_the_sensor() -> None:
