@@ -265,8 +265,9 @@ def _print_fit(recordings: RecordingSet, fit: FitResult) -> None:
         for figure in stereo_figures(fit.stereo):
             out.print(f"{figure.name}: {figure.text}")
     for side, camera in fit.cameras.items():
-        for remark in camera.noise.remarks if camera.noise else ():
-            out.print(f"{side}: {escape(remark)}")
+        for part in (camera.noise, camera.spectral):
+            for remark in part.remarks if part else ():
+                out.print(f"{side}: {escape(remark)}")
     _print_skipped(fit.skipped)
 
 

@@ -195,7 +195,12 @@ def render_report(
         "residuals": _residuals(diagnosis, sides),
         "rows": rows,
         "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
-        "remarks": [(side, remark) for side, noise in noises.items() if noise for remark in noise.remarks],
+        "remarks": [
+            (side, remark)
+            for side, camera in fit.cameras.items()
+            for part in (camera.noise, camera.spectral)
+            for remark in (part.remarks if part else ())
+        ],
         "transfer": {side: charts.photon_transfer(noise) if noise else None for side, noise in noises.items()},
         "sheets": list(data_sheets(recordings, fit)),
         "linearity": {side: charts.linearity(noise) if noise else None for side, noise in noises.items()},
