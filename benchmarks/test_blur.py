@@ -20,7 +20,14 @@ from scipy.signal import fftconvolve
 from benchmarks.peers.iso12233 import iso12233_mtf
 from lab.fit.mosleh import mosleh_kernel
 from lab.fit.mtf import edge_mtf
-from lab.fit.psf import ScreenPictures, estimate_kernel, measure_kernels, normal_equations, photographed_kernel
+from lab.fit.psf import (
+    ScreenPictures,
+    displaced,
+    estimate_kernel,
+    measure_kernels,
+    normal_equations,
+    photographed_kernel,
+)
 from lab.recording import Bernoulli, Screen
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, expected_electrons, kernel
@@ -32,7 +39,7 @@ from sim.scene.scenes import ScreenPattern
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
 from tests.lab.fit.test_mtf import edge, gaussian_mtf, gaussian_mtf50
-from tests.lab.fit.test_psf import KERNELS, blurred_target, misplaced_target, psnr_db
+from tests.lab.fit.test_psf import KERNELS, blurred_target, misplaced_target, misplacement, psnr_db
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 DRAWS = int(os.environ.get("CALIBENCH_BENCH_DRAWS", "40"))
@@ -111,7 +118,7 @@ def test_edges_beside_iso_12233() -> None:
         )
         assert max(map(abs, ours)) <= 0.02
         # a standard deviation of so many draws is known to 1 / sqrt(2 n): three of these
-        assert sd <= 1.1 * bound * (1 + 3 / np.sqrt(2 * DRAWS)) or sigma > 1.0
+        assert sd <= 1.1 * bound * (1 + 3 / np.sqrt(2 * DRAWS))
         assert np.abs(excess).max() < 0.004
 
 
@@ -146,26 +153,40 @@ def test_kernels_beside_mosleh() -> None:
 
 def test_corner_errors() -> None:
     print(
-        "\n| kernel | placed, dB | corners 0.3 px off: with refinement, dB | without, dB | s |\n| --- | --- | --- | --- | --- |"
+        "\n| kernel | placed, dB | corners 0.3 px off: with refinement, dB | without, dB | cost, dB | cost to the CRB, dB | s |"
     )
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in ("Gauss 1", "Gauss 2.2 x 1.5", "disc 4.5", "Gauss 3"):
         truth = KERNELS[name][0]
-        # A common shift is the kernel's: compared without it, by the moduli of the transforms
-        peak = truth.max()
-
-        def modulus_db(estimate: np.ndarray, truth: np.ndarray = truth, peak: float = peak) -> float:
-            gap = np.abs(np.fft.fft2(estimate)) - np.abs(np.fft.fft2(truth))
-            return float(20 * np.log10(peak / np.sqrt(np.mean(gap**2) / truth.size)))
-
-        placed = estimate_kernel(*misplaced_target(truth, 0.0), len(truth))
-        pictures = misplaced_target(truth, 0.3)
-        start = time.process_time()
-        joint = estimate_kernel(*pictures, len(truth))
-        taken = time.process_time() - start
-        believed = estimate_kernel(*pictures, len(truth), register=False)
+        rows = []
+        for seed in range(3):
+            sharp, blurred, field = misplacement(truth, 0.3, seed=seed)
+            placed = estimate_kernel(*misplaced_target(truth, 0.0, seed=seed), len(truth))
+            start = time.process_time()
+            joint = estimate_kernel(sharp, blurred, len(truth))
+            taken = time.process_time() - start
+            believed = estimate_kernel(sharp, blurred, len(truth), register=False)
+            # what the displaced target itself tells less: pixels see it interpolated
+            traces = [
+                np.trace(np.linalg.inv(normal_equations(u, blurred, len(truth)).gram))
+                for u in (sharp, displaced(sharp, field))
+            ]
+            dbs = [modulus_db(f.kernel, truth) for f in (placed, joint, believed)]
+            rows.append([*dbs, dbs[0] - dbs[1], 10 * np.log10(traces[1] / traces[0]), taken])
+        means = np.mean(rows, axis=0)
         print(
-            f"| {name} | {modulus_db(placed.kernel):.1f} | {modulus_db(joint.kernel):.1f} | {modulus_db(believed.kernel):.1f} | {taken:.1f} |"
+            f"| {name} | "
+            + " | ".join(f"{v:.1f}" for v in means[:3])
+            + f" | {means[3]:.2f} | {means[4]:.2f} | {means[5]:.1f} |"
         )
+        # the goal is 1 dB; the scatter of three draws' difference is 0.3 dB
+        assert means[3] < 1.3
+
+
+def modulus_db(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """By the moduli of the transforms: a common shift of a misplaced target is the kernel's own."""
+    gap = np.abs(np.fft.fft2(estimate)) - np.abs(np.fft.fft2(truth))
+    return float(20 * np.log10(truth.max() / np.sqrt(np.mean(gap**2) / truth.size)))
 
 
 def both_db(estimate: np.ndarray, truth: np.ndarray) -> str:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,8 +40,11 @@ LENGTHS_PX = (0.0, 0.6, 1.0, 1.6, 2.5)  # of the prior's correlation; 0: none
 STRENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the prior, relative to the kernel's maximum
 FAR_STD = 0.1  # of the prior of the light from beyond the support
 REGISTRATION_STEPS = 3
-GRID_PX = 16.0  # of the grid on which the place of a drawn pattern is refined
+GRID_PX = 11.0  # of the grid on which the place of a drawn pattern is refined
 NODE_STD_PX = 0.5  # how far its nodes may move
+NODE_BENDS_PX = (0.02, 0.1, 0.5)  # second differences between its nodes, by evidence
+LEAST_FIELD_EVIDENCE = 3.0  # logarithm, for a displacement against none
+BRIEF_SOLVES, MOST_SOLVES = 4, 80  # of the polish: of a kernel that is not the last one, and of one that is
 GRID_STD = 5e-4  # of the kernel's maximum: what five taps on half pixels leave of a diffraction-limited kernel
 SHIFT_STD_PX = 0.005  # of the corners' common place, beside their scatter: neighbouring squares of unequal shading
 MOMENT_WINDOW_PX = 2.0  # of the moments that tell whether kernels over the field are symmetric
@@ -97,7 +100,7 @@ def estimate_kernel(
 
     blurred[r, c] = sum_ij kernel[i, j] sharp[r - i + support // 2, c - j + support // 2] + noise, on the rows and columns at
     least support // 2 from the border. `noise_std` is taken from the residual where it isn't given. With `register`, where the
-    residual shows that `sharp` was drawn a little off its place (`displaced`), the places are refined with the kernel: all
+    residual shows that `sharp` was drawn a little off its place (`displacement`), the places are refined with the kernel: all
     but a common shift, which is the kernel's. Raises `NotDetermined` where the picture is smaller than 2 x support, isn't
     finite or holds no structure, or where `sharp` explains nothing of `blurred`.
     """
@@ -114,25 +117,30 @@ def estimate_kernel(
                 "psf", f"{int((~np.isfinite(picture)).sum())} pixels of the {name} picture aren't finite"
             )
     normal = normal_equations(u, b, support)
-    found = solve_kernel(normal, support, noise_std)
+    found = solve_kernel(normal, support, noise_std, rounds=1, solves=BRIEF_SOLVES)
     inner = np.s_[support // 2 : u.shape[0] - support // 2, support // 2 : u.shape[1] - support // 2]
-    _refuse_unrelated(fftconvolve(u, found.kernel, mode="same")[inner], b[inner])
-    if not register:
-        return found
-    for step in range(REGISTRATION_STEPS + 1):
-        predicted = fftconvolve(u, found.kernel, mode="same")
-        moved = displaced(predicted, b, support // 2, force=step > 0)
-        if moved is None:
-            break
-        # The kernel sees the blurred picture less what the displacement does to the predicted one: its noise stays as it is
-        right = normal_equations_right(u, b - (moved - predicted), support)
-        normal = replace(normal, right=right[0], power=right[1])
-        last = step == REGISTRATION_STEPS
-        if last:
-            found = solve_kernel(normal, support, noise_std, rounds=1, begin=found)
-        else:
-            found = solve_kernel(normal, support, noise_std, like=found)
-    return found
+    kernel, predicted = found.kernel, fftconvolve(u, found.kernel, mode="same")
+    _refuse_unrelated(predicted[inner], b[inner])
+    field = displacement(predicted, b, support // 2) if register else None
+    if field is not None:
+        # Gauss-Newton: the derivatives by the kernel are the target's own values where the field says that they lie
+        carried = displaced(u, field)
+        normal = normal_equations(carried, b, support)
+        for step in range(REGISTRATION_STEPS):
+            moved = displaced(predicted, field)
+            linear = b - moved + fftconvolve(carried, kernel, mode="same")
+            right = normal_equations_right(carried, linear, support)
+            normal = replace(normal, right=right[0], power=right[1])
+            if step < REGISTRATION_STEPS - 1:
+                noise2 = float(np.mean((b - moved)[inner] ** 2))
+                elements = on_simplex(
+                    normal.gram + noise2 * found.precision, normal.right, kernel.ravel(), BRIEF_SOLVES
+                )
+                kernel = elements.reshape(support, support)
+                predicted = fftconvolve(u, kernel, mode="same")
+                field = displacement(predicted, b, support // 2, field)
+        found = replace(found, kernel=kernel)
+    return solve_kernel(normal, support, noise_std, begin=found, rounds=ROUNDS - 1)
 
 
 def _refuse_unrelated(predicted: Array, seen: Array) -> None:
@@ -145,41 +153,69 @@ def _refuse_unrelated(predicted: Array, seen: Array) -> None:
         )
 
 
-def displaced(predicted: Array, seen: Array, border: int, force: bool = False) -> Array | None:
-    """`predicted` as it lies in `seen`: moved by a displacement that is bilinear between the nodes of a grid of about
-    `GRID_PX`, or the kernel's width (2 `border` + 1) if that is more, its mean taken out; None where that isn't significant (5 sigma), unless by `force`.
+def displaced(picture: Array, field: Array) -> Array:
+    """`picture` read off at every pixel's place plus `field` (2, rows, cols), px, by splines of order 5."""
+    rows, cols = np.indices(picture.shape, dtype=float)
+    return np.asarray(ndimage.map_coordinates(picture, [rows + field[0], cols + field[1]], order=5, mode="nearest"))
 
-    Gauss-Newton on the residual, with the nodes' roughness held down by a weak prior of `NODE_STD_PX`.
+
+@overload
+def displacement(predicted: Array, seen: Array, border: int, start: Array) -> Array: ...
+@overload
+def displacement(predicted: Array, seen: Array, border: int) -> Array | None: ...
+def displacement(predicted: Array, seen: Array, border: int, start: Array | None = None) -> Array | None:
+    """Field (2, rows, cols) by which `predicted` has to be read off elsewhere to be `seen`, px: bilinear between the nodes of a
+    grid of about `GRID_PX`, its mean taken out. None where the evidence is against one, but where `start` says that there is one.
+
+    Gauss-Newton on the residual. The nodes move by `NODE_STD_PX` at most, and bend the grid by as much as the evidence says.
     """
     inner = np.s_[border : seen.shape[0] - border, border : seen.shape[1] - border]
-    shape = seen[inner].shape
-    # a wide kernel leaves little to see finer displacements by
-    spacing = max(GRID_PX, 2.0 * border + 1.0)
-    hats = [_hats(n, max(2, round(n / spacing) + 1)) for n in shape]
-    nodes = hats[0].shape[1] * hats[1].shape[1]
-    field, moved = np.zeros((2, *seen.shape)), predicted
-    rows, cols = np.indices(seen.shape, dtype=float)
+    hats = [_hats(n, max(2, round(n / GRID_PX) + 1)) for n in seen[inner].shape]
+    shape = hats[0].shape[1], hats[1].shape[1]
+    nodes = shape[0] * shape[1]
+    field, at = np.zeros((2, *seen.shape)), np.zeros(2 * nodes)
+    if start is not None:
+        field = start
+        at = np.concatenate([(_pinv(hats[0]) @ part[inner] @ _pinv(hats[1]).T).ravel() for part in start])
+    one = [_roughness(shape, bend) + np.eye(nodes) / NODE_STD_PX**2 for bend in NODE_BENDS_PX]
+    precision = one[0]
     for turn in range(2):
+        moved = displaced(predicted, field)
         residual = (seen - moved)[inner]
         noise2 = float(np.mean(residual**2))
         slopes = [np.gradient(moved, axis=axis)[inner] for axis in (0, 1)]
-        gram, right = np.zeros((2 * nodes, 2 * nodes)), np.zeros(2 * nodes)
-        for i in (0, 1):
-            right[i * nodes : (i + 1) * nodes] = (hats[0].T @ (slopes[i] * residual) @ hats[1]).ravel()
-            for j in (0, 1):
-                gram[i * nodes : (i + 1) * nodes, j * nodes : (j + 1) * nodes] = _hat_gram(hats, slopes[i] * slopes[j])
-        step = np.linalg.solve(gram + noise2 / NODE_STD_PX**2 * np.eye(2 * nodes), right)
-        if turn == 0 and not force:
-            # Of noise alone, the fall of chi2 by so many free numbers is chi2 distributed
-            fall, freedom = float(right @ step) / noise2, 2 * nodes
-            if fall < freedom + 5.0 * np.sqrt(2.0 * freedom):
+        gram = np.block([[_hat_gram(hats, a * b) for b in slopes] for a in slopes]) / noise2
+        right = np.concatenate([(hats[0].T @ (a * residual) @ hats[1]).ravel() for a in slopes]) / noise2
+        if turn == 0:
+            evidence = [_field_evidence(gram, right + gram @ at, p) for p in one]
+            if start is None and max(evidence) < LEAST_FIELD_EVIDENCE:
                 return None
-        for i in (0, 1):
-            grid = step[i * nodes : (i + 1) * nodes].reshape(hats[0].shape[1], -1)
-            part = hats[0] @ grid @ hats[1].T
-            field[i] += np.pad(part - part.mean(), border, mode="edge")
-        moved = ndimage.map_coordinates(predicted, [rows + field[0], cols + field[1]], order=3, mode="nearest")
-    return moved
+            precision = linalg.block_diag(*[one[int(np.argmax(evidence))]] * 2)
+        factor = linalg.cho_factor(gram + precision, lower=True, check_finite=False)
+        at = at + linalg.cho_solve(factor, right - precision @ at, check_finite=False)
+        parts = [hats[0] @ part.reshape(shape) @ hats[1].T for part in np.split(at, 2)]
+        field = np.stack([np.pad(part - part.mean(), border, mode="edge") for part in parts])
+    return field
+
+
+def _pinv(hats: Array) -> Array:
+    return np.asarray(np.linalg.pinv(hats))
+
+
+def _roughness(shape: tuple[int, int], bend_px: float) -> Array:
+    """Precision of a grid's nodes whose second differences, along both axes and across them, are about `bend_px`."""
+    down, across = (np.eye(n) for n in shape)
+    bends = [np.kron(np.diff(down, 2, axis=0), across), np.kron(down, np.diff(across, 2, axis=0))]
+    bends.append(np.kron(np.diff(down, axis=0), np.diff(across, axis=0)))
+    return np.asarray(sum(b.T @ b for b in bends) / bend_px**2)
+
+
+def _field_evidence(gram: Array, right: Array, precision: Array) -> float:
+    """Logarithm of the evidence for a displacement of given precision (of one axis), over that for none."""
+    factor = linalg.cholesky(gram + linalg.block_diag(precision, precision), lower=True, check_finite=False)
+    half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
+    prior = linalg.cholesky(precision, lower=True, check_finite=False)
+    return float(0.5 * half @ half - np.log(np.diag(factor)).sum() + 2.0 * np.log(np.diag(prior)).sum())
 
 
 def _hats(count: int, nodes: int) -> Array:
@@ -266,6 +302,7 @@ def solve_kernel(
     rounds: int = ROUNDS,
     like: KernelEstimate | None = None,
     begin: KernelEstimate | None = None,
+    solves: int = MOST_SOLVES,
 ) -> KernelEstimate:
     """The kernel of given normal equations; see `estimate_kernel`.
 
@@ -308,10 +345,10 @@ def solve_kernel(
     for last in range(1 - rounds if like is None else 1, 1):
         prior, at = _by_evidence(inside, seen, found[:size].reshape(support, support), at)
         precision[:size, :size] = prior.precision()
-        found = on_simplex(information + precision, weighted, found, 80 if last == 0 else 3)
+        found = on_simplex(information + precision, weighted, found, solves if last == 0 else 3)
     if like is not None:
         prior, precision = _Prior(_envelope(like.kernel), like.length_px, like.strength), like.precision
-        found = on_simplex(information + precision, weighted, found, 80)
+        found = on_simplex(information + precision, weighted, found, solves)
     share = float(found[:size].sum())
     posterior = prior.posterior(inside) / share**2
     return KernelEstimate(
@@ -1078,7 +1115,7 @@ def _project_on_simplex(x: Array) -> Array:
     return np.asarray(np.maximum(x - excess[np.flatnonzero(ordered > excess)[-1]], 0.0))
 
 
-def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = 80) -> Array:
+def on_simplex(quadratic: Array, linear: Array, start: Array, solves: int = MOST_SOLVES) -> Array:
     """argmin 1/2 x Q x - c x over x >= 0, sum x = 1: projected gradients with momentum, then an exact active-set polish.
 
     `solves` limits the polish, each of which costs one factorisation; it ends by itself at the optimum.

@@ -17,6 +17,7 @@ from lab.errors import NotDetermined
 from lab.fit.mosleh import mosleh_kernel
 from lab.fit.psf import (
     ScreenKernel,
+    displacement,
     estimate_kernel,
     fit_psf,
     fit_psf_field,
@@ -157,6 +158,11 @@ def test_an_even_support_and_unequal_shapes_are_refused():
 
 def misplaced_target(kernel, corner_px, size=256, square=32, seed=0):
     """A target that was drawn with errors of its checkerboard's corners, bilinear in between; as much of it as `blurred_target`."""
+    return misplacement(kernel, corner_px, size, square, seed)[:2]
+
+
+def misplacement(kernel, corner_px, size=256, square=32, seed=0):
+    """As `misplaced_target`, and the displacement (2, rows, cols), px."""
     rng = np.random.default_rng(seed)
     wide = size + 2 * square
     sharp = rng.integers(0, 2, (wide, wide)).astype(float)
@@ -166,9 +172,9 @@ def misplaced_target(kernel, corner_px, size=256, square=32, seed=0):
         map_coordinates(nodes, [r / square, c / square], order=1)
         for nodes in rng.normal(0, corner_px, (2, wide // square + 2, wide // square + 2))
     ]
-    at = [x + d - d[inner].mean() for x, d in zip((r, c), moved, strict=True)]
-    blurred = map_coordinates(fftconvolve(sharp, kernel, mode="same"), at, order=5)
-    return sharp[inner], blurred[inner] + rng.normal(0, 0.01, (size, size))
+    field = np.array([d - d[inner].mean() for d in moved])
+    blurred = map_coordinates(fftconvolve(sharp, kernel, mode="same"), np.array([r, c]) + field, order=5)
+    return sharp[inner], blurred[inner] + rng.normal(0, 0.01, (size, size)), field[:, *inner]
 
 
 def test_corner_errors_of_three_tenths_of_a_pixel_are_taken_out():
@@ -180,8 +186,19 @@ def test_corner_errors_of_three_tenths_of_a_pixel_are_taken_out():
     wrong = [
         np.linalg.norm(np.abs(np.fft.fft2(f.kernel)) - np.abs(np.fft.fft2(kernel))) for f in (placed, joint, believed)
     ]
-    assert wrong[1] < 1.6 * wrong[0]
+    # 1 dB is 1.12; a single draw scatters by as much
+    assert wrong[1] < 1.25 * wrong[0]
     assert wrong[2] > 4.0 * wrong[1]
+
+
+def test_the_displacement_of_a_target_is_found():
+    sharp, blurred, truth = misplacement(gaussian(15, 1.6, 1.3, 30), 0.3, 160)
+    predicted = fftconvolve(sharp, gaussian(15, 1.6, 1.3, 30), mode="same")
+    found = displacement(predicted, blurred, 7)
+    inner = np.s_[:, 7:-7, 7:-7]
+    # slopes of some 0.1 a pixel: 121 pixels a node know its place to 0.01 / 0.1 / 11 px; kinks within a cell double that
+    assert truth[inner].std() > 0.15
+    assert (found - truth)[inner].std() < 0.02
 
 
 def test_a_target_in_its_place_is_left_there():
