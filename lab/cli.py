@@ -196,11 +196,17 @@ def _validated(
         return validate(recordings, fit, models=models)
 
 
-def _examined(recordings: RecordingSet, fit: FitResult, baseline: dict[Side, CameraFile] | None = None) -> Diagnosis:
+def _examined(
+    recordings: RecordingSet,
+    fit: FitResult,
+    baseline: dict[Side, CameraFile] | None = None,
+    *,
+    pictures: bool = True,
+) -> Diagnosis:
     from lab.diagnose import examine
 
     with _bar("diagnose") as advance:
-        return examine(recordings, fit, advance, baseline=baseline)
+        return examine(recordings, fit, advance, baseline=baseline, pictures=pictures)
 
 
 def _camera_path(recordings: RecordingSet, side: Side, path: Path) -> Path:
@@ -420,7 +426,7 @@ def diagnose(
     if save is not None:
         _camera_path(recordings, recordings.sides[0], save)
     baseline = _read_models(recordings, model)
-    found = _examined(recordings, _fitted(recordings, fit_file), baseline)
+    found = _examined(recordings, _fitted(recordings, fit_file), baseline, pictures=False)
     if str(json) != "-":
         _print_diagnosis(found.result)
     _write_json(found.result, json)

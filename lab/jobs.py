@@ -110,9 +110,10 @@ class _Task:
         return validate(self.recordings, self._latest("fit", FitResult, self.fit))
 
     def diagnose(self) -> DiagnosisResult:
-        from lab.diagnose import diagnose
+        from lab.diagnose import examine
 
-        return diagnose(self.recordings, fit=self._latest("fit", FitResult, self.fit), progress=self.progress)
+        fitted = self._latest("fit", FitResult, self.fit)
+        return examine(self.recordings, fitted, self.progress, pictures=True).result
 
     def report(self) -> ReportFile:
         from lab.report import provenance_of, write_report

@@ -661,6 +661,57 @@ class NextCapture(Frozen):
     told_apart: float
 
 
+class Place(Frozen):
+    """A part of one measurement that was looked at: chi2 under the baseline and with the named effects, and how significant that is once
+    the number of places is allowed for."""
+
+    side: Side
+    measurement: str
+    axis: str
+    where: str
+    n: int
+    chi2_before: float
+    chi2_after: float
+    sigma_before: float
+    sigma_after: float
+
+
+class MeasurementFit(Frozen):
+    """chi2 of one measurement as a whole, before and after the named effects: of what choice and fit saw, and of what was held out."""
+
+    side: Side
+    measurement: str
+    n: int
+    chi2_before: float
+    chi2_after: float
+    held_out_n: int
+    held_out_before: float
+    held_out_after: float
+
+
+class Visibility(Frozen):
+    """What could have been seen of one effect: the smallest size of each of its parameters that would have been, in 90 % of all cases (none
+    where it isn't small anywhere); the effect most like it with the cosine of their signatures, and how often these would be told apart."""
+
+    side: Side
+    effect: str
+    smallest: dict[str, float]
+    nearest: str | None
+    cosine: float
+    told_apart: float
+
+
+class ResidualPicture(Frozen):
+    """A frame less its prediction by cells, in standard deviations of a cell, under the baseline and with what was found."""
+
+    side: Side
+    kind: str
+    capture: str
+    held_out: bool
+    before: tuple[tuple[float, ...], ...]
+    after: tuple[tuple[float, ...], ...]
+
+
 class Resolution(Frozen):
     """What was undecided, the capture that was taken to settle it, and where its frames lie; the result itself is the decision after."""
 
@@ -682,6 +733,10 @@ class DiagnosisResult(Frozen):
     next_capture: str | None = None
     next_captures: tuple[NextCapture, ...] = ()  # best first, side by side
     resolution: Resolution | None = None
+    places: tuple[Place, ...] = ()
+    measurements: tuple[MeasurementFit, ...] = ()
+    visibility: tuple[Visibility, ...] = ()
+    pictures: tuple[ResidualPicture, ...] = ()
     threshold: float | None = None
     false_alarm_rate: float | None = None
     curves: tuple[ResidualCurve, ...] = ()

@@ -36,6 +36,8 @@ def in_processes(
     fit: FitResult | None,
     baseline: Mapping[Side, CameraFile],
     report: Callable[[Side, str], None],
+    *,
+    pictures: bool = False,
 ) -> list[SideFindings]:
     """What every side shows, in the order of the sides. `report` is called in the caller's thread; what it raises, or what a
     process raised, ends all of them. Raises InputError where a process was ended from outside."""
@@ -44,7 +46,7 @@ def in_processes(
     with contextlib.ExitStack() as stack:
         for side in recordings.sides:
             # registered before it starts: an interrupt in between must find it
-            stack.enter_context(_Process(side, (recordings, side, fit, baseline.get(side)), said)).start()
+            stack.enter_context(_Process(side, (recordings, side, fit, baseline.get(side), pictures), said)).start()
         while len(found) < len(recordings.sides):
             try:
                 side, what = said.get(timeout=WAKE_S)

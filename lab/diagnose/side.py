@@ -14,11 +14,24 @@ from lab.diagnose.decide import Candidate, Verdict, decide
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.improved import Correction, improved_model
 from lab.diagnose.locate import describe
+from lab.diagnose.looked_at import measurement_fits, places, visibility
 from lab.diagnose.next_capture import Proposal, proposals
+from lab.diagnose.pictures import residual_pictures
 from lab.diagnose.summaries import Block
 from lab.diagnose.unknown import with_discrepancy
 from lab.recording import RecordingSet
-from lab.results import FitResult, HeldOut, Mismatch, ResidualCurve, Skipped, Unexplained
+from lab.results import (
+    FitResult,
+    HeldOut,
+    MeasurementFit,
+    Mismatch,
+    Place,
+    ResidualCurve,
+    ResidualPicture,
+    Skipped,
+    Unexplained,
+    Visibility,
+)
 from sim.camera import Side
 from sim.effects.base import Effect
 
@@ -51,12 +64,22 @@ class SideFindings:
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None  # the model with what was found
     proposals: tuple[Proposal, ...] = ()  # what to capture next
+    places: tuple[Place, ...] = ()
+    measurements: tuple[MeasurementFit, ...] = ()
+    visibility: tuple[Visibility, ...] = ()
+    pictures: tuple[ResidualPicture, ...] = ()
 
 
 def diagnose_side(
-    recordings: RecordingSet, side: Side, fit: FitResult | None, baseline: CameraFile | None, report: Report
+    recordings: RecordingSet,
+    side: Side,
+    fit: FitResult | None,
+    baseline: CameraFile | None,
+    report: Report,
+    *,
+    pictures: bool = False,
 ) -> SideFindings:
-    """Everything that is told of one side."""
+    """Everything that is told of one side. `pictures`: residual pictures, too, which take the forward model some seconds."""
     report("summarising the recordings")
     evidence, skipped = evidence_of(recordings, side, fit, baseline)
     if evidence is None:
@@ -78,6 +101,10 @@ def diagnose_side(
         curves=tuple(_curves(side, verdict)),
         improved=improved,
         proposals=proposals(recordings, side, verdict),
+        places=tuple(places(side, verdict)),
+        measurements=tuple(measurement_fits(side, verdict)),
+        visibility=tuple(visibility(side, verdict)),
+        pictures=tuple(residual_pictures(recordings, side, evidence, improved)) if pictures else (),
     )
 
 

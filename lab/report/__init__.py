@@ -18,6 +18,7 @@ from lab.errors import InputError
 from lab.rawfile import replacing
 from lab.recording import RecordingSet
 from lab.report import charts, geometry, words
+from lab.report import diagnosis as diagnosis_page
 from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
@@ -36,7 +37,6 @@ from sim.camera import Side
 
 __all__ = ["Provenance", "installed_versions", "provenance_of", "render_report", "write_report"]
 KERNELS_A_SIDE = 12
-CURVES_A_SIDE = 4
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _residuals(
     return {
         side: [
             (curve, charts.residual_curve(curve))
-            for curve in charts.worst_curves([curve for curve in curves if curve.side == side], CURVES_A_SIDE)
+            for curve in diagnosis_page.worst_of_each([curve for curve in curves if curve.side == side])
         ]
         for side in sides
     }
@@ -151,6 +151,7 @@ def page_environment() -> jinja2.Environment:
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,
+        "mood": diagnosis_page.mood,
     }
     return environment
 
@@ -193,6 +194,7 @@ def render_report(
         "mismatch_map": charts.mismatch_map(diagnosis) if diagnosis is not None else None,
         "held_out": charts.held_out_bars(diagnosis) if diagnosis is not None else None,
         "residuals": _residuals(diagnosis, sides),
+        **diagnosis_page.context(diagnosis, sides),
         "rows": rows,
         "stated": any(figure.stated is not None for _, figures in rows for figure in figures.values()),
         "remarks": [

@@ -466,23 +466,6 @@ def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
     }
 
 
-def worst_curves(curves: Sequence[ResidualCurve], most: int = 4) -> list[ResidualCurve]:
-    """The curves that tell most, of each measurement in turn: by how much chi2 the named effects take away, or is there."""
-
-    def weight(curve: ResidualCurve) -> float:
-        std = np.maximum(np.asarray(curve.measured_std), 1e-12)
-        before = np.sum(((np.asarray(curve.measured) - np.asarray(curve.before)) / std) ** 2)
-        return float(before)
-
-    by_measurement: dict[str, list[ResidualCurve]] = {}
-    for curve in sorted(curves, key=weight, reverse=True):
-        by_measurement.setdefault(curve.measurement, []).append(curve)
-    ranked: list[ResidualCurve] = []
-    for turn in range(most):
-        ranked += [group[turn] for group in by_measurement.values() if turn < len(group)]
-    return ranked[:most]
-
-
 def _range(curve: ResidualCurve) -> list[float]:
     """Range of the ordinate: what was measured and explained, and of the baseline only as much as leaves that legible."""
     seen = np.concatenate([curve.measured, curve.after])
@@ -491,6 +474,13 @@ def _range(curve: ResidualCurve) -> list[float]:
     before = np.clip(curve.before, low - span, high + span)
     low, high = min(low, float(before.min())), max(high, float(before.max()))
     return [low - 0.06 * (high - low), high + 0.06 * (high - low)]
+
+
+def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
+    """Where x only numbers the points: their names."""
+    if not curve.names:
+        return {}
+    return {"tickvals": list(curve.x), "ticktext": list(curve.names), "tickangle": -45, "tickfont": {"size": 9}}
 
 
 def residual_curve(curve: ResidualCurve) -> Figure:
@@ -538,7 +528,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
         "data": data,
         "layout": layout(
             330,
-            xaxis=axis(curve.axis, anchor="y2"),
+            xaxis=axis(curve.axis, anchor="y2", **_named_ticks(curve)),
             yaxis=axis("measured", domain=[0.42, 1.0], range=_range(curve)),
             yaxis2=axis("residual, σ", domain=[0.0, 0.32], zeroline=True),
             shapes=[

@@ -211,7 +211,7 @@ def test_diagnosis_with_a_stored_fit(
     assert cli.main(["fit", str(flats), "--json", str(tmp_path / "fit.json")]) == 0
     monkeypatch.setattr(cli, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
     result = DiagnosisResult(source="x", verdict="no_mismatch", skipped=(Skipped(step="mtf", reason="no [edges]"),))
-    monkeypatch.setattr(cli, "_examined", lambda recordings, fit, baseline: Diagnosis(result, {}))
+    monkeypatch.setattr(cli, "_examined", lambda recordings, fit, baseline, pictures: Diagnosis(result, {}))
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 0
     shown = capsys.readouterr().out
     assert "verdict: no_mismatch" in shown

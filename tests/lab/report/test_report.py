@@ -103,7 +103,9 @@ def test_page_says_what_the_results_say(page: Page) -> None:
 
 
 def test_charts_carry_uncertainty_and_labelled_axes(page: Page) -> None:
-    assert len(page.figures) >= 2 + 4 + 4 + 2 + 2 + 2  # diagnosis, residuals, transfer, QE, MTF, chart
+    assert (
+        len(page.figures) >= 2 + 2 + 4 + 2 + 2 + 2
+    )  # diagnosis, residuals (one a measurement), transfer, QE, MTF, chart
     for figure in page.figures:
         axes = [value for key, value in figure["layout"].items() if re.fullmatch(r"[xy]axis\d*", key)]
         assert axes

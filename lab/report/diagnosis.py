@@ -1,0 +1,191 @@
+"""The diagnosis on the page: heat maps of all places that were looked at, residual pictures, what could have been seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from lab.diagnose.looked_at import detectable
+from lab.report.charts import Figure, axis, layout
+from lab.report.figures import SHOWN_UNITS
+from lab.report.pictures import difference_picture
+from lab.results import DiagnosisResult, Place, ResidualCurve, ResidualPicture, Visibility
+from sim.camera import Side
+from sim.effects.library import effects as library
+
+#: Standard deviations at which a residual picture's colours end.
+PICTURE_LIMIT = 6.0
+#: Above this quantile of noise alone, a chi2 is marked.
+MARKED_QUANTILE = 0.999
+CURVES_A_SIDE = 8
+#: Significance at which the heat maps' colour ends: beyond, more is no news.
+DEEPEST_SIGMA = 12.0
+
+
+def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[str, Any]:
+    """What `diagnosis.html` draws beside the result itself."""
+    if diagnosis is None:
+        return {}
+    threshold = diagnosis.threshold
+    return {
+        "place_map": place_maps(diagnosis, sides),
+        "residual_pictures": [_Pair.of(picture) for picture in diagnosis.pictures],
+        "picture_limit": f"{PICTURE_LIMIT:g}",
+        "visibility": _visibility(diagnosis.visibility),
+        "detectable": f"{detectable(threshold):.0f}" if threshold is not None else "",
+    }
+
+
+def mood(chi2: float, n: int) -> str:
+    """The class of a chi2's cell: marked where noise alone leaves less in 99.9 % of all cases."""
+    return "open" if n and chi2 > stats.chi2.ppf(MARKED_QUANTILE, n) else ""
+
+
+def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) -> list[ResidualCurve]:
+    """Of every measurement the curve that the baseline misses most, of held-out captures where there are any; worst first."""
+
+    def missed(curve: ResidualCurve) -> float:
+        std = np.maximum(np.asarray(curve.measured_std), 1e-12)
+        return float(np.mean(np.square((np.asarray(curve.measured) - np.asarray(curve.before)) / std)))
+
+    chosen: dict[str, ResidualCurve] = {}
+    for curve in sorted(curves, key=lambda curve: (curve.held_out, missed(curve))):
+        chosen[curve.measurement] = curve
+    return sorted(chosen.values(), key=missed, reverse=True)[:most]
+
+
+# --- heat maps -----------------------------------------------------------------------------------------------------------
+
+
+def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
+    """Heat maps of significance by measurement and axis, one a side and model: the baseline, and with the named effects where any are."""
+    maps = []
+    for side in sides:
+        mine = [place for place in diagnosis.places if place.side == side]
+        if not mine:
+            continue
+        maps.append((f"{side}, baseline", _place_map(mine, after=False)))
+        if any(side in effect.sides for effect in diagnosis.effects):
+            maps.append((f"{side}, with the named effects", _place_map(mine, after=True)))
+    return maps
+
+
+def _place_map(places: Sequence[Place], *, after: bool) -> Figure:
+    rows = list(dict.fromkeys(place.measurement for place in places))
+    axes = list(dict.fromkeys(place.axis for place in places))
+
+    def sigma(place: Place) -> float:
+        return place.sigma_after if after else place.sigma_before
+
+    worst: dict[tuple[str, str], Place] = {}
+    for place in places:
+        key = place.measurement, place.axis
+        if key not in worst or sigma(place) > sigma(worst[key]):
+            worst[key] = place
+    cells = [[worst.get((row, name)) for name in axes] for row in rows]
+    return {
+        "data": [
+            {
+                "type": "heatmap",
+                "x": [name.replace("_", " ") for name in axes],
+                "y": [row.replace("_", " ") for row in rows],
+                "z": [[None if cell is None else min(sigma(cell), DEEPEST_SIGMA) for cell in line] for line in cells],
+                "customdata": [
+                    ["" if cell is None else f"{sigma(cell):.1f} σ, {cell.where}" for cell in line] for line in cells
+                ],
+                "hovertemplate": "%{y}, %{x}<br>%{customdata}<extra></extra>",
+                "colorscale": [[0, "#eef1f4"], [0.25, "#fbe3c8"], [0.6, "#f0874f"], [1, "#a1232f"]],
+                "zmin": 0.0,
+                "zmax": DEEPEST_SIGMA,
+                "xgap": 2,
+                "ygap": 2,
+                "showscale": False,
+            }
+        ],
+        "layout": layout(
+            70 + 26 * len(rows),
+            xaxis=axis("", side="top", showgrid=False, ticks="", tickangle=-35),
+            yaxis=axis("", autorange="reversed", showgrid=False, ticks=""),
+            margin={"l": 110, "r": 14, "t": 70, "b": 12},
+            annotations=[
+                {
+                    "x": axes[column].replace("_", " "),
+                    "y": rows[line].replace("_", " "),
+                    "text": _short(sigma(cell)),
+                    "showarrow": False,
+                    "font": {"size": 11, "color": "#ffffff" if sigma(cell) > 0.8 * DEEPEST_SIGMA else "#1b1b1b"},
+                }
+                for line, of_row in enumerate(cells)
+                for column, cell in enumerate(of_row)
+                if cell is not None and sigma(cell) >= 0.05
+            ],
+        ),
+    }
+
+
+def _short(sigma: float) -> str:
+    """To fit its cell."""
+    return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 999.5 else "> 999"
+
+
+# --- residual pictures -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """One frame's residuals before and after, as pictures."""
+
+    side: Side
+    kind: str
+    capture: str
+    held_out: bool
+    before: str
+    after: str
+    rms_before: str
+    rms_after: str
+
+    @classmethod
+    def of(cls, picture: ResidualPicture) -> _Pair:
+        before, after = np.asarray(picture.before), np.asarray(picture.after)
+        return cls(
+            side=picture.side,
+            kind=picture.kind,
+            capture=picture.capture,
+            held_out=picture.held_out,
+            before=difference_picture(before, PICTURE_LIMIT),
+            after=difference_picture(after, PICTURE_LIMIT),
+            rms_before=f"{np.sqrt(np.mean(np.square(before))):.2f}",
+            rms_after=f"{np.sqrt(np.mean(np.square(after))):.2f}",
+        )
+
+
+# --- what could have been seen -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """One effect's cells of the table."""
+
+    smallest: str
+    nearest: str | None
+    cosine: float
+    told_apart: float
+
+
+def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Seen]]:
+    """Effect -> side -> what stands in the table; in the order of the names."""
+    table: dict[str, dict[Side, _Seen]] = {}
+    for item in sorted(items, key=lambda item: item.effect):
+        units = {name: quantity.unit for name, quantity in library()[item.effect].quantities().items()}
+        sizes = [
+            f"{name.removesuffix('_' + ('percent' if units[name] == '%' else units[name])).replace('_', ' ')} {value:.2g} "
+            f"{SHOWN_UNITS.get(units[name], '' if units[name] == '1' else units[name])}".strip()
+            for name, value in item.smallest.items()
+        ]
+        text = ", ".join(sizes) or "its place matters, not its size"
+        table.setdefault(item.effect, {})[item.side] = _Seen(text, item.nearest, item.cosine, item.told_apart)
+    return table
