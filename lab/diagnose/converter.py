@@ -41,7 +41,7 @@ SCATTER_FLOOR = 0.03  # of a chi2's number of codes
 COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
 AROUND = 9  # pixels a side of a colour's plane, whose mean is the light's own course
 PARTS = 4  # of the range of codes, whose scatter is looked at by itself
-FINE = 16  # samples a code of the converter's law
+FINE = 8  # samples a code of the converter's law
 
 
 @dataclass(frozen=True)
@@ -283,6 +283,12 @@ def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
     x = (np.arange((size + 2 * margin) * FINE) + 0.5) / FINE - 0.5 + codes.first - margin
     for effect in effects:
         x = effect.codes(x, study.camera)
-    code = np.rint(x).astype(int) - codes.first
-    inside = (code >= 0) & (code < size)
-    return np.bincount(code[inside], minlength=size) / FINE
+    # each sample stands for an interval of its output, which may lie across the border of two codes
+    top = x + 0.5 / FINE - codes.first
+    code = np.rint(top).astype(int)
+    above = np.clip((top - code + 0.5) * FINE, 0.0, 1.0)
+    found = np.zeros(size + 1)
+    for at, share in ((code, above), (code - 1, 1.0 - above)):
+        inside = (at >= 0) & (at < size)
+        found += np.bincount(at[inside], share[inside], minlength=size + 1)
+    return found[:size] / FINE

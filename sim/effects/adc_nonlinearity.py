@@ -21,7 +21,7 @@ class AdcNonlinearity(Effect):
     reference: ClassVar[str] = (
         "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"
     )
-    form_tolerance: ClassVar[float] = 0.2
+    form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
     )
