@@ -98,6 +98,7 @@ class Changing:
 
     contrasts: int
     variance_dn2: float  # of a pixel
+    pixel_dn2: float  # the same without what lines have in common
     squares: Image  # sum of squared contrasts, over its surroundings' variance
     lines: dict[Lines, tuple[FloatArray, FloatArray, float]]
     along: dict[
@@ -197,6 +198,7 @@ def _read(study: Study, condition: Condition, with_pattern: bool) -> Frames:
 def _changing(contrasts: list[Image]) -> Changing:
     total = np.zeros_like(contrasts[0])
     variance: list[float] = []
+    pixel: list[float] = []
     white: list[float] = []
     cells: list[float] = []
     rows, cols, along_rows, along_cols = [], [], [], []
@@ -208,6 +210,8 @@ def _changing(contrasts: list[Image]) -> Changing:
         for lines, value in spare.items():
             excess[lines].append(value)
         variance.append(float(np.mean(np.square(cut), dtype=np.float64)))
+        own = _robust_std(rest)
+        pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
         total += np.square(rest)
         cells.append(float(np.mean(np.square(_cell_means(cut)))))
         if len(white) < 6:  # spectra of more are known well enough
@@ -221,6 +225,7 @@ def _changing(contrasts: list[Image]) -> Changing:
     return Changing(
         contrasts=len(contrasts),
         variance_dn2=float(np.mean(variance)),
+        pixel_dn2=float(np.mean(pixel)),
         squares=(total / local).astype(np.float32),
         lines={"rows": _pooled(rows), "columns": _pooled(cols)},
         along={"rows": _pooled_along(along_rows), "columns": _pooled_along(along_cols)},
@@ -571,7 +576,7 @@ def _fine(step: str, frames: Sequence[Frames], least_dn: float) -> list[Frames]:
     every = [f for f in frames if f.changing]
     if not every:
         raise NotDetermined(step, "no two dark frames of the same exposure and temperature")
-    fine = [f for f in every if all(c.variance_dn2 > least_dn**2 for c in f.changing.values())]
+    fine = [f for f in every if all(c.pixel_dn2 > least_dn**2 for c in f.changing.values())]
     if not fine:
         raise NotDetermined(step, _too_coarse(every, least_dn))
     return fine
@@ -584,7 +589,7 @@ def _by_part(frames: Sequence[Frames]) -> dict[bool, list[Changing]]:
 
 
 def _too_coarse(frames: Sequence[Frames], limit_dn: float) -> str:
-    noise = min(np.sqrt(c.variance_dn2) for f in frames for c in f.changing.values())
+    noise = min(np.sqrt(c.pixel_dn2) for f in frames for c in f.changing.values())
     return f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse to show how it is distributed; a higher gain would"
 
 
@@ -870,7 +875,7 @@ def odd_pixel_block(study: Study) -> Block:
 
 def _pixel_noise(study: Study, frames: Frames, part: Fixed) -> tuple[float, float]:
     """(temporal, fixed) standard deviation of single pixels in DN: their median's spread less what the frames' noise leaves of it."""
-    moving = next((c.variance_dn2 for c in frames.changing.values()), None)
+    moving = next((c.pixel_dn2 for c in frames.changing.values()), None)
     left = _order_moments(part.of_median)[1]
     if moving is None:  # of a lone frame all counts as noise
         return max(part.spread_dn, 0.05), 0.0
@@ -996,7 +1001,7 @@ def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray
 def _hot_above(study: Study, part: Sequence[Frames], out: bool, rate: FloatArray, edges: FloatArray) -> FloatArray:
     """(rates, edges): hot pixels have more shot noise, the more the longer the exposure; by the first two moments."""
     count = np.array([f.changing[out].contrasts for f in part], float)
-    noise = np.array([f.changing[out].variance_dn2 for f in part])
+    noise = np.array([f.changing[out].pixel_dn2 for f in part])
     charge = study.noise.gain**2 * rate[:, None] * np.array([f.condition.exposure_s for f in part])
     factor = 1.0 + charge / noise
     mean, variance = factor @ count, 2.0 * np.square(factor) @ count
@@ -1015,7 +1020,7 @@ def _jump_above(
     freedom: int,
 ) -> FloatArray:
     """(amplitudes, edges): mean over which of the frames are high."""
-    unit = np.sum([draws[id(f)][out] / f.changing[out].variance_dn2 for f in part], axis=0)
+    unit = np.sum([draws[id(f)][out] / f.changing[out].pixel_dn2 for f in part], axis=0)
     found = []
     for amplitude in amplitude_e:
         away = np.square(study.noise.gain * amplitude) * unit

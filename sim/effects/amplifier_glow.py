@@ -35,7 +35,7 @@ class AmplifierGlow(Effect):
     ] = 0.0
     reach_mm: Annotated[
         float,
-        Quantity("mm", "distance over which it falls to 1/e", lower=0.01, upper=100.0, prior=(1.0, 1.0), absent=1.0),
+        Quantity("mm", "distance over which it falls to 1/e", lower=0.01, upper=5.0, prior=(1.0, 1.0), absent=1.0),
     ] = 1.0
     corner: Corner = "top_left"
 
@@ -43,7 +43,7 @@ class AmplifierGlow(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         half_mm = 0.5 * float(np.hypot(camera.rows, camera.cols)) * camera.pixel_pitch_um * 1e-3
         return tuple(
-            (cls(glow_e_per_s=6.0, reach_mm=float(np.clip(share * half_mm, 0.011, 90.0)), corner=corner),)
+            (cls(glow_e_per_s=6.0, reach_mm=float(np.clip(share * half_mm, 0.011, 4.5)), corner=corner),)
             for corner in get_args(Corner)
             for share in (0.1, 0.3, 0.7)
         )

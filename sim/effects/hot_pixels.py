@@ -18,7 +18,7 @@ class HotPixels(Effect):
     name: ClassVar[str] = "hot_pixels"
     stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, logarithmic histograms of defect pixels"
-    form_tolerance: ClassVar[float] = 0.2
+    form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "wavelength", "field", "level", "orientation", "time"}
     )

@@ -21,7 +21,7 @@ class RandomTelegraphNoise(Effect):
     name: ClassVar[str] = "random_telegraph_noise"
     stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "X. Wang et al., Random telegraph signal in CMOS image sensor pixels, IEDM 2006"
-    form_tolerance: ClassVar[float] = 0.3
+    form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     )

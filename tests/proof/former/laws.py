@@ -526,6 +526,19 @@ class BlackLevelDrift(Law):
         return {"drift_dn_per_min": self.a} if self.v == 0 else {}
 
 
+class BlackLevelTemperature(Law):
+    """The black level follows the sensor's temperature."""
+
+    name, effect = "black_level_temperature", "black_level_drift"
+    unit, nominal, limits, signed, needs, shown_by = "DN/C", 0.2, (0.002, 5.0), True, "temperature", DARK
+
+    def offset(self, elapsed_s: float, temperature_c: float) -> float:
+        return self.a * (temperature_c - 25.0)
+
+    def stated(self) -> dict[str, float]:
+        return {"drift_dn_per_c": self.a}
+
+
 class RowNoise(Law):
     """An offset a row, anew in each frame: white; alike in neighbouring rows."""
 
@@ -745,7 +758,7 @@ class AmbientLight(Law):
 LISTED: tuple[type[Law], ...] = (
     OpticalLowPassFilter, Defocus, SphericalAberration, Astigmatism, Coma, AxialColour, VeilingGlare, Ghost, Vignetting,
     VignettingDecentre, InfraredCutFilter, VibrationBlur, PixelAperture, ChargeDiffusion, Crosstalk, GreenImbalance,
-    DarkCurrentTemperature, AmplifierGlow, HotPixels, ImageLag, BrighterFatter, Nonlinearity, AdcNonlinearity, BlackLevelDrift,
+    DarkCurrentTemperature, AmplifierGlow, HotPixels, ImageLag, BrighterFatter, Nonlinearity, AdcNonlinearity, BlackLevelDrift, BlackLevelTemperature,
     RowNoise, ColumnNoise, RandomTelegraphNoise, OnChipSharpening, OnChipSmoothing, SourceDrift, StrayLight, SourceBandwidth,
     WavelengthOffset, RadiometerNonlinearity, LightFlicker, ExposureOffset, NonUniformIllumination, ScreenPixelStructure, AmbientLight,
 )  # fmt: skip
@@ -810,6 +823,26 @@ class PeriodicBanding(Law):
     def noise(self, shape: tuple[int, int], k: int) -> Array:
         phase = self.rng(7, k).random()
         return self.s * np.sin(2 * np.pi * (np.arange(shape[0]) / (6.0 + 10.0 * self.u[0]) + phase))[:, None]
+
+
+class TapOffset(Law):
+    """The right half is read by another amplifier, with another black level."""
+
+    name, unit, nominal, limits, shown_by = "tap_offset", "e", 1.0, (0.02, 30.0), DARK
+
+    def noise(self, shape: tuple[int, int], k: int) -> Array:
+        return np.where(np.arange(shape[1]) < shape[1] // 2, 0.0, self.s)[None, :] * np.ones((shape[0], 1))
+
+
+class LightLeak(Law):
+    """Light finds its way past the cap, most of it about one place inside the frame (a sibling of the amplifier's glow)."""
+
+    name, unit, nominal, limits, shown_by = "light_leak", "e/s", 5.0, (0.05, 400.0), DARK
+
+    def dark(self, rate: Array, temperature_c: float) -> Array:
+        x, y = self.cam.place
+        r2 = (x - 0.8 * (self.u[0] - 0.5)) ** 2 + (y - 0.6 * (self.u[1] - 0.5)) ** 2
+        return rate + self.s * np.exp(-0.5 * r2 / 0.3**2)
 
 
 class TreeRings(Law):
@@ -1001,7 +1034,7 @@ class JitteredRows(Law):
 
 
 OUTSIDE: tuple[type[Law], ...] = (
-    CoverGlassFringe, AbsorptionBand, RedLeak, PolarisedLight, TapGain, PeriodicBanding, TreeRings, PulsedLight, ResponseTail,
+    CoverGlassFringe, AbsorptionBand, RedLeak, PolarisedLight, TapGain, TapOffset, LightLeak, PeriodicBanding, TreeRings, PulsedLight, ResponseTail,
     CompandingKnee, DefectInterpolation, DigitalGain, LossyCodes, LeakyShutter, DoubleImage, Motion, Trefoil, Halo, InterPixelCapacitance, PinkNoise,
     DustShadow, LampJump, Smear, JitteredRows,
 )  # fmt: skip
