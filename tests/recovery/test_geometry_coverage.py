@@ -16,7 +16,7 @@ from lab.fit.stereo import Pair, depth_std, solve_rig
 from lab.results import CameraFit, FitResult
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
-DRAWS, VARIANCE_DRAWS = 400, 1600
+DRAWS, VARIANCE_DRAWS = 400, 800
 VIEWS = 16
 NOISE_PX = 0.1
 DEPTHS_MM = (500.0, 1000.0, 2000.0)
@@ -151,7 +151,7 @@ def test_geometry_covers() -> None:
 
 
 def test_projection_variance_is_that_of_many_solves() -> None:
-    """Wanted: within 10 % everywhere in the frame. So many draws know a variance to 3.5 % where one direction dominates."""
+    """Wanted: within 10 % everywhere in the frame. So many draws know a variance to 5 % where one direction dominates."""
     x, y = grid(SHAPE)
     image = grid_points(x, y)
     truth = intrinsics_of(TRUTH.left, TRUTH.distortion_left)
@@ -162,7 +162,7 @@ def test_projection_variance_is_that_of_many_solves() -> None:
         found = difference(truth, one.intrinsics, one.covariance, one.points, points_at(image, truth, 700.0))
         squares += np.sum(found.vectors_px**2, axis=1)
         stated += np.sum(found.variances_px2, axis=1)
-        if draw + 1 in (200, 400, 800, VARIANCE_DRAWS):
+        if draw + 1 in (200, 400, VARIANCE_DRAWS):
             ratio = squares / stated
             print(
                 f"{draw + 1} draws: variance of the projection's errors over the stated one, over the frame: "
