@@ -22,6 +22,7 @@ from lab.diagnose.summaries import (
     Prediction,
     Study,
     held_out_of,
+    rounding_std_dn,
     wide_contrast,
 )
 from lab.errors import NotDetermined
@@ -164,9 +165,10 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
     channel = np.array([p.channel for p in points])
     perfect = np.array([signal[channel == c].max() / 0.9 for c in channel])  # DN of a perfect diffuser
     temporal = (noise.gain * signal + noise.read_dn**2) / pixels / repeats
-    fixed = (noise.prnu * signal) ** 2 / pixels + (PATCH_COLOUR_STD * signal) ** 2
+    digits = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
+    fixed = np.sqrt((noise.prnu * signal) ** 2 / pixels + (PATCH_COLOUR_STD * signal) ** 2 + digits**2)
     same = names[:, None] == names
-    covariance = np.diag(temporal + noise.jitter_dn**2) + np.diag(fixed)
+    covariance = np.diag(temporal + noise.jitter_dn**2) + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
     covariance += same * (
         np.outer(tail, tail) * TAIL_STD**2
         + np.outer(signal, signal) * PATCH_STD**2

@@ -94,7 +94,9 @@ class Block:
 
 
 SPECTRAL_HOOKS = frozenset({"radiance", "transmittance"})
-UNIFORM_HOOKS = frozenset({"codes", "drift", "exposure", "illumination", "ambient_e_per_s", "charge", "response", "offset_dn"})
+UNIFORM_HOOKS = frozenset(
+    {"codes", "drift", "exposure", "illumination", "ambient_e_per_s", "charge", "response", "offset_dn"}
+)
 #: Of measurements in whose prediction the frame before enters.
 SEQUENCE_HOOKS = frozenset({"left_behind"})
 
@@ -474,6 +476,12 @@ def level_scatter(repeats: Sequence[RepeatedLevels]) -> float:
     left = [float(np.sum(np.square(r.away - trend * r.elapsed_s))) - (len(r.away) - 1) * r.noise for r in repeats]
     free = float(sum(w * (len(r.away) - 1) for w, r in zip(weight, repeats, strict=True)))
     return float(np.sqrt(max(float(weight @ left) / free, 0.0))) if free > 0 else 0.0
+
+
+def rounding_std_dn(variance_dn2: FloatArray) -> FloatArray:
+    """Of the mean of many pixels, by rounding to whole DN: exp(-2 pi^2 s^2) / (pi sqrt 2), the root mean square of the first harmonic of
+    the saw-tooth that rounding is, averaged over pixels that spread by s. Quiet cameras of few bits don't dither: up to 0.2 DN."""
+    return np.asarray(np.exp(-2.0 * np.pi**2 * np.maximum(variance_dn2, 0.0)) / (np.pi * np.sqrt(2.0)))
 
 
 def pair_variance(frames: Sequence[Any]) -> float:

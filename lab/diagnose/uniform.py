@@ -22,6 +22,7 @@ from lab.diagnose.summaries import (
     held_out_of,
     overrides,
     repeated_levels,
+    rounding_std_dn,
 )
 from lab.errors import NotDetermined
 from lab.predict import collected_electrons, mean_dn
@@ -113,6 +114,8 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
     repeats = (group[:, None] == group) & (channel_of[:, None] == channel_of)
     covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels)
     covariance += repeats * np.outer(signal, signal) * LEVEL_FLOOR**2
+    rounding = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
+    covariance += repeats * np.outer(rounding, rounding)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])
     scatter = signal * _scatter(study, groups)[group]
     covariance += same * (np.outer(scatter, scatter) + noise.jitter_dn**2)
@@ -186,7 +189,8 @@ def narrowband_block(study: Study) -> Block:
     frame = np.array([c.id for c, *_ in points])
     setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
     reading = np.array([c.radiance for c, *_ in points])
-    own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2)
+    digits = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
+    own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2 + digits**2)
     expected = curves.rates(()) * exposures
     radiometer = signal * _reading_std(points, signal, shot, expected)
     covariance = np.diag(shot) + (setting[:, None] == setting) * np.outer(own, own)
