@@ -647,9 +647,11 @@ def colour_block(study: Study) -> Block:
         for j, (q, other) in enumerate(points):
             if p.channel != q.channel or p.light is not q.light:
                 continue
-            both = sum((a.common + b.common)[np.ix_(at, at)] for a, b in ((p, q), (green, other))) / 2.0
+            # parts beyond the bands, which stand last, needn't be as many for every channel
+            own = np.ix_(at, at)
+            both = 0.5 * np.sum([one.common[own] for one in (p, q, green, other)], axis=0)
             if i == j:
-                both = both + (p.shown + green.shown)[np.ix_(at, at)]
+                both = both + p.shown[own] + green.shown[own]
             covariance[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = table @ both @ table.T
         for k, (distance, way) in enumerate(((near, "outwards"), (far, "outwards"), (far, "around"))):
             labels.append(Label(distance, p.channel, way, p.captures, p.held_out))
