@@ -19,12 +19,13 @@ from lab.diagnose.patches import patch_covariance, patch_levels
 from lab.diagnose.summaries import Study
 from lab.errors import NotDetermined
 from lab.fit.mtf import EdgeMtf, measure_edge
+from lab.fit.psf import expected_kernel
 from lab.predict import camera_model
 from lab.recording import Bernoulli, RecordingSet, SlantedEdge
 from lab.results import CameraFit, Check, Curve, FitResult, KernelPair, Patch, Skipped, ValidationResult
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
-from sim.forward import edge_profile, electron_rate, kernel
+from sim.forward import edge_profile, electron_rate, optical_transfer
 from sim.optics.illumination import relative_illumination
 from sim.scene.colorchecker import reflectances
 from sim.spectrum import FloatArray
@@ -34,6 +35,7 @@ PASSED_QUANTILE = 0.999
 LIGHT_STD = 0.01  # of the chart's light: radiometer at the chart against radiometer at the sphere, and geometry
 MTF_FREQUENCIES = np.arange(1, 26) * 0.02
 MTF_FLOOR = 0.002
+CELL_PX = 4.0  # of a random pattern on a screen, where the recordings don't say
 KERNEL_FLOOR = 0.002  # of the kernel's maximum
 
 
@@ -235,16 +237,26 @@ def _kernels(
 ) -> list[Check]:
     if not fit.psf:
         raise NotDetermined("psf", "no kernel was fitted")
-    radiances = {c.id: c.screen.radiance for c in recordings.captures(Bernoulli, side)}
+    screens = {c.id: c.screen for c in recordings.captures(Bernoulli, side)}
     by_capture: dict[str, list[KernelPair]] = {}
     numbers: dict[str, list[tuple[FloatArray, FloatArray, FloatArray]]] = {}
     for found in fit.psf:
         if found.sample_pitch_px != 1.0:
             continue
-        path = radiances.get(found.capture)
-        light = recordings.spectrum(path) if path else None
+        screen = screens.get(found.capture)
+        light = recordings.spectrum(screen.radiance) if screen and screen.radiance else None
+        cell_px = screen.cell_camera_px if screen else None
         measured, std = np.array(found.psf), np.array(found.psf_std)
-        predicted = kernel(model, found.channel, light, len(measured), 1, effects)
+        predicted: FloatArray = np.asarray(
+            expected_kernel(
+                lambda fx, fy, channel=found.channel, light=light: optical_transfer(  # type: ignore[misc]
+                    model, channel, light, fx, fy, effects, "bernoulli"
+                ),
+                len(measured),
+                cell_px or CELL_PX,
+            ),
+            np.float64,
+        )
         error = float(np.mean(np.square(measured - predicted)))
         peak = float(predicted.max())
         by_capture.setdefault(found.capture, []).append(

@@ -584,6 +584,42 @@ def _reported(camera: Camera, capture: str, found: ScreenKernel) -> PsfKernel:
     )
 
 
+def expected_kernel(
+    transfer: Callable[[Array, Array], NDArray[np.complex128]], support_px: int, cell_px: float, oversample: int = 2
+) -> Array:
+    """Kernel on the sensor's pixels, (support, support), sum 1, that `measure_kernels` converges to for a transfer function of lens
+    and pixel: `transfer(fx, fy)` in cy/px.
+
+    It is the least squares' own: kernels on samples of 1 / `oversample` px that map a random pattern of cells as it is drawn there
+    (squares of drawing, the taps that take them out again) to what pixels record of it. Of a lens that passes detail beyond what
+    these samples resolve, such a kernel isn't the transfer's own samples, as rims of cells lie anywhere between them. With P the
+    pattern's power, D the drawing's response, H the transfer, the normal equations hold integral P D^2 exp(2 pi i f (n - m)) df and
+    integral P D H exp(2 pi i f n) df at samples n, m.
+    """
+    support = oversample * support_px + 1
+    fine = 4 * oversample
+    count = max(32, 4 * support_px) * fine
+    fy, fx = np.fft.fftfreq(count, 1.0 / fine), np.fft.rfftfreq(count, 1.0 / fine)
+    taps = _taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
+    order = np.arange(len(taps)) - len(taps) // 2
+    drawn_y, drawn_x = (
+        np.sinc(f / oversample) * (np.cos(2.0 * np.pi * f[:, None] * order / oversample) @ taps) for f in (fy, fx)
+    )
+    power = np.square(np.sinc(cell_px * fy))[:, None] * np.square(np.sinc(cell_px * fx))
+    drawn = drawn_y[:, None] * drawn_x
+    every = fine // oversample
+    own = np.fft.irfft2(power * drawn**2, (count, count))[::every, ::every]
+    cross = np.fft.irfft2(power * drawn * transfer(fx[None, :], fy[:, None]), (count, count))[::every, ::every]
+    at = np.arange(support) - support // 2
+    lag = at[:, None] - at
+    matrix = own[lag[:, None, :, None], lag[None, :, None, :]].reshape(support**2, support**2)
+    # what a pattern doesn't tell stays small; its mean makes the sum known far better than anything else
+    matrix = matrix + 1e-4 * own[0, 0] * np.eye(support**2)
+    mean = 1e3 * own[0, 0]
+    kernel = np.linalg.solve(matrix + mean, cross[at[:, None], at].ravel() + mean)
+    return _on_pixels(kernel.reshape(support, support), oversample)
+
+
 def radial_symmetry(parts: Sequence[ScreenKernel], axis_px: tuple[float, float]) -> PsfSymmetry:
     """Whether kernels at several places fit a lens that looks the same all around its axis: tested, not assumed.
 
