@@ -28,7 +28,7 @@ CAUSE_FROM = 0.8
 LONE_SCORE = 10.0
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
-#: A declared rival beside an effect has to gain this share of what that gains: less may be an error of the effect's law.
+#: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
 COMPANION_SHARE = 0.03
 
 
@@ -114,17 +114,25 @@ def _believed(
     What is given up no longer props up the others: these are fitted and weighed again without it.
     """
     given_up: list[Candidate] = []
+    weighed: set[frozenset[str]] = set()
     while current.effects:
-        members = []
+        weighed.add(frozenset(current.names))
+        members, likelier = [], None
         for index, e in enumerate(current.effects):
             report(f"weighing {e.name} against its rivals")
-            members.append(_weighed(evidence, current, index, known))
+            candidate, better = _weighed(evidence, current, index, known)
+            members.append(candidate)
+            likelier = likelier or better
+        if likelier is not None and frozenset(likelier.names) not in weighed:
+            current = refit(evidence, likelier.effects)
+            continue
         crowd = _crowd(evidence, current)
         if crowd:
             lost = [members[i] for i in crowd]
         else:
-            weak = [c for c in members if not _holds(c, members, threshold)]
-            lost = sorted(weak, key=lambda c: (not _companion(c, members), c.gain))[:1]
+            companions = [c for c in members if _companion(c, members, evidence)]
+            weak = companions or [c for c in members if not _holds(c, threshold)]
+            lost = sorted(weak, key=lambda c: c.gain)[:1]
         if not lost:
             return members, given_up
         given_up += lost
@@ -133,23 +141,35 @@ def _believed(
     return [], given_up
 
 
-def _holds(candidate: Candidate, members: list[Candidate], threshold: float) -> bool:
+def _holds(candidate: Candidate, threshold: float) -> bool:
     return (
         candidate.unknown <= UNKNOWN_UP_TO
         and candidate.probability >= NAMED_FROM
         and 2.0 * candidate.gain >= threshold
         and candidate.explains >= CAUSE_FROM
-        and not _companion(candidate, members)
     )
 
 
-def _companion(candidate: Candidate, members: list[Candidate]) -> bool:
-    """Whether an effect may be no more than the error of a stronger one's law."""
-    return any(
-        candidate.effect.name in type(other.effect).rivals and candidate.gain < COMPANION_SHARE * other.gain
-        for other in members
-        if other is not candidate
-    )
+def _companion(candidate: Candidate, members: list[Candidate], evidence: Evidence) -> bool:
+    """Whether an effect may be no more than the error of a stronger one's law: of a declared rival's, or of one that changes
+    what the effect is seen in many times as much."""
+    others = [c for c in members if c is not candidate]
+    if any(
+        candidate.effect.name in type(c.effect).rivals and candidate.gain < COMPANION_SHARE * c.gain for c in others
+    ):
+        return True
+    around = tuple(c.effect for c in others)
+    pulls = [
+        _gain(evidence, candidate.effect, around, i) if b.touched_by(type(candidate.effect)) else 0.0
+        for i, b in enumerate(evidence.blocks)
+    ]
+    most = int(np.argmax(pulls))
+    for c in others:
+        if evidence.blocks[most].touched_by(type(c.effect)):
+            without = (candidate.effect, *(o.effect for o in others if o is not c))
+            if pulls[most] < COMPANION_SHARE * _gain(evidence, c.effect, without, most):
+                return True
+    return False
 
 
 def _crowd(evidence: Evidence, fit: Fit) -> list[int]:
@@ -175,8 +195,9 @@ def _crowd(evidence: Evidence, fit: Fit) -> list[int]:
     return []
 
 
-def _weighed(evidence: Evidence, fit: Fit, index: int, known: Iterable[type[Effect]]) -> Candidate:
-    """Probabilities of an effect's name, of its rivals in its place, and of something unknown."""
+def _weighed(evidence: Evidence, fit: Fit, index: int, known: Iterable[type[Effect]]) -> tuple[Candidate, Fit | None]:
+    """Probabilities of an effect's name, of its rivals in its place, and of something unknown; and the set with a rival that is
+    likelier, now that both may leave something unknown behind."""
     effect = fit.effects[index]
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     without = refit(evidence, rest, passes=2)
@@ -212,7 +233,9 @@ def _weighed(evidence: Evidence, fit: Fit, index: int, known: Iterable[type[Effe
         sorted(((n, s / total) for n, s in share.items() if n != effect.name and s / total > 1e-4), key=lambda r: -r[1])
     )
     explains = _explained(evidence, fit, without, touched)
-    return Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains)
+    first = max((n for n in share if n != "unknown"), key=lambda n: share[n])
+    better = fits[first] if share[first] > 2.0 * share[effect.name] else None
+    return Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains), better
 
 
 def _explained(evidence: Evidence, fit: Fit, without: Fit, touched: list[int]) -> float:
@@ -225,9 +248,7 @@ def _explained(evidence: Evidence, fit: Fit, without: Fit, touched: list[int]) -
     index = np.concatenate([np.arange(evidence.slices[i].start, evidence.slices[i].stop) for i in touched])
     index = index[evidence.seen[index]]
     covariance = evidence.gaussian().covariance[np.ix_(index, index)]
-    after, before = (
-        chi2((evidence.value - evidence.mean(f.effects))[index], covariance) for f in (fit, without)
-    )
+    after, before = (chi2((evidence.value - evidence.mean(f.effects))[index], covariance) for f in (fit, without))
     left = after - len(index)
     if left < 3.0 * np.sqrt(2.0 * len(index)) or before <= after:
         return 1.0

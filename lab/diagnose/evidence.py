@@ -21,6 +21,10 @@ from sim.effects.base import Effect
 from sim.spectrum import FloatArray
 
 
+#: Share of every variance that keeps covariances positive against rounding.
+ROUNDING = 1e-9
+
+
 @dataclass(frozen=True)
 class Gaussian:
     """Mean and covariance of all numbers under one set of effects."""
@@ -140,6 +144,8 @@ class Evidence:
                 if error.any():
                     here = slice(int(end) - len(error), int(end))
                     covariance[here, here] += error[:, None] * kinship[here, here] * error
+        # strong slopes leave directions whose variance rounding could make negative
+        covariance[np.diag_indices_from(covariance)] *= 1.0 + ROUNDING
         return Gaussian(mean[where], covariance)
 
     def pull(self, effects: Effects = (), process: FloatArray | None = None) -> FloatArray:
@@ -176,11 +182,11 @@ class Evidence:
             return 0.0, 0
         model = self.gaussian(effects)
         residual = self.value - model.mean
-        inside = cholesky(model.covariance[np.ix_(self.seen, self.seen)], lower=True)
-        cross = solve_triangular(inside, model.covariance[np.ix_(self.seen, out)], lower=True)
-        expected = cross.T @ solve_triangular(inside, residual[self.seen], lower=True)
-        left = model.covariance[np.ix_(out, out)] - cross.T @ cross
-        return chi2(residual[out] - expected, left), int(out.sum())
+        both = self.seen | out
+        # p(held out | seen) = p(both) / p(seen)
+        all_of = chi2(residual[both], model.covariance[np.ix_(both, both)])
+        given = chi2(residual[self.seen], model.covariance[np.ix_(self.seen, self.seen)])
+        return max(all_of - given, 0.0), int(out.sum())
 
     def captures(self, held_out: bool, where: np.ndarray | None = None) -> tuple[str, ...]:
         labels = [label for b in self.blocks for label in b.labels]
