@@ -20,7 +20,6 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray
 
-
 #: Share of every variance that keeps covariances positive against rounding.
 ROUNDING = 1e-9
 
