@@ -79,6 +79,7 @@ class Pattern:
     value: FloatArray  # (bands + MORE + parts beyond the bands,)
     shown: FloatArray  # covariance by what differs from repeat to repeat
     common: FloatArray  # ... and by what white, black and drawing share
+    mix: FloatArray  # (bands, 2 bands): what the halves of the bands contribute to the bands' coefficients
     greys: FloatArray  # as `value`: what the coefficients become where every grey v is shown as v^2
     levels_e: tuple[float, float]  # electrons of black and of white
     light: Spectrum | None
@@ -101,6 +102,7 @@ class Band:
     fx: FloatArray
     fy: FloatArray
     share: FloatArray
+    upper: NDArray[np.bool_]  # nodes of the upper half of the frequencies
 
 
 _KEPT: WeakKeyDictionary[Study, list[list[Pattern]] | NotDetermined] = WeakKeyDictionary()
@@ -208,7 +210,7 @@ def _measured(
             found.append(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
-                    value=value, shown=shown, common=common, greys=design.greys, levels_e=levels, light=light,
+                    value=value, shown=shown, common=common, mix=design.mix, greys=design.greys, levels_e=levels, light=light,
                     turned=turned_by, reach=design.reach,
                 )
             )  # fmt: skip
@@ -398,6 +400,7 @@ class _Design:
     columns: FloatArray
     fixed: FloatArray
     inverse: FloatArray  # of the normal matrix
+    mix: FloatArray  # (bands, 2 bands): what the halves of the bands contribute to the bands' coefficients
     greys: FloatArray
     reach: float
 
@@ -413,7 +416,7 @@ class _Design:
         spectrum = canvas.low * passed
         mask = _pixels(study, canvas, channel, seen)
         power = np.abs(spectrum) ** 2
-        bands, columns = [], []
+        bands, columns, halves = [], [], []
         low_part = np.zeros(canvas.shape)
         for i, (low, high) in enumerate(pairwise(RINGS_CY_PER_PX)):
             ring = (radius >= low) & (radius < high)
@@ -423,9 +426,15 @@ class _Design:
                 part = ring & (np.abs(away) <= 0.5 * np.pi / SECTORS) if i else ring
                 if not part.any():
                     continue
-                picture = canvas.picture(np.where(part, spectrum, 0.0))
+                # in two halves, so that what a transfer does within the band is known
+                split = 0.5 * (low + high)
+                pieces = [
+                    canvas.picture(np.where(part & side, spectrum, 0.0)) for side in (radius < split, radius >= split)
+                ]
+                picture = pieces[0] + pieces[1]
                 low_part += picture
                 columns.append(picture[mask])
+                halves += [piece[mask] for piece in pieces]
                 bands.append(_band(part, radius, away, middle, power, (low, high), whole=not i))
         beyond = [canvas.picture(np.where((radius >= RINGS_CY_PER_PX[-1]) & _below(canvas), spectrum, 0.0))]
         beyond += canvas.beyond(otf, camera.fill_factor)
@@ -456,7 +465,10 @@ class _Design:
         normal = (table / scale[:, None]) @ (table / scale[:, None]).T
         inverse = np.linalg.inv(normal) / np.outer(scale, scale)
         lost = canvas.picture(canvas.bent * passed - spectrum)[mask]
-        return _Design(mask, tuple(bands), table, fixed, inverse, inverse @ (table @ lost), float(np.sqrt(r2.max())))
+        mix = (inverse @ (table @ np.array(halves).T))[: len(bands)]
+        return _Design(
+            mask, tuple(bands), table, fixed, inverse, mix, inverse @ (table @ lost), float(np.sqrt(r2.max()))
+        )
 
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients; their covariance by `temporal`, the variance (pixels,) that repeats average out; and by the rest.
@@ -499,7 +511,14 @@ def _band(
     at_r = np.bincount(cell, p * r, len(total))[keep] / total[keep]
     at_a = middle + np.bincount(cell, p * a, len(total))[keep] / total[keep]
     share = total[keep] / total.sum()
-    return Band(float(share @ at_r), float(np.rad2deg(middle)), at_r * np.cos(at_a), at_r * np.sin(at_a), share)
+    return Band(
+        float(share @ at_r),
+        float(np.rad2deg(middle)),
+        at_r * np.cos(at_a),
+        at_r * np.sin(at_a),
+        share,
+        np.flatnonzero(keep) // NODES[1] >= NODES[0] // 2,
+    )
 
 
 # --- blocks ----------------------------------------------------------------------------------------------------------------
@@ -568,8 +587,14 @@ def _contrasts(study: Study, p: Pattern, effects: Effects) -> FloatArray:
     changed = np.real(optical_transfer(study.camera, p.channel, p.light, fx, fy, effects, "bernoulli"))
     ratio = changed / np.where(np.abs(plain) > 1e-3, plain, np.inf)
     ends = np.cumsum([len(b.fx) for b in p.bands])
-    parts = [float(b.share @ ratio[e - len(b.fx) : e]) for b, e in zip(p.bands, ends, strict=True)]
-    return np.array(parts) + _greyness(effects, study) * p.greys[: len(p.bands)]
+    halves = []
+    for band, end in zip(p.bands, ends, strict=True):
+        own = ratio[end - len(band.fx) : end]
+        whole = float(band.share @ own)
+        for use in (~band.upper, band.upper):
+            total = float(band.share[use].sum())
+            halves.append(float(band.share[use] @ own[use]) / total if total > 0 else whole)
+    return p.mix @ np.array(halves) + _greyness(effects, study) * p.greys[: len(p.bands)]
 
 
 def _greyness(effects: Effects, study: Study) -> float:
