@@ -67,6 +67,7 @@ MOST_REACH_PX = 60.0
 SMOOTHING = 1e-6  # of a knot's weight: bridges knots that no sample falls on; 1e-4 of the signal at 1 cy/px
 EDGE_ORDER = 3
 FEW_PHASES_PX, WIDEST_GAP_PX = 0.6, 1.02  # gaps between the samples' distances, of a quarter and of the whole edge
+WIDEST_RISE = 0.65  # from 10 % to 90 %, of the room on either side
 REFINED_PX = 6.0  # the samples within see the edge's place
 CORE_PX, CORE_SIGMAS = 2.5, 3.0  # half-width of the core
 PASSES = 3  # of the least squares: noise levels and gradients need the profile
@@ -281,6 +282,10 @@ def planes_mtf(
     frequency = (
         DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else np.asarray(frequency_cy_per_px, dtype=float)
     )
+    if frequency.ndim != 1 or not np.isfinite(frequency).all() or (frequency < 0.0).any():
+        raise ValueError("frequency_cy_per_px must be a list of finite frequencies that aren't negative")
+    if noise_std is not None and not 0.0 < noise_std < np.inf:
+        raise ValueError(f"noise_std = {noise_std} must be positive and finite; without it the residual says it")
     _refuse_unusable(planes)
     edge = _first_line(planes[0])
     widest = _reach(planes, edge)
@@ -688,6 +693,7 @@ def _measure(
         variance = std_dark**2 + np.clip(esf, 0.0, 1.0) * (std_light**2 - std_dark**2) + NUMERICAL_FLOOR**2
         used = np.abs(residual) < 6.0 * np.sqrt(variance) + 0.02
     _refuse_unless_one_edge(residual, dark_tail | light_tail, max(std_dark, std_light), float(np.mean(~used)))
+    _refuse_too_wide(spline, solution[:size], outer)
     _refuse_clipped(samples.value[placed.order][light_tail], std_dark * contrast, contrast)
 
     geometry = EdgeGeometry(
@@ -1034,6 +1040,18 @@ def _refuse_unless_one_edge(residual: Array, tail: NDArray[np.bool_], std: float
         raise NotDetermined("mtf", "the region holds more than one edge: narrow it down to a single one")
 
 
+def _refuse_too_wide(spline: Spline, coefficients: Array, reach: float) -> None:
+    """Levels that the profile hasn't reached within the region are nobody's."""
+    at = np.linspace(-reach, reach, 201)
+    esf = spline.design(at) @ coefficients
+    rise = float(np.count_nonzero((esf > 0.1) & (esf < 0.9)) * (at[1] - at[0]))
+    if rise > WIDEST_RISE * reach:
+        raise NotDetermined(
+            "mtf",
+            f"the edge takes {rise:.0f} px from 10 % to 90 %, with only {reach:.0f} px beside it: widen the region",
+        )
+
+
 def _refuse_clipped(light: Array, noise_std: float, contrast: float) -> None:
     """A light side that stands still at its highest value although there is noise has met the converter's end."""
     values = np.unique(light)
@@ -1181,6 +1199,12 @@ def measure_edge(
     saturated = float(np.mean(frames[0][row0:row1, col0:col1] >= camera.saturation_dn))
     if saturated > 0.002:
         raise NotDetermined("mtf", f"{first.id}: {100 * saturated:.1f} % of the region is saturated; expose it shorter")
+    empty = float(np.mean(frames[0][row0:row1, col0:col1] <= 0))
+    if black > 0.0 and empty > 0.002:
+        raise NotDetermined(
+            "mtf",
+            f"{first.id}: {100 * empty:.1f} % of the region is at 0, below the black level {black:g}: it is clipped",
+        )
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
     planes = region_planes(mean, region, camera.cfa, channel, black)
     frequency = DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else frequency_cy_per_px

@@ -107,8 +107,10 @@ def estimate_kernel(
     u, b = np.asarray(sharp, dtype=float), np.asarray(blurred, dtype=float)
     if u.shape != b.shape or u.ndim != 2:
         raise ValueError(f"sharp {u.shape} and blurred {b.shape} must be of the same two-dimensional shape")
-    if support < 1 or support % 2 == 0:
-        raise ValueError(f"support = {support} must be odd and positive: the kernel has a middle")
+    if support != int(support) or support < 1 or support % 2 == 0:
+        raise ValueError(f"support = {support} must be a whole number, odd and positive: the kernel has a middle")
+    if noise_std is not None and not 0.0 <= noise_std < np.inf:
+        raise ValueError(f"noise_std = {noise_std} must be finite and not negative")
     if min(u.shape) < 2 * support:
         raise NotDetermined("psf", f"{u.shape[0]} x {u.shape[1]} px are too few for a kernel of {support} x {support}")
     for name, picture in (("sharp", u), ("blurred", b)):
@@ -145,12 +147,31 @@ def estimate_kernel(
 
 def _refuse_unrelated(predicted: Array, seen: Array) -> None:
     """A pattern that isn't the one in the picture explains nothing of it, whatever the kernel: never a kernel without a basis."""
+    if not seen.std() > 0.0:
+        raise NotDetermined(
+            "psf", f"the blurred picture is uniform at {seen.flat[0]:g}: is the target lit, or is it saturated?"
+        )
     agreement = float(np.corrcoef(predicted.ravel(), seen.ravel())[0, 1]) if predicted.std() > 0.0 else 0.0
     if not agreement**2 > 0.25:
         raise NotDetermined(
             "psf",
             f"the sharp picture explains {100 * max(agreement, 0.0) ** 2:.0f} % of the blurred one: is it that pattern?",
         )
+    contrast = agreement * float(seen.std() / predicted.std())
+    if not 0.5 < contrast < 2.0:
+        raise NotDetermined(
+            "psf",
+            f"the blurred picture has {contrast:.2g} times the contrast of the sharp one: level it between white and black, or widen the support",
+        )
+    for name, end in (("lowest", seen.min()), ("highest", seen.max())):
+        standing = seen == end
+        share = float(standing.mean())
+        # of pixels that stand still although the pattern says that they differ
+        if share > 0.02 and float(predicted[standing].std()) > 0.1 * float(predicted.std()):
+            raise NotDetermined(
+                "psf",
+                f"{100 * share:.0f} % of the blurred picture stand at its {name} value, {end:g}: it is clipped, expose it anew",
+            )
 
 
 def displaced(picture: Array, field: Array) -> Array:

@@ -253,6 +253,15 @@ def test_a_clipped_edge_and_a_corner_are_refused():
         edge_mtf(corner[5:175, 5:175])
 
 
+def test_an_edge_wider_than_its_region_and_unusable_settings_are_refused():
+    with pytest.raises(NotDetermined, match="widen the region"):
+        edge_mtf(noisy(edge(200, 5.0, 25.0), np.random.default_rng(0)))
+    with pytest.raises(ValueError, match="frequencies"):
+        edge_mtf(edge(64, 5.0, 0.6), [np.nan])
+    with pytest.raises(ValueError, match="noise_std"):
+        edge_mtf(edge(64, 5.0, 0.6), noise_std=0.0)
+
+
 def recordings(frames, captures, cfa="RGGB"):
     rows, cols = next(iter(frames.values())).shape
     camera = SimpleNamespace(

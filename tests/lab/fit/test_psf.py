@@ -227,6 +227,20 @@ def test_a_pattern_that_is_another_is_refused():
         estimate_kernel(sharp, blurred, 9)
 
 
+def test_a_clipped_an_unlit_and_an_unlevelled_target_are_refused():
+    sharp, blurred = blurred_target(gaussian(9, 1, 1), 96)
+    for seen, reason in (
+        (np.minimum(blurred, 0.5), "highest value, 0.5: it is clipped"),
+        (np.full_like(blurred, 1.0), "uniform at 1"),
+        (np.random.default_rng(0).normal(0.0, 0.01, blurred.shape), "explains 0 %"),
+        (200.0 * blurred, "times the contrast"),
+    ):
+        with pytest.raises(NotDetermined, match=reason):
+            estimate_kernel(sharp, seen, 9)
+    with pytest.raises(ValueError, match="noise_std"):
+        estimate_kernel(sharp, blurred, 9, np.nan)
+
+
 # --- symmetry --------------------------------------------------------------------------------------------------------------
 
 
