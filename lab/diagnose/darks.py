@@ -392,15 +392,19 @@ def _pooled_along(parts: list[tuple[FloatArray, FloatArray, FloatArray]]) -> tup
 
 @dataclass(frozen=True)
 class _Bands:
-    """A spectrum's bands of equally many frequencies: their edges in the list of frequencies, and their middles."""
+    """A spectrum's bands: their edges in the list of frequencies, and their middles."""
 
     first: NDArray[np.intp]
     last: NDArray[np.intp]
     middle: FloatArray
 
     @staticmethod
-    def of(frequency: FloatArray, count: int) -> _Bands:
-        edges = np.unique(np.linspace(0, len(frequency), min(count, max(len(frequency) // 3, 1)) + 1).astype(int))
+    def of(frequency: FloatArray, count: int, power: float = 1.0) -> _Bands:
+        """`power` above 1: narrower ones towards low frequencies, of two frequencies at least."""
+        share = np.linspace(0.0, 1.0, min(count, max(len(frequency) // 3, 1)) + 1) ** power
+        edges = np.unique(np.rint(len(frequency) * share).astype(int))
+        edges = edges[np.append(np.diff(edges) > 1, True)]
+        edges[0] = 0
         middle = np.array([frequency[a:b].mean() for a, b in pairwise(edges)])
         return _Bands(edges[:-1], edges[1:], middle)
 
@@ -635,7 +639,8 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
     fine = _fine(f"dark_{name}", frames, LEAST_LINE_DN)
     parts = _by_part(fine)
     frequency = next(iter(parts.values()))[0].lines[lines][0]
-    bands = _Bands.of(frequency, BANDS)
+    # a ripple of some rows' period lies where noise that neighbouring rows share has its bend
+    bands = _Bands.of(frequency, 8, 1.5)
     length = study.camera.cols if lines == "rows" else study.camera.rows
     value, variance, labels, inverse = [], [], [], []
     for out, part in parts.items():
@@ -753,9 +758,10 @@ def along_block(study: Study) -> Block:
     if not labels:
         raise NotDetermined("dark_correlation", "the frames are too small to show noise that neighbours share")
     n = len(labels)
+    # what lines share leaves no trace within them: where there is one, it wasn't the lines
     return Block(
         measurement="dark_correlation", axis="spatial_frequency", unit="cy/px", reach=0.03, value=np.concatenate(value),
-        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), hooks=frozenset(),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), hooks=frozenset({"line_spectrum_e2"}),
         predict=lambda effects: Prediction(np.zeros(n), {}), scale=np.ones(n), conditions="direction",
     )  # fmt: skip
 
