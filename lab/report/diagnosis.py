@@ -129,7 +129,7 @@ def _place_map(places: Sequence[Place], *, after: bool) -> Figure:
 
 def _short(sigma: float) -> str:
     """To fit its cell."""
-    return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 999.5 else "> 999"
+    return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 99.5 else "99+"
 
 
 # --- residual pictures -----------------------------------------------------------------------------------------------------

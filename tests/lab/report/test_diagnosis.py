@@ -30,7 +30,7 @@ def test_the_map_has_every_measurement_and_its_worst_place() -> None:
     assert heat["y"] == ["a new one", "slanted edge"]
     assert heat["z"] == [[0.0, None], [None, 12.0]]  # the colour ends there
     assert "1234.5" in heat["customdata"][1][1]
-    assert [note["text"] for note in figure["layout"]["annotations"]] == ["> 999"]
+    assert [note["text"] for note in figure["layout"]["annotations"]] == ["99+"]
 
 
 def test_a_second_map_shows_what_named_effects_leave() -> None:
