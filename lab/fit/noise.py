@@ -149,14 +149,16 @@ def fit_transfer(
     curvature = float(solution[1])
     curve_gain = gain
     if by_line:
-        floor, floor_std = points.dark_variances(dark_error)
-        v = (variance - floor[plane])[on_line]
-        line = float(np.sum(x * v) / np.sum(x * x))
+        for _ in range(3):  # the line starts at the floor, and the darks' own signal has noise by the line
+            floor, floor_std, dark_signal = points.dark_variances(dark_error, line)
+            v = (variance - floor[plane])[on_line]
+            line = float(np.sum(x * v) / np.sum(x * x))
         line_std = float(np.sqrt(np.sum((x * (v - line * x)) ** 2)) / np.sum(x * x))
         # The gain at zero signal may lie anywhere between the line's and the curve's.
         covariance = np.zeros_like(covariance)
         covariance[0, 0] = line_std**2 + (line - gain) ** 2 / 3.0
-        covariance[2:, 2:] = np.diag(floor_std**2)
+        covariance[2:, 2:] = np.diag(floor_std**2) + covariance[0, 0] * np.outer(dark_signal, dark_signal)
+        covariance[0, 2:] = covariance[2:, 0] = -covariance[0, 0] * dark_signal
         gain, curvature = line, 0.0
     return TransferFit(
         gain=gain,
@@ -254,15 +256,17 @@ class _Points:
             curve = self.curve(used, (np.sqrt(squares[0]), np.sqrt(squares[1])))
         return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
 
-    def dark_variances(self, error: float) -> tuple[FloatArray, FloatArray]:
-        """Weighted mean of the darks' variances by plane, with standard uncertainties."""
-        values, stds = [], []
+    def dark_variances(self, error: float, gain: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """By plane, the darks' variances less the shot noise of their own signal (`gain` times it): weighted mean, standard
+        uncertainty, and the signal that was allowed for."""
+        values, stds, signals = [], [], []
         for index in range(int(self.plane.max()) + 1):
             own = ~self.light & (self.plane == index)
             weight = 1.0 / (np.hypot(self.relative[own], error) * self.variance[own]) ** 2
-            values.append(float(np.average(self.variance[own], weights=weight)))
+            values.append(float(np.average(self.variance[own] - gain * self.signal[own], weights=weight)))
+            signals.append(float(np.average(self.signal[own], weights=weight)))
             stds.append(float(weight.sum() ** -0.5))
-        return np.array(values), np.array(stds)
+        return np.array(values), np.array(stds), np.array(signals)
 
 
 # --- a recording set ---------------------------------------------------------------------------------------------------

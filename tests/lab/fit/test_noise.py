@@ -213,6 +213,18 @@ def test_a_bend_is_believed_only_against_the_models_error() -> None:
     assert abs(sure.line_gain - 0.4) > 5.0 * sure.gain_std / 3.0
 
 
+def test_a_straight_line_starts_below_the_darks_own_shot_noise() -> None:
+    """Darks with dark current aren't the floor: 2 DN^2 here, where their mean variance is 4.4."""
+    x, v, _, plane, light = scattered(0.015, -0.05, 7)
+    x[:5] = (0.0, 3.0, 6.0, 9.0, 12.0)
+    v[:5] = (2.0 + 0.4 * x[:5]) * v[:5] / 2.0  # each with the error that it had
+    fit = fit_transfer(x, v, 0.003 * v, plane, light, 4000.0)
+    assert fit.by_line
+    # Sampling 0.3 % of 2..7 DN^2 over five darks, and the line's gain, off by as much as its uncertainty says, times 3 DN.
+    assert abs(float(fit.floor[0]) - 2.0) < 3.0 * float(np.sqrt(fit.covariance[2, 2]))
+    assert np.sqrt(fit.covariance[2, 2]) < 0.1
+
+
 def test_dark_currents_follow_arrhenius_and_double() -> None:
     kelvin = np.array([293.15, 303.15, 313.15])
     current = 20.0 * np.exp(-0.6 / 8.617333262e-5 * (1.0 / kelvin - 1.0 / kelvin[0]))
