@@ -24,7 +24,7 @@ class InfraredCutFilter(Effect):
     name: ClassVar[str] = "infrared_cut_filter"
     stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "H. A. Macleod, Thin-Film Optical Filters, chapter on edge filters"
-    form_tolerance: ClassVar[float] = 0.02
+    form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"cut_wavelength_nm", "width_nm"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband", "chart"})
