@@ -11,7 +11,7 @@ from lab.diagnose.edges import ASIDE, REAL_AT, _Edges, _interpolation, _spread, 
 from lab.diagnose.evidence import chi2
 from lab.diagnose.summaries import Block, Study
 from lab.predict import camera_model
-from lab.recording import RecordingSet
+from lab.recording import Manifest, RecordingSet
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from sim.forward import edge_profile, optical_transfer
@@ -26,7 +26,7 @@ def _study(recordings: RecordingSet) -> Study:
 
 
 def _recorded(
-    *laws: Law, seed: int = 7, plan: Plan = EDGES, pitch: float | None = None, rows: int = 144, **camera: Any
+    *laws: Law, seed: int = 7, plan: Plan = EDGES, pitch: float | None = None, rows: int = 112, **camera: Any
 ) -> Study:
     former = Camera(seed, laws, rows=rows, cols=rows, **camera)
     former.pitch = pitch or former.pitch
@@ -103,17 +103,17 @@ def test_coma_shows_in_the_asymmetry_with_its_direction() -> None:
 
 
 def test_a_blur_that_is_alike_on_both_sides_has_no_asymmetry() -> None:
-    block = edge_block(_recorded(concealed.Defocus(20.0, 1), cfa="MONO", f_number=2.8))
+    block = edge_block(_recorded(concealed.Defocus(10.0, 1), cfa="MONO", f_number=2.8))
     assert _misfit(block, aside=False) > 5.0
     assert _misfit(block, aside=True) < 1.0
-    assert _misfit(block, effect("defocus")(defocus_um=20.0)) < 1.0
+    assert _misfit(block, effect("defocus")(defocus_um=10.0)) < 1.0
 
 
 def test_charge_that_crosses_colours_brings_their_edges_along() -> None:
     """In light of 460 and 640 nm a colour's pixels hold much of their neighbours' charge: the mosaic's mix explains it, the
     transfer of one channel by itself doesn't."""
     block = edge_block(
-        _recorded(concealed.Crosstalk(4.0, 0), cfa="RGGB", f_number=4.0, plan=Plan(EDGES.kinds, lights=True))
+        _recorded(concealed.Crosstalk(4.0, 0), cfa="RGGB", f_number=4.0, rows=96, plan=Plan(EDGES.kinds, lights=True))
     )
     assert _misfit(block) > 1.0
     assert _misfit(block, effect("crosstalk")(share_percent=4.0)) < 1.0
@@ -132,3 +132,27 @@ def test_directions_point_to_the_light() -> None:
     study = _recorded(cfa="MONO", f_number=4.0)
     found = sorted({round(e.direction_deg) for e in _Edges(study).edges})
     assert found == [-40, 3, 5, 95]
+
+
+def test_field_curvature_needs_more_than_one_place() -> None:
+    """Edges all in one place, wherever that is, tell nothing of what differs from place to place; two places do."""
+    former = Camera(7, (), cfa="MONO", f_number=4.0, rows=112, cols=112)
+    recordings = former.record(EDGES)
+    manifest = recordings.manifest.model_dump(mode="json")
+    bowl = effect("field_curvature")(curvature_um=30.0)
+    changes = []
+    for count in (1, 2):
+        for k, capture in enumerate(c for c in manifest["captures"] if c["kind"] == "slanted_edge"):
+            capture["field_mm"] = [0.1 * (k // 2 % count), 0.05]
+        frames = {c.frame: np.array(recordings.frame(c)) for c in recordings.manifest.captures}
+        paths = [*recordings.camera("left").quantum_efficiency.values()]
+        paths += [str(c.light_radiance) for c in recordings.captures("slanted_edge")]
+        moved = RecordingSet(
+            Manifest.model_validate(manifest),
+            frames,
+            {path: recordings.spectrum(path) for path in dict.fromkeys(paths)},
+        )
+        block = edge_block(_study(moved))
+        changes.append(float(np.abs(block.predict((bowl,)).mean - block.predict(()).mean).max()))
+    assert changes[0] == 0.0
+    assert changes[1] > 1e-3

@@ -283,6 +283,29 @@ def test_axial_colour_is_each_wavelengths_own_defocus() -> None:
     assert one.transfer(f, none, 550.0, CAMERA) is None
 
 
+def test_field_curvature_is_each_places_own_defocus() -> None:
+    """c r^2 + a x + b y in half diagonals: 0.6 along columns and -0.8 along rows with c = 10, a = 5, b = 2 um make 11.4 um."""
+    half_um = 0.5 * CAMERA.pixel_pitch_um * float(np.hypot(CAMERA.rows, CAMERA.cols))
+    one = effect("field_curvature")(curvature_um=10.0, tilt_x_um=5.0, tilt_y_um=2.0)
+    f, none = np.linspace(0.0, 0.4, 9), np.zeros(9)
+    there = one.at_place(0.6 * half_um, -0.8 * half_um, CAMERA)
+    wanted = effect("defocus")(defocus_um=11.4).transfer(f, none, 550.0, CAMERA)
+    np.testing.assert_allclose(there.transfer(f, none, 550.0, CAMERA), wanted, atol=1e-12)
+    assert one.transfer(f, none, 550.0, CAMERA) is None
+
+
+def test_coma_moves_detail_along_it_and_leaves_it_even_across() -> None:
+    """W131 r^2 x: along x the transfer has a phase that isn't in proportion to frequency, along y it is real."""
+    one = effect("coma")(w131_x_um=0.3)
+    f, none = np.linspace(0.02, 0.3, 8), np.zeros(8)
+    along, across = one.transfer(f, none, 550.0, CAMERA), one.transfer(none, f, 550.0, CAMERA)
+    np.testing.assert_allclose(along * pupil_otf(f, none, 550.0, 4.0, seidel()),
+                               pupil_otf(f, none, 550.0, 4.0, seidel(coma_um=(0.3, 0.0))), atol=1e-6)  # fmt: skip
+    slope = np.unwrap(np.angle(along)) / f
+    assert np.ptp(slope) > 0.1 * np.abs(slope).max()
+    np.testing.assert_allclose(np.imag(across), 0.0, atol=1e-9)
+
+
 def test_axial_colour_swaps_the_channels_through_focus() -> None:
     """Red focuses behind: with the sensor moved back red gains and blue loses, and only the sum of the paths says so."""
     f = np.full(1, 0.3)
