@@ -16,8 +16,9 @@ from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
-from scipy.interpolate import CubicSpline, RegularGridInterpolator
+from scipy.interpolate import CubicSpline, RectBivariateSpline, RegularGridInterpolator
 from scipy.special import ndtr, pdtrik
 
 from lab.recording import Manifest, RecordingSet
@@ -48,13 +49,24 @@ class Plan:
     repeats: int = 3
 
 
+@dataclass(frozen=True)
+class Pose:
+    """A board before a camera: its middle at `centre_mm` (x right, y down, z away), turned about x, then y, then z (degrees)."""
+
+    centre_mm: tuple[float, float, float]
+    turn_deg: tuple[float, float, float]
+
+
 class Camera:
     """One camera, drawn from `seed`, with laws built in. `cfa`, `f_number` None: drawn. `noise_draw`: which of the noises that the same
-    camera may make; its fixed patterns stay."""
+    camera may make; its fixed patterns stay. `offset_mm`: how far right of the pair's left camera it stands; `pair_middle_mm`: where boards for
+    both stand."""
 
     def __init__(
-        self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None, rows: int = 384, cols: int = 512, noise_draw: int = 0
+        self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None, rows: int = 384, cols: int = 512, noise_draw: int = 0,
+        side: str = "left", offset_mm: float = 0.0, pair_middle_mm: float = 0.0,
     ) -> None:  # fmt: skip
+        self.side, self.offset_mm, self.pair_middle_mm = side, offset_mm, pair_middle_mm
         self.seed, self.noise_draw, self.rows, self.cols = seed, noise_draw, rows, cols
         rng = np.random.default_rng([seed, 1])
         drawn = str(rng.choice(["RGGB", "BGGR", "GRBG", "GBRG", "MONO"], p=[0.2, 0.2, 0.2, 0.2, 0.2]))
@@ -103,6 +115,11 @@ class Camera:
             c: np.prod([np.ones_like(WL), *(law.transmission(c) * np.ones_like(WL) for law in self.laws)], axis=0)
             for c in self.qe
         }
+        shape_rng = np.random.default_rng([seed, 5])
+        #: Focal length and middle in px, k1 and k2: every lens distorts a little.
+        self.focal_px = 1000 * self.focal / self.pitch * float(shape_rng.uniform(0.99, 1.01))
+        self.middle = (cols - 1) / 2 + float(shape_rng.uniform(-3, 3)), (rows - 1) / 2 + float(shape_rng.uniform(-3, 3))
+        self.bends = float(shape_rng.uniform(-0.3, 0.1)), float(shape_rng.uniform(-0.1, 0.1))
         self.frames: dict[str, Any] = {}
         self.spectra: dict[str, Spectrum] = {}
         self.captures: list[dict[str, Any]] = []
@@ -270,25 +287,106 @@ class Camera:
             out[c] = self.rate(radiance, c) * (dark + (1 - dark) * np.interp(distance, away, step))
         return out
 
+    @cached_property
+    def _moves(self) -> bool:
+        return any(law.lands(np.zeros(1), np.zeros(1), 550.0) is not None for law in self.laws)
+
+    def _unmoved(self, row: Array, col: Array, channel: str, radiance: Array) -> tuple[Array, Array]:
+        """Where light that lands at a place (px) would without the laws' shifts: the mean over what the channel detects."""
+        if not self._moves:
+            return row, col
+        shares = self._shares(radiance, channel)
+        half = 0.5 * float(np.hypot(self.rows, self.cols))
+        from_row, from_col = np.broadcast_arrays(row, col)
+        for _ in range(2):  # the shifts are small: what they shift by at the place they come from
+            x, y = (from_col - (self.cols - 1) / 2) / half, (from_row - (self.rows - 1) / 2) / half
+            right, down = np.zeros(x.shape), np.zeros(x.shape)
+            for law in self.laws:
+                for share, w in zip(shares, NODES, strict=True):
+                    moved = law.lands(x, y, float(w)) if abs(share) > 1e-6 else None
+                    if moved is not None:
+                        right, down = right + share * moved[0], down + share * moved[1]
+            from_row, from_col = row - down, col - right
+        return from_row, from_col
+
+    def board(self, texture: Array, texel_mm: float, pose: Pose, radiance: Array) -> dict[str, Array]:
+        """A flat printed board of `texture` (0 black .. 1 white) through pinhole, distortion and blur; dark around it."""
+        a, b, c = np.deg2rad(pose.turn_deg)
+        about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+        about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+        about_z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+        turn = about_z @ about_y @ about_x
+        centre = np.array(pose.centre_mm) - [self.offset_mm, 0, 0]
+        # where a place of the frame sees the board is smooth: worked out every few pixels, and splines between
+        coarse = [np.linspace(-2.0, n + 1.0, n // 6 + 4) for n in (self.rows, self.cols)]
+        fine_row, fine_col = ((np.arange(n * FINE) + 0.5) / FINE - 0.5 for n in (self.rows, self.cols))
+        inside = (np.arange(2) + 0.5) / 2 / FINE - 0.5 / FINE
+        pictures: dict[str, Array] = {}
+        for ch in self.qe:
+            if pictures and not self._moves:
+                pictures[ch] = next(iter(pictures.values()))
+                continue
+            row, col = self._unmoved(coarse[0][:, None], coarse[1][None, :], ch, radiance)
+            xd, yd = np.broadcast_arrays((col - self.middle[0]) / self.focal_px, (row - self.middle[1]) / self.focal_px)
+            xu, yu = xd, yd
+            for _ in range(6):
+                r2 = xu * xu + yu * yu
+                stretch = 1 + self.bends[0] * r2 + self.bends[1] * r2 * r2
+                xu, yu = xd / stretch, yd / stretch
+            # the ray meets the plane of normal turn[:, 2] through the centre
+            depth = (turn[:, 2] @ centre) / (turn[0, 2] * xu + turn[1, 2] * yu + turn[2, 2])
+            away = xu * depth - centre[0], yu * depth - centre[1], depth - centre[2]
+            across, down = (
+                RectBivariateSpline(*coarse, sum(turn[k, axis] * away[k] for k in range(3)) / texel_mm)
+                for axis in (0, 1)
+            )
+            fine = np.zeros((self.rows * FINE, self.cols * FINE))
+            for y, x in itertools.product(inside, inside):
+                i = np.floor(down(fine_row + y, fine_col + x) + texture.shape[0] / 2).astype(np.int32)
+                j = np.floor(across(fine_row + y, fine_col + x) + texture.shape[1] / 2).astype(np.int32)
+                ok = (i >= 0) & (i < texture.shape[0]) & (j >= 0) & (j < texture.shape[1])
+                fine += (
+                    np.where(ok, texture[np.clip(i, 0, texture.shape[0] - 1), np.clip(j, 0, texture.shape[1] - 1)], 0.0)
+                    / 4
+                )
+            pictures[ch] = fine
+        filtered = self._filtered(pictures, radiance, FINE)
+        return {ch: self.rate(radiance, ch) * (0.04 + 0.86 * image) for ch, image in filtered.items()}
+
     def pattern(self, target: Array, radiance: Array, dark: float, cell_px: float = 4.0) -> dict[str, Array]:
         """Cells on a screen, turned by 0.6 degrees, drawn on the fine grid and filtered there."""
         r = ((np.arange(self.rows * FINE) + 0.5) / FINE - 0.5 - (self.rows - 1) / 2)[:, None]
         c = ((np.arange(self.cols * FINE) + 0.5) / FINE - 0.5 - (self.cols - 1) / 2)[None, :]
         t = np.deg2rad(0.6)
-        fine = np.zeros((self.rows * FINE, self.cols * FINE))
         # each fine sample is a mean over its square: else the cells' turned rims would be jagged
         inside = (np.arange(PARTS) + 0.5) / PARTS / FINE - 0.5 / FINE
-        for y, x in itertools.product(inside, inside):
-            i = np.floor(((r + y) * np.cos(t) - (c + x) * np.sin(t)) / cell_px + target.shape[0] / 2).astype(np.int32)
-            j = np.floor(((r + y) * np.sin(t) + (c + x) * np.cos(t)) / cell_px + target.shape[1] / 2).astype(np.int32)
-            ok = (i >= 0) & (i < target.shape[0]) & (j >= 0) & (j < target.shape[1])
-            cells = target[np.clip(i, 0, target.shape[0] - 1), np.clip(j, 0, target.shape[1] - 1)]
-            fine += np.where(ok, cells, 0.0) / PARTS**2
-        for law in self.laws:
-            fine = law.screen(fine, r, c)
+        middle = (self.rows - 1) / 2, (self.cols - 1) / 2
+        coarse = [np.linspace(-2.0, n + 1.0, n // 6 + 4) for n in (self.rows, self.cols)]
+        pictures: dict[str, Array] = {}
+        for ch in self.qe:
+            if pictures and not self._moves:
+                pictures[ch] = next(iter(pictures.values()))
+                continue
+            fine = np.zeros((self.rows * FINE, self.cols * FINE))
+            sources = self._unmoved(coarse[0][:, None], coarse[1][None, :], ch, radiance) if self._moves else ()
+            for y, x in itertools.product(inside, inside):
+                down, right = r + y, c + x
+                if self._moves:
+                    at = down[:, 0] + middle[0], right[0] + middle[1]
+                    down, right = (
+                        RectBivariateSpline(*coarse, m)(*at) - o for m, o in zip(sources, middle, strict=True)
+                    )
+                i = np.floor((down * np.cos(t) - right * np.sin(t)) / cell_px + target.shape[0] / 2).astype(np.int32)
+                j = np.floor((down * np.sin(t) + right * np.cos(t)) / cell_px + target.shape[1] / 2).astype(np.int32)
+                ok = (i >= 0) & (i < target.shape[0]) & (j >= 0) & (j < target.shape[1])
+                cells = target[np.clip(i, 0, target.shape[0] - 1), np.clip(j, 0, target.shape[1] - 1)]
+                fine += np.where(ok, cells, 0.0) / PARTS**2
+            for law in self.laws:
+                fine = law.screen(fine, r, c)
+            pictures[ch] = fine
         return {
             ch: self.rate(radiance, ch) * (dark + (1 - dark) * im)
-            for ch, im in self._filtered(dict.fromkeys(self.qe, fine), radiance, FINE).items()
+            for ch, im in self._filtered(pictures, radiance, FINE).items()
         }
 
     def _filtered(self, pictures: dict[str, Array], radiance: Array, over: int) -> dict[str, Array]:
@@ -352,19 +450,22 @@ class Camera:
         temperature_c: float = 25.0,
         **more: Any,
     ) -> None:
+        mark = "" if self.side == "left" else "right-"
+        for law in self.laws if images is not None else ():
+            images = {c: image * law.scene(kind) for c, image in images.items()}
         for _ in range(repeats):
             k = len(self.captures)
-            path = f"frames/{k:04d}.npy"
+            path = f"frames/{mark}{k:04d}.npy"
             self.frames[path] = self.expose(images, exposure_s, k, temperature_c)
             when = datetime(2026, 3, 2, 9, tzinfo=UTC) + timedelta(seconds=STEP_S * k)
             self.captures.append(
-                {"id": f"c{k:04d}", "kind": kind, "side": "left", "frame": path, "exposure_s": exposure_s,
+                {"id": f"{mark}c{k:04d}", "kind": kind, "side": self.side, "frame": path, "exposure_s": exposure_s,
                  "temperature_c": temperature_c, "time": when.isoformat(), **more}
             )  # fmt: skip
 
     def note(self, radiance: Array) -> str:
         """The file in which the radiometer's reading of a light is kept."""
-        path = f"spectra/{len(self.spectra):03d}.csv"
+        path = f"spectra/{'' if self.side == 'left' else 'right-'}{len(self.spectra):03d}.csv"
         self.spectra[path] = Spectrum.of(WL, radiance)
         return path
 
@@ -381,13 +482,14 @@ class Camera:
                 "narrowband": self._sweep,
                 "chart": self._charts,
                 "slanted_edge": self._edges,
+                "charuco": self._boards,
             }.get(kind, lambda _plan, light: targets.update(self._screen(rng, light)))(plan, lamp)
         camera = {
             "rows": self.rows, "cols": self.cols, "pixel_pitch_um": self.pitch, "fill_factor": self.fill, "cfa": self.cfa,
             "bit_depth": 12, "black_level_dn": self.black, "white_level_dn": FULL_CODE, "f_number": self.n, "focal_length_mm": self.focal,
             "lens_transmittance": self.tau, "quantum_efficiency": curves,
         }  # fmt: skip
-        manifest = Manifest.model_validate({"name": name, "cameras": {"left": camera}, "captures": self.captures})
+        manifest = Manifest.model_validate({"name": name, "cameras": {self.side: camera}, "captures": self.captures})
         return RecordingSet(manifest, self.frames, self.spectra, targets, source=name)
 
     def _darks(self, plan: Plan, lamp: Array) -> None:
@@ -446,6 +548,33 @@ class Camera:
                 self.take("slanted_edge", self.edge(angle, light, 0.08), self.exposure_for(light, 0.8), 2, region=region,
                           angle_deg=angle, light_radiance=path, field_mm=[0.0, 0.0])  # fmt: skip
 
+    def _boards(self, plan: Plan, lamp: Array) -> None:
+        """A ChArUco board of 6 x 8 squares in ten poses, tilted to all sides, each square 9 mm."""
+        board = cv2.aruco.CharucoBoard((8, 6), 9.0, 6.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+        texture = np.asarray(board.generateImage((8 * 18, 6 * 18), marginSize=0, borderBits=1)) / 255.0
+        light = 0.6 * lamp
+        # so far that the board covers three quarters of the frame
+        away = 9.0 * max(8 / self.cols, 6 / self.rows) / 0.75 * self.focal_px
+        x, y = 0.1 * away * self.cols / self.focal_px, 0.1 * away * self.rows / self.focal_px
+        tilts = (
+            (0, 0, 0),
+            (35, 0, 3),
+            (-35, 0, -4),
+            (0, 35, 5),
+            (0, -35, 2),
+            (25, 25, -6),
+            (-25, 25, 4),
+            (25, -25, 8),
+            (-25, -25, -3),
+            (10, -15, 20),
+        )
+        for k, tilt in enumerate(tilts):
+            place = (x * ((k * 7) % 5 - 2) / 2, y * ((k * 3) % 5 - 2) / 2, away * (1 + 0.03 * (k % 4)))
+            if self.pair_middle_mm:
+                place = (place[0] + self.pair_middle_mm, place[1], place[2])
+            self.take("charuco", self.board(texture, 0.5, Pose(place, tilt), light), self.exposure_for(light, 0.7),
+                      dictionary="DICT_4X4_50", squares=[6, 8], square_mm=9.0, marker_mm=6.0, pose=f"b{k}")  # fmt: skip
+
     def _screen(self, rng: np.random.Generator, lamp: Array) -> dict[str, Array]:
         screen = 0.1 * lamp
         path = self.note(screen)
@@ -460,6 +589,23 @@ class Camera:
         for kind, (file, target) in zip(("checkerboard", "bernoulli"), targets.items(), strict=True):
             self.take(kind, self.pattern(target, screen, 0.0035), t, 3, target=file, **where)
         return targets
+
+
+def pair(left: Camera, right: Camera, plan: Plan, name: str = "pair") -> RecordingSet:
+    """Both cameras' sessions in one recording set."""
+    one, two = left.record(plan, name), right.record(plan, name)
+    whole = {
+        "name": name,
+        "cameras": {
+            **one.manifest.model_dump(mode="json")["cameras"],
+            **two.manifest.model_dump(mode="json")["cameras"],
+        },
+        "captures": [*left.captures, *right.captures],
+    }
+    targets = {c["target"]: one.target(c["target"]) for c in left.captures if c.get("target")}
+    return RecordingSet(
+        Manifest.model_validate(whole), left.frames | right.frames, left.spectra | right.spectra, targets, source=name
+    )
 
 
 def poisson(mean: Array, z: Array) -> Array:

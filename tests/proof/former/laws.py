@@ -79,11 +79,18 @@ class Law:
     def screen(self, fine: Array, row: Array, col: Array) -> Array:
         return fine
 
+    def scene(self, kind: str) -> float:
+        return 1.0
+
     # optics
     def transmission(self, channel: str) -> Array:
         return 1.0
 
     def wavefront(self, x: Array, y: Array, lam_nm: float) -> Array | None:
+        return None
+
+    def lands(self, x: Array, y: Array, lam_nm: float) -> tuple[Array, Array] | None:
+        """Shift of light (right, down; px) at (x, y) half diagonals from the middle."""
         return None
 
     def mono(self, f_cy_um: Array, lam_um: float) -> Array:
@@ -742,6 +749,80 @@ class ScreenPixelStructure(Law):
         return fine * (1 + self.s / 100 * np.cos(2 * np.pi * col / period) * np.cos(2 * np.pi * row / period))
 
 
+class ScreenGamma(Law):
+    """Greys at cells' rims are shown darker: a power on rims as narrow as drawn; on rims of a pixel; above an offset."""
+
+    name = effect = "screen_gamma"
+    variants, unit, nominal, limits, shown_by = 3, "1", 1.2, (0.01, 4.0), frozenset({"checkerboard"})
+
+    def screen(self, fine: Array, row: Array, col: Array) -> Array:
+        asked = gaussian_filter(fine, 1.6, mode="nearest") if self.v == 1 else fine
+        asked = np.clip(asked, 0.0, 1.0)
+        if self.v == 2:
+            return np.clip((asked - 0.05) / 0.95, 0.0, 1.0) ** (1 + self.s)
+        return asked ** (1 + self.s)
+
+
+class LateralColour(Law):
+    """Colours at other scales: in proportion to the wavelength; by Conrady's dispersion; with a third of it as the cube of the radius."""
+
+    name = effect = "lateral_chromatic_aberration"
+    variants, unit, nominal, limits, signed, needs = 3, "um", 1.5, (0.02, 20.0), True, "bayer"
+    shown_by = frozenset({"checkerboard"})
+
+    def lands(self, x: Array, y: Array, lam_nm: float) -> tuple[Array, Array]:
+        t = (lam_nm - REFERENCE_NM) / 100.0
+        if self.v == 1:
+            t = 2.3 * (1.0 - (REFERENCE_NM / lam_nm) ** 3.5) / 1.5
+        out = self.a * t / self.cam.pitch * (1.0 if self.v < 2 else (2.0 + x * x + y * y) / 3.0)
+        return out * x, out * y
+
+    def stated(self) -> dict[str, float]:
+        return {"slope_um": self.a} if self.v == 0 else {}
+
+
+class LensDistortion(Law):
+    """The image's scale changes with the radius since the calibration: as its cube; as its fifth power."""
+
+    name = effect = "distortion"
+    variants, unit, nominal, limits, signed, shown_by = 2, "%", 0.5, (0.005, 10.0), True, frozenset({"charuco"})
+
+    def lands(self, x: Array, y: Array, lam_nm: float) -> tuple[Array, Array]:
+        r2 = x * x + y * y
+        out = self.a / 100.0 * 0.5 * float(np.hypot(self.cam.rows, self.cam.cols)) * (r2 if self.v == 0 else r2 * r2)
+        return out * x, out * y
+
+    def stated(self) -> dict[str, float]:
+        return {"corner_percent": self.a} if self.v == 0 else {}
+
+
+class LensDecentre(Law):
+    """An element slips sideways: Brown's tangential distortion; a thin prism's."""
+
+    name = effect = "decentre"
+    variants, unit, nominal, limits, shown_by = 2, "um", 2.0, (0.02, 40.0), frozenset({"charuco"})
+
+    def lands(self, x: Array, y: Array, lam_nm: float) -> tuple[Array, Array]:
+        t = 2.0 * np.pi * self.u[0]
+        a, b = (self.s / self.cam.pitch * v for v in (np.cos(t), np.sin(t)))
+        if self.v == 1:
+            return a * (x * x + y * y), b * (x * x + y * y)
+        return a * (3 * x * x + y * y) + 2 * b * x * y, b * (x * x + 3 * y * y) + 2 * a * x * y
+
+
+class StereoGain(Law):
+    """One camera of a pair answers scenes more strongly than uniform light."""
+
+    name = effect = "stereo_gain_mismatch"
+    unit, nominal, limits, signed, shown_by = "%", 6.0, (0.1, 50.0), True, frozenset({"charuco"})
+
+    def scene(self, kind: str) -> float:
+        return 1.0 if kind in {"flat", "narrowband"} else 1.0 + self.a / 100.0
+
+    def stated(self) -> dict[str, float]:
+        return {"gain_percent": self.a}
+
+
 class AmbientLight(Law):
     """The room's light while the shutter is open: grey; reddish."""
 
@@ -760,8 +841,11 @@ LISTED: tuple[type[Law], ...] = (
     VignettingDecentre, InfraredCutFilter, VibrationBlur, PixelAperture, ChargeDiffusion, Crosstalk, GreenImbalance,
     DarkCurrentTemperature, AmplifierGlow, HotPixels, ImageLag, BrighterFatter, Nonlinearity, AdcNonlinearity, BlackLevelDrift, BlackLevelTemperature,
     RowNoise, ColumnNoise, RandomTelegraphNoise, OnChipSharpening, OnChipSmoothing, SourceDrift, StrayLight, SourceBandwidth,
-    WavelengthOffset, RadiometerNonlinearity, LightFlicker, ExposureOffset, NonUniformIllumination, ScreenPixelStructure, AmbientLight,
+    WavelengthOffset, RadiometerNonlinearity, LightFlicker, ExposureOffset, NonUniformIllumination, ScreenPixelStructure, ScreenGamma, LateralColour, AmbientLight,
 )  # fmt: skip
+
+#: Of the list too, but to be seen only beside an earlier calibration or a second camera: a challenge of single cameras has neither.
+BESIDE: tuple[type[Law], ...] = (LensDistortion, LensDecentre, StereoGain)
 
 
 # --- kinds that no list names, siblings of listed ones among them -----------------------------------------------------------
