@@ -53,7 +53,9 @@ def merged(source: str, found: Sequence[SideFindings]) -> DiagnosisResult:
         threshold=max((f.threshold for f in found if f.threshold is not None), default=None),
         false_alarm_rate=FALSE_ALARM_RATE if any(f.is_judged for f in found) else None,
         curves=tuple(c for f in found for c in f.curves),
-        skipped=tuple(s for f in found for s in f.skipped),
+        skipped=tuple(
+            dict.fromkeys(s for f in found for s in f.skipped)
+        ),  # parts of one measurement give the same reason
         summary=tuple(_summary(verdict, mismatches, effects, unexplained, held_out)),
     )
 
