@@ -139,9 +139,16 @@ def _span(table: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > 1e-6 * max(float(s.max(initial=0.0)), 1e-300)])
 
 
+#: Weight of the columns' own sizes in their fit: 1e-8 of a score.
+ALIKE = 1e-4
+
+
 def _cone(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray]:
     size = np.linalg.norm(table, axis=0)
-    share, rest = nnls(table / np.where(size > 0, size, 1.0), white)
+    unit = table / np.where(size > 0, size, 1.0)
+    # next to nothing holds columns apart that are all but the same, between which the active set would go round in circles
+    held = np.vstack([unit, ALIKE * np.eye(unit.shape[1])])
+    share, rest = nnls(held, np.concatenate([white, np.zeros(unit.shape[1])]))
     return max(float(white @ white - rest**2), 0.0), share / np.where(size > 0, size, 1.0)
 
 
