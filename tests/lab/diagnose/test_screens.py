@@ -1,0 +1,104 @@
+"""Patterns on screens: healthy cameras leave nothing to find, and what second image formers conceal is found by its own measurement."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.diagnose.decide import Verdict, decide
+from lab.diagnose.evidence import Evidence
+from lab.diagnose.screens import SCREEN_BLOCKS, colour_block, contrast_block, grid_block, turned_block
+from lab.diagnose.summaries import Study
+from lab.errors import NotDetermined
+from lab.predict import camera_model
+from lab.recording import RecordingSet
+from sim.effects.defocus import Defocus
+from tests.proof.former import Camera, Law, Plan
+from tests.proof.former import laws as concealed
+
+PLAN = Plan(kinds=("dark", "flat", "screen"))
+
+
+def recorded(*laws: Law, seed: int = 61, cfa: str = "GRBG", plan: Plan = PLAN) -> RecordingSet:
+    return Camera(seed, laws, cfa=cfa, f_number=2.8, rows=96, cols=128).record(plan)
+
+
+def study_of(recordings: RecordingSet) -> Study:
+    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+def verdict_of(recordings: RecordingSet) -> Verdict:
+    study = study_of(recordings)
+    blocks = []
+    for make in SCREEN_BLOCKS:
+        try:
+            blocks.append(make(study))
+        except NotDetermined:
+            continue
+    return decide(Evidence(tuple(blocks), study.camera), np.random.default_rng(3))
+
+
+@pytest.mark.parametrize(("seed", "cfa"), [(62, "MONO"), (63, "RGGB")])
+def test_a_healthy_camera_keeps_the_contrast_that_the_model_says(seed: int, cfa: str) -> None:
+    verdict = verdict_of(recorded(seed=seed, cfa=cfa))
+    assert not verdict.named
+    assert not verdict.abstained
+    assert not verdict.before
+    block = verdict.evidence.blocks[0]
+    model = verdict.evidence.gaussian()
+    at = verdict.evidence.slices[0]
+    residual = (verdict.evidence.value - model.mean)[at]
+    chi2 = float(residual @ np.linalg.solve(model.covariance[at, at], residual))
+    # floors make it less than n; above it the noise's covariance would be too small: 4 sigma of a chi2 of n numbers
+    assert chi2 < len(block.value) + 4 * np.sqrt(2 * len(block.value))
+
+
+FOUND: list[tuple[Law, str]] = [
+    (concealed.Ghost(0.6, 0, 5), "ghost"),
+    (concealed.Ghost(2.0, 1, 5), "ghost"),
+    (concealed.ScreenPixelStructure(8.0, 0, 5), "screen_pixel_structure"),
+    (concealed.ScreenGamma(1.5, 0, 5), "screen_gamma"),
+    (concealed.LateralColour(3.0, 0, 5), "lateral_chromatic_aberration"),
+]
+
+
+@pytest.mark.parametrize(("law", "name"), FOUND, ids=[f"{type(law).__name__}-{law.v}" for law, _ in FOUND])
+def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
+    verdict = verdict_of(recorded(law))
+    assert [c.effect.name for c in verdict.named] == [name]
+
+
+def test_defocus_changes_the_contrast_as_predicted() -> None:
+    """12 um: far out of the noise, and with the effect within it, levels and the screen's own blur free."""
+    study = study_of(recorded(concealed.Defocus(12.0, 1)))
+    evidence = Evidence((contrast_block(study),), study.camera)
+    for effects, low, high in (((), 5.0, 1e9), ((Defocus(defocus_um=12.0),), 0.0, 1.0)):
+        model = evidence.gaussian(effects)
+        residual = evidence.value - model.mean
+        n = len(residual)
+        chi2 = float(residual @ np.linalg.solve(model.covariance, residual))
+        assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
+
+
+def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
+    """3 um a 100 nm in the corner: what each colour's light is apart from green's, by the block's own prediction at that size."""
+    from sim.effects.lateral_chromatic_aberration import LateralChromaticAberration
+
+    law = concealed.LateralColour(3.0, 0, 5)
+    block = colour_block(study_of(recorded(law)))
+    expected = block.predict((LateralChromaticAberration(slope_um=law.a),)).mean
+    std = np.sqrt(np.diag(block.covariance))
+    assert np.abs(expected).max() > 8 * std.max()
+    assert np.all(np.abs(block.value - expected) < 4 * std + 0.05 * np.abs(expected))
+
+
+def test_the_screen_s_grid_is_seen_in_white_frames_alone() -> None:
+    """Lit screens without white captures say nothing of it, and one channel nothing of lateral colour."""
+    mono = study_of(recorded(cfa="MONO"))
+    assert abs(float(grid_block(mono).value[0])) < 4.0
+    with pytest.raises(NotDetermined, match="one channel"):
+        colour_block(mono)
+    with pytest.raises(NotDetermined, match="no white captures"):
+        grid_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))
+    with pytest.raises(NotDetermined, match="no bernoulli captures"):
+        turned_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))
