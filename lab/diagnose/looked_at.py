@@ -17,6 +17,8 @@ from sim.effects.base import Effect
 from sim.effects.library import effects as library
 from sim.spectrum import FloatArray
 
+#: Of a number's variance: how well matrices are inverted.
+ROUNDING = 1e-9
 #: What could have been seen: so often it would have been.
 SEEN_RATE = 0.9
 
@@ -51,6 +53,9 @@ def measurement_fits(side: Side, verdict: Verdict) -> Iterator[MeasurementFit]:
         left, covariance = (
             conditional(residual, model.covariance, ~seen, seen) if (~seen).any() else (np.zeros(0), np.zeros((0, 0)))
         )
+        # what the seen numbers tell of the others to the last digit leaves a variance of rounding, which may be below 0
+        covariance = 0.5 * (covariance + covariance.T)
+        covariance += np.diag(ROUNDING * np.diag(model.covariance)[~seen])
         numbers = []
         for at in evidence.slices:
             mine = np.zeros(len(seen), bool)
