@@ -182,10 +182,14 @@ def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[Fl
 def lagrange_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
     """(curves, nodes): how much each node counts in sum weight x g, for g given at the nodes only and taken as the polynomial
     through them. `weight` is (curves, positions); the shares of a curve add up to its sum, exactly."""
-    basis = np.ones((nodes.size, position.size))
-    for k, node in enumerate(nodes):
-        for other in np.delete(nodes, k):
-            basis[k] *= (position - other) / (node - other)
+    # the barycentric form: as exact as the products, at a cost of nodes x positions (Berrut and Trefethen 2004)
+    apart = (nodes[:, None] - nodes) / max(float(np.ptp(nodes)), 1e-300)
+    np.fill_diagonal(apart, 1.0)
+    away = position - nodes[:, None]
+    met = away == 0.0
+    basis = (1.0 / np.prod(apart, axis=1))[:, None] / np.where(met, 1.0, away)
+    basis /= np.sum(basis, axis=0)
+    basis = np.where(met.any(axis=0), met, basis)
     shares = weight @ basis.T
     shares[:, -1] += np.sum(weight, axis=1) - np.sum(shares, axis=1)
     return shares

@@ -20,6 +20,7 @@ from lab.replay import Replay
 from lab.results import FitResult
 from sim.camera import CameraModel, Side
 from sim.effects.library import effects as library
+from sim.spectrum import Spectrum
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def _at_recorded_levels(recordings: RecordingSet, side: Side, camera: CameraMode
     highest = max(max(curve.value) for curve in camera.quantum_efficiency.values())
     factor = min(float(np.median(ratios)), 1.0 / highest)
     scaled = {
-        channel: curve.model_copy(update={"value": tuple(factor * v for v in curve.value)})
+        channel: Spectrum.of(curve.wavelength_nm, [factor * v for v in curve.value])
         for channel, curve in camera.quantum_efficiency.items()
     }
     return camera.model_copy(update={"quantum_efficiency": scaled})
