@@ -31,6 +31,7 @@ from sim.forward import electron_rate
 from sim.spectrum import FloatArray
 
 LEVEL_FLOOR = 1.0e-4  # of a level, one for its repeats: non-linearity below what a linear camera may have, and rounding
+READING_COLOUR_STD = 5e-4  # of a lamp's reading, by channel: the radiometer's noise by wavelength
 RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels, where too few readings say less
 READING_STD = 1e-4  # what readings scatter at least
 _READINGS = 8  # wavelengths from which on their own scatter tells
@@ -92,9 +93,11 @@ def linearity_block(study: Study) -> Block:
             slopes[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
         if len(lights) > len(set(study.lamps.values())):
             for path in lights:
-                slopes[f"reading:{path}"] = np.where(
-                    [c.radiance == path for c, *_ in points], RADIOMETER_STD * lit, 0.0
-                )
+                read_there = np.array([c.radiance == path for c, *_ in points])
+                slopes[f"reading:{path}"] = np.where(read_there, RADIOMETER_STD * lit, 0.0)
+                for channel in study.channels if len(study.channels) > 1 else ():
+                    mine = read_there & np.array([c == channel for _, c, *_ in points])
+                    slopes[f"reading:{path}:{channel}"] = np.where(mine, READING_COLOUR_STD * lit, 0.0)
         return Prediction(mean, slopes)
 
     return Block(
