@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,8 @@ NAMED_FROM = 0.35
 CAUSE_FROM = 0.8
 #: A score that no slice and no refit bears out has to exceed the threshold by so much, for what a covariance doesn't hold.
 LONE_SCORE = 10.0
+#: A probability from which on a name isn't weighed again.
+CERTAIN = 0.99
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
@@ -115,13 +117,19 @@ def _believed(
     """
     given_up: list[Candidate] = []
     weighed: set[frozenset[str]] = set()
+    certain: dict[str, Candidate] = {}
     while current.effects:
         weighed.add(frozenset(current.names))
         members, likelier = [], None
         for index, e in enumerate(current.effects):
+            if e.name in certain:  # a weaker member that left changes nothing about this one's name
+                members.append(replace(certain[e.name], effect=e, std=current.std[index]))
+                continue
             report(f"weighing {e.name} against its rivals")
             candidate, better = _weighed(evidence, current, index, known)
             members.append(candidate)
+            if candidate.probability > CERTAIN and candidate.gain > threshold:
+                certain[e.name] = candidate
             likelier = likelier or better
         if likelier is not None and frozenset(likelier.names) not in weighed:
             current = refit(evidence, likelier.effects)
@@ -207,9 +215,10 @@ def _weighed(evidence: Evidence, fit: Fit, index: int, known: Iterable[type[Effe
     pool = [s for s in likely if s.value > 0 and (s.effect.name in declared or s.value > 0.6 * gain)]
     fits = {effect.name: fit}
     for score in pool[:SCREENED]:
-        fits[score.effect.name] = refit(
-            evidence, (*fit.effects[:index], score.start, *fit.effects[index + 1 :]), passes=2, evaluations=10
-        )
+        start = (*fit.effects[:index], score.start, *fit.effects[index + 1 :])
+        rough = refit(evidence, start, passes=1, evaluations=4, final=False)
+        near = rough.weight > fit.weight - HOPELESS - 0.3 * gain
+        fits[score.effect.name] = refit(evidence, rough.effects, passes=2, evaluations=10) if near else rough
     touched = [i for i, b in enumerate(evidence.blocks) if b.touched_by(type(effect))]
     weights = {}
     for name, tried in fits.items():
