@@ -592,7 +592,9 @@ def _one_deviation(kind: type[Effect]) -> Effect:
 SPREADING = [
     _one_deviation(kind)
     for kind in library.effects().values()
-    if kind.transfer is not Effect.transfer and kind.name != "veiling_glare"
+    if kind.transfer is not Effect.transfer
+    and kind.at_place is Effect.at_place  # on axis what grows with the field does nothing
+    and kind.name != "veiling_glare"
 ]
 
 
