@@ -143,7 +143,8 @@ def _believed(
             lost = sorted(weak, key=lambda c: c.gain)[:1]
         if not lost:
             return members, given_up
-        given_up += lost
+        if crowd or not companions:  # the error of a law that is named is nothing unexplained
+            given_up += lost
         left = tuple(c.effect for c in members if c not in lost)
         current = refit(evidence, left, passes=2)
     return [], given_up
