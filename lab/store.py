@@ -462,32 +462,40 @@ class Store:
         steps, done = db.execute(
             sa.select(sa.func.count(), sa.func.count(StepRow.finished)).where(StepRow.session_id == row.id)
         ).one()
-        state: Any = row.state
-        if state in ("running", "paused") and not self.lock(row.id).is_held():
-            state = "interrupted"  # its process ended without a word
         return SessionInfo(
             id=row.id,
             name=row.name,
             notes=row.notes,
             created=_aware(row.created),
             closed=row.closed and _aware(row.closed),
-            state=state,
+            state=row.state,  # type: ignore[arg-type]
             error=row.error,
             packed=row.packed,
             steps=steps,
             steps_done=done,
         )
 
+    def _now(self, read: SessionInfo) -> SessionInfo:
+        """What was read, unless it says that the session runs and no process holds its lock: then it is read again, because
+        the process may have said how it ended in between, and is "interrupted" if it ended without a word."""
+        if read.state not in ("running", "paused") or self.lock(read.id).is_held():
+            return read
+        with self.reading() as db:
+            again = self._info(db, self._row(db, read.id))
+        return again.model_copy(update={"state": "interrupted"}) if again.state in ("running", "paused") else again
+
     def session(self, session_id: str) -> SessionInfo:
         """One session."""
         with self.reading() as db:
-            return self._info(db, self._row(db, session_id))
+            found = self._info(db, self._row(db, session_id))
+        return self._now(found)
 
     def sessions(self) -> list[SessionInfo]:
         """All sessions, the newest first."""
         with self.reading() as db:
             rows = db.scalars(sa.select(SessionRow).order_by(SessionRow.created.desc(), SessionRow.id.desc()))
-            return [self._info(db, row) for row in rows]
+            found = [self._info(db, row) for row in rows]
+        return [self._now(one) for one in found]
 
     def has_session(self, session_id: str) -> bool:
         """Whether there is such a session."""

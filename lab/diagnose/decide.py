@@ -12,7 +12,6 @@ from lab.diagnose.locate import Slice, look
 from lab.diagnose.refit import Fit, likelihood, refit
 from lab.diagnose.score import signatures
 from lab.diagnose.search import SCREENED, Search
-from lab.diagnose.summaries import Effects
 from lab.diagnose.unknown import Discrepancy, discrepancy
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
@@ -23,7 +22,7 @@ UNKNOWN_UP_TO = 0.4
 #: nor where the name's own share, its rivals' taken off, is less than this.
 NAMED_FROM = 0.35
 #: Of the excess chi2 in the measurements that an effect acts on, what its name has to explain where something significant is left.
-CAUSE_FROM = 0.8
+CAUSE_FROM = 0.9
 #: A score that no slice and no refit bears out has to exceed the threshold by so much, for what a covariance doesn't hold.
 LONE_SCORE = 10.0
 #: A probability from which on a name isn't weighed again.
@@ -91,17 +90,11 @@ def decide(evidence: Evidence, rng: np.random.Generator, report: Callable[[str],
         if not unexplained:
             touched = max(
                 (i for i, b in enumerate(evidence.blocks) if b.touched_by(type(c.effect))),
-                key=lambda i: _gain(evidence, c.effect, effects, i),
+                key=lambda i: evidence.shown(c.effect, effects, i),
             )
             unexplained[id(evidence.blocks[touched])] = touched
     unknown = tuple(discrepancy(evidence, model, i) for i in unexplained.values())
     return Verdict(evidence, threshold, top, before, tuple(named), tuple(abstained), after, unknown)
-
-
-def _gain(evidence: Evidence, effect: Effect, others: Effects, index: int) -> float:
-    at = evidence.slices[index]
-    change = evidence.mean((*others, effect))[at] - evidence.mean(others)[at]
-    return float(np.sum(np.square(change) / np.diag(evidence.blocks[index].covariance)))
 
 
 def _others(known: Iterable[type[Effect]], current: Fit) -> list[type[Effect]]:
@@ -169,14 +162,14 @@ def _companion(candidate: Candidate, members: list[Candidate], evidence: Evidenc
         return True
     around = tuple(c.effect for c in others)
     pulls = [
-        _gain(evidence, candidate.effect, around, i) if b.touched_by(type(candidate.effect)) else 0.0
+        evidence.shown(candidate.effect, around, i) if b.touched_by(type(candidate.effect)) else 0.0
         for i, b in enumerate(evidence.blocks)
     ]
     most = int(np.argmax(pulls))
     for c in others:
         if evidence.blocks[most].touched_by(type(c.effect)):
             without = (candidate.effect, *(o.effect for o in others if o is not c))
-            if pulls[most] < COMPANION_SHARE * _gain(evidence, c.effect, without, most):
+            if pulls[most] < COMPANION_SHARE * evidence.shown(c.effect, without, most):
                 return True
     return False
 
@@ -189,7 +182,7 @@ def _crowd(evidence: Evidence, fit: Fit) -> list[int]:
         rest = (*fit.effects[:i], *fit.effects[i + 1 :])
         touched = [k for k, b in enumerate(evidence.blocks) if b.touched_by(type(e))]
         if touched:
-            by_block.setdefault(max(touched, key=lambda k, e=e, rest=rest: _gain(evidence, e, rest, k)), []).append(i)  # type: ignore[misc]
+            by_block.setdefault(max(touched, key=lambda k, e=e, rest=rest: evidence.shown(e, rest, k)), []).append(i)  # type: ignore[misc]
     full = evidence.gaussian(fit.effects)
     for index, members in by_block.items():
         if len(members) < 2:

@@ -8,7 +8,6 @@ What is held out of choice and fit is judged by its distribution given the rest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -147,6 +146,12 @@ class Evidence:
         covariance[np.diag_indices_from(covariance)] *= 1.0 + ROUNDING
         return Gaussian(mean[where], covariance)
 
+    def shown(self, effect: Effect, others: Effects, index: int) -> float:
+        """What an effect changes in one block beside others: sum of squares, in the numbers' own standard deviations."""
+        at = self.slices[index]
+        change = self.mean((*others, effect))[at] - self.mean(others)[at]
+        return float(np.sum(np.square(change) / np.diag(self.blocks[index].covariance)))
+
     def pull(self, effects: Effects = (), process: FloatArray | None = None) -> FloatArray:
         """C^-1 (y - m) of the seen numbers, nil at the others, (n,): what any part J P J' of C, times this, has of the residual.
         `process` (n, n): a discrepancy's covariance, on top."""
@@ -216,7 +221,3 @@ def conditional(
     inside = cholesky(covariance[np.ix_(given, given)], lower=True), True
     gain = cho_solve(inside, covariance[np.ix_(given, of)])
     return residual[of] - gain.T @ residual[given], covariance[np.ix_(of, of)] - gain.T @ covariance[np.ix_(given, of)]
-
-
-def blocks_named(blocks: Sequence[Block]) -> tuple[str, ...]:
-    return tuple(b.measurement for b in blocks)

@@ -154,10 +154,8 @@ def _mask(evidence: Evidence, at: slice) -> np.ndarray:
 
 
 def _pull(evidence: Evidence, verdict: Verdict, effect: Effect, block: Block) -> float:
-    at = evidence.slices[evidence.blocks.index(block)]
     others = tuple(e for e in verdict.effects if e.name != effect.name)
-    change = (evidence.mean((*others, effect)) - evidence.mean(others))[at]
-    return float(np.sum(np.square(change) / np.diag(block.covariance)))
+    return evidence.shown(effect, others, evidence.blocks.index(block))
 
 
 def _shown_in(verdict: Verdict, candidate: Candidate) -> tuple[str, ...]:

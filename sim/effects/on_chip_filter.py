@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+
+#: Of the blur's weight, across corners.
+CornerShare = Annotated[
+    float,
+    Quantity("1", "share of the blur's weight across corners", lower=0.0, upper=0.8, prior=(0.33, 0.2), absent=0.33),
+]
 
 
 class OnChipFilter(Effect):
@@ -18,6 +26,12 @@ class OnChipFilter(Effect):
     k > 0 sharpens, k < 0 smooths. Signal, fixed pattern and noise go through it alike: neighbours' noise is correlated in the same
     proportion at all levels and in the dark.
     """
+
+    stage: ClassVar[Stage] = Stage.ELECTRONICS
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"corner_share"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli", "flat", "dark"})
 
     @abstractmethod
     def detail(self) -> tuple[float, float]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
-from sim.effects.base import Stage
-from sim.effects.on_chip_filter import OnChipFilter
+from sim.effects.on_chip_filter import CornerShare, OnChipFilter
 from sim.parameters import Quantity
 
 
@@ -15,12 +14,7 @@ class OnChipSmoothing(OnChipFilter):
     neighbours have noise in common, in the same proportion at all levels."""
 
     name: ClassVar[str] = "on_chip_smoothing"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "ISO 15739:2023, annex on noise filtering"
-    form_tolerance: ClassVar[float] = 0.1
-    invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
-    shapes: ClassVar[frozenset[str]] = frozenset({"corner_share"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli", "flat", "dark"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {"brighter_fatter", "crosstalk", "inter_pixel_capacitance", "pixel_aperture"}
     )
@@ -40,12 +34,7 @@ class OnChipSmoothing(OnChipFilter):
             slope_power=1,
         ),
     ] = 0.0
-    corner_share: Annotated[
-        float,
-        Quantity(
-            "1", "share of the blur's weight across corners", lower=0.0, upper=0.8, prior=(0.33, 0.2), absent=0.33
-        ),
-    ] = 0.33
+    corner_share: CornerShare = 0.33
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:

@@ -201,6 +201,21 @@ def test_a_session_without_a_process_is_interrupted(store: Store) -> None:
     lock.release()
 
 
+def test_a_process_that_ends_while_it_is_looked_at_is_believed(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The row says that it runs; before its lock is looked at it says how it ended and lets go of the lock."""
+    session = started(store)
+    store.set_state(session, "running")
+
+    class EndsNow(Lock):
+        def is_held(self) -> bool:
+            store.set_state(session, "interrupted", error="aborted by the operator")
+            return False
+
+    monkeypatch.setattr(store, "lock", lambda id: EndsNow(store.folder(id) / ".lock"))
+    found = store.session(session)
+    assert (found.state, found.error) == ("interrupted", "aborted by the operator")
+
+
 # --- as a recording set --------------------------------------------------------------------------------------------------
 
 SCREEN = Calibration(dark=DarkSequence(exposures_s=(0.001,), frames=2), screen=ScreenSequence(frames=2))
