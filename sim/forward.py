@@ -157,10 +157,10 @@ def common_wavelengths(
         wavelength_nm, weight = _detected(camera, channel, [(radiance, None)], effects, kind)
         # a sight without light is that of equal energy
         found.append(_otf_weight(camera, channel, wavelength_nm, weight[0]))
-    position = np.concatenate([at for at, _ in found])
-    order = np.argsort(position, kind="stable")
-    pooled = np.concatenate([part for _, part in found]) / len(found)
-    nodes, _ = gauss_rule(position[order], pooled[order], count)
+    # sights have most of their wavelengths in common: each once
+    position, which = np.unique(np.concatenate([at for at, _ in found]), return_inverse=True)
+    pooled = np.bincount(which, np.concatenate([part for _, part in found])) / len(found)
+    nodes, _ = gauss_rule(position, pooled, count)
     return nodes, np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
 
 

@@ -8,11 +8,14 @@ What is held out of choice and fit is judged by its distribution given the rest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from lab.diagnose.summaries import Block, Effects, Prediction
 from sim.camera import CameraModel
@@ -21,14 +24,102 @@ from sim.spectrum import FloatArray
 
 #: Share of every variance that keeps covariances positive against rounding.
 ROUNDING = 1e-9
+#: Covariances within blocks are kept up to so many numbers in all.
+KEPT_NUMBERS = 2e7
+
+
+@dataclass(frozen=True)
+class Within:
+    """Covariance of one block's numbers by itself: noise, floors, the errors of laws, and the free quantities that only it has."""
+
+    covariance: FloatArray
+
+    @cached_property
+    def lower(self) -> FloatArray:
+        """Cholesky's factor."""
+        return np.asarray(cholesky(self.covariance, lower=True, check_finite=False))
 
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Mean and covariance of all numbers under one set of effects."""
+    """Mean and covariance of numbers under one set of effects: C = D + F F', D block by block, F the slopes by free
+    quantities that several blocks have, which alone tie them to each other. Inverted as such, C costs what its largest block does."""
 
     mean: FloatArray
-    covariance: FloatArray
+    within: tuple[Within, ...]
+    free: FloatArray  # (n, k)
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        ends = np.cumsum([len(w.covariance) for w in self.within])
+        return tuple(slice(int(e) - len(w.covariance), int(e)) for w, e in zip(self.within, ends, strict=True))
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Of all numbers, (n, n)."""
+        whole = self.free @ self.free.T
+        for one, at in zip(self.within, self.slices, strict=True):
+            whole[at, at] += one.covariance
+        return np.asarray(whole)
+
+    def of(self, index: int) -> FloatArray:
+        """Covariance of one block's numbers."""
+        free = self.free[self.slices[index]]
+        return np.asarray(self.within[index].covariance + free @ free.T)
+
+    def plus(self, index: int, kernel: FloatArray) -> Gaussian:
+        """With a discrepancy of that covariance in one block."""
+        more = Within(self.within[index].covariance + kernel)
+        return replace(self, within=(*self.within[:index], more, *self.within[index + 1 :]))
+
+    @cached_property
+    def _ties(self) -> tuple[FloatArray, FloatArray]:
+        """Left singular vectors and values of D^-1/2 F."""
+        if self.free.shape[1] == 0:
+            return np.zeros((len(self.mean), 0)), np.zeros(0)
+        u, s, _ = np.linalg.svd(self._split(self.free), full_matrices=False)
+        return u, s
+
+    def _split(self, table: FloatArray) -> FloatArray:
+        """D^-1/2 times vectors, block by block; blocks on which they are nil cost nothing."""
+        out = np.zeros_like(table)
+        for one, at in zip(self.within, self.slices, strict=True):
+            if table[at].any():
+                out[at] = solve_triangular(one.lower, table[at], lower=True, check_finite=False)
+        return out
+
+    def white(self, table: FloatArray) -> FloatArray:
+        """Vectors, (n,) or (n, m), in coordinates in which the covariance is 1: (1 + B B')^-1/2 D^-1/2 of them, B = D^-1/2 F."""
+        split = self._split(table)
+        u, s = self._ties
+        less = 1.0 / np.sqrt(1.0 + s * s) - 1.0
+        return np.asarray(split + (u * less) @ (u.T @ split))
+
+    def solved(self, table: FloatArray) -> FloatArray:
+        """C^-1 times vectors."""
+        split = self._split(table)
+        u, s = self._ties
+        split = split - (u * (s * s / (1.0 + s * s))) @ (u.T @ split)
+        out = np.zeros_like(split)
+        for one, at in zip(self.within, self.slices, strict=True):
+            out[at] = solve_triangular(one.lower, split[at], lower=True, trans="T", check_finite=False)
+        return out
+
+    def chi2(self, value: FloatArray) -> float:
+        """(y - m)' C^-1 (y - m)."""
+        white = self.white(value - self.mean)
+        return float(white @ white)
+
+    def log_likelihood(self, value: FloatArray) -> float:
+        """Of y, without the constant."""
+        diagonals = sum(float(np.log(np.diag(one.lower)).sum()) for one in self.within)
+        return -0.5 * self.chi2(value) - diagonals - 0.5 * float(np.log1p(np.square(self._ties[1])).sum())
+
+
+class _Numbered(NamedTuple):
+    number: int
+    acts: tuple[bool, ...]  # on which blocks
+    effect: Effect
 
 
 @dataclass
@@ -39,7 +130,9 @@ class Evidence:
     blocks: tuple[Block, ...]
     camera: CameraModel
     always: tuple[Effect, ...] = ()
-    _kept: dict[tuple[int, tuple[Effect, ...]], Prediction] = field(default_factory=dict)
+    _kept: dict[tuple[int, ...], Prediction] = field(default_factory=dict)
+    _laws: dict[tuple[bytes, tuple[int, ...]], Within] = field(default_factory=dict)
+    _numbers: dict[Effect, int] = field(default_factory=dict)
 
     @cached_property
     def value(self) -> FloatArray:
@@ -56,46 +149,58 @@ class Evidence:
         return np.array([not label.held_out for b in self.blocks for label in b.labels])
 
     @cached_property
-    def _noise(self) -> FloatArray:
-        covariance = np.zeros((len(self.value), len(self.value)))
-        for block, at in zip(self.blocks, self.slices, strict=True):
-            covariance[at, at] = block.covariance
-        return covariance
+    def _acting(self) -> dict[type[Effect], tuple[bool, ...]]:
+        return {}
 
-    def _prediction(self, index: int, acting: Effects) -> Prediction:
-        block = self.blocks[index]
-        key = index, tuple(e for e in acting if block.touched_by(type(e)))
+    def acts(self, effect: type[Effect]) -> tuple[bool, ...]:
+        """On which blocks an effect may act."""
+        if effect not in self._acting:
+            self._acting[effect] = tuple(block.touched_by(effect) for block in self.blocks)
+        return self._acting[effect]
+
+    def _numbered(self, acting: Effects) -> list[_Numbered]:
+        """Effects with a number each, which keys can be made of at less cost than of all their values."""
+        return [_Numbered(self._numbers.setdefault(e, len(self._numbers)), self.acts(type(e)), e) for e in acting]
+
+    def _prediction(self, index: int, acting: list[_Numbered]) -> Prediction:
+        here = [e for e in acting if e.acts[index]]
+        key = index, *(e.number for e in here)
         if key not in self._kept:
             if len(self._kept) > 20000:
                 self._kept.clear()
-            self._kept[key] = block.predict(key[1])
+            self._kept[key] = self.blocks[index].predict(tuple(e.effect for e in here))
         return self._kept[key]
 
     def mean(self, effects: Effects = ()) -> FloatArray:
         """Prediction of everything, (n,)."""
-        return self._mean_of((*self.always, *effects))
-
-    def _mean_of(self, acting: Effects) -> FloatArray:
+        acting = self._numbered((*self.always, *effects))
         return np.concatenate([self._prediction(i, acting).mean for i in range(len(self.blocks))])
 
     def _columns(self, effects: Effects) -> dict[str, FloatArray]:
         """Slopes by every free quantity, (n,) each, per prior standard deviation; one that several blocks share is one column."""
         columns: dict[str, FloatArray] = {}
+        acting = self._numbered((*self.always, *effects))
         for index, at in enumerate(self.slices):
-            for name, column in self._prediction(index, (*self.always, *effects)).slopes.items():
+            for name, column in self._prediction(index, acting).slopes.items():
                 columns.setdefault(name, np.zeros(len(self.value)))[at] = column
         return columns
 
+    @cached_property
+    def _lone(self) -> frozenset[str]:
+        """Free quantities of one block only, which belong to the covariance within it."""
+        count = Counter(name for i in range(len(self.blocks)) for name in self._prediction(i, []).slopes)
+        return frozenset(name for name, blocks in count.items() if blocks == 1)
+
     def _free(self, effects: Effects) -> FloatArray:
-        """The same as a table, (n, k)."""
-        columns = self._columns(effects)
-        return np.column_stack(list(columns.values())) if columns else np.zeros((len(self.value), 0))
+        """The slopes by what several blocks share as a table, (n, k)."""
+        columns = [c for name, c in self._columns(effects).items() if name not in self._lone]
+        return np.column_stack(columns) if columns else np.zeros((len(self.value), 0))
 
     @cached_property
-    def _kinship(self) -> FloatArray:
-        """How alike the error of a law is at two points: smooth along the axis, less so between channels and conditions."""
-        kin = np.zeros((len(self.value), len(self.value)))
-        for block, at in zip(self.blocks, self.slices, strict=True):
+    def _kinship(self) -> tuple[FloatArray, ...]:
+        """How alike the error of a law is at two points of a block: smooth along the axis, less so between channels and conditions."""
+        found = []
+        for block in self.blocks:
             x = block.position.reshape(len(block.value), -1)
             channel = np.array([label.channel for label in block.labels])
             condition = np.array([label.condition for label in block.labels])
@@ -103,48 +208,46 @@ class Evidence:
             near = near * np.where(channel[:, None] == channel, 1.0, 0.7)
             if block.conditions and not block.places:
                 near = near * np.where(condition[:, None] == condition, 1.0, 0.7)
-            kin[at, at] = near
-        return kin
+            found.append(near)
+        return tuple(found)
 
-    def gaussian(self, effects: Effects = ()) -> Gaussian:
-        """Mean and covariance of everything under these effects."""
-        return self._gaussian(effects, np.ones(len(self.value), bool))
+    def gaussian(self, effects: Effects = (), where: np.ndarray | None = None) -> Gaussian:
+        """Mean and covariance under these effects, of everything or of the numbers that `where` (n,) marks."""
+        where = np.ones(len(self.value), bool) if where is None else where
+        acting = self._numbered((*self.always, *effects))
+        within = tuple(self._within(index, acting, where) for index in range(len(self.blocks)))
+        return Gaussian(self.mean(effects)[where], within, self._free(effects)[where])
 
     def seen_gaussian(self, effects: Effects = ()) -> Gaussian:
         """The same of the seen numbers only."""
-        return self._gaussian(effects, self.seen)
+        return self.gaussian(effects, self.seen)
 
     @property
     def seen_value(self) -> FloatArray:
         return self.value[self.seen]
 
-    @cached_property
-    def _parts(self) -> dict[bytes, tuple[FloatArray, FloatArray]]:
-        return {}
-
-    def _gaussian(self, effects: Effects, where: np.ndarray) -> Gaussian:
-        key = where.tobytes()
-        if key not in self._parts:
-            only = np.ix_(where, where)
-            self._parts[key] = self._noise[only], self._kinship[only]
-        noise, kinship = self._parts[key]
-        mean = self.mean(effects)
-        free = self._free(effects)[where]
-        covariance = noise.copy()
-        freed = np.flatnonzero(np.any(free != 0.0, axis=1))  # edges, the most of all numbers, have no free quantity
-        covariance[np.ix_(freed, freed)] += free[freed] @ free[freed].T
-        ends = np.cumsum([int(where[at].sum()) for at in self.slices])
-        acting = (*self.always, *effects)
-        for i, effect in enumerate(acting):
-            change = mean - self._mean_of((*acting[:i], *acting[i + 1 :]))
-            for at, end in zip(self.slices, ends, strict=True):
-                error = effect.form_tolerance * change[at][where[at]]
+    def _within(self, index: int, acting: list[_Numbered], where: np.ndarray) -> Within:
+        only = where[self.slices[index]]
+        here = [e for e in acting if e.acts[index]]
+        key = only.tobytes(), (index, *(e.number for e in here))
+        if key not in self._laws:
+            if sum(w.covariance.size for w in self._laws.values()) > KEPT_NUMBERS:
+                self._laws.clear()
+            block, both = self.blocks[index], np.ix_(only, only)
+            covariance = block.covariance[both].copy()
+            model = self._prediction(index, here)
+            lone = [slope[only] for name, slope in model.slopes.items() if name in self._lone]
+            if lone:
+                covariance += np.transpose(lone) @ np.array(lone)
+            for i, one in enumerate(here):
+                change = model.mean - self._prediction(index, [*here[:i], *here[i + 1 :]]).mean
+                error = one.effect.form_tolerance * change[only]
                 if error.any():
-                    here = slice(int(end) - len(error), int(end))
-                    covariance[here, here] += error[:, None] * kinship[here, here] * error
-        # strong slopes leave directions whose variance rounding could make negative
-        covariance[np.diag_indices_from(covariance)] *= 1.0 + ROUNDING
-        return Gaussian(mean[where], covariance)
+                    covariance += error[:, None] * self._kinship[index][both] * error
+            # measurements of the same frames leave directions whose variance rounding could make negative
+            covariance[np.diag_indices_from(covariance)] *= 1.0 + ROUNDING
+            self._laws[key] = Within(covariance)
+        return self._laws[key]
 
     def shown(self, effect: Effect, others: Effects, index: int) -> float:
         """What an effect changes in one block beside others: sum of squares, in the numbers' own standard deviations."""
@@ -152,31 +255,33 @@ class Evidence:
         change = self.mean((*others, effect))[at] - self.mean(others)[at]
         return float(np.sum(np.square(change) / np.diag(self.blocks[index].covariance)))
 
-    def pull(self, effects: Effects = (), process: FloatArray | None = None) -> FloatArray:
+    def pull(self, effects: Effects = (), processes: Mapping[int, FloatArray] | None = None) -> FloatArray:
         """C^-1 (y - m) of the seen numbers, nil at the others, (n,): what any part J P J' of C, times this, has of the residual.
-        `process` (n, n): a discrepancy's covariance, on top."""
-        model = self.gaussian(effects)
-        covariance = model.covariance if process is None else model.covariance + process
-        inside = cho_factor(covariance[np.ix_(self.seen, self.seen)], lower=True)
+        `processes`: covariances of discrepancies by the block's index, on top."""
+        model = self.seen_gaussian(effects)
+        for index, kernel in (processes or {}).items():
+            seen = self.seen[self.slices[index]]
+            model = model.plus(index, kernel[np.ix_(seen, seen)])
         found = np.zeros(len(self.value))
-        found[self.seen] = cho_solve(inside, (self.value - model.mean)[self.seen])
+        found[self.seen] = model.solved(self.seen_value - model.mean)
         return found
 
-    def quantities(self, effects: Effects = (), process: FloatArray | None = None) -> dict[str, float]:
+    def quantities(self, effects: Effects = (), processes: Mapping[int, FloatArray] | None = None) -> dict[str, float]:
         """Where the seen numbers put the free quantities, by name, in prior standard deviations from their first guess."""
-        found = self._free(effects).T @ self.pull(effects, process)
-        return dict(zip(self._columns(effects), found.tolist(), strict=True))
+        pull = self.pull(effects, processes)
+        return {name: float(column @ pull) for name, column in self._columns(effects).items()}
 
     def levelled(self, effects: Effects = ()) -> FloatArray:
         """Prediction of everything with the free quantities there, (n,)."""
-        found = np.array(list(self.quantities(effects).values()))
-        return np.asarray(self.mean(effects) + self._free(effects) @ found)
+        found = self.quantities(effects)
+        moved = sum(found[name] * column for name, column in self._columns(effects).items())
+        return np.asarray(self.mean(effects) + moved)
 
     def touched(self, effect: type[Effect]) -> np.ndarray:
         """Numbers that an effect may change."""
         mask = np.zeros(len(self.value), bool)
-        for block, at in zip(self.blocks, self.slices, strict=True):
-            mask[at] = block.touched_by(effect)
+        for touched, at in zip(self.acts(effect), self.slices, strict=True):
+            mask[at] = touched
         return mask
 
     def held_out(self, effects: Effects = (), where: np.ndarray | None = None) -> tuple[float, int]:
@@ -184,12 +289,10 @@ class Evidence:
         out = ~self.seen if where is None else ~self.seen & where
         if not out.any():
             return 0.0, 0
-        model = self.gaussian(effects)
-        residual = self.value - model.mean
-        both = self.seen | out
         # p(held out | seen) = p(both) / p(seen)
-        all_of = chi2(residual[both], model.covariance[np.ix_(both, both)])
-        given = chi2(residual[self.seen], model.covariance[np.ix_(self.seen, self.seen)])
+        both = self.seen | out
+        all_of = self.gaussian(effects, both).chi2(self.value[both])
+        given = self.seen_gaussian(effects).chi2(self.seen_value)
         return max(all_of - given, 0.0), int(out.sum())
 
     def captures(self, held_out: bool, where: np.ndarray | None = None) -> tuple[str, ...]:
@@ -205,13 +308,6 @@ def chi2(residual: FloatArray, covariance: FloatArray) -> float:
     """residual' covariance^-1 residual."""
     white = solve_triangular(cholesky(covariance, lower=True), residual, lower=True)
     return float(white @ white)
-
-
-def log_likelihood(residual: FloatArray, covariance: FloatArray) -> float:
-    """Of a normal distribution, without the constant."""
-    lower = cholesky(covariance, lower=True)
-    white = solve_triangular(lower, residual, lower=True)
-    return float(-0.5 * white @ white - np.log(np.diag(lower)).sum())
 
 
 def conditional(

@@ -62,9 +62,9 @@ def improved_model(
     if fit is None and baseline is None:
         camera = evidence.camera
     # what is measured is electrons times gain: of another gain, the curves take up the difference
-    applied, process = _applied(evidence, unknown)
-    quantities = evidence.quantities(effects, process)
-    pull = evidence.pull(effects, process)
+    applied, processes = _applied(evidence, unknown)
+    quantities = evidence.quantities(effects, processes)
+    pull = evidence.pull(effects, processes)
     share = evidence.camera.conversion_gain_dn_per_e / camera.conversion_gain_dn_per_e
     curves = {
         channel: _scaled(freed, share if freed is not curve else 1.0)
@@ -96,9 +96,11 @@ def improved_model(
     return CameraFile(f"{recordings.manifest.name} {side}".strip(), improved, tuple(acting)), tuple(corrections)
 
 
-def _applied(evidence: Evidence, unknown: Sequence[Discrepancy]) -> tuple[list[tuple[Applied | None, str]], FloatArray]:
-    """What each discrepancy is applied as, or why it isn't, and the joint covariance of those that are."""
-    process = np.zeros((len(evidence.value), len(evidence.value)))
+def _applied(
+    evidence: Evidence, unknown: Sequence[Discrepancy]
+) -> tuple[list[tuple[Applied | None, str]], dict[int, FloatArray]]:
+    """What each discrepancy is applied as, or why it isn't, and the covariances of those that are, by their block."""
+    processes: dict[int, FloatArray] = {}
     found: list[tuple[Applied | None, str]] = []
     for gap in unknown:
         kind = _place_for(evidence.blocks[gap.index])
@@ -110,9 +112,8 @@ def _applied(evidence: Evidence, unknown: Sequence[Discrepancy]) -> tuple[list[t
             found.append((None, "another correction acts there already"))
         else:
             found.append((kind, ""))
-            at = evidence.slices[gap.index]
-            process[at, at] += gap.kernel
-    return found, process
+            processes[gap.index] = gap.kernel
+    return found, processes
 
 
 def _place_for(block: Block) -> Applied | None:

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import least_squares
 
-from lab.diagnose.evidence import Evidence, log_likelihood
+from lab.diagnose.evidence import Evidence, Gaussian
 from lab.diagnose.summaries import Effects
 from sim.effects.base import Effect
 from sim.parameters import Quantity
@@ -85,8 +84,7 @@ def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tupl
 
 def likelihood(evidence: Evidence, effects: Effects) -> float:
     """Of the seen numbers under the effects as they stand."""
-    model = evidence.seen_gaussian(effects)
-    return log_likelihood(evidence.seen_value - model.mean, model.covariance)
+    return evidence.seen_gaussian(effects).log_likelihood(evidence.seen_value)
 
 
 def refit(
@@ -111,15 +109,13 @@ def refit(
     prior_std = np.array([s**c.quantity.slope_power for s, c in zip(prior_std, coords, strict=True)])
     jacobian = np.zeros((int(seen.sum()), len(coords)))
     for turn in range(passes):
-        lower = cholesky(evidence.seen_gaussian(moved(effects, coords, u)).covariance, lower=True)
+        model = evidence.seen_gaussian(moved(effects, coords, u))
 
-        def residual(at: FloatArray, lower: FloatArray = lower) -> FloatArray:
-            white = solve_triangular(
-                lower, (evidence.value - evidence.mean(moved(effects, coords, at)))[seen], lower=True
-            )
+        def residual(at: FloatArray, model: Gaussian = model) -> FloatArray:
+            white = model.white((evidence.value - evidence.mean(moved(effects, coords, at)))[seen])
             return np.concatenate([white, (at - prior_centre) / prior_std])
 
-        def slope(at: FloatArray, lower: FloatArray = lower) -> FloatArray:
+        def slope(at: FloatArray, model: Gaussian = model) -> FloatArray:
             # steps of 2 % of a typical size, towards the inside of the bounds
             base = evidence.mean(moved(effects, coords, at))[seen]
             columns = []
@@ -129,7 +125,7 @@ def refit(
                 shifted = at.copy()
                 shifted[k] += step
                 columns.append((base - evidence.mean(moved(effects, coords, shifted))[seen]) / step)
-            white = solve_triangular(lower, np.array(columns).T, lower=True)
+            white = model.white(np.array(columns).T)
             return np.vstack([white, np.diag(1.0 / prior_std)])
 
         inside = np.clip(u, low + 1e-9 * scale, high - 1e-9 * scale)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from lab.diagnose.evidence import Evidence
@@ -110,11 +109,10 @@ def signatures(
     seen = evidence.seen
     model = evidence.seen_gaussian(current)
     base = evidence.mean(current)
-    lower = cholesky(model.covariance, lower=True)
-    white = solve_triangular(lower, evidence.seen_value - model.mean, lower=True)
+    white = model.white(evidence.seen_value - model.mean)
     out = np.zeros((len(white), 0))
     if tangents is not None and tangents.size:
-        out = _span(solve_triangular(lower, tangents[seen], lower=True))
+        out = _span(model.white(tangents[seen]))
         white = white - out @ (out.T @ white)
     columns = []
     for effect in candidates:
@@ -124,7 +122,7 @@ def signatures(
             raw = np.stack([evidence.mean((*current, p)) - base for p in prototypes], axis=1)[seen]
             if not np.any(np.abs(raw) > 0):
                 continue
-            table = solve_triangular(lower, raw, lower=True)
+            table = model.white(raw)
             table = table - out @ (out.T @ table)
             columns.append((effect, prototypes, table))
     return Signatures(white, columns)

@@ -542,18 +542,20 @@ def contrast_block(study: Study) -> Block:
     frequency = np.array([label.x for label in labels])
     covariance = _joint(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
     scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
+    # drawn alike and seen in the same light, what is held out has its twin's prediction
+    sights: dict[tuple[str, Spectrum | None, int], tuple[Pattern, list[int], list[int]]] = {}
+    for k, (number, p, b) in enumerate(places):
+        _, members, parts = sights.setdefault((p.channel, p.light, number), (p, [], []))
+        members.append(k)
+        parts.append(b)
+    plain = [_transfer(study, p, ()) for p, _, _ in sights.values()]
 
     def predict(effects: Effects) -> Prediction:
         mean = np.ones(len(places))
         if effects:
-            kept: dict[tuple[str, Spectrum | None, int], FloatArray] = {}
-            for k, (number, p, b) in enumerate(places):
-                key = p.channel, p.light, number
-                if key not in kept:
-                    kept[key] = _contrasts(study, p, effects)
-                mean[k] = kept[key][b]
-                if not np.isfinite(mean[k]):
-                    mean[k] = 1.0
+            for (p, members, parts), before in zip(sights.values(), plain, strict=True):
+                mean[members] = _contrasts(study, p, effects, before)[parts]
+            mean[~np.isfinite(mean)] = 1.0
         slopes = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
         for name in dict.fromkeys(scales):
             slopes[name] = CONTRAST_SCALE_STD * mean * np.array([s == name for s in scales])
@@ -580,11 +582,15 @@ def _joint(places: Sequence[tuple[int, Pattern, int]], study: Study) -> FloatArr
     return table
 
 
-def _contrasts(study: Study, p: Pattern, effects: Effects) -> FloatArray:
-    """Contrast in every band with the effects over that without."""
+def _transfer(study: Study, p: Pattern, effects: Effects) -> FloatArray:
+    """At the frequencies of all bands, one after another."""
     fx, fy = np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])
-    plain = np.real(optical_transfer(study.camera, p.channel, p.light, fx, fy, (), "bernoulli"))
-    changed = np.real(optical_transfer(study.camera, p.channel, p.light, fx, fy, effects, "bernoulli"))
+    return np.real(optical_transfer(study.camera, p.channel, p.light, fx, fy, effects, "bernoulli"))
+
+
+def _contrasts(study: Study, p: Pattern, effects: Effects, plain: FloatArray) -> FloatArray:
+    """Contrast in every band with the effects over that without, whose transfer is `plain`."""
+    changed = _transfer(study, p, effects)
     ratio = changed / np.where(np.abs(plain) > 1e-3, plain, np.inf)
     ends = np.cumsum([len(b.fx) for b in p.bands])
     halves = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from lab.diagnose.evidence import Evidence
@@ -15,6 +15,10 @@ MOST_EFFECTS = 4
 SCREENED = 8  # candidates that are refitted for a set
 PAIRS = 4  # pairs that are refitted at the start
 BEAM = 2  # sets of one size from which the search goes on
+#: Of the best score: what is below it isn't refitted, as its refit would have to gain so many times what it promises.
+HOPELESS_SHARE = 0.1
+#: Of what a member gains, in nats: the score from which on an effect may stand in its place.
+RIVAL_FROM = 0.6
 #: Nats below the best by which a set may lie and still be gone on from.
 BEHIND = 25.0
 
@@ -34,13 +38,13 @@ class Search:
 
     def best(self, report: Callable[[str], None] = lambda _: None) -> Fit:
         """Grow sets effect by effect, then leave out and exchange members while that is worth more."""
-        current = self._fitted((), final=True)
+        current = self.fitted((), final=True)
         beam = [current]
         for count in range(MOST_EFFECTS):
             report(f"looking for {'another' if count else 'an'} effect")
             grown = [fit for state in beam for fit in self._grown(state)]
             grown = sorted({frozenset(f.names): f for f in grown}.values(), key=self.worth, reverse=True)
-            beam = [self._fitted(f.effects, final=True) for f in grown[:BEAM]]
+            beam = [self.fitted(f.effects, final=True) for f in grown[:BEAM]]
             beam = sorted(beam, key=self.worth, reverse=True)
             if not beam or self.worth(beam[0]) < self.worth(current) - BEHIND:
                 break
@@ -59,33 +63,37 @@ class Search:
             [e for e in self.known if e.name not in state.names],
             state.tangents,
         )
-        scores = [s for s in found.scores() if s.value > self.threshold][:SCREENED]
+        every = found.scores()
+        least = max(self.threshold, HOPELESS_SHARE * every[0].value) if every else self.threshold
+        scores = [s for s in every if s.value > least][:SCREENED]
         starts: list[Effects] = [(*state.effects, s.start) for s in scores]
         if not state.effects:
-            single = scores[0].value if scores else self.threshold
+            single = every[0].value if every else self.threshold
             starts += [pair.starts for pair in found.pairs(PAIRS) if pair.value > single + self.threshold]
-        return [self._fitted(start) for start in starts]
+        return [self.fitted(start) for start in starts]
 
     def _mended(self, fit: Fit) -> Fit:
         """With members left out or exchanged for a declared rival, while that is worth more."""
         while fit.effects:
             others = [tuple(e for e in fit.effects if e is not gone) for gone in fit.effects]
-            tried = [self._fitted(rest, final=True) for rest in others]
+            tried = [self.fitted(rest, final=True) for rest in others]
             if len(fit.effects) > 1:
-                tried += [f for i in range(len(fit.effects)) for f in self._exchanged(fit, i)]
+                tried += [f for i, rest in enumerate(tuple(tried)) for f in self._exchanged(fit, i, rest)]
             better = max(tried, key=self.worth)
             if self.worth(better) <= self.worth(fit) + 0.5:
                 return fit
-            fit = self._fitted(better.effects, final=True)
+            fit = self.fitted(better.effects, final=True)
         return fit
 
-    def _exchanged(self, fit: Fit, index: int) -> list[Fit]:
+    def _exchanged(self, fit: Fit, index: int, without: Fit) -> list[Fit]:
         rest = (*fit.effects[:index], *fit.effects[index + 1 :])
         rivals = type(fit.effects[index]).rivals
         kinds = [e for e in self.known if e.name in rivals and e.name not in fit.names]
-        return [self._fitted((*rest, start)) for start in starts_beside(self.evidence, rest, kinds)]
+        scores = signatures(self.evidence, self.evidence.camera, rest, kinds).scores()
+        least = RIVAL_FROM * (fit.weight - without.weight)
+        return [self.fitted((*rest, s.start)) for s in scores if s.value > least]
 
-    def _fitted(self, start: Effects, *, final: bool = False) -> Fit:
+    def fitted(self, start: Effects, *, final: bool = False) -> Fit:
         """A set's fit, made once (a rough one is good to tell sets apart; `final`: to convergence)."""
         key = frozenset(e.name for e in start)
         if key not in self.fits or (final and not self.fits[key].final):
@@ -94,8 +102,3 @@ class Search:
             made = refit(self.evidence, from_here, passes=passes, evaluations=evaluations, final=final)
             self.fits[key] = made
         return self.fits[key]
-
-
-def starts_beside(evidence: Evidence, rest: Effects, kinds: Iterable[type[Effect]]) -> list[Effect]:
-    """Where refits of effects beside `rest` begin: their prototypes' best combination for what the rest leaves."""
-    return [score.start for score in signatures(evidence, evidence.camera, rest, kinds).scores() if score.value > 0]

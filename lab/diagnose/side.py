@@ -18,7 +18,6 @@ from lab.diagnose.looked_at import measurement_fits, places, visibility
 from lab.diagnose.next_capture import Proposal, proposals
 from lab.diagnose.pictures import residual_pictures
 from lab.diagnose.summaries import Block
-from lab.diagnose.unknown import with_discrepancy
 from lab.recording import RecordingSet
 from lab.results import (
     FitResult,
@@ -182,7 +181,7 @@ def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]
         only = np.ix_(index, index)
         residual = (evidence.value - model.mean)[index]
         before = float(residual @ np.linalg.solve(model.covariance[only], residual))
-        after = float(residual @ np.linalg.solve(with_discrepancy(evidence, model, gap).covariance[only], residual))
+        after = float(residual @ np.linalg.solve(model.plus(gap.index, gap.kernel).covariance[only], residual))
         where = describe(evidence, model, part)[0] if part is not None else "along the whole axis"
         families = [
             f"{c.effect.name} ({100 * c.probability:.0f} %)"

@@ -29,11 +29,12 @@ class Discrepancy:
 
 
 def discrepancy(evidence: Evidence, model: Gaussian, index: int) -> Discrepancy:
-    """Maximum of the marginal likelihood over amplitude, reach and kinship of a squared-exponential process; block by block."""
+    """Maximum of the marginal likelihood over amplitude, reach and kinship of a squared-exponential process; block by block.
+    `model`: of the seen numbers."""
     block, at = evidence.blocks[index], evidence.slices[index]
     seen = evidence.seen[at]
-    residual = (evidence.value - model.mean)[at][seen]
-    covariance = model.covariance[at, at][np.ix_(seen, seen)]
+    residual = evidence.value[at][seen] - model.mean[model.slices[index]]
+    covariance = model.of(index)
     x = block.position
     channel = np.array([label.channel for label in block.labels])
     condition = np.array([label.condition for label in block.labels])
@@ -81,10 +82,3 @@ def _smooth(x: FloatArray, reach: float) -> FloatArray:
 def _by_group(factor: FloatArray, group: NDArray[np.intp]) -> FloatArray:
     """The factor's columns once for every group, nil outside it: the process is drawn for each group by itself."""
     return np.concatenate([np.where((group == g)[:, None], factor, 0.0) for g in range(int(group.max()) + 1)], axis=1)
-
-
-def with_discrepancy(evidence: Evidence, model: Gaussian, found: Discrepancy) -> Gaussian:
-    """The model with the process in its covariance."""
-    covariance = model.covariance.copy()
-    covariance[evidence.slices[found.index], evidence.slices[found.index]] += found.kernel
-    return Gaussian(model.mean, covariance)

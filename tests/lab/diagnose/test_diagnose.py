@@ -10,7 +10,7 @@ import pytest
 
 from lab.diagnose import diagnose
 from lab.diagnose.decide import decide
-from lab.diagnose.evidence import Evidence, chi2, log_likelihood
+from lab.diagnose.evidence import Evidence, Gaussian, Within, chi2
 from lab.diagnose.locate import look
 from lab.diagnose.refit import refit
 from lab.diagnose.score import signatures
@@ -147,9 +147,9 @@ def test_slices_find_nothing_in_noise_and_the_place_of_a_bump() -> None:
 
 def test_unknown_process_takes_a_smooth_discrepancy_and_leaves_noise() -> None:
     quiet = _evidence(np.random.default_rng(11))
-    assert discrepancy(quiet, quiet.gaussian(), 0).gain == 0.0
+    assert discrepancy(quiet, quiet.seen_gaussian(), 0).gain == 0.0
     wave = _evidence(np.random.default_rng(12), (), 0.03 * np.sin(6.0 * FREQUENCY))
-    found = discrepancy(wave, wave.gaussian(), 0)
+    found = discrepancy(wave, wave.seen_gaussian(), 0)
     assert found.gain > 50.0
     assert 0.005 < found.amplitude < 0.1
 
@@ -180,13 +180,28 @@ def test_what_nobody_lists_gets_no_name() -> None:
 
 
 def test_gaussians_agree_with_their_formulas() -> None:
+    """Blocks by themselves, tied by free quantities: whitened, solved and weighed as the dense matrix is."""
     rng = np.random.default_rng(5)
-    a = rng.standard_normal((4, 4))
-    covariance, r = a @ a.T + np.eye(4), rng.standard_normal(4)
-    assert chi2(r, covariance) == pytest.approx(r @ np.linalg.inv(covariance) @ r)
-    assert log_likelihood(r, covariance) == pytest.approx(
-        -0.5 * r @ np.linalg.inv(covariance) @ r - 0.5 * np.log(np.linalg.det(covariance))
-    )
+    blocks = [a @ a.T + np.eye(len(a)) for a in (rng.standard_normal((4, 4)), rng.standard_normal((3, 3)))]
+    free = rng.standard_normal((7, 2)) * (1.0, 1e3)  # one all but undetermined beforehand
+    model = Gaussian(rng.standard_normal(7), tuple(Within(b) for b in blocks), free)
+    dense = free @ free.T
+    dense[:4, :4] += blocks[0]
+    dense[4:, 4:] += blocks[1]
+    np.testing.assert_allclose(model.covariance, dense)
+    np.testing.assert_allclose(model.of(1), dense[4:, 4:])
+    y = model.mean + rng.standard_normal(7)
+    r = y - model.mean
+    # the dense inverse is good to 1e-16 of the condition of 1e7
+    solved = np.linalg.solve(dense, r)
+    np.testing.assert_allclose(model.solved(r), solved, rtol=1e-4, atol=1e-6)
+    white = model.white(np.column_stack([r, free]))
+    np.testing.assert_allclose(white.T @ white, np.column_stack([r, free]).T @ model.solved(np.column_stack([r, free])), rtol=1e-6, atol=1e-9)  # fmt: skip
+    assert model.chi2(y) == pytest.approx(r @ solved, rel=1e-4)
+    assert chi2(r, dense) == pytest.approx(r @ solved, rel=1e-4)
+    assert model.log_likelihood(y) == pytest.approx(-0.5 * r @ solved - 0.5 * np.linalg.slogdet(dense)[1], rel=1e-4)
+    more = model.plus(0, np.eye(4))
+    np.testing.assert_allclose(more.covariance - dense, np.diag([1.0] * 4 + [0.0] * 3), atol=1e-4)
 
 
 # --- recordings ------------------------------------------------------------------------------------------------------------

@@ -104,7 +104,7 @@ def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
     ripple = 0.1 * np.sin(9.0 * FREQUENCY)
     block, content = _edges(ripple)
     evidence = Evidence((block,), content.camera)
-    gap = discrepancy(evidence, evidence.gaussian(), 0)
+    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
     improved, corrections = improved_model(SET, "left", None, content, evidence, (), (gap,))
     assert [(c.measurement, c.kind) for c in corrections] == [("slanted_edge", "transfer")]
     (one,) = improved.effects
@@ -119,7 +119,7 @@ def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
 def test_what_the_model_has_no_place_for_is_said() -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
     evidence = Evidence((replace(block, measurement="patches_of_light", places="patches"),), content.camera)
-    gap = discrepancy(evidence, evidence.gaussian(), 0)
+    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
     improved, corrections = improved_model(SET, "left", None, content, evidence, (), (gap,))
     assert not improved.effects
     assert corrections[0].kind is None
@@ -137,6 +137,6 @@ def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str,
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
     other = replace(block, axis=axis, unit=unit, hooks=frozenset({hook}), conditions="")
     evidence = Evidence((other,), content.camera)
-    gap = discrepancy(evidence, evidence.gaussian(), 0)
+    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
     improved, _ = improved_model(SET, "left", None, content, evidence, (), (gap,))
     assert [e.along for e in improved.effects if isinstance(e, NamelessCorrection)] == [along]
