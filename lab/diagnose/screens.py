@@ -61,6 +61,7 @@ COLOUR_FLOOR_PX = (
     0.012  # cells of whole pixels alias alike everywhere: what a drawing gets wrong there doesn't average out
 )
 CERTAIN = 8.0  # standard deviations
+PLACINGS = 4  # steps in which a shifted picture is found
 GRID_STD = 1.3  # of the strongest line's number: the noise's mean is measured, too
 GRID_DETREND_PX = 8.0  # what is wider is shading
 GRID_LOWEST = 0.12  # cycles a sample: below, what was taken off as shading still tells
@@ -79,7 +80,7 @@ class Pattern:
     value: FloatArray  # (bands + MORE + parts beyond the bands,)
     shown: FloatArray  # covariance by what differs from repeat to repeat
     common: FloatArray  # ... and by what white, black and drawing share
-    mix: FloatArray  # (bands, 2 bands): what the halves of the bands contribute to the bands' coefficients
+    mix: FloatArray  # (bands, 4 bands): what the halves of the bands, then their phases, contribute to the bands' coefficients
     greys: FloatArray  # as `value`: what the coefficients become where every grey v is shown as v^2
     levels_e: tuple[float, float]  # electrons of black and of white
     light: Spectrum | None
@@ -102,6 +103,7 @@ class Band:
     fx: FloatArray
     fy: FloatArray
     share: FloatArray
+    power: float  # of the pattern in it
     upper: NDArray[np.bool_]  # nodes of the upper half of the frequencies
 
 
@@ -400,7 +402,7 @@ class _Design:
     columns: FloatArray
     fixed: FloatArray
     inverse: FloatArray  # of the normal matrix
-    mix: FloatArray  # (bands, 2 bands): what the halves of the bands contribute to the bands' coefficients
+    mix: FloatArray  # (bands, 4 bands): what the halves of the bands, then their phases, contribute to the bands' coefficients
     greys: FloatArray
     reach: float
 
@@ -416,7 +418,7 @@ class _Design:
         spectrum = canvas.low * passed
         mask = _pixels(study, canvas, channel, seen)
         power = np.abs(spectrum) ** 2
-        bands, columns, halves = [], [], []
+        bands, columns, halves, turned_halves = [], [], [], []
         low_part = np.zeros(canvas.shape)
         for i, (low, high) in enumerate(pairwise(RINGS_CY_PER_PX)):
             ring = (radius >= low) & (radius < high)
@@ -427,10 +429,11 @@ class _Design:
                 if not part.any():
                     continue
                 # in two halves, so that what a transfer does within the band is known
-                split = 0.5 * (low + high)
-                pieces = [
-                    canvas.picture(np.where(part & side, spectrum, 0.0)) for side in (radius < split, radius >= split)
-                ]
+                sides = [part & (radius < 0.5 * (low + high)), part & (radius >= 0.5 * (low + high))]
+                pieces = [canvas.picture(np.where(side, spectrum, 0.0)) for side in sides]
+                # a quarter of a period on along the band's direction: what a transfer's phase adds
+                on = 1j * np.where(np.cos(angle - middle) >= 0, spectrum, -spectrum)
+                turned_halves += [canvas.picture(np.where(side, on, 0.0))[mask] for side in sides]
                 picture = pieces[0] + pieces[1]
                 low_part += picture
                 columns.append(picture[mask])
@@ -465,7 +468,7 @@ class _Design:
         normal = (table / scale[:, None]) @ (table / scale[:, None]).T
         inverse = np.linalg.inv(normal) / np.outer(scale, scale)
         lost = canvas.picture(canvas.bent * passed - spectrum)[mask]
-        mix = (inverse @ (table @ np.array(halves).T))[: len(bands)]
+        mix = (inverse @ (table @ np.array(halves + turned_halves).T))[: len(bands)]
         return _Design(
             mask, tuple(bands), table, fixed, inverse, mix, inverse @ (table @ lost), float(np.sqrt(r2.max()))
         )
@@ -517,6 +520,7 @@ def _band(
         at_r * np.cos(at_a),
         at_r * np.sin(at_a),
         share,
+        float(total.sum()),
         np.flatnonzero(keep) // NODES[1] >= NODES[0] // 2,
     )
 
@@ -582,25 +586,45 @@ def _joint(places: Sequence[tuple[int, Pattern, int]], study: Study) -> FloatArr
     return table
 
 
-def _transfer(study: Study, p: Pattern, effects: Effects) -> FloatArray:
+def _transfer(study: Study, p: Pattern, effects: Effects) -> NDArray[np.complex128]:
     """At the frequencies of all bands, one after another."""
     fx, fy = np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])
-    return np.real(optical_transfer(study.camera, p.channel, p.light, fx, fy, effects, "bernoulli"))
+    return optical_transfer(study.camera, p.channel, p.light, fx, fy, effects, "bernoulli")
 
 
-def _contrasts(study: Study, p: Pattern, effects: Effects, plain: FloatArray) -> FloatArray:
-    """Contrast in every band with the effects over that without, whose transfer is `plain`."""
+def _contrasts(study: Study, p: Pattern, effects: Effects, plain: NDArray[np.complex128]) -> FloatArray:
+    """Contrast in every band with the effects over that without, whose transfer is `plain`, where the pattern comes to lie."""
     changed = _transfer(study, p, effects)
-    ratio = changed / np.where(np.abs(plain) > 1e-3, plain, np.inf)
-    ends = np.cumsum([len(b.fx) for b in p.bands])
-    halves = []
-    for band, end in zip(p.bands, ends, strict=True):
-        own = ratio[end - len(band.fx) : end]
+    ratio = _in_place(p, changed / np.where(np.abs(plain) > 1e-3, plain, np.inf))
+    halves = np.concatenate([_halves(p, np.real(ratio)), _halves(p, np.imag(ratio))])
+    return p.mix @ halves + _greyness(effects, study) * p.greys[: len(p.bands)]
+
+
+def _halves(p: Pattern, at_nodes: FloatArray) -> list[float]:
+    """Means over the lower and the upper half of every band."""
+    halves, start = [], 0
+    for band in p.bands:
+        own = at_nodes[start : start + len(band.fx)]
+        start += len(band.fx)
         whole = float(band.share @ own)
         for use in (~band.upper, band.upper):
             total = float(band.share[use].sum())
             halves.append(float(band.share[use] @ own[use]) / total if total > 0 else whole)
-    return p.mix @ np.array(halves) + _greyness(effects, study) * p.greys[: len(p.bands)]
+    return halves
+
+
+def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """A change of transfer where the drawing is laid over the picture: a shift s that least squares find, of which
+    sum P f Im(ratio exp(-2 pi i f s)) = 0 along both axes (Gauss and Newton), isn't a loss of contrast."""
+    if not np.any(np.abs(np.imag(ratio)) > 1e-6):
+        return ratio
+    turn = 2.0 * np.pi * np.array([np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])])
+    weight = np.concatenate([b.power * b.share for b in p.bands])
+    for _ in range(PLACINGS):
+        slope = (turn * weight * np.maximum(np.real(ratio), 0.0)) @ turn.T
+        shift = np.linalg.lstsq(slope, (turn * weight) @ np.imag(ratio), rcond=1e-9)[0]
+        ratio = ratio * np.exp(-1j * shift @ turn)
+    return ratio
 
 
 def _greyness(effects: Effects, study: Study) -> float:
