@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from lab.store import Store
 
 EXIT_INTERNAL, EXIT_INPUT, EXIT_CHECK, EXIT_INTERRUPTED = 1, 2, 4, 130
+#: Drawn cameras from which a threshold is taken: a standard deviation of fewer is known to a quarter and worse.
+FEWEST_DRAWS = 10
 
 app = typer.Typer(
     name="calibench",
@@ -202,11 +204,12 @@ def _examined(
     baseline: dict[Side, CameraFile] | None = None,
     *,
     pictures: bool = True,
+    bootstrap: int = 0,
 ) -> Diagnosis:
     from lab.diagnose import examine
 
     with _bar("diagnose") as advance:
-        return examine(recordings, fit, advance, baseline=baseline, pictures=pictures)
+        return examine(recordings, fit, advance, baseline=baseline, pictures=pictures, bootstrap=bootstrap)
 
 
 def _camera_path(recordings: RecordingSet, side: Side, path: Path) -> Path:
@@ -419,14 +422,25 @@ def diagnose(
         typer.Option("--save", metavar="DIR", help="write each camera with what was found as DIR/SIDE.toml"),
     ] = None,
     model: Model = None,
+    bootstrap: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help=f"draw N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
+        ),
+    ] = 0,
 ) -> None:
     """Name the physics that the model left out, where the recordings show any."""
+    if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
+        raise InputError(
+            f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
+        )
     _check_writable(json)
     recordings = _recordings(source)
     if save is not None:
         _camera_path(recordings, recordings.sides[0], save)
     baseline = _read_models(recordings, model)
-    found = _examined(recordings, _fitted(recordings, fit_file), baseline, pictures=False)
+    found = _examined(recordings, _fitted(recordings, fit_file), baseline, pictures=False, bootstrap=bootstrap)
     if str(json) != "-":
         _print_diagnosis(found.result)
     _write_json(found.result, json)

@@ -55,13 +55,15 @@ def examine(
     baseline: Mapping[Side, CameraFile] | None = None,
     at_once: bool = True,
     pictures: bool = False,
+    bootstrap: int = 0,
 ) -> Diagnosis:
     """Diagnose every side. `fit` gives the geometry and, where the maker states no curves, the sensitivities; None: neither.
 
     Noise and levels are taken from the recordings anew, as free quantities of the same model. What the recordings don't
     determine is not judged, and stands in `skipped`. `baseline`: cameras with their effects, in place of the maker's word and the
     fit, for the sides that it has. Several sides are worked on at the same time, each in a process of its own; one side, or with
-    `at_once` False each in its turn, in this one. `pictures`: draw residual pictures, for the report. `progress` is called in the caller's thread.
+    `at_once` False each in its turn, in this one. `pictures`: draw residual pictures, for the report.
+    `bootstrap`: so many healthy cameras like the baseline are drawn frame by frame, whose scores the threshold has to hold. `progress` is called in the caller's thread.
     """
     shares = dict.fromkeys(recordings.sides, 0.0)
     cameras = baseline or {}
@@ -73,11 +75,17 @@ def examine(
 
     def alone(side: Side) -> SideFindings:
         return diagnose_side(
-            recordings, side, fit, cameras.get(side), lambda text: report(side, text), pictures=pictures
+            recordings,
+            side,
+            fit,
+            cameras.get(side),
+            lambda text: report(side, text),
+            pictures=pictures,
+            bootstrap=bootstrap,
         )
 
     if at_once and len(shares) > 1:
-        found = in_processes(recordings, fit, cameras, report, pictures=pictures)
+        found = in_processes(recordings, fit, cameras, report, pictures=pictures, bootstrap=bootstrap)
     else:
         found = [alone(side) for side in recordings.sides]
     if progress is not None:

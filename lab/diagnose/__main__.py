@@ -20,8 +20,8 @@ def _serve() -> None:
             to.flush()
 
         try:
-            recordings, side, fit, baseline, pictures = pickle.load(sys.stdin.buffer)
-            say(diagnose_side(recordings, side, fit, baseline, say, pictures=pictures))
+            recordings, side, fit, baseline, pictures, bootstrap = pickle.load(sys.stdin.buffer)
+            say(diagnose_side(recordings, side, fit, baseline, say, pictures=pictures, bootstrap=bootstrap))
         except BrokenPipeError:
             os._exit(1)  # nobody listens any more
         except Exception as error:

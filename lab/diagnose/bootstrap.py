@@ -1,12 +1,13 @@
 """A bootstrap of images: what a healthy camera like the fitted baseline would score, drawn frame by frame by the forward model.
 
-The threshold in `decide.py` is drawn from the covariance of the measurements. Here the baseline's frames are drawn instead, with
+The threshold in `decide.py` is drawn from the covariance of the measurements, in no time. Here the baseline's frames are drawn instead, with
 patterns and noise of their own, and go through every estimator: what a covariance leaves out (estimators' errors, an edge's tail, rounding)
 shows in the scores.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,14 @@ def healthy_draws(
         if again is not None:
             found.append(_draw_of(again))
     return found
+
+
+def image_threshold(draws: Sequence[HealthyDraw], false_alarm_rate: float) -> float:
+    """The score that a share `false_alarm_rate` of healthy cameras exceeds, of the extreme-value distribution (Gumbel's) that
+    has the draws' mean and standard deviation: the largest of many scores follows it, and few draws fix it."""
+    tops = np.array([d.top_score for d in draws])
+    scale = float(np.std(tops, ddof=1)) * np.sqrt(6.0) / np.pi
+    return float(np.mean(tops)) - scale * (np.euler_gamma + float(np.log(-np.log1p(-false_alarm_rate))))
 
 
 def _draw_of(evidence: Evidence) -> HealthyDraw:

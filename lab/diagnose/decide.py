@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from operator import and_
 
 import numpy as np
 
@@ -25,6 +26,14 @@ NAMED_FROM = 0.35
 CAUSE_FROM = 0.8
 #: The same where what is left is more than the law's own tolerance allows: a name that nearly fits isn't the cause.
 OPEN_CAUSE_FROM = 0.95
+#: From which share on a name needn't be all but sure, and how sure it has to be below that.
+WELL_EXPLAINED, SURE = 0.95, 0.8
+#: Of an effect's gain: what something unexplained in the same frames may have, or the effect is but a part of what that is.
+REMAINDER_SHARE = 0.1
+#: Of the first effect's: what a further one has to gain. The first one's law may be wrong, too.
+FURTHER = 1.5
+#: Of a stronger effect's gain: below that, what acts on the same measurement is taken for an error of its law.
+LEAST_SHARE = 1e-4
 #: A score that no slice and no refit bears out has to exceed the threshold by so much, for what a covariance doesn't hold.
 LONE_SCORE = 10.0
 #: A probability from which on a name isn't weighed again.
@@ -73,32 +82,64 @@ class Verdict:
         return tuple(c.effect for c in self.named)
 
 
-def decide(evidence: Evidence, rng: np.random.Generator, report: Callable[[str], None] = lambda _: None) -> Verdict:
-    """The whole chain on one side's evidence. Deterministic for a given generator."""
+def decide(
+    evidence: Evidence,
+    rng: np.random.Generator,
+    report: Callable[[str], None] = lambda _: None,
+    *,
+    least_threshold: float = 0.0,
+) -> Verdict:
+    """The whole chain on one side's evidence. Deterministic for a given generator. `least_threshold`: of the scores, where more is
+    known of healthy cameras than the covariance says (`bootstrap.py`)."""
     known = tuple(effect for effect in library().values() if effect.shown_by)
     first = signatures(evidence, evidence.camera, (), known)
-    threshold = first.threshold(rng, 1.0 - FALSE_ALARM_RATE)
+    threshold = max(first.threshold(rng, 1.0 - FALSE_ALARM_RATE), least_threshold)
     scores = first.scores()
     top = scores[0].value if scores else 0.0
     before = tuple(s for s in look(evidence, evidence.gaussian()) if s.significant)
     search = Search(evidence, known, threshold)
     named, abstained = _believed(search, search.best(report), report)
-    named.sort(key=lambda c: -c.gain)
-    effects = tuple(c.effect for c in named)
     if top > threshold + LONE_SCORE and not named and not before and not abstained:
         # something is off that no effect fits any better than nothing does
         abstained.append(Candidate(scores[0].start, {}, 0.0, (("unknown", 1.0),), 0.5 * top))
-    after = tuple(s for s in look(evidence, evidence.gaussian(effects)) if s.significant)
-    unexplained = {id(s.block): evidence.blocks.index(s.block) for s in after}
-    for c in abstained:
-        if not unexplained:
-            touched = max(
-                (i for i, b in enumerate(evidence.blocks) if b.touched_by(type(c.effect))),
-                key=lambda i: evidence.shown(c.effect, effects, i),
-            )
-            unexplained[id(evidence.blocks[touched])] = touched
-    unknown = tuple(discrepancy(evidence, evidence.seen_gaussian(effects), i) for i in unexplained.values())
-    return Verdict(evidence, threshold, top, before, tuple(named), tuple(abstained), after, unknown)
+    while True:
+        named.sort(key=lambda c: -c.gain)
+        effects = tuple(c.effect for c in named)
+        after = tuple(s for s in look(evidence, evidence.gaussian(effects)) if s.significant)
+        unexplained = {id(s.block): evidence.blocks.index(s.block) for s in after}
+        for c in abstained:
+            if not unexplained:
+                unexplained[id(evidence.blocks[_seat(evidence, c, effects)])] = _seat(evidence, c, effects)
+        unknown = tuple(discrepancy(evidence, evidence.seen_gaussian(effects), i) for i in unexplained.values())
+        parts = [c for c in named if after and _is_part(evidence, c, effects, unknown)]
+        if not parts:
+            return Verdict(evidence, threshold, top, before, tuple(named), tuple(abstained), after, unknown)
+        # weakest first: with it gone, what is left may be no more than another one's law allows
+        abstained.append(parts[-1])
+        rest = search.fitted(tuple(c.effect for c in named if c is not parts[-1]), final=True)
+        kept = {c.effect.name: c for c in named}
+        named = [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]
+
+
+def _seat(evidence: Evidence, candidate: Candidate, effects: Iterable[Effect]) -> int:
+    """The block in which an effect shows most beside others."""
+    others = tuple(e for e in effects if e.name != candidate.effect.name)
+    acts = evidence.acts(type(candidate.effect))
+    return max((i for i, a in enumerate(acts) if a), key=lambda i: evidence.shown(candidate.effect, others, i))
+
+
+def _is_part(
+    evidence: Evidence, candidate: Candidate, effects: Iterable[Effect], unknown: Iterable[Discrepancy]
+) -> bool:
+    """Whether the frames in which a name shows most hold something unexplained that is strong beside it: both may be one."""
+    seat = _seat(evidence, candidate, effects)
+    frames = _frames(evidence, seat)
+    strong = [g.index for g in unknown if g.index != seat and g.gain > REMAINDER_SHARE * candidate.gain]
+    return any(2 * len(frames & (seen := _frames(evidence, i))) > min(len(frames), len(seen)) for i in strong)
+
+
+def _frames(evidence: Evidence, index: int) -> set[str]:
+    return {name for label in evidence.blocks[index].labels for name in label.captures}
 
 
 def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tuple[list[Candidate], list[Candidate]]:
@@ -131,7 +172,10 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
             lost = [members[i] for i in crowd]
         else:
             companions = [c for c in members if _companion(c, members, evidence)]
-            weak = companions or [c for c in members if not _holds(c, threshold)]
+            first = max(c.gain for c in members)
+            weak = companions or [
+                c for c in members if not _holds(c, threshold if c.gain == first else FURTHER * threshold)
+            ]
             lost = sorted(weak, key=lambda c: c.gain)[:1]
         if not lost:
             return members, given_up
@@ -144,7 +188,7 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
 def _holds(candidate: Candidate, threshold: float) -> bool:
     return (
         candidate.unknown <= UNKNOWN_UP_TO
-        and candidate.probability >= NAMED_FROM
+        and candidate.probability >= (NAMED_FROM if candidate.explains >= WELL_EXPLAINED else SURE)
         and 2.0 * candidate.gain >= threshold
         and candidate.explains >= (CAUSE_FROM if candidate.closed else OPEN_CAUSE_FROM)
     )
@@ -158,11 +202,13 @@ def _companion(candidate: Candidate, members: list[Candidate], evidence: Evidenc
         candidate.effect.name in type(c.effect).rivals and candidate.gain < COMPANION_SHARE * c.gain for c in others
     ):
         return True
+    acts = evidence.acts(type(candidate.effect))
+    if any(
+        candidate.gain < LEAST_SHARE * c.gain and any(map(and_, acts, evidence.acts(type(c.effect)))) for c in others
+    ):
+        return True
     around = tuple(c.effect for c in others)
-    pulls = [
-        evidence.shown(candidate.effect, around, i) if b.touched_by(type(candidate.effect)) else 0.0
-        for i, b in enumerate(evidence.blocks)
-    ]
+    pulls = [evidence.shown(candidate.effect, around, i) if acting else 0.0 for i, acting in enumerate(acts)]
     most = int(np.argmax(pulls))
     for c in others:
         if evidence.blocks[most].touched_by(type(c.effect)):

@@ -38,6 +38,7 @@ def in_processes(
     report: Callable[[Side, str], None],
     *,
     pictures: bool = False,
+    bootstrap: int = 0,
 ) -> list[SideFindings]:
     """What every side shows, in the order of the sides. `report` is called in the caller's thread; what it raises, or what a
     process raised, ends all of them. Raises InputError where a process was ended from outside."""
@@ -46,7 +47,9 @@ def in_processes(
     with contextlib.ExitStack() as stack:
         for side in recordings.sides:
             # registered before it starts: an interrupt in between must find it
-            stack.enter_context(_Process(side, (recordings, side, fit, baseline.get(side), pictures), said)).start()
+            stack.enter_context(
+                _Process(side, (recordings, side, fit, baseline.get(side), pictures, bootstrap), said)
+            ).start()
         while len(found) < len(recordings.sides):
             try:
                 side, what = said.get(timeout=WAKE_S)

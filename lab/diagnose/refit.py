@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -157,8 +158,23 @@ def refit(
         )
     value = likelihood(evidence, best)
     prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
+    prior += sum(_usual_nats(e, s) for e, s in zip(best, std, strict=True))
     tangents = _tangents(evidence, best, coords, u, scale, high)
     return Fit(best, tuple(std), value, value + prior - PARAMETER_NATS * len(coords), tangents, final)
+
+
+def _usual_nats(effect: Effect, std: dict[str, float | None]) -> float:
+    """The most usual of what lies within a standard deviation of the values found: noise makes nothing unusual."""
+    if type(effect).usual_nats is Effect.usual_nats:
+        return 0.0
+    quantities = type(effect).quantities()
+    near = []
+    for name, spread in std.items():
+        value, low, high = float(getattr(effect, name)), quantities[name].lower, quantities[name].upper
+        around = (value - (spread or 0.0), value, value + (spread or 0.0))
+        near.append([min(max(v, -np.inf if low is None else low), np.inf if high is None else high) for v in around])
+    values = {name: getattr(effect, name) for name in type(effect).model_fields}
+    return max(type(effect)(**values | dict(zip(std, v, strict=True))).usual_nats() for v in product(*near))
 
 
 def _tangents(

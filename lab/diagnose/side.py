@@ -10,7 +10,8 @@ import numpy as np
 
 from lab.camera_file import CameraFile
 from lab.diagnose.blocks import evidence_of
-from lab.diagnose.decide import Candidate, Verdict, decide
+from lab.diagnose.bootstrap import healthy_draws, image_threshold
+from lab.diagnose.decide import FALSE_ALARM_RATE, Candidate, Verdict, decide
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.improved import Correction, improved_model
 from lab.diagnose.locate import describe
@@ -77,14 +78,22 @@ def diagnose_side(
     report: Report,
     *,
     pictures: bool = False,
+    bootstrap: int = 0,
 ) -> SideFindings:
-    """Everything that is told of one side. `pictures`: residual pictures, too, which take the forward model some seconds."""
+    """Everything that is told of one side. `pictures`: residual pictures, too, which take the forward model some seconds.
+    `bootstrap`: healthy recording sets that are drawn frame by frame for the threshold, each as long as summarising takes."""
     report("summarising the recordings")
     evidence, skipped = evidence_of(recordings, side, fit, baseline)
     if evidence is None:
         return SideFindings(side, skipped)
+    rng = np.random.default_rng(SEED)
+    least = 0.0
+    if bootstrap:
+        report(f"drawing {bootstrap} healthy cameras")
+        draws = healthy_draws(recordings, side, evidence, bootstrap, rng, fit, baseline)
+        least = image_threshold(draws, FALSE_ALARM_RATE)
     report("scoring the effects")
-    verdict = decide(evidence, np.random.default_rng(SEED), report)
+    verdict = decide(evidence, rng, report, least_threshold=least)
     report("looking for the next capture")
     improved, corrections = improved_model(recordings, side, fit, baseline, evidence, verdict.effects, verdict.unknown)
     return SideFindings(

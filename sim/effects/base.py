@@ -67,6 +67,11 @@ class Effect(Frozen):
             )
         return cls(**values)
 
+    def usual_nats(self) -> float:
+        """By how much this combination of values is less likely than the priors of the single ones say, at most 0: hardware
+        has its habits, that a rival with as many parameters hasn't."""
+        return 0.0
+
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         """Small or typical instances whose change of the prediction is the effect's signature in the score test.

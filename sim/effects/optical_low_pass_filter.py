@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
+
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.optics.filters import birefringent_displacement_um, birefringent_otf
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+
+#: Ratios of the displacements' squares between which two plates aren't nearly alike and one isn't alone, and what that costs.
+UNALIKE, UNUSUAL_NATS = (0.02, 0.08, 0.35, 0.55), -4.0
 
 
 class OpticalLowPassFilter(Effect):
@@ -67,6 +72,11 @@ class OpticalLowPassFilter(Effect):
     ] = 0.0
 
     plate: Literal["quartz"] | None = None
+
+    def usual_nats(self) -> float:
+        """Filters are made of one plate, or of two nearly alike: not of a thick one and one of a third of its strength."""
+        low, high = sorted((self.displacement_x_um**2, self.displacement_y_um**2))
+        return float(np.interp(low / high, UNALIKE, (0.0, UNUSUAL_NATS, UNUSUAL_NATS, 0.0))) if high > 0 else 0.0
 
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
