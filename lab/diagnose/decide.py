@@ -39,7 +39,7 @@ LONE_SCORE = 10.0
 #: A probability from which on a name isn't weighed again.
 CERTAIN = 0.99
 #: Of what a name gains, in nats: the score from which on a rival that it declares is fitted in its place.
-DECLARED_FROM = 0.3
+DECLARED_FROM = 0.6
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.

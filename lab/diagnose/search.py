@@ -17,8 +17,8 @@ PAIRS = 4  # pairs that are refitted at the start
 BEAM = 2  # sets of one size from which the search goes on
 #: Of the best score: what is below it isn't refitted, as its refit would have to gain so many times what it promises.
 HOPELESS_SHARE = 0.1
-#: Of what a member gains, in nats: the score from which on an effect may stand in its place.
-RIVAL_FROM = 0.6
+#: Of what a member gains, in nats: the score (two a nat) from which on an effect may stand in its place.
+RIVAL_FROM = 1.2
 #: Nats below the best by which a set may lie and still be gone on from.
 BEHIND = 25.0
 

@@ -13,7 +13,7 @@ from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
 #: Ratios of the displacements' squares between which two plates aren't nearly alike and one isn't alone, and what that costs.
-UNALIKE, UNUSUAL_NATS = (0.02, 0.08, 0.35, 0.55), -4.0
+UNALIKE, UNUSUAL_NATS = (0.002, 0.02, 0.35, 0.55), -4.0
 
 
 class OpticalLowPassFilter(Effect):

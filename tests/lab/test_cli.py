@@ -211,7 +211,7 @@ def test_diagnosis_with_a_stored_fit(
     assert cli.main(["fit", str(flats), "--json", str(tmp_path / "fit.json")]) == 0
     monkeypatch.setattr(cli, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
     result = DiagnosisResult(source="x", verdict="no_mismatch", skipped=(Skipped(step="mtf", reason="no [edges]"),))
-    monkeypatch.setattr(cli, "_examined", lambda recordings, fit, baseline, pictures: Diagnosis(result, {}))
+    monkeypatch.setattr(cli, "_examined", lambda recordings, fit, baseline, pictures, bootstrap: Diagnosis(result, {}))
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 0
     shown = capsys.readouterr().out
     assert "verdict: no_mismatch" in shown
@@ -219,6 +219,12 @@ def test_diagnosis_with_a_stored_fit(
     (tmp_path / "fit.json").write_text('{"format": "calibench-fit"}')
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 2
     assert "not what --json wrote" in capsys.readouterr().err
+
+
+def test_a_threshold_needs_more_than_a_few_draws(flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["diagnose", str(flats), "--bootstrap", "3"]) == 2
+    said = capsys.readouterr().err
+    assert "--bootstrap 3" in said and "10" in said
 
 
 @pytest.mark.parametrize(
