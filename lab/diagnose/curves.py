@@ -83,6 +83,11 @@ class CurveSlopes:
             )
         return np.array(found)
 
+    @cached_property
+    def sample_shares(self) -> FloatArray:
+        """Relative slopes of the baseline's rates by the light's relative value in each nanometre, (n, wavelengths): rows' sums are 1."""
+        return np.asarray(self._weight / np.maximum(self._total, 1e-300)[:, None])
+
     def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
         """Rates (n,) and the modes' shares in them (n, modes)."""
         spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))

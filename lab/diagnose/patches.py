@@ -102,7 +102,7 @@ def chart_block(study: Study) -> Block:
             out = effect.response(out, camera)
         lit = out * noise.gain - noise.dark_dn_per_s * exposures
         shift = np.array([study.offset(p.captures[0], effects) for p in points])
-        slopes = study.free_offsets(exposures)
+        slopes = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
         slopes |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.slopes(effects).items()}
         slopes["chart:scale"] = CHART_SCALE_STD * lit
         slopes["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2

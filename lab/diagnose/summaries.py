@@ -35,6 +35,7 @@ NARROWBAND_FLOOR = 1e-4  # of a level, each channel by itself, one for its repea
 TAIL_STD = 0.1  # of the light that the baseline's point spread itself sends into dark squares
 CLIPPED_SHARE = 2e-4
 USUAL_JITTER_DN = 0.02  # of a dark frame's mean, from repeat to repeat
+WARMTH_STD = 0.1  # of the dark current, a degree: it doubles within 5 to 10 degrees
 ALIKE_C = 2.0  # dark captures whose temperatures are that close count as of one
 NOISELESS_DN = 0.5  # a frame of less standard deviation may be like another by chance
 LEVEL_REACH = 0.8  # of a level's logarithm: over a factor of 2 a smooth departure from a line may change
@@ -271,6 +272,14 @@ class Study:
             "black": np.full(len(exposures), self.noise.black_std),
             "dark": exposures * self.noise.dark_std,
         }
+
+    def free_warmth(self, captures: Sequence[Capture]) -> dict[str, FloatArray]:
+        """Slope by what a degree does to the dark current of captures that aren't as warm as most; darks tell of it by themselves."""
+        if self.temperature_c is None:
+            return {}
+        warmer = [0.0 if c.temperature_c is None else c.temperature_c - self.temperature_c for c in captures]
+        exposures = np.array([c.exposure_s for c in captures])
+        return {"warmth": WARMTH_STD * self.noise.dark_dn_per_s * exposures * np.array(warmer)}
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,11 +30,13 @@ from lab.errors import NotDetermined
 from lab.predict import collected_electrons, mean_dn
 from lab.recording import Narrowband
 from sim.forward import electron_rate
-from sim.spectrum import FloatArray
+from sim.spectrum import FloatArray, Spectrum
 
 LEVEL_FLOOR = 1.0e-4  # of a level, one for its repeats: non-linearity below what a linear camera may have, and rounding
 READING_COLOUR_STD = 5e-4  # of a lamp's reading, by channel: the radiometer's noise by wavelength
 RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels, where too few readings say less
+READING_SAMPLE_STD = 1e-3  # of a narrowband reading, sample by sample, where no repeats tell
+MOST_SAMPLE_STD = 4e-3
 READING_STD = 1e-4  # what readings scatter at least
 _READINGS = 8  # wavelengths from which on their own scatter tells
 
@@ -88,7 +92,7 @@ def linearity_block(study: Study) -> Block:
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
             carried = noise.gain * study.carried_e(capture, channel, effects)
             mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
-        slopes = study.free_offsets(exposures)
+        slopes = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
         for lamp, channel in rate:
             slopes[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
         if len(lights) > len(set(study.lamps.values())):
@@ -182,24 +186,11 @@ def narrowband_block(study: Study) -> Block:
     value = np.array([p[2] for p in points])
     noise = study.noise
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 0.0)
-    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
     curves = CurveSlopes(study, [(c.radiance, channel, c.exposure_s, "narrowband", None) for c, channel, *_ in points])
     every = list(dict.fromkeys(c.radiance for c, *_ in points))
     known = [c for c in study.channels if c in study.camera.quantum_efficiency]
     whole = CurveSlopes(study, [(path, c, 1.0, "narrowband", None) for path in every for c in known])
-    rounded = curves.rounding * exposures * float(study.field.light.mean()) * noise.gain
-    shot = (noise.gain * signal + noise.read_dn**2) / pixels
-    frame = np.array([c.id for c, *_ in points])
-    setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
-    reading = np.array([c.radiance for c, *_ in points])
-    digits = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
-    own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2 + digits**2)
-    expected = curves.rates(()) * exposures
-    radiometer = signal * _reading_std(points, signal, shot, expected)
-    covariance = np.diag(shot) + (setting[:, None] == setting) * np.outer(own, own)
-    covariance += (reading[:, None] == reading) * np.outer(radiometer, radiometer)
-    scatter = signal * noise.jitter_lamp
-    covariance += (frame[:, None] == frame) * (np.outer(scatter, scatter) + noise.jitter_dn**2)
+    covariance = _narrowband_covariance(study, points, signal, curves)
 
     def predict(effects: Effects) -> Prediction:
         camera = study.camera
@@ -222,7 +213,8 @@ def narrowband_block(study: Study) -> Block:
             carried = noise.gain * study.carried_e(capture, channel, effects)
             mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
             share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
-        slopes = study.free_offsets(exposures) | {k: v * share for k, v in curves.slopes(effects).items()}
+        slopes = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+        slopes |= {k: v * share for k, v in curves.slopes(effects).items()}
         return Prediction(mean, slopes)
 
     return Block(
@@ -230,6 +222,33 @@ def narrowband_block(study: Study) -> Block:
         labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
         hooks=UNIFORM_HOOKS | SEQUENCE_HOOKS | SPECTRAL_HOOKS, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
+
+
+def _narrowband_covariance(
+    study: Study, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveSlopes
+) -> FloatArray:
+    """Of narrowband signals: shot and read noise, what is one for repeats, the radiometer's reading, the lamp's scatter."""
+    noise = study.noise
+    exposures = np.array([c.exposure_s for c, *_ in points])
+    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
+    rounded = curves.rounding * exposures * float(study.field.light.mean()) * noise.gain
+    shot = (noise.gain * signal + noise.read_dn**2) / pixels
+    frame = np.array([c.id for c, *_ in points])
+    setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
+    reading = np.array([c.radiance for c, *_ in points])
+    digits = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
+    own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2 + digits**2)
+    expected = curves.rates(()) * exposures
+    radiometer = signal * _reading_std(points, signal, shot, expected)
+    covariance = np.diag(shot) + (setting[:, None] == setting) * np.outer(own, own)
+    readings: dict[float, dict[str, Spectrum]] = {}
+    for c, *_ in points:
+        readings.setdefault(c.wavelength_nm, {})[c.radiance] = study.spectrum(c.radiance)
+    sampled = curves.sample_shares * (_sample_std([*r.values()] for r in readings.values()) * signal)[:, None]
+    covariance += (reading[:, None] == reading) * (np.outer(radiometer, radiometer) + sampled @ sampled.T)
+    scatter = signal * noise.jitter_lamp
+    covariance += (frame[:, None] == frame) * (np.outer(scatter, scatter) + noise.jitter_dn**2)
+    return np.asarray(covariance)
 
 
 def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expected: FloatArray) -> float:
@@ -259,3 +278,16 @@ def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expect
     noise = float(np.median(v[1:-1] + 0.25 * (v[:-2] + v[2:])))
     spread = float(np.median(np.abs(bend))) / 0.6745
     return float(np.sqrt(np.clip((spread**2 - noise) / 1.5, READING_STD**2, RADIOMETER_STD**2)))
+
+
+def _sample_std(repeats: Iterable[Sequence[Spectrum]]) -> float:
+    """Relative scatter of a radiometer's readings from sample to sample, from those of one wavelength each: of the log ratio of two
+    readings about its mean, over sqrt 2, where the light exceeds a tenth of its peak; the median of all pairs."""
+    found = []
+    for readings in repeats:
+        for first, second in pairwise(readings):
+            (w, a), (v, b) = first.arrays, second.arrays
+            lit = (a > 0.1 * a.max()) & (b > 0.1 * b.max()) if np.array_equal(w, v) else np.zeros(len(w), bool)
+            if lit.sum() > 2:
+                found.append(float(np.std(np.log(a[lit] / b[lit]), ddof=1)) / np.sqrt(2.0))
+    return min(float(np.median(found)), MOST_SAMPLE_STD) if found else READING_SAMPLE_STD

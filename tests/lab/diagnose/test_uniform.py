@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 
 from lab.diagnose.summaries import level_scatter, repeated_levels, rounding_std_dn
-from lab.diagnose.uniform import RADIOMETER_STD, READING_STD, _reading_std, linearity_block, narrowband_block
+from lab.diagnose.uniform import (
+    MOST_SAMPLE_STD,
+    RADIOMETER_STD,
+    READING_SAMPLE_STD,
+    READING_STD,
+    _reading_std,
+    _sample_std,
+    linearity_block,
+    narrowband_block,
+)
 from sim.effects.second_order_light import SecondOrderLight
+from sim.spectrum import Spectrum
 from tests.lab.diagnose.on_blocks import UNIFORM, evidence, former, names, rendered, sigmas, study, verdict
 from tests.proof.former import Law
 from tests.proof.former.laws import (
@@ -118,3 +128,30 @@ def test_rounding_moves_means_of_quiet_pixels_only() -> None:
     error = np.round(level[:, None] + 0.3 * rng.standard_normal((50, 4000))).mean(1) - level
     assert np.sqrt(np.mean(error**2)) == pytest.approx(rounding_std_dn(np.array(0.09)), rel=0.1)
     assert rounding_std_dn(np.array(1.0)) < 1e-8
+
+
+@pytest.mark.parametrize("scatter", [0.0, 1.5e-3, 0.02])
+def test_scatter_within_readings_is_measured_and_capped(scatter: float) -> None:
+    """24 pairs of some 16 samples: their median is good to 5 %. A level that changed between two readings is none."""
+    rng = np.random.default_rng(8)
+    wavelength = np.arange(540.0, 581.0)
+    line = np.exp(-0.5 * ((wavelength - 560.0) / 4.0) ** 2)
+    pairs = [
+        [Spectrum.of(wavelength, level * line * (1.0 + scatter * rng.standard_normal(41))) for level in (1.0, 1.1)]
+        for _ in range(24)
+    ]
+    assert _sample_std(pairs) == pytest.approx(min(scatter, MOST_SAMPLE_STD), rel=0.15, abs=1e-12)
+    assert _sample_std(readings[:1] for readings in pairs) == READING_SAMPLE_STD
+
+
+def test_a_warmer_frame_s_dark_current_is_free() -> None:
+    """A tenth of the dark current for each degree above the session's median; nothing where no temperature is stated."""
+    recordings = former(35, kinds=UNIFORM)
+    looked_at = study(recordings)
+    capture = recordings.captures("narrowband")[0]
+    assert looked_at.temperature_c is not None
+    warm = capture.model_copy(update={"temperature_c": looked_at.temperature_c + 3.0})
+    slope = looked_at.free_warmth([capture.model_copy(update={"temperature_c": None}), warm])["warmth"]
+    assert slope == pytest.approx([0.0, 0.3 * looked_at.noise.dark_dn_per_s * capture.exposure_s])
+    looked_at.temperature_c = None
+    assert looked_at.free_warmth([capture]) == {}
