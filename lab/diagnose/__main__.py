@@ -20,7 +20,11 @@ def _serve() -> None:
             to.flush()
 
         try:
-            recordings, side, fit, baseline, pictures, bootstrap = pickle.load(sys.stdin.buffer)
+            task = pickle.load(sys.stdin.buffer)
+        except (EOFError, pickle.UnpicklingError):
+            os._exit(1)  # who started this was interrupted before it had handed over the work
+        recordings, side, fit, baseline, pictures, bootstrap = task
+        try:
             say(diagnose_side(recordings, side, fit, baseline, say, pictures=pictures, bootstrap=bootstrap))
         except BrokenPipeError:
             os._exit(1)  # nobody listens any more

@@ -96,8 +96,9 @@ def test_ctrl_c_ends_cleanly(tmp_path: Path) -> None:
     write(_darks(), tmp_path / "set")
     line = [sys.executable, "-m", "lab.cli", "diagnose", str(tmp_path / "set")]
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while len(begun := _children(process.pid)) < 2 and process.poll() is None:
-        time.sleep(0.05)
+    # one is enough: on a busy machine the first may be done before the second begins
+    while not (begun := _children(process.pid)) and process.poll() is None:
+        time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, err.strip()) == (130, "calibench: interrupted"), out
