@@ -740,6 +740,8 @@ def _capture_problems(capture: Capture, camera: Camera) -> Iterator[str]:
 
 #: More than this share of a channel's pixels clipped: the capture says nothing of that channel's level.
 CLIPPED_LIMIT = 0.5
+#: A narrowband light's centre this far and a quarter of its bandwidth off the wavelength set is remarked on.
+OFF_NAME_NM = 3.0
 #: A saturated flat belongs to an exposure ladder when that many unsaturated levels lie below it ...
 LADDER_LEVELS = 3
 #: ... and these foretell at least this share of the white level for it (lamps and sensors aren't exactly linear).
@@ -931,11 +933,35 @@ def _check_spectra_and_targets(recordings: RecordingSet, found: _Findings) -> No
             )
         elif not user.startswith("quantum_efficiency") and highest <= 0:
             found.warnings.append(f"{where}: no light at any wavelength; was the shutter open?")
+    found.warnings += _lights_off_their_names(recordings)
     for path, user in targets.items():
         try:
             recordings.target(path)
         except InputError as error:
             found.problems.append(f"{recordings.where(path)} ({user}): {error.__cause__}")
+
+
+def _lights_off_their_names(recordings: RecordingSet) -> Iterator[str]:
+    """One line on the narrowband lights whose measured centre, over what exceeds half of the maximum, isn't the wavelength set."""
+    off: dict[str, str] = {}
+    for capture in recordings.manifest.captures:
+        if not isinstance(capture, Narrowband) or capture.radiance in off:
+            continue
+        try:
+            wavelength, value = recordings.spectrum(capture.radiance).arrays
+        except InputError:  # named with the spectra
+            continue
+        if value.max() > 0:
+            share = value / value.max()
+            above = share > 0.5
+            centre_nm = float(np.average(wavelength[above], weights=share[above]))
+            if abs(centre_nm - capture.wavelength_nm) > OFF_NAME_NM + 0.25 * (capture.bandwidth_nm or 0.0):
+                off[capture.radiance] = f"{capture.wavelength_nm:g} nm: {centre_nm:.1f} nm"
+    if off:
+        yield (
+            f"{recordings.source}: {len(off)} narrowband lights are centred elsewhere than they are set ({'; '.join(off.values())}); "
+            "their measured spectra are used; correct wavelength_nm, or measure again"
+        )
 
 
 def inspect(recordings: RecordingSet) -> tuple[list[str], list[str]]:

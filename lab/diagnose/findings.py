@@ -138,7 +138,9 @@ def _summary(
 ) -> list[str]:
     lines = []
     if verdict == "no_mismatch":
-        lines.append(f"The baseline explains everything, at a false-alarm rate of {100 * FALSE_ALARM_RATE:.0f} %.")
+        lines.append(
+            f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * FALSE_ALARM_RATE:.0f} %."
+        )
     lines += [
         f"{m.measurement.replace('_', ' ')} of the {m.side} camera departs from the baseline: {m.where} ({m.significance_sigma:.1f} sigma)."
         for m in mismatches

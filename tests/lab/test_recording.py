@@ -445,6 +445,22 @@ def test_capture_that_contradicts_itself(folder: Path, kind: str, change: dict[s
     only(folder, kind, word)
 
 
+def test_a_narrowband_light_that_lies_off_its_name_is_remarked_on(folder: Path) -> None:
+    def call_it(wavelength_nm: float) -> None:
+        def change(manifest: dict[str, Any]) -> None:
+            for capture in manifest["captures"]:
+                if capture["kind"] == "narrowband":
+                    capture["wavelength_nm"] = wavelength_nm
+
+        edit(folder, change)
+
+    assert not any("narrowband" in line for line in read(folder).warnings)
+    call_it(554.0)  # within 3 nm and a quarter of the 10 nm
+    assert not any("narrowband" in line for line in read(folder).warnings)
+    call_it(556.0)
+    assert [line for line in read(folder).warnings if "1 narrowband lights are centred elsewhere" in line]
+
+
 def test_levels_that_contradict_each_other(folder: Path) -> None:
     edit(
         folder, lambda m: m["cameras"]["left"].update(black_level_dn=4095) or m["cameras"]["right"].update(bit_depth=11)

@@ -11,6 +11,7 @@ from scipy import stats
 
 from lab.diagnose import diagnose, examine
 from lab.importers import read_foreign
+from lab.recording import inspect
 from tests.proof.former import Camera, Plan
 from tests.proof.former import laws as concealed_laws
 
@@ -40,17 +41,22 @@ def test_the_mtf_that_fell_short_and_the_red_end_have_names_and_then_fit() -> No
 
 
 @pytest.mark.skipif(not FLEA.is_dir(), reason="the shared recordings of a Flea3 aren't here")
-def test_real_dark_frames_show_odd_pixels_and_what_cant_be_judged(
+def test_real_frames_show_odd_pixels_filters_off_their_names_and_what_cant_be_judged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["llanos_darks.py", str(FLEA), str(tmp_path)])
-    runpy.run_path(str(ROOT / "docs" / "llanos_darks.py"), run_name="__main__")
-    result = diagnose(read_foreign("raw-folder", tmp_path))
+    monkeypatch.setattr(sys, "argv", ["llanos.py", str(FLEA), str(tmp_path)])
+    runpy.run_path(str(ROOT / "docs" / "llanos.py"), run_name="__main__")
+    result = diagnose(read_foreign("raw-folder", tmp_path / "darks"))
     assert "odd_pixels" in {m.measurement for m in result.mismatches}
     assert {e.name for e in result.effects} <= {"hot_pixels"}  # nothing else may be named from these
     reasons = " ".join(item.reason for item in result.skipped)
     assert "codes are too coarse" in reasons
     assert "f-number or pixel pitch isn't stated" in reasons
+    # the white patch behind filters: off their names, and greens that agree
+    patch = read_foreign("raw-folder", tmp_path / "white")
+    _, warnings = inspect(patch)
+    assert any("4 narrowband lights are centred elsewhere than they are set (450 nm: 440.4 nm;" in w for w in warnings)
+    assert diagnose(patch).verdict == "no_mismatch"
 
 
 @pytest.mark.slow
