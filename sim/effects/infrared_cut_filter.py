@@ -14,8 +14,8 @@ from sim.spectrum import FloatArray
 
 
 class InfraredCutFilter(Effect):
-    """Transmittance 1 / (1 + exp((wavelength - cut) / width)): density grows linearly behind the edge, as behind the edge of
-    an interference filter's stop band.
+    """Transmittance 1 / (1 + exp(u + steepening u^3)), u = (wavelength - cut) / width: density grows linearly behind the edge, as
+    behind the edge of an interference filter's stop band, or faster.
 
     Of a filter that is known to be such a coating, `effective_index` (1.5 to 2.1 are usual) has its edge move to
     cut sqrt(1 - sin^2 / n^2) at the chief ray's angle; without it the edge stays, as that of glass does.
@@ -26,7 +26,7 @@ class InfraredCutFilter(Effect):
     reference: ClassVar[str] = "H. A. Macleod, Thin-Film Optical Filters, chapter on edge filters"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
-    shapes: ClassVar[frozenset[str]] = frozenset({"cut_wavelength_nm", "width_nm"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"cut_wavelength_nm", "width_nm", "steepening"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband", "chart"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {"wavelength_offset", "source_bandwidth", "second_order_light", "stray_light"}
@@ -41,8 +41,19 @@ class InfraredCutFilter(Effect):
     ] = 1500.0
     width_nm: Annotated[
         float,
-        Quantity("nm", "wavelength over which the light falls by e behind the edge", lower=0.5, upper=20.0, absent=6.0),
+        Quantity("nm", "wavelength over which the light falls by e behind the edge", lower=0.5, upper=40.0, absent=6.0),
     ] = 6.0
+    steepening: Annotated[
+        float,
+        Quantity(
+            "1",
+            "by how much faster than exponentially the light falls behind the edge; 0.0173: as a Gaussian's integral",
+            lower=0.0,
+            upper=0.2,
+            prior=(0.0, 0.02),
+            absent=0.0,
+        ),
+    ] = 0.0
 
     effective_index: Annotated[
         float | None, Field(ge=1.0, le=4.0, description="effective refractive index of an interference filter's layers")
@@ -57,4 +68,6 @@ class InfraredCutFilter(Effect):
         )
 
     def transmittance(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
-        return edge_transmittance(wavelength_nm, self.cut_wavelength_nm, self.width_nm, sin_theta, self.effective_index)
+        return edge_transmittance(
+            wavelength_nm, self.cut_wavelength_nm, self.width_nm, sin_theta, self.effective_index, self.steepening
+        )

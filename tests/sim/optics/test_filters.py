@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import special
 
 from sim.optics.filters import (
     birefringent_displacement_um,
@@ -60,6 +61,13 @@ def test_plate_is_spherical_aberration_with_or_without_its_defocus() -> None:
     assert plate_wavefront(0.5, 1.52, 2.8)(rim, none) == pytest.approx(w040)
     left = plate_wavefront(0.5, 1.52, 2.8, refocused=False)(rim, none)
     assert left == pytest.approx(w040 - 500.0 * (1 - 1 / 1.52) / (8 * 2.8**2))
+
+
+def test_a_steepened_edge_is_a_gaussian_s_integral() -> None:
+    """The logistic of 1.5976 x + 0.07056 x^3 is Phi(x) within 1.4e-4."""
+    x = np.linspace(-6.0, 6.0, 121)
+    edge = edge_transmittance(650.0 + 10.0 * x, 650.0, 10.0 / 1.5976, steepening=0.07056 / 1.5976**3)
+    np.testing.assert_allclose(edge, special.ndtr(-x), atol=1.5e-4)
 
 
 def test_interference_edges_move_to_the_blue_and_glass_stays() -> None:
