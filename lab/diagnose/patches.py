@@ -267,7 +267,7 @@ def screen_block(study: Study) -> Block:
             "screen", "no white, black and patterned captures of one screen with dark squares wide enough"
         )
     value = np.array([p.value for p in points])
-    tail = np.array([p.tail for p in points])
+    tail, beyond = np.array([p.tail for p in points]), np.array([p.beyond for p in points])
     lift = np.array([p.lift for p in points])
     covariance = np.diag(np.array([p.std for p in points]) ** 2 + 2 * noise.jitter_dn**2)
     ids = [p.kind for p in points]
@@ -275,6 +275,7 @@ def screen_block(study: Study) -> Block:
     white = np.array([p.white for p in points])
     covariance += (
         same * np.outer(tail, tail) * TAIL_STD**2
+        + np.outer(beyond, beyond)
         + np.outer(white, white) * SCREEN_FLOOR**2
         + np.diag(np.square(1e-4 * white))
     )
@@ -308,6 +309,7 @@ class _DarkSquares:
     value: float
     std: float
     tail: float
+    beyond: float  # what the tail is uncertain by: light beyond the frame
     lift: float
     white: float
     black: float
@@ -348,13 +350,17 @@ def _dark_squares(
         else:
             continue
         pad = [(0, n) for n in share.shape]
-        picture = np.pad(np.where((share > 0.5) & bright, full, 0.0), pad)
-        fy = np.fft.fftfreq(picture.shape[0], step)[:, None]
-        fx = np.fft.rfftfreq(picture.shape[1], step)[None, :]
+        picture = np.where((share > 0.5) & bright, full, 0.0)
+        fy = np.fft.fftfreq(2 * share.shape[0], step)[:, None]
+        fx = np.fft.rfftfreq(2 * share.shape[1], step)[None, :]
         radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
         otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
-        # halves of the contrast mark the edges: as much light is drawn as there is, and far away its outline doesn't matter
-        spread = np.fft.irfft2(np.fft.rfft2(picture) * otf, picture.shape)[: share.shape[0], : share.shape[1]]
+        # halves of the contrast mark the edges: as much light is drawn as there is, and far away its outline doesn't matter;
+        # a screen that reaches the frame's border goes on beyond it, nobody says how far: not at all, or without an end
+        ends, endless = (
+            np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
+            for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))
+        )
         difference = (shown - black)[plane][use]
         variance = (noise.gain * max(float(black[plane][use].mean()) - noise.black, 0.0) + noise.read_dn**2) * (
             1 / len(part) + 1 / blacks
@@ -362,7 +368,7 @@ def _dark_squares(
         means = [float(study.pixels_of(f, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
-                         float(np.sqrt(variance / use.sum())), float(spread[use].mean()), means[0] - means[1], float(full[bright].mean()),
+                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black)
         )  # fmt: skip
     return found
