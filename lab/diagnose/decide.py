@@ -40,6 +40,8 @@ LONE_SCORE = 10.0
 CERTAIN = 0.99
 #: Of what a name gains, in nats: the score from which on a rival that it declares is fitted in its place.
 DECLARED_FROM = 0.6
+#: Nats below which a member's gain isn't believed before the others were fitted once more, from where they stand beside it.
+CLOSE = 100.0
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
@@ -155,8 +157,12 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
         weighed.add(frozenset(current.names))
         members, likelier = [], None
         for index, e in enumerate(current.effects):
-            if e.name in certain:  # a weaker member that left changes nothing about this one's name
-                members.append(replace(certain[e.name], effect=e, std=current.std[index]))
+            if (
+                e.name in certain
+            ):  # a weaker member that left changes nothing about this one's name, but what is left to explain
+                explains, closed = _explained(evidence, current, *_without(search, current, index))
+                kept = replace(certain[e.name], effect=e, std=current.std[index], explains=explains, closed=closed)
+                members.append(kept)
                 continue
             report(f"weighing {e.name} against its rivals")
             candidate, better = _weighed(search, current, index)
@@ -247,7 +253,7 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     likelier, now that both may leave something unknown behind."""
     evidence, effect = search.evidence, fit.effects[index]
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
-    without = search.fitted(rest, final=True)
+    without, touched = _without(search, fit, index)
     others = [e for e in search.known if e.name not in fit.names]
     likely = signatures(evidence, evidence.camera, without.effects, others, without.tangents).scores()
     gain = fit.weight - without.weight
@@ -260,7 +266,6 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
         rough = search.fitted(start)
         near = rough.weight > fit.weight - HOPELESS - 0.3 * gain
         fits[score.effect.name] = search.fitted(start, final=True) if near else rough
-    touched = [i for i, b in enumerate(evidence.blocks) if b.touched_by(type(effect))]
     weights = {}
     for name, tried in fits.items():
         weights[name] = tried.weight
@@ -288,6 +293,15 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     return Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains, closed), better
 
 
+def _without(search: Search, fit: Fit, index: int) -> tuple[Fit, list[int]]:
+    """The set fitted without one of its effects, and the blocks that this one acts on."""
+    rest = (*fit.effects[:index], *fit.effects[index + 1 :])
+    without = search.fitted(rest, final=True)
+    if rest and fit.weight - without.weight < CLOSE:
+        without = search.fitted(rest, final=True, again=True)
+    return without, [i for i, b in enumerate(search.evidence.blocks) if b.touched_by(type(fit.effects[index]))]
+
+
 def _explained(evidence: Evidence, fit: Fit, without: Fit, touched: list[int]) -> tuple[float, bool]:
     """Share of the excess chi2 that an effect takes where it acts, 1 where what is left is within three sigmas of noise; and
     whether that is within five of noise and the named laws' tolerances.
@@ -308,6 +322,6 @@ def _explained(evidence: Evidence, fit: Fit, without: Fit, touched: list[int]) -
         float(np.sum(np.square(model.white((evidence.value - evidence.mean(f.effects))[where]))))
         for f in (fit, without)
     )
-    if after - n < 3.0 * np.sqrt(2.0 * n) or before <= after:
+    if after - n < 3.0 * np.sqrt(2.0 * n):
         return 1.0, closed
-    return (before - after) / max(before - n, 1e-9), closed
+    return max(before - after, 0.0) / max(before - n, 1e-9), closed

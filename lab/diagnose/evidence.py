@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cho_solve, cholesky, eigh, solve_triangular
 
 from lab.diagnose.summaries import Block, Effects, Prediction
 from sim.camera import CameraModel
@@ -24,6 +24,8 @@ from sim.spectrum import FloatArray
 
 #: Share of every variance that keeps covariances positive against rounding.
 ROUNDING = 1e-9
+#: Of a correlation matrix: what its directions' variance is at least where it isn't positive definite.
+LEAST_SIZE = 1e-4
 #: Covariances within blocks are kept up to so many numbers in all.
 KEPT_NUMBERS = 2e7
 
@@ -36,8 +38,14 @@ class Within:
 
     @cached_property
     def lower(self) -> FloatArray:
-        """Cholesky's factor."""
-        return np.asarray(cholesky(self.covariance, lower=True, check_finite=False))
+        """Cholesky's factor; of covariances estimated from frames, directions that came out negative are given a little."""
+        try:
+            return np.asarray(cholesky(self.covariance, lower=True, check_finite=False))
+        except LinAlgError:
+            scale = np.sqrt(np.diag(self.covariance))
+            size, vectors = eigh(self.covariance / np.outer(scale, scale))
+            mended = (vectors * np.maximum(size, LEAST_SIZE)) @ vectors.T
+            return np.asarray(cholesky(mended * np.outer(scale, scale), lower=True, check_finite=False))
 
 
 @dataclass(frozen=True)

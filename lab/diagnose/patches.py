@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.diagnose.curves import CurveSlopes
@@ -28,6 +29,7 @@ from lab.diagnose.summaries import (
 from lab.errors import NotDetermined
 from lab.predict import Field, mixed_charge
 from lab.recording import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
+from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.forward import optical_transfer
 from sim.optics.illumination import relative_illumination
@@ -290,12 +292,15 @@ def screen_block(study: Study) -> Block:
             for effect in effects:
                 base, high = effect.response(base, camera), effect.response(high, camera)
             shift = (high - base) * noise.gain - tail
+        copied = [e for e in effects if type(e).image is not Effect.image]
+        if copied:
+            shift = shift + np.array([_copied(p, copied, camera) for p in points])
         return Prediction(contrast * tail + (1.0 - contrast) * lift + shift, {})
 
     return Block(
         measurement="screen", axis="level", unit="DN", reach=1e9, value=value, covariance=covariance,
         labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
-        hooks=frozenset({"veil", "response"}), predict=predict, scale=np.array([p.white for p in points]),
+        hooks=frozenset({"veil", "response", "image"}), predict=predict, scale=np.array([p.white for p in points]),
         conditions="pattern", places="dark squares",
     )  # fmt: skip
 
@@ -309,10 +314,20 @@ class _DarkSquares:
     value: float
     std: float
     tail: float
+    picture: FloatArray  # what the pattern adds to the dark screen, DN, over the channel's plane
+    use: NDArray[np.bool_]  # the dark squares' insides in it
     beyond: float  # what the tail is uncertain by: light beyond the frame
     lift: float
     white: float
     black: float
+
+
+def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> float:
+    """What effects on the whole image bring into the dark squares, DN."""
+    shown = squares.picture
+    for effect in effects:
+        shown = effect.image(shown, camera)
+    return float(shown[squares.use].mean() - squares.picture[squares.use].mean())
 
 
 def steady(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatArray:
@@ -368,7 +383,8 @@ def _dark_squares(
         means = [float(study.pixels_of(f, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
-                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
+                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
+                         (shown - black)[plane], use, 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black)
         )  # fmt: skip
     return found

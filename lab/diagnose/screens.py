@@ -205,10 +205,14 @@ def _measured(
             float(np.nanmean(white[window][design.mask])) * exposure / study.noise.gain,
         )
         turned_by = _turned_by(study, design, whole, window)
+        solved = []
         for part, picture in zip(parts, seen, strict=True):
             dn = np.maximum(picture[window][design.mask] * area + black[window][design.mask], 0.0) * exposure
             temporal = (study.noise.gain * dn + study.noise.read_dn**2) / len(part) / (area * exposure) ** 2
-            value, shown, common = design.solved(picture[window][design.mask], temporal)
+            solved.append(design.solved(picture[window][design.mask], temporal))
+        # one for all parts, or what they share could exceed what one of them has
+        common = np.mean([c for *_, c in solved], axis=0)
+        for part, (value, shown, _) in zip(parts, solved, strict=True):
             found.append(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
@@ -630,10 +634,12 @@ def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex12
 def _greyness(effects: Effects, study: Study) -> float:
     """By how much the screen darkens greys, over what squaring them would do: rims' mean light decides."""
     grey = np.linspace(0.0, 1.0, 41)
-    shown = grey
+    # a pattern that lies over all greys alike averages out
+    x, y = np.meshgrid(np.arange(24) * 0.37, np.arange(24) * 0.37) * np.array(study.camera.pixel_pitch_um)
+    shown = np.broadcast_to(grey[:, None, None], (len(grey), *x.shape))
     for effect in effects:
-        shown = effect.screen(shown, np.zeros(41), np.zeros(41), study.camera)
-    return float(np.trapezoid(grey - shown, grey) / np.trapezoid(grey - grey**2, grey))
+        shown = effect.screen(shown, x, y, study.camera)
+    return float(np.trapezoid(grey - shown.mean((1, 2)), grey) / np.trapezoid(grey - grey**2, grey))
 
 
 def rim_block(study: Study) -> Block:

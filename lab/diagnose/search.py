@@ -31,6 +31,7 @@ class Search:
     known: tuple[type[Effect], ...]
     threshold: float
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
+    twice: set[frozenset[str]] = field(default_factory=set)
 
     def worth(self, fit: Fit) -> float:
         """Nats less what every effect has to earn: half the threshold, beyond which one in a hundred healthy cameras gets."""
@@ -93,12 +94,19 @@ class Search:
         least = RIVAL_FROM * (fit.weight - without.weight)
         return [self.fitted((*rest, s.start)) for s in scores if s.value > least]
 
-    def fitted(self, start: Effects, *, final: bool = False) -> Fit:
-        """A set's fit, made once (a rough one is good to tell sets apart; `final`: to convergence)."""
-        key = frozenset(e.name for e in start)
-        if key not in self.fits or (final and not self.fits[key].final):
-            from_here = self.fits[key].effects if key in self.fits else tuple(start)
-            passes, evaluations = (3, 12) if final else (2, 8)
-            made = refit(self.evidence, from_here, passes=passes, evaluations=evaluations, final=final)
+    def fitted(self, start: Effects, *, final: bool = False, again: bool = False) -> Fit:
+        """A set's fit, made once (a rough one is good to tell sets apart; `final`: to convergence). There are several optima: `again`
+        goes on from `start` whatever was found, once, and keeps the better."""
+        key, begin = frozenset(e.name for e in start), tuple(start)
+        known = self.fits.get(key)
+        if known is not None and known.final >= final:
+            if not again or key in self.twice:
+                return known
+            self.twice.add(key)
+        elif known is not None:
+            begin = known.effects
+        passes, evaluations = (3, 12) if final else (2, 8)
+        made = refit(self.evidence, begin, passes=passes, evaluations=evaluations, final=final)
+        if known is None or known.final < final or made.weight > known.weight:
             self.fits[key] = made
         return self.fits[key]

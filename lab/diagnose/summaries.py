@@ -36,6 +36,7 @@ TAIL_STD = 0.1  # of the light that the baseline's point spread itself sends int
 CLIPPED_SHARE = 2e-4
 USUAL_JITTER_DN = 0.02  # of a dark frame's mean, from repeat to repeat
 WARMTH_STD = 0.1  # of the dark current, a degree: it doubles within 5 to 10 degrees
+USUAL_PRNU = 0.008
 ALIKE_C = 2.0  # dark captures whose temperatures are that close count as of one
 NOISELESS_DN = 0.5  # a frame of less standard deviation may be like another by chance
 LEVEL_REACH = 0.8  # of a level's logarithm: over a factor of 2 a smooth departure from a line may change
@@ -392,26 +393,8 @@ def noise_guess(study: Study) -> NoiseGuess:
         first = min((darks[i] for i in near), key=lambda g: g[0].exposure_s)
         if len(first) > 1:
             read = float(np.sqrt(pair_variance([recordings.frame(c) for c in first[:4]])))
-    gain = stated.conversion_gain_dn_per_e
-    prnu, lamp = 0.008, 3e-4
-    signal, variance = [], []
-    for group in study.flat_levels():
-        if len(group) < 2:
-            continue
-        frames = [recordings.frame(c) for c in group]
-        for channel in study.channels:
-            planes = [study.pixels_of(f, channel) for f in frames]
-            if any(np.mean(p >= study.saturation_dn) >= CLIPPED_SHARE for p in planes):
-                continue
-            signal.append(float(np.mean([p.mean() for p in planes])) - black)
-            variance.append(pair_variance(planes))
-            if 0.3 < signal[-1] / (study.saturation_dn - black) < 0.8:
-                first_plane = np.mean(frames, axis=0)[mosaic.phases(study.camera.cfa)[channel][0][0] :: mosaic.step(study.camera.cfa),
-                                                      mosaic.phases(study.camera.cfa)[channel][0][1] :: mosaic.step(study.camera.cfa)]  # fmt: skip
-                rough = first_plane - ndimage.uniform_filter(first_plane, 9)
-                prnu = (
-                    float(np.sqrt(max(rough[6:-6, 6:-6].var() - variance[-1] / len(frames), 0.0)) / signal[-1]) * 1.006
-                )
+    gain, lamp = stated.conversion_gain_dn_per_e, 3e-4
+    signal, variance, prnu = _transfer_points(study, black)
     if len(signal) > 1:
         s, v = np.array(signal), np.array(variance)
         weight = 1.0 / np.maximum(v, 1e-9)
@@ -422,6 +405,41 @@ def noise_guess(study: Study) -> NoiseGuess:
     if gain is None or gain <= 0:
         gain = 1.0
     return NoiseGuess(black, dark, gain, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
+
+
+def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:
+    """Signal and temporal variance (DN, DN^2) of repeated flats by level and channel; PRNU from what is between them and saturation."""
+    step, prnu = mosaic.step(study.camera.cfa), USUAL_PRNU
+    signal, variance = [], []
+    for group in study.flat_levels():
+        if len(group) < 2:
+            continue
+        frames = [study.recordings.frame(c) for c in group]
+        evened = [_even_rows(f, step) for f in frames]  # a light that flickers is no shot noise
+        freedom = 1.0 - step / frames[0].shape[1]
+        for channel in study.channels:
+            planes = [study.pixels_of(f, channel) for f in frames]
+            if any(np.mean(p >= study.saturation_dn) >= CLIPPED_SHARE for p in planes):
+                continue
+            signal.append(float(np.mean([p.mean() for p in planes])) - black)
+            variance.append(pair_variance([study.pixels_of(f, channel) for f in evened]) / freedom)
+            if 0.3 < signal[-1] / (study.saturation_dn - black) < 0.8:
+                row, col = mosaic.phases(study.camera.cfa)[channel][0]
+                plane = np.mean(frames, axis=0)[row::step, col::step]
+                rough = (plane - ndimage.uniform_filter(plane, 9))[6:-6, 6:-6]
+                fixed = max(rough.var() - variance[-1] / len(frames), 0.0)
+                prnu = float(np.sqrt(fixed) / signal[-1]) * 1.006  # of 81 pixels' mean, 1/81 of the variance is missing
+    return signal, variance, prnu
+
+
+def _even_rows(frame: Any, step: int) -> FloatArray:
+    """A frame whose rows have the same mean in each plane of the mosaic."""
+    even = np.array(frame, float)
+    for row in range(step):
+        for col in range(step):
+            plane = even[row::step, col::step]
+            plane -= plane.mean(axis=1, keepdims=True) - plane.mean()
+    return even
 
 
 def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray]) -> float:

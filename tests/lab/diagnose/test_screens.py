@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from lab.diagnose.decide import Verdict, decide
 from lab.diagnose.evidence import Evidence
+from lab.diagnose.patches import screen_block
 from lab.diagnose.screens import SCREEN_BLOCKS, colour_block, contrast_block, grid_block, turned_block
-from lab.diagnose.summaries import Study
+from lab.diagnose.summaries import Block, Study
 from lab.errors import NotDetermined
 from lab.predict import camera_model
 from lab.recording import RecordingSet
 from sim.effects.defocus import Defocus
+from sim.effects.ghost import Ghost
 from tests.proof.former import Camera, Law, Plan
 from tests.proof.former import laws as concealed
 
@@ -25,6 +29,11 @@ def recorded(*laws: Law, seed: int = 61, cfa: str = "GRBG", plan: Plan = PLAN) -
 
 def study_of(recordings: RecordingSet) -> Study:
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+def evidence(recordings: RecordingSet, make: Callable[[Study], Block]) -> Evidence:
+    study = study_of(recordings)
+    return Evidence((make(study),), study.camera)
 
 
 def verdict_of(recordings: RecordingSet) -> Verdict:
@@ -66,6 +75,22 @@ FOUND: list[tuple[Law, str]] = [
 def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
     verdict = verdict_of(recorded(law))
     assert [c.effect.name for c in verdict.named] == [name]
+
+
+def test_a_screen_that_fills_the_frame_lights_dark_squares_from_beyond() -> None:
+    """The former's screen goes on beyond the frame; what that is uncertain by is half of all that an endless screen would add."""
+    found = evidence(recorded(), screen_block)
+    model = found.gaussian()
+    away = (found.value - model.mean) / np.sqrt(np.diag(model.of(0)))
+    assert np.all(np.abs(away) < 1.5)
+
+
+def test_a_copy_of_the_image_falls_into_the_dark_squares() -> None:
+    """Of light of mean m in the plane, turned about its middle, 1 % of what lies there: between nothing and the brightest."""
+    block = evidence(recorded(), screen_block).blocks[0]
+    more = block.predict((Ghost(share_percent=1.0),)).mean - block.predict(()).mean
+    assert np.all(more > 0.0)
+    assert np.all(more < 0.011 * block.scale)
 
 
 def test_defocus_changes_the_contrast_as_predicted() -> None:
