@@ -30,7 +30,7 @@ OPEN_CAUSE_FROM = 0.95
 WELL_EXPLAINED, SURE = 0.95, 0.8
 #: Of an effect's gain: what something unexplained in the same frames may have, or the effect is but a part of what that is.
 REMAINDER_SHARE = 0.1
-#: Of the first effect's: what a further one has to gain. The first one's law may be wrong, too.
+#: Of the threshold: what an effect has to gain where a stronger one acts, too. That one's law may be wrong.
 FURTHER = 1.5
 #: Of a stronger effect's gain: below that, what acts on the same measurement is taken for an error of its law.
 LEAST_SHARE = 1e-4
@@ -42,6 +42,8 @@ CERTAIN = 0.99
 DECLARED_FROM = 0.6
 #: Nats below which a member's gain isn't believed before the others were fitted once more, from where they stand beside it.
 CLOSE = 100.0
+#: Nats within which two signs of a quantity are as good as each other.
+SAME = 2.0
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
@@ -115,12 +117,35 @@ def decide(
         unknown = tuple(discrepancy(evidence, evidence.seen_gaussian(effects), i) for i in unexplained.values())
         parts = [c for c in named if after and _is_part(evidence, c, effects, unknown)]
         if not parts:
-            return Verdict(evidence, threshold, top, before, tuple(named), tuple(abstained), after, unknown)
+            told = tuple(_either_sign(evidence, c, effects) for c in named)
+            return Verdict(evidence, threshold, top, before, told, tuple(abstained), after, unknown)
         # weakest first: with it gone, what is left may be no more than another one's law allows
         abstained.append(parts[-1])
         rest = search.fitted(tuple(c.effect for c in named if c is not parts[-1]), final=True)
         kept = {c.effect.name: c for c in named}
         named = [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]
+
+
+def _either_sign(evidence: Evidence, candidate: Candidate, effects: tuple[Effect, ...]) -> Candidate:
+    """The same with uncertainties that hold both signs of quantities that act by their square, where the recordings don't tell them
+    apart: root mean square distances from the value told."""
+    effect = candidate.effect
+    both = {
+        name: float(getattr(effect, name))
+        for name, q in type(effect).quantities().items()
+        if q.slope_power == 2 and (q.lower is None or q.lower < 0.0)
+    }
+    mirrored = type(effect)(
+        **{n: getattr(effect, n) for n in type(effect).model_fields} | {n: -v for n, v in both.items()}
+    )
+    others = tuple(e for e in effects if e is not effect)
+    if not both or likelihood(evidence, (*others, mirrored)) < likelihood(evidence, effects) - SAME:
+        return candidate
+    std = {
+        n: s if s is None or n not in both else float(np.hypot(s, np.sqrt(2.0) * both[n]))
+        for n, s in candidate.std.items()
+    }
+    return replace(candidate, std=std)
 
 
 def _seat(evidence: Evidence, candidate: Candidate, effects: Iterable[Effect]) -> int:
@@ -178,9 +203,8 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
             lost = [members[i] for i in crowd]
         else:
             companions = [c for c in members if _companion(c, members, evidence)]
-            first = max(c.gain for c in members)
             weak = companions or [
-                c for c in members if not _holds(c, threshold if c.gain == first else FURTHER * threshold)
+                c for c in members if not _holds(c, threshold * (FURTHER if _beside(c, members, evidence) else 1.0))
             ]
             lost = sorted(weak, key=lambda c: c.gain)[:1]
         if not lost:
@@ -198,6 +222,15 @@ def _holds(candidate: Candidate, threshold: float) -> bool:
         and 2.0 * candidate.gain >= threshold
         and candidate.explains >= (CAUSE_FROM if candidate.closed else OPEN_CAUSE_FROM)
     )
+
+
+def _beside(candidate: Candidate, members: list[Candidate], evidence: Evidence) -> bool:
+    """Whether a stronger effect changes what an effect shows most in."""
+    stronger = [c for c in members if c.gain > candidate.gain]
+    if not stronger:
+        return False
+    block = evidence.blocks[_seat(evidence, candidate, (c.effect for c in members))]
+    return any(block.touched_by(type(c.effect)) for c in stronger)
 
 
 def _companion(candidate: Candidate, members: list[Candidate], evidence: Evidence) -> bool:
