@@ -182,9 +182,8 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
         weighed.add(frozenset(current.names))
         members, likelier = [], None
         for index, e in enumerate(current.effects):
-            if (
-                e.name in certain
-            ):  # a weaker member that left changes nothing about this one's name, but what is left to explain
+            if e.name in certain:
+                # a weaker member that left changes nothing about this one's name, but what is left to explain
                 explains, closed = _explained(evidence, current, *_without(search, current, index))
                 kept = replace(certain[e.name], effect=e, std=current.std[index], explains=explains, closed=closed)
                 members.append(kept)

@@ -25,7 +25,7 @@ BEHIND = 25.0
 
 @dataclass
 class Search:
-    """The search's state: every set that was fitted, by its names."""
+    """The search's state: every set that was fitted, by its names, and which of them once more from elsewhere."""
 
     evidence: Evidence
     known: tuple[type[Effect], ...]

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pytest
 
-from lab.diagnose.evidence import Evidence
+from lab.diagnose.decide import Candidate, _either_sign
+from lab.diagnose.evidence import Evidence, Within
 from lab.diagnose.score import signatures
 from lab.diagnose.search import Search
 from lab.diagnose.summaries import Block, Label, Prediction
@@ -130,3 +132,38 @@ def test_nothing_is_found_in_noise() -> None:
 def test_the_nearer_of_two_rivals_wins() -> None:
     assert _best((_Up(size_dn=0.1), _Ripple(size_dn=0.05)), 4) == {"up", "ripple"}
     assert _best((_Up(size_dn=0.1), _Wave(size_dn=0.05)), 5) == {"up", "wave"}
+
+
+class _Squared(_Curve):
+    name: ClassVar[str] = "squared"
+    size_dn: Annotated[
+        float, Quantity("DN", "size", lower=-5.0, upper=5.0, prior=(0.0, 1.0), absent=0.0, slope_power=2)
+    ] = 0.0
+    skew: ClassVar[float] = 0.0
+
+    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+        return (self.size_dn**2 + self.skew * self.size_dn) * elapsed_s
+
+
+class _Lopsided(_Squared):
+    name: ClassVar[str] = "lopsided"
+    skew: ClassVar[float] = 0.3
+
+
+def test_an_uncertainty_holds_both_signs_where_only_the_square_acts() -> None:
+    """Distances 0 and 2 v from the value told, as likely: sqrt(2) v. A sign that the numbers tell stays as it is known."""
+    for kind, widened in ((_Squared, True), (_Lopsided, False)):
+        truth = kind(size_dn=0.5)
+        evidence = _evidence((truth,), np.random.default_rng(6))
+        candidate = Candidate(truth, {"size_dn": 0.01}, 1.0, (), 50.0)
+        std = _either_sign(evidence, candidate, (truth,)).std["size_dn"]
+        assert std == pytest.approx(np.hypot(0.01, np.sqrt(2.0) * 0.5) if widened else 0.01)
+
+
+def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> None:
+    covariance = np.array([[1.0, 1.2], [1.2, 1.0]]) * 4.0
+    lower = Within(covariance).lower
+    assert np.linalg.eigvalsh(lower @ lower.T)[0] > 0.0
+    np.testing.assert_allclose((lower @ lower.T)[0, 1], 4.4, rtol=1e-3)  # what eigenvalues of 2.2 and 0 leave
+    positive = np.array([[1.0, 0.5], [0.5, 1.0]])
+    np.testing.assert_allclose(Within(positive).lower @ Within(positive).lower.T, positive)
