@@ -117,3 +117,11 @@ def test_equality_asks_for_the_fields_alone() -> None:
     assert hash(one) == hash(other)
     assert one != one.scaled(2.0)
     assert one != "a spectrum"
+
+
+def test_shares_far_beyond_the_nodes_are_those_of_the_nearest() -> None:
+    """Where rounding leaves nothing of the polynomials' sum, as it does between 500 and 600 nm seen from 1e20."""
+    shares = lagrange_shares(np.array([550.0, 1e20]), np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([500.0, 600.0]))
+    np.testing.assert_allclose(shares[0], [0.5, 0.5])
+    assert np.all(np.isfinite(shares[1]))
+    assert shares[1].sum() == pytest.approx(1.0)
