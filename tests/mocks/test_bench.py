@@ -389,7 +389,7 @@ class TestHidden:
                 *(value for row in camera.geometry.camera_matrix[:2] for value in row if value),
             ]
             secrets += [value for value in camera.geometry.distortion if value]
-            secrets += [value for e in camera.effects for value in e.model_dump().values() if value is not None]
+            secrets += [value for e in camera.effects for value in e.model_dump().values() if value]
             assert not [secret for secret in secrets if f"{secret:.6g}" in told]
 
     def test_fixed_pattern_has_its_size(self) -> None:
