@@ -76,6 +76,8 @@ def _named(found: Sequence[SideFindings]) -> list[NamedEffect]:
                     rivals[rival] = max(rivals.get(rival, 0.0), probability)
         parameters = {}
         for field, quantity in kind.quantities().items():
+            if quantity.dispensable and all(c.std.get(field) is None for c in candidates):
+                continue
             value, std = _mean([(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates])
             parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit)
         shown = sorted({measurement.replace("_", " ") for _, one in members for measurement in one.shown_in})

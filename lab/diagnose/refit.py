@@ -18,6 +18,8 @@ from sim.spectrum import FloatArray
 PASSES = 3  # the covariance depends on the parameters by the form tolerance: refined so often
 #: Nats that a parameter has to earn: half the logarithm of the independent numbers it is fitted to, a few hundred.
 PARAMETER_NATS = 2.5
+#: Nats that a dispensable parameter has to earn besides, as what it refines is a law with a tolerance.
+REFINED_FROM = 8.0
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,26 @@ def refit(
 ) -> Fit:
     """Maximum a posteriori of all parameters of `start`, by Gauss-Newton with bounds; the prior is three times as wide as
     the declared one, as a camera at hand needn't be typical. Standard uncertainties follow from the slopes and hold the form
-    tolerance, as the covariance does."""
-    effects = tuple(start)
-    coords = coordinates(effects)
+    tolerance, as the covariance does. A final fit does without the dispensable parameters where that is worth nearly as much."""
+    coords = coordinates(tuple(start))
+    found = _refit(evidence, tuple(start), coords, passes, evaluations, final)
+    spare = [c for c in coords if c.quantity.dispensable]
+    if final and spare:
+        without = moved(found.effects, spare, np.zeros(len(spare)))
+        less = _refit(evidence, without, [c for c in coords if c not in spare], passes, evaluations, final)
+        found = less if less.weight >= found.weight - REFINED_FROM else found
+    return found
+
+
+def _refit(
+    evidence: Evidence,
+    effects: tuple[Effect, ...],
+    coords: Sequence[Coordinate],
+    passes: int,
+    evaluations: int,
+    final: bool,
+) -> Fit:
+    """Of the parameters `coords`, the others as they are."""
     seen = evidence.seen
     if not coords:
         value = likelihood(evidence, effects)

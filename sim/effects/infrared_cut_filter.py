@@ -50,8 +50,9 @@ class InfraredCutFilter(Effect):
             "by how much faster than exponentially the light falls behind the edge; 0.0173: as a Gaussian's integral",
             lower=0.0,
             upper=0.2,
-            prior=(0.0, 0.005),
+            prior=(0.0, 0.02),
             absent=0.0,
+            dispensable=True,
         ),
     ] = 0.0
 
