@@ -191,8 +191,9 @@ def lagrange_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray)
     total = np.sum(basis, axis=0)
     # a node's own place, and far beyond all nodes, where the sum is lost in rounding: what the nearest one has
     lost = met.any(axis=0) | (total == 0.0)
-    nearest = np.argmin(np.abs(away), axis=0) == np.arange(len(nodes))[:, None]
-    basis = np.where(lost, nearest, basis / np.where(lost, 1.0, total))
+    basis /= np.where(lost, 1.0, total)
+    if lost.any():
+        basis[:, lost] = np.argmin(np.abs(away[:, lost]), axis=0) == np.arange(len(nodes))[:, None]
     shares = weight @ basis.T
     shares[:, -1] += np.sum(weight, axis=1) - np.sum(shares, axis=1)
     return shares

@@ -110,11 +110,10 @@ def decide(
         named.sort(key=lambda c: -c.gain)
         effects = tuple(c.effect for c in named)
         after = tuple(s for s in look(evidence, evidence.gaussian(effects)) if s.significant)
-        unexplained = {id(s.block): evidence.blocks.index(s.block) for s in after}
-        for c in abstained:
-            if not unexplained:
-                unexplained[id(evidence.blocks[_seat(evidence, c, effects)])] = _seat(evidence, c, effects)
-        unknown = tuple(discrepancy(evidence, evidence.seen_gaussian(effects), i) for i in unexplained.values())
+        unexplained = list(dict.fromkeys(evidence.blocks.index(s.block) for s in after))
+        if abstained and not unexplained:
+            unexplained = [_seat(evidence, abstained[0], effects)]
+        unknown = tuple(discrepancy(evidence, evidence.seen_gaussian(effects), i) for i in unexplained)
         parts = [c for c in named if after and _is_part(evidence, c, effects, unknown)]
         if not parts:
             told = tuple(_either_sign(evidence, c, effects) for c in named)
@@ -135,11 +134,11 @@ def _either_sign(evidence: Evidence, candidate: Candidate, effects: tuple[Effect
         for name, q in type(effect).quantities().items()
         if q.slope_power == 2 and (q.lower is None or q.lower < 0.0)
     }
-    mirrored = type(effect)(
-        **{n: getattr(effect, n) for n in type(effect).model_fields} | {n: -v for n, v in both.items()}
-    )
+    if not both:
+        return candidate
+    mirrored = effect.having(**{n: -v for n, v in both.items()})
     others = tuple(e for e in effects if e is not effect)
-    if not both or likelihood(evidence, (*others, mirrored)) < likelihood(evidence, effects) - SAME:
+    if likelihood(evidence, (*others, mirrored)) < likelihood(evidence, effects) - SAME:
         return candidate
     std = {
         n: s if s is None or n not in both else float(np.hypot(s, np.sqrt(2.0) * both[n]))
@@ -151,8 +150,7 @@ def _either_sign(evidence: Evidence, candidate: Candidate, effects: tuple[Effect
 def _seat(evidence: Evidence, candidate: Candidate, effects: Iterable[Effect]) -> int:
     """The block in which an effect shows most beside others."""
     others = tuple(e for e in effects if e.name != candidate.effect.name)
-    acts = evidence.acts(type(candidate.effect))
-    return max((i for i, a in enumerate(acts) if a), key=lambda i: evidence.shown(candidate.effect, others, i))
+    return max(_touched(evidence, candidate.effect), key=lambda i: evidence.shown(candidate.effect, others, i))
 
 
 def _is_part(
@@ -184,7 +182,8 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
         for index, e in enumerate(current.effects):
             if e.name in certain:
                 # a weaker member that left changes nothing about this one's name, but what is left to explain
-                explains, closed = _explained(evidence, current, *_without(search, current, index))
+                without = _without(search, current, index)
+                explains, closed = _explained(evidence, current, without, _touched(evidence, e))
                 kept = replace(certain[e.name], effect=e, std=current.std[index], explains=explains, closed=closed)
                 members.append(kept)
                 continue
@@ -263,7 +262,7 @@ def _crowd(search: Search, fit: Fit) -> list[int]:
     by_block: dict[int, list[int]] = {}
     for i, e in enumerate(fit.effects):
         rest = (*fit.effects[:i], *fit.effects[i + 1 :])
-        touched = [k for k, b in enumerate(evidence.blocks) if b.touched_by(type(e))]
+        touched = _touched(evidence, e)
         if touched:
             by_block.setdefault(max(touched, key=lambda k, e=e, rest=rest: evidence.shown(e, rest, k)), []).append(i)  # type: ignore[misc]
     full = evidence.seen_gaussian(fit.effects)
@@ -285,7 +284,7 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     likelier, now that both may leave something unknown behind."""
     evidence, effect = search.evidence, fit.effects[index]
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
-    without, touched = _without(search, fit, index)
+    without, touched = _without(search, fit, index), _touched(evidence, effect)
     others = [e for e in search.known if e.name not in fit.names]
     likely = signatures(evidence, evidence.camera, without.effects, others, without.tangents).scores()
     gain = fit.weight - without.weight
@@ -325,13 +324,18 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     return Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains, closed), better
 
 
-def _without(search: Search, fit: Fit, index: int) -> tuple[Fit, list[int]]:
-    """The set fitted without one of its effects, and the blocks that this one acts on."""
+def _touched(evidence: Evidence, effect: Effect) -> list[int]:
+    """The blocks that an effect acts on."""
+    return [i for i, acting in enumerate(evidence.acts(type(effect))) if acting]
+
+
+def _without(search: Search, fit: Fit, index: int) -> Fit:
+    """The set fitted without one of its effects."""
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     without = search.fitted(rest, final=True)
     if rest and fit.weight - without.weight < CLOSE:
         without = search.fitted(rest, final=True, again=True)
-    return without, [i for i, b in enumerate(search.evidence.blocks) if b.touched_by(type(fit.effects[index]))]
+    return without
 
 
 def _explained(evidence: Evidence, fit: Fit, without: Fit, touched: list[int]) -> tuple[float, bool]:

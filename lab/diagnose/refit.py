@@ -79,10 +79,10 @@ def coordinates(effects: Effects) -> list[Coordinate]:
 
 def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tuple[Effect, ...]:
     """The same effects at other values of their coordinates."""
-    values = [{name: getattr(e, name) for name in type(e).model_fields} for e in effects]
+    values: list[dict[str, float]] = [{} for _ in effects]
     for c, at in zip(coords, u, strict=True):
         values[c.index][c.name] = c.back(float(at))
-    return tuple(type(e)(**v) for e, v in zip(effects, values, strict=True))
+    return tuple(e.having(**v) for e, v in zip(effects, values, strict=True))
 
 
 def likelihood(evidence: Evidence, effects: Effects) -> float:
@@ -192,8 +192,7 @@ def _usual_nats(effect: Effect, std: dict[str, float | None]) -> float:
         value, low, high = float(getattr(effect, name)), quantities[name].lower, quantities[name].upper
         around = (value - (spread or 0.0), value, value + (spread or 0.0))
         near.append([min(max(v, -np.inf if low is None else low), np.inf if high is None else high) for v in around])
-    values = {name: getattr(effect, name) for name in type(effect).model_fields}
-    return max(type(effect)(**values | dict(zip(std, v, strict=True))).usual_nats() for v in product(*near))
+    return max(effect.having(**dict(zip(std, v, strict=True))).usual_nats() for v in product(*near))
 
 
 def _tangents(

@@ -153,7 +153,7 @@ def _cone(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray]:
 def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray) -> Effect:
     """The prototypes scaled in their slope coordinates by the shares found, within bounds."""
     likest = prototypes[int(np.argmax(share))]
-    values = {name: getattr(likest, name) for name in effect.model_fields}
+    values: dict[str, float] = {}
     for name, quantity in effect.quantities().items():
         if name in effect.shapes:
             continue
@@ -170,4 +170,4 @@ def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: Float
             values[name] = max(
                 values[name], absent + 0.9 * (quantity.lower - absent) if quantity.lower < absent else quantity.lower
             )
-    return effect(**values)
+    return likest.having(**values)

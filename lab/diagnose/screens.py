@@ -633,6 +633,8 @@ def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex12
 
 def _greyness(effects: Effects, study: Study) -> float:
     """By how much the screen darkens greys, over what squaring them would do: rims' mean light decides."""
+    if all(type(e).screen is Effect.screen for e in effects):
+        return 0.0
     grey = np.linspace(0.0, 1.0, 41)
     # a pattern that lies over all greys alike averages out
     x, y = np.meshgrid(np.arange(24) * 0.37, np.arange(24) * 0.37) * np.array(study.camera.pixel_pitch_um)

@@ -55,6 +55,10 @@ class Effect(Frozen):
         """The declared parameters, by field name."""
         return declared(cls)
 
+    def having(self, **values: float) -> Self:
+        """The same effect with other values of its fields, checked as any are."""
+        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | values)
+
     @classmethod
     def from_slopes(cls, slopes: dict[str, float]) -> Self:
         """The effect at given slope coordinates u = parameter ** slope_power (measured from `absent`)."""
