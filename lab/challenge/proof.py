@@ -50,8 +50,12 @@ def table(found: ChallengeScore) -> str:
         ("outside the library above 25, the mismatch is seen", found.outside_located),
     ):
         lines.append(f"| {what} | {_rate(rate)} |")
-    if found.excess_removed_median is not None:
-        lines.append(f"| held-out excess chi2 removed, median | {100 * found.excess_removed_median:.1f} % |")
+    for what, share in (
+        ("held-out excess chi2 removed, median", found.excess_removed_median),
+        ("the same outside the library, without a name, median", found.outside_excess_removed_median),
+    ):
+        if share is not None:
+            lines.append(f"| {what} | {100 * share:.1f} % |")
     if found.cpu_median_s is not None and found.memory_max_mib is not None:
         lines.append(
             f"| CPU time of a case, median; memory, largest | {found.cpu_median_s:.1f} s; {found.memory_max_mib:.0f} MiB |"

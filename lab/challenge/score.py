@@ -117,6 +117,7 @@ class ChallengeScore(Frozen):
     parameters_covered: Rate
     excess_removed: float | None
     excess_removed_median: float | None
+    outside_excess_removed_median: float | None
     wall_median_s: float | None
     cpu_median_s: float | None
     cpu_max_s: float | None
@@ -169,7 +170,8 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     outside = [s for s in scored if s.kind == "outside"]
     strong = [s for s in compounds if min(s.noncentrality) > STRONG]
     sets = [(s.truth[0], {s.named[0], *s.rivals}) for s in singles if s.named]
-    removed = [s.excess_removed for s in scored if s.excess_removed is not None]
+    removed = [s.excess_removed for s in scored if s.excess_removed is not None and s.kind != "outside"]
+    outside_removed = [s.excess_removed for s in outside if s.excess_removed is not None]
     ran = [run for _, _, run in cases if run.error is None]
     classes = (
         _singles("above 50", [s for s in singles if s.noncentrality[0] > STRONG]),
@@ -229,6 +231,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
         compounds_both_named=both, compounds_one_named=one, compounds_strong_both_named=both_strong, rival_sets_cover=cover,
         rival_set_mean_size=size, false_alarms=alarms, false_names=names, outside_not_named=abstained, outside_located=located,
         parameters_covered=covered, excess_removed=mean_removed, excess_removed_median=median(removed) if removed else None,
+        outside_excess_removed_median=median(outside_removed) if outside_removed else None,
         wall_median_s=median(r.wall_s for r in ran) if ran else None, cpu_median_s=median(r.cpu_s for r in ran) if ran else None,
         cpu_max_s=cpu, memory_max_mib=memory, goals=goals, case_scores=tuple(scored),
     )  # fmt: skip
@@ -258,9 +261,9 @@ def _case_score(case: str, truth: Truth, run: CaseRun) -> CaseScore:
 
 
 def _removed(truth: Truth, found: DiagnosisResult | None) -> float | None:
-    """(before - after) / (before - n) of held-out chi2, -1..1, where a listed effect left an excess to remove there."""
+    """(before - after) / (before - n) of held-out chi2, -1..1, where what is concealed left an excess to remove there."""
     held = found.held_out if found is not None else None
-    if held is None or not truth.names or max(c.noncentrality for c in truth.concealed) <= STRONG:
+    if held is None or max((c.noncentrality for c in truth.concealed), default=0.0) <= STRONG:
         return None
     excess = held.chi2_before - held.n
     if excess <= EXCESS_SIGMAS * (2.0 * held.n) ** 0.5:

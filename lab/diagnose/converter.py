@@ -61,6 +61,7 @@ def code_block(study: Study) -> Block:
     """Of all even light: steps (DN) where a high bit changes, combs of a few codes' period, and the scatter about a smooth curve."""
     counts = _counted(study)
     labels: list[Label] = []
+    places: list[tuple[float, float]] = []
     sets: list[tuple[_Codes, FloatArray, list[_Part]]] = []
     values, covariances = [], []
     for held_out in (False, True):
@@ -89,6 +90,11 @@ def code_block(study: Study) -> Block:
         for p in parts:
             low, high = codes.first + p.at.start, codes.first + p.at.stop - 1
             labels.append(Label(0.5 * (low + high), "scatter", f"codes {low} to {high}", members, held_out))
+        # combs of other periods and phases have nothing in common, one of the same is the same everywhere
+        far = 10.0 * study.camera.white_level_dn
+        places += [(float(codes.first + b), 0.0) for b in boundaries]
+        places += [(0.0, far * k) for k in range(len(names))]
+        places += [(label.x, 0.0) for label in labels[len(places) :]]
         sets.append((codes, linear, parts))
     if not labels:
         raise NotDetermined(
@@ -106,6 +112,7 @@ def code_block(study: Study) -> Block:
     return Block(
         measurement="code_density", axis="level", unit="DN", reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
         covariance=block_diag(*covariances), labels=tuple(labels), hooks=frozenset({"codes"}), predict=predict, scale=np.ones(len(labels)),
+        along=np.array(places),
     )  # fmt: skip
 
 

@@ -13,9 +13,10 @@ from lab.diagnose.locate import SLACK, Slice, look
 from lab.diagnose.refit import Fit, likelihood
 from lab.diagnose.score import signatures
 from lab.diagnose.search import RIVAL_FROM, SCREENED, Search
-from lab.diagnose.unknown import Discrepancy, discrepancy
+from lab.diagnose.unknown import Discrepancy, discrepancy, predictive
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
+from sim.spectrum import FloatArray
 
 FALSE_ALARM_RATE = 0.01
 #: A name isn't given where something unknown holds more than this share of the probability,
@@ -82,6 +83,11 @@ class Verdict:
     unknown: tuple[Discrepancy, ...]
 
     @property
+    def processes(self) -> dict[int, FloatArray]:
+        """Covariances of what has no name, by their block."""
+        return {gap.index: gap.kernel for gap in self.unknown if gap.gain > 0}
+
+    @property
     def effects(self) -> tuple[Effect, ...]:
         return tuple(c.effect for c in self.named)
 
@@ -117,7 +123,8 @@ def decide(
         parts = [c for c in named if after and _is_part(evidence, c, effects, unknown)]
         if not parts:
             told = tuple(_either_sign(evidence, c, effects) for c in named)
-            return Verdict(evidence, threshold, top, before, told, tuple(abstained), after, unknown)
+            unnamed = tuple(predictive(evidence, evidence.seen_gaussian(effects), i) for i in unexplained)
+            return Verdict(evidence, threshold, top, before, told, tuple(abstained), after, unnamed)
         # weakest first: with it gone, what is left may be no more than another one's law allows
         abstained.append(parts[-1])
         rest = search.fitted(tuple(c.effect for c in named if c is not parts[-1]), final=True)

@@ -279,11 +279,20 @@ class Evidence:
         pull = self.pull(effects, processes)
         return {name: float(column @ pull) for name, column in self._columns(effects).items()}
 
-    def levelled(self, effects: Effects = ()) -> FloatArray:
-        """Prediction of everything with the free quantities there, (n,)."""
-        found = self.quantities(effects)
+    def levelled(self, effects: Effects = (), processes: Mapping[int, FloatArray] | None = None) -> FloatArray:
+        """Prediction of everything with the free quantities there, and with the processes' means, (n,)."""
+        found = self.quantities(effects, processes)
         moved = sum(found[name] * column for name, column in self._columns(effects).items())
-        return np.asarray(self.mean(effects) + moved)
+        return np.asarray(self.mean(effects) + moved + self.discrepant(effects, processes or {}))
+
+    def discrepant(self, effects: Effects, processes: Mapping[int, FloatArray]) -> FloatArray:
+        """Mean of the processes given the seen numbers, at everything, (n,)."""
+        mean = np.zeros(len(self.value))
+        if processes:
+            pull = self.pull(effects, processes)
+            for index, kernel in processes.items():
+                mean[self.slices[index]] = kernel @ pull[self.slices[index]]
+        return mean
 
     def touched(self, effect: type[Effect]) -> np.ndarray:
         """Numbers that an effect may change."""
@@ -292,15 +301,19 @@ class Evidence:
             mask[at] = touched
         return mask
 
-    def held_out(self, effects: Effects = (), where: np.ndarray | None = None) -> tuple[float, int]:
-        """chi2 and number of the held-out numbers, given the seen ones, under these effects."""
+    def held_out(
+        self, effects: Effects = (), where: np.ndarray | None = None, processes: Mapping[int, FloatArray] | None = None
+    ) -> tuple[float, int]:
+        """chi2 and number of the held-out numbers, given the seen ones, under these effects. `processes` predict by their means
+        alone: they make nothing less sure."""
         out = ~self.seen if where is None else ~self.seen & where
         if not out.any():
             return 0.0, 0
         # p(held out | seen) = p(both) / p(seen)
         both = self.seen | out
-        all_of = self.gaussian(effects, both).chi2(self.value[both])
-        given = self.seen_gaussian(effects).chi2(self.seen_value)
+        value = self.value - self.discrepant(effects, processes or {})
+        all_of = self.gaussian(effects, both).chi2(value[both])
+        given = self.seen_gaussian(effects).chi2(value[self.seen])
         return max(all_of - given, 0.0), int(out.sum())
 
     def captures(self, held_out: bool, where: np.ndarray | None = None) -> tuple[str, ...]:

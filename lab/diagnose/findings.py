@@ -118,9 +118,9 @@ def _mean(values: list[tuple[float, float | None]]) -> tuple[float, float | None
 
 
 def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
-    """Of the sides for which effects were named; of all where none was."""
-    anything = any(f.named for f in found)
-    parts = [f.held_out for f in found if f.held_out is not None and (f.named or not anything)]
+    """Of the sides to whose model something was added; of all where nothing was."""
+    anything = any(f.named or f.unexplained for f in found)
+    parts = [f.held_out for f in found if f.held_out is not None and (f.named or f.unexplained or not anything)]
     if not parts:
         return None
     return HeldOut(
@@ -152,7 +152,7 @@ def _summary(
         f"Not explained: {u.measurement.replace('_', ' ')} of the {u.side} camera, {u.where}: {u.shape}."
         for u in unexplained
     ]
-    if held_out is not None and effects:
+    if held_out is not None and held_out.chi2_after < held_out.chi2_before:
         lines.append(
             f"On captures that neither choice nor fit has seen, chi2 falls from {held_out.chi2_before:.0f} to {held_out.chi2_after:.0f} for {held_out.n} numbers."
         )

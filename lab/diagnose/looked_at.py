@@ -47,9 +47,9 @@ def measurement_fits(side: Side, verdict: Verdict) -> Iterator[MeasurementFit]:
     """chi2 of every measurement as a whole: of what choice and fit saw, and of what was held out, given that."""
     evidence, seen = verdict.evidence, verdict.evidence.seen
     found = []
-    for effects in ((), verdict.effects):
+    for effects, processes in (((), {}), (verdict.effects, verdict.processes)):
         model = evidence.gaussian(effects)
-        residual = evidence.value - model.mean
+        residual = evidence.value - model.mean - evidence.discrepant(effects, processes)
         left, covariance = (
             conditional(residual, model.covariance, ~seen, seen) if (~seen).any() else (np.zeros(0), np.zeros((0, 0)))
         )

@@ -223,17 +223,18 @@ def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]
 
 
 def _held_out(verdict: Verdict) -> HeldOut | None:
-    """Over the measurements that the named effects act on; over all where none is named."""
-    evidence, effects = verdict.evidence, verdict.effects
-    where = np.any([evidence.touched(type(e)) for e in effects], axis=0) if effects else None
+    """Over the measurements that something was added for, by a name or without; over all where nothing was."""
+    evidence, effects, processes = verdict.evidence, verdict.effects, verdict.processes
+    added = [evidence.touched(type(e)) for e in effects] + [_mask(evidence, evidence.slices[i]) for i in processes]
+    where = np.any(added, axis=0) if added else None
     before, n = evidence.held_out((), where)
-    after, _ = evidence.held_out(effects, where)
+    after, _ = evidence.held_out(effects, where, processes)
     return HeldOut(captures=evidence.captures(True, where), chi2_before=before, chi2_after=after, n=n) if n else None
 
 
 def _curves(side: Side, verdict: Verdict) -> list[ResidualCurve]:
     evidence = verdict.evidence
-    before, after = evidence.levelled(), evidence.levelled(verdict.effects)
+    before, after = evidence.levelled(), evidence.levelled(verdict.effects, verdict.processes)
     found = []
     for block, at in zip(evidence.blocks, evidence.slices, strict=True):
         std = np.sqrt(np.diag(block.covariance))

@@ -60,7 +60,7 @@ CASES: tuple[tuple[Truth, DiagnosisResult | None], ...] = (
     (truth("compound", ("defocus", 80.0), ("vignetting", 90.0)), named("vignetting", "defocus")),
     (truth("compound", ("defocus", 80.0), ("vignetting", 20.0)), named("vignetting")),
     (truth("compound", ("defocus", 80.0), ("vignetting", 90.0)), None),  # failed
-    (truth("outside", ("smear", 80.0)), named()),
+    (truth("outside", ("smear", 80.0)), named(held=(300.0, 150.0, 100))),  # 75 % removed without a name
     (truth("outside", ("motion", 80.0), accepts=("vibration_blur",)), named("vibration_blur")),
     (truth("outside", ("halo", 80.0)), named("veiling_glare")),
     (truth("outside", fault="stale_frame"), HEALTHY),
@@ -100,6 +100,7 @@ def test_every_figure_is_what_a_hand_counts() -> None:
     # 2.0, 2.19 and 2.21 of the singles, 2.0 twice of the first compound, 2.0 of the second's one; the interval is 2 +- 0.196
     assert counts(found.parameters_covered) == (5, 6)
     assert found.excess_removed == pytest.approx((0.9 + 0.5) / 2)
+    assert found.outside_excess_removed_median == pytest.approx(0.75)
     assert found.cpu_max_s == 15.0
     assert found.memory_max_mib == 115.0
     assert found.failed == {"case-0012": "ValueError: x"}

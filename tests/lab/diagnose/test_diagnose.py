@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from lab.diagnose.locate import look
 from lab.diagnose.refit import refit
 from lab.diagnose.score import signatures
 from lab.diagnose.summaries import Block, Label, Prediction
-from lab.diagnose.unknown import discrepancy
+from lab.diagnose.unknown import discrepancy, predictive
 from lab.recording import Manifest, RecordingSet
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
@@ -152,6 +153,52 @@ def test_unknown_process_takes_a_smooth_discrepancy_and_leaves_noise() -> None:
     found = discrepancy(wave, wave.seen_gaussian(), 0)
     assert found.gain > 50.0
     assert 0.005 < found.amplitude < 0.1
+
+
+def _spectral(rng: np.random.Generator, extra: Callable[[np.ndarray], np.ndarray]) -> Evidence:
+    """A capture a wavelength, every third held out; white noise about 0 and a departure."""
+    x = np.arange(400.0, 700.0, 10.0)
+    labels = tuple(Label(float(w), "Y", "", (f"narrow-{i}",), i % 3 == 1) for i, w in enumerate(x))
+    n = len(x)
+    block = Block(
+        measurement="narrowband", axis="wavelength", unit="nm", reach=40.0, value=extra(x) + NOISE * rng.standard_normal(n),
+        covariance=NOISE**2 * np.eye(n), labels=labels, hooks=frozenset({"transmittance"}), predict=lambda _: Prediction(np.zeros(n), {}),
+        scale=np.ones(n),
+    )  # fmt: skip
+    return Evidence((block,), CAMERA)
+
+
+def test_the_unknown_is_predicted_where_nothing_was_seen() -> None:
+    """A smooth departure at wavelengths left out: chi2 falls to their number, as the noise of what was seen averages out."""
+    evidence = _spectral(np.random.default_rng(31), lambda x: 0.1 * np.sin(x / 60.0))
+    gap = predictive(evidence, evidence.seen_gaussian(), 0)
+    before, n = evidence.held_out()
+    after, _ = evidence.held_out(processes={0: gap.kernel})
+    assert before > 100 * n
+    # the process' own error adds to the noise at most as much again; chi2 of n numbers scatters by sqrt(2 n)
+    assert after < 2 * (n + 3 * np.sqrt(2 * n))
+
+
+def test_what_is_irregular_is_not_predicted_elsewhere() -> None:
+    """Departures that neighbours don't share: the likeliest process holds them as they are, and none is better left-out captures."""
+    rng = np.random.default_rng(32)
+    evidence = _spectral(rng, lambda x: 0.1 * rng.standard_normal(len(x)))
+    assert discrepancy(evidence, evidence.seen_gaussian(), 0).gain > 20.0
+    assert predictive(evidence, evidence.seen_gaussian(), 0).gain == 0.0
+
+
+def test_repeats_of_what_is_irregular_are_predicted() -> None:
+    """Each direction has its own departure, whose repeat is held out: another direction's says nothing of it, its own does."""
+    rng = np.random.default_rng(33)
+    ragged = [0.05 * rng.standard_normal(len(FREQUENCY)) for _ in range(2)]
+    evidence = _evidence(rng)
+    evidence = Evidence((replace(evidence.blocks[0], value=evidence.value + np.concatenate([ragged[0]] * 2 + [ragged[1]] * 2)),), CAMERA)  # fmt: skip
+    gap = predictive(evidence, evidence.seen_gaussian(), 0)
+    before, n = evidence.held_out()
+    after, _ = evidence.held_out(processes={0: gap.kernel})
+    assert before > 20 * n
+    # a number is predicted by one other of the same noise: twice the variance
+    assert after < 2 * (n + 3 * np.sqrt(2 * n))
 
 
 @pytest.mark.parametrize(
