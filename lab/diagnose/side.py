@@ -223,10 +223,12 @@ def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]
 
 
 def _held_out(verdict: Verdict) -> HeldOut | None:
-    """Over the measurements that something was added for, by a name or without; over all where nothing was."""
+    """Over the measurements that something was added for, by a name or without; over all where nothing was, or nothing is held out."""
     evidence, effects, processes = verdict.evidence, verdict.effects, verdict.processes
     added = [evidence.touched(type(e)) for e in effects] + [_mask(evidence, evidence.slices[i]) for i in processes]
     where = np.any(added, axis=0) if added else None
+    if where is not None and evidence.seen[where].all():
+        where = None
     before, n = evidence.held_out((), where)
     after, _ = evidence.held_out(effects, where, processes)
     return HeldOut(captures=evidence.captures(True, where), chi2_before=before, chi2_after=after, n=n) if n else None
