@@ -625,7 +625,8 @@ class Unexplained(Frozen):
 
 
 class HeldOut(Frozen):
-    """Captures that no part of the effects' fit or choice has seen."""
+    """chi2 of captures that no part of a fit or choice has seen, by the baseline, and with the named effects and the processes of what
+    has no name, which predict by their means alone."""
 
     captures: tuple[str, ...]
     chi2_before: float
@@ -646,7 +647,7 @@ class ResidualCurve(Frozen):
     measured: tuple[float, ...]
     measured_std: tuple[float, ...]
     before: tuple[float, ...]  # prediction of the baseline
-    after: tuple[float, ...]  # prediction with the named effects
+    after: tuple[float, ...]  # prediction with the named effects, and the processes of what has no name
     held_out: bool
 
 
@@ -677,7 +678,7 @@ class Place(Frozen):
 
 
 class MeasurementFit(Frozen):
-    """chi2 of one measurement as a whole, before and after the named effects: of what choice and fit saw, and of what was held out."""
+    """chi2 of one measurement as a whole, before and after (the named effects, and the processes of what has no name): of what choice and fit saw, and of what was held out."""
 
     side: Side
     measurement: str

@@ -266,7 +266,7 @@ def _panel_title(number: int, text: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Overlay:
-    """One channel's measured curve with its predictions: by the baseline, and with the named effects where there are any."""
+    """One channel's measured curve with its predictions: by the baseline, and with what was found where anything was."""
 
     channel: str
     x: Sequence[float]
@@ -332,7 +332,7 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
         data.append(_legend(f"{channel} measured", mode="markers", marker={"color": CHANNEL.get(channel, "#888888")}))
     data.append(_legend("baseline", mode="lines", line={"color": "@fg", "width": 1.3, "dash": "dash"}))
     if any(overlay.explained is not None for overlay in everything):
-        data.append(_legend("with the named effects", mode="lines", line={"color": "@fg", "width": 1.8}))
+        data.append(_legend("with what was found", mode="lines", line={"color": "@fg", "width": 1.8}))
 
     def add(overlay: Overlay, y: Sequence[float], on: dict[str, str], **trace: Any) -> None:
         data.append({"type": "scatter", "x": list(overlay.x), "y": list(y), "showlegend": False} | on | trace)
@@ -484,7 +484,7 @@ def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
 
 
 def residual_curve(curve: ResidualCurve) -> Figure:
-    """One measurement with the baseline and the named effects, and below it what is left, in standard deviations."""
+    """One measurement with the baseline and with what was found, and below it what is left, in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
     data: list[Trace] = [
@@ -500,7 +500,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
     ]
     for name, values, colour, dash in (
         ("baseline", curve.before, BEFORE, "dash"),
-        ("with the named effects", curve.after, AFTER, "solid"),
+        ("with what was found", curve.after, AFTER, "solid"),
     ):
         data.append(
             {
@@ -559,7 +559,7 @@ def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
             {
                 "type": "bar",
                 "orientation": "h",
-                "y": ["baseline", "with the named effects"],
+                "y": ["baseline", "with what was found"],
                 "x": [held.chi2_before / held.n, held.chi2_after / held.n],
                 "marker": {"color": [BEFORE, AFTER]},
                 "text": [f"{held.chi2_before / held.n:.2f}", f"{held.chi2_after / held.n:.2f}"],

@@ -67,8 +67,8 @@ def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: Diag
         ]
         if named and clean:
             yield f"The {' and '.join(clean)} camera conceals nothing that these recordings would show."
-        if diagnosis.held_out is not None and diagnosis.effects:
-            held = diagnosis.held_out
+        held = diagnosis.held_out
+        if held is not None and held.chi2_after < held.chi2_before:
             yield (
                 f"On {len(held.captures)} captures that no part of this has seen, χ² falls from {held.chi2_before:.0f} to "
                 f"{held.chi2_after:.0f} over {held.n} numbers."
