@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import and_
 
@@ -12,7 +12,7 @@ from lab.diagnose.evidence import Evidence
 from lab.diagnose.locate import SLACK, Slice, look
 from lab.diagnose.refit import Fit, likelihood
 from lab.diagnose.score import signatures
-from lab.diagnose.search import RIVAL_FROM, SCREENED, Search
+from lab.diagnose.search import FURTHER, RIVAL_FROM, SCREENED, Search
 from lab.diagnose.unknown import Discrepancy, discrepancy, predictive
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
@@ -26,13 +26,13 @@ NAMED_FROM = 0.35
 #: Of the excess chi2 in the measurements that an effect acts on, what its name has to explain where something significant is left.
 CAUSE_FROM = 0.8
 #: The same where what is left is more than the law's own tolerance allows: a name that nearly fits isn't the cause.
-OPEN_CAUSE_FROM = 0.95
+OPEN_CAUSE_FROM = 0.98
 #: From which share on a name needn't be all but sure, and how sure it has to be below that.
 WELL_EXPLAINED, SURE = 0.95, 0.8
 #: Of an effect's gain: what something unexplained in the same frames may have, or the effect is but a part of what that is.
-REMAINDER_SHARE = 0.1
-#: Of the threshold: what an effect has to gain where a stronger one acts, too. That one's law may be wrong.
-FURTHER = 1.5
+REMAINDER_SHARE = 0.02
+#: Nats that it may have in any case.
+REMAINDER_NATS = 5.0
 #: Of a stronger effect's gain: below that, what acts on the same measurement is taken for an error of its law.
 LEAST_SHARE = 1e-4
 #: A score that no slice and no refit bears out has to exceed the threshold by so much, for what a covariance doesn't hold.
@@ -47,6 +47,8 @@ CLOSE = 100.0
 SAME = 2.0
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
+#: Of what a name gains: as far behind it a rival may lie after a rough fit to be fitted to convergence.
+ROUGH_SHARE = 0.15
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
 COMPANION_SHARE = 0.03
 
@@ -118,7 +120,7 @@ def decide(
         after = tuple(s for s in look(evidence, evidence.gaussian(effects)) if s.significant)
         unexplained = list(dict.fromkeys(evidence.blocks.index(s.block) for s in after))
         if abstained and not unexplained:
-            unexplained = [_seat(evidence, abstained[0], effects)]
+            unexplained = [evidence.seat(abstained[0].effect, effects)]
         unknown = tuple(discrepancy(evidence, evidence.seen_gaussian(effects), i) for i in unexplained)
         parts = [c for c in named if after and _is_part(evidence, c, effects, unknown)]
         if not parts:
@@ -154,19 +156,13 @@ def _either_sign(evidence: Evidence, candidate: Candidate, effects: tuple[Effect
     return replace(candidate, std=std)
 
 
-def _seat(evidence: Evidence, candidate: Candidate, effects: Iterable[Effect]) -> int:
-    """The block in which an effect shows most beside others."""
-    others = tuple(e for e in effects if e.name != candidate.effect.name)
-    return max(_touched(evidence, candidate.effect), key=lambda i: evidence.shown(candidate.effect, others, i))
-
-
 def _is_part(
-    evidence: Evidence, candidate: Candidate, effects: Iterable[Effect], unknown: Iterable[Discrepancy]
+    evidence: Evidence, candidate: Candidate, effects: Sequence[Effect], unknown: Iterable[Discrepancy]
 ) -> bool:
     """Whether the frames in which a name shows most hold something unexplained that is strong beside it: both may be one."""
-    seat = _seat(evidence, candidate, effects)
-    frames = _frames(evidence, seat)
-    strong = [g.index for g in unknown if g.index != seat and g.gain > REMAINDER_SHARE * candidate.gain]
+    frames = _frames(evidence, evidence.seat(candidate.effect, effects))
+    least = max(REMAINDER_SHARE * candidate.gain, REMAINDER_NATS)
+    strong = [g.index for g in unknown if g.gain > least]
     return any(2 * len(frames & (seen := _frames(evidence, i))) > min(len(frames), len(seen)) for i in strong)
 
 
@@ -185,6 +181,18 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
     certain: dict[str, Candidate] = {}
     while current.effects:
         weighed.add(frozenset(current.names))
+        slight = _slightest(search, current)
+        if slight is not None:
+            index, is_companion = slight
+            if not is_companion:  # the error of a law that is named is nothing unexplained
+                report(f"weighing {current.effects[index].name} against its rivals")
+                candidate, better = _weighed(search, current, index)
+                if better is not None and frozenset(better.names) not in weighed:
+                    current = search.fitted(better.effects, final=True)
+                    continue
+                given_up.append(candidate)
+            current = _without(search, current, index)
+            continue
         members, likelier = [], None
         for index, e in enumerate(current.effects):
             if e.name in certain:
@@ -204,27 +212,33 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
             current = search.fitted(likelier.effects, final=True)
             continue
         crowd = _crowd(search, current)
-        if crowd:
-            lost = [members[i] for i in crowd]
-        else:
-            companions = [c for c in members if _companion(c, members, evidence)]
-            weak = companions or [
-                c for c in members if not _holds(c, threshold * (FURTHER if _beside(c, members, evidence) else 1.0))
-            ]
-            lost = sorted(weak, key=lambda c: c.gain)[:1]
+        lost = [members[i] for i in crowd] or sorted((c for c in members if not _holds(c)), key=lambda c: c.gain)[:1]
         if not lost:
             return members, given_up
-        if crowd or not companions:  # the error of a law that is named is nothing unexplained
-            given_up += lost
+        given_up += lost
         current = search.fitted(tuple(c.effect for c in members if c not in lost), final=True)
     return [], given_up
 
 
-def _holds(candidate: Candidate, threshold: float) -> bool:
+def _slightest(search: Search, fit: Fit) -> tuple[int, bool] | None:
+    """The weakest member that is too weak for a name whatever its rivals, and whether it may be no more than the error of
+    another's law. Looked at before anything is weighed, as each rival of each other member would be fitted beside it."""
+    gains = [fit.weight - _without(search, fit, i).weight for i in range(len(fit.effects))]
+    members = [Candidate(e, s, 0.0, (), gain) for e, s, gain in zip(fit.effects, fit.std, gains, strict=True)]
+    evidence, threshold = search.evidence, search.threshold
+    companions = [c for c in members if _companion(c, members, evidence)]
+    weak = companions or [
+        c for c in members if 2.0 * c.gain < threshold * (FURTHER if _beside(c, members, evidence) else 1.0)
+    ]
+    if not weak:
+        return None
+    return members.index(min(weak, key=lambda c: c.gain)), bool(companions)
+
+
+def _holds(candidate: Candidate) -> bool:
     return (
         candidate.unknown <= UNKNOWN_UP_TO
         and candidate.probability >= (NAMED_FROM if candidate.explains >= WELL_EXPLAINED else SURE)
-        and 2.0 * candidate.gain >= threshold
         and candidate.explains >= (CAUSE_FROM if candidate.closed else OPEN_CAUSE_FROM)
     )
 
@@ -234,7 +248,7 @@ def _beside(candidate: Candidate, members: list[Candidate], evidence: Evidence) 
     stronger = [c for c in members if c.gain > candidate.gain]
     if not stronger:
         return False
-    block = evidence.blocks[_seat(evidence, candidate, (c.effect for c in members))]
+    block = evidence.blocks[evidence.seat(candidate.effect, [c.effect for c in members])]
     return any(block.touched_by(type(c.effect)) for c in stronger)
 
 
@@ -268,10 +282,7 @@ def _crowd(search: Search, fit: Fit) -> list[int]:
     evidence = search.evidence
     by_block: dict[int, list[int]] = {}
     for i, e in enumerate(fit.effects):
-        rest = (*fit.effects[:i], *fit.effects[i + 1 :])
-        touched = _touched(evidence, e)
-        if touched:
-            by_block.setdefault(max(touched, key=lambda k, e=e, rest=rest: evidence.shown(e, rest, k)), []).append(i)  # type: ignore[misc]
+        by_block.setdefault(evidence.seat(e, fit.effects), []).append(i)
     full = evidence.seen_gaussian(fit.effects)
     for index, members in by_block.items():
         if len(members) < 2:
@@ -302,7 +313,7 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     for score in pool[:SCREENED]:
         start = (*fit.effects[:index], score.start, *fit.effects[index + 1 :])
         rough = search.fitted(start)
-        near = rough.weight > fit.weight - HOPELESS - 0.3 * gain
+        near = rough.weight > fit.weight - HOPELESS - ROUGH_SHARE * gain
         fits[score.effect.name] = search.fitted(start, final=True) if near else rough
     weights = {}
     for name, tried in fits.items():

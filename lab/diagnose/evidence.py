@@ -263,6 +263,12 @@ class Evidence:
         change = self.mean((*others, effect))[at] - self.mean(others)[at]
         return float(np.sum(np.square(change) / np.diag(self.blocks[index].covariance)))
 
+    def seat(self, effect: Effect, effects: Effects) -> int:
+        """The block in which an effect shows most beside the others of a set."""
+        others = tuple(e for e in effects if e.name != effect.name)
+        touched = [i for i, acting in enumerate(self.acts(type(effect))) if acting]
+        return max(touched, key=lambda i: self.shown(effect, others, i), default=0)
+
     def pull(self, effects: Effects = (), processes: Mapping[int, FloatArray] | None = None) -> FloatArray:
         """C^-1 (y - m) of the seen numbers, nil at the others, (n,): what any part J P J' of C, times this, has of the residual.
         `processes`: covariances of discrepancies by the block's index, on top."""

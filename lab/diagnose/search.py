@@ -19,6 +19,8 @@ BEAM = 2  # sets of one size from which the search goes on
 HOPELESS_SHARE = 0.1
 #: Of what a member gains, in nats: the score (two a nat) from which on an effect may stand in its place.
 RIVAL_FROM = 1.2
+#: Of the threshold: what an effect has to gain where a stronger one acts on the same measurement. That one's law may be wrong.
+FURTHER = 1.5
 #: Nats below the best by which a set may lie and still be gone on from.
 BEHIND = 25.0
 
@@ -52,9 +54,20 @@ class Search:
             if self.worth(beam[0]) <= self.worth(current) and count:
                 break
             beam = [f for f in beam if self.worth(f) > self.worth(beam[0]) - BEHIND]
-            if self.worth(beam[0]) > self.worth(current):
+            if self.worth(beam[0]) > self.worth(current) + self._further(beam[0], current):
                 current = beam[0]
         return self._mended(current)
+
+    def _further(self, fit: Fit, than: Fit) -> float:
+        """Nats that a set has to be worth more than the one that it was grown from: of an effect that shows most where one of those
+        acts."""
+        new = [e for e in fit.effects if e.name not in than.names]
+        if not than.effects or len(new) != len(fit.effects) - len(than.effects):
+            return 0.0
+        seats = [self.evidence.blocks[self.evidence.seat(e, fit.effects)] for e in new]
+        old = [type(e) for e in fit.effects if e.name in than.names]
+        beside = any(seat.touched_by(e) for seat in seats for e in old)
+        return 0.5 * (FURTHER - 1.0) * self.threshold if beside else 0.0
 
     def _grown(self, state: Fit) -> list[Fit]:
         found = signatures(

@@ -14,8 +14,8 @@ from lab.diagnose.summaries import Block
 from sim.spectrum import FloatArray
 
 AMPLITUDES = np.geomspace(2e-4, 1.0, 20)
-#: What amplitude, smoothness and kinship of the process cost, in nats.
-PROCESS_NATS = 3.0
+#: What the choice of amplitude, reach and kinship costs, in nats: the logarithm of how many of them differ.
+PROCESS_NATS = 5.0
 #: Parts of a block's captures that are left out in turn.
 MOST_PARTS = 6
 #: Nats within which two processes are as likely as each other.

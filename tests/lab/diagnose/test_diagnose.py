@@ -13,8 +13,9 @@ from lab.diagnose import diagnose
 from lab.diagnose.decide import decide
 from lab.diagnose.evidence import Evidence, Gaussian, Within, chi2
 from lab.diagnose.locate import look
-from lab.diagnose.refit import refit
+from lab.diagnose.refit import Fit, refit
 from lab.diagnose.score import signatures
+from lab.diagnose.search import Search
 from lab.diagnose.summaries import Block, Label, Prediction
 from lab.diagnose.unknown import discrepancy, predictive
 from lab.recording import Manifest, RecordingSet
@@ -224,6 +225,26 @@ def test_what_nobody_lists_gets_no_name() -> None:
     assert not verdict.named
     assert verdict.after
     assert verdict.unknown
+
+
+def test_a_name_beside_a_strong_remainder_is_a_family() -> None:
+    """A filter, and a ripple that no law has: the nearest name takes 96 % of the excess, and what it leaves isn't within its tolerance."""
+    evidence = _evidence(np.random.default_rng(23), (effect("optical_low_pass_filter")(displacement_x_um=1.6, displacement_y_um=1.6),), 0.03 * np.sin(14.0 * FREQUENCY))  # fmt: skip
+    verdict = decide(evidence, np.random.default_rng(0))
+    assert not verdict.named
+    assert verdict.abstained
+    assert verdict.unknown
+
+
+def test_what_is_added_beside_a_stronger_effect_has_to_earn_more() -> None:
+    """Half as much again as the threshold, where both act on the same measurement; a first effect earns the threshold alone."""
+    evidence = _evidence(np.random.default_rng(24))
+    search = Search(evidence, tuple(e for e in effects().values() if e.shown_by), 18.0)
+    alone = Fit((effect("defocus")(defocus_um=3.0),), ({},), 0.0, 0.0, np.zeros((len(evidence.value), 0)))
+    both = replace(alone, effects=(*alone.effects, effect("charge_diffusion")(length_um=0.3)))
+    none = replace(alone, effects=())
+    assert search._further(alone, none) == 0.0
+    assert search._further(both, alone) == pytest.approx(0.25 * 18.0)
 
 
 def test_gaussians_agree_with_their_formulas() -> None:
