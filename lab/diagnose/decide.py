@@ -30,9 +30,11 @@ OPEN_CAUSE_FROM = 0.98
 #: From which share on a name needn't be all but sure, and how sure it has to be below that.
 WELL_EXPLAINED, SURE = 0.95, 0.8
 #: Of an effect's gain: what something unexplained in the same frames may have, or the effect is but a part of what that is.
-REMAINDER_SHARE = 0.02
-#: Nats that it may have in any case.
-REMAINDER_NATS = 5.0
+REMAINDER_SHARE = 0.1
+#: The same of what it leaves in the measurement that shows it most, or of anything from so many nats on: no law's error is as sure.
+OWN_REMAINDER_SHARE, SURE_REMAINDER_NATS = 0.02, 1000.0
+#: Nats that a remainder may have in any case.
+REMAINDER_NATS = 3.0
 #: Of a stronger effect's gain: below that, what acts on the same measurement is taken for an error of its law.
 LEAST_SHARE = 1e-4
 #: A score that no slice and no refit bears out has to exceed the threshold by so much, for what a covariance doesn't hold.
@@ -160,9 +162,14 @@ def _is_part(
     evidence: Evidence, candidate: Candidate, effects: Sequence[Effect], unknown: Iterable[Discrepancy]
 ) -> bool:
     """Whether the frames in which a name shows most hold something unexplained that is strong beside it: both may be one."""
-    frames = _frames(evidence, evidence.seat(candidate.effect, effects))
-    least = max(REMAINDER_SHARE * candidate.gain, REMAINDER_NATS)
-    strong = [g.index for g in unknown if g.gain > least]
+    seat = evidence.seat(candidate.effect, effects)
+    frames = _frames(evidence, seat)
+
+    def is_strong(gap: Discrepancy) -> bool:
+        own = gap.index == seat or gap.gain > SURE_REMAINDER_NATS
+        return gap.gain > max((OWN_REMAINDER_SHARE if own else REMAINDER_SHARE) * candidate.gain, REMAINDER_NATS)
+
+    strong = [g.index for g in unknown if is_strong(g)]
     return any(2 * len(frames & (seen := _frames(evidence, i))) > min(len(frames), len(seen)) for i in strong)
 
 

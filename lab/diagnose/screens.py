@@ -6,7 +6,7 @@ transfer function. Band by band of frequency and orientation its picture is spli
 
     seen = sum over bands of c_b P_b + rim P (1 - P) + turned T + even + shifts . gradient P + P beyond the bands
 
-by least squares over each channel's own pixels. Under the baseline every c_b is 1 and all the rest 0. Drawn and seen by the
+by least squares over each channel's own pixels; a channel whose picture lies elsewhere than green's is drawn there. Under the baseline every c_b is 1 and all the rest 0. Drawn and seen by the
 same pixels, aliasing is in both, so that a band holds its own frequencies alone.
 """
 
@@ -29,6 +29,7 @@ from lab.errors import NotDetermined
 from lab.fit.psf import area_drawn
 from lab.fit.screen import ScreenWarp, register
 from lab.recording import Bernoulli, Black, Capture, Checkerboard, White
+from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.forward import optical_transfer
 from sim.optics.diffraction import aperture_otf
@@ -60,6 +61,7 @@ TURNED_FLOOR = 1.5e-4
 COLOUR_FLOOR_PX = (
     0.012  # cells of whole pixels alias alike everywhere: what a drawing gets wrong there doesn't average out
 )
+MOVED_PX = 0.03  # a channel further off is drawn where it is
 CERTAIN = 8.0  # standard deviations
 PLACINGS = 4  # steps in which a shifted picture is found
 GRID_STD = 1.3  # of the strongest line's number: the noise's mean is measured, too
@@ -91,7 +93,7 @@ class Pattern:
 
 
 #: Coefficients behind the bands', in their order: rim, turned, even, shift x, shift y, radial, radial^3, across.
-RIM, TURNED, EVEN, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 5, 6, 7
+RIM, TURNED, EVEN, SHIFT_X, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 3, 5, 6, 7
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,13 @@ def _measured(
     found = []
     for channel in camera.channels:
         design = _Design.of(study, canvas, channel, light, whole, turned)
+        moved = design.shifts(whole[window][design.mask])
+        if channel != reference and np.abs(_field(study, design.mask, window, moved)).max() > MOVED_PX:
+            # so far out that its slopes don't tell what is lost: drawn anew where it is
+            there = _displaced(warp, design.mask, window, _field(study, design.mask, window, moved))
+            design = _Design.of(study, _Canvas.of(target, there, window), channel, light, whole, turned)
+        else:
+            moved = np.zeros(len(moved))
         area = contrast[window][design.mask]
         exposure = group[0].exposure_s
         levels = (
@@ -212,6 +221,8 @@ def _measured(
             solved.append(design.solved(picture[window][design.mask], temporal))
         # one for all parts, or what they share could exceed what one of them has
         common = np.mean([c for *_, c in solved], axis=0)
+        for value, *_ in solved:
+            value[len(design.bands) + SHIFT_X : len(design.bands) + ACROSS + 1] += moved
         for part, (value, shown, _) in zip(parts, solved, strict=True):
             found.append(
                 Pattern(
@@ -221,6 +232,31 @@ def _measured(
                 )
             )  # fmt: skip
     return found
+
+
+def _field(study: Study, mask: NDArray[np.bool_], window: tuple[slice, slice], shifts: FloatArray) -> FloatArray:
+    """Where a pixel sees what would lie at itself without these shifts (x, y, radial, radial^3, across), less where it is: (2, pixels), px."""
+    row, col = np.nonzero(mask)
+    u, v, r2 = _from_middle(study.camera, row + window[0].start, col + window[1].start)
+    x, y, radial, radial3, across = shifts
+    outwards = radial + radial3 * r2
+    return np.array([x - outwards * u + across * v, y - outwards * v - across * u])
+
+
+def _displaced(warp: ScreenWarp, mask: NDArray[np.bool_], window: tuple[slice, slice], field: FloatArray) -> ScreenWarp:
+    """The warp with a field of displacements (2, pixels), a polynomial of the warp's own order."""
+    row, col = np.nonzero(mask)
+    terms = warp.basis(np.column_stack([col + window[1].start, row + window[0].start]).astype(float))
+    return warp.displaced(np.linalg.lstsq(terms.T, field.T, rcond=1e-12)[0].T)
+
+
+def _from_middle(
+    camera: CameraModel, row: NDArray[Any], col: NDArray[Any]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Columns and rows from the frame's middle, in half diagonals, and the squared distance."""
+    half = 0.5 * float(np.hypot(camera.rows, camera.cols))
+    u, v = (col - 0.5 * (camera.cols - 1)) / half, (row - 0.5 * (camera.rows - 1)) / half
+    return u, v, u * u + v * v
 
 
 def _turned_by(
@@ -448,10 +484,7 @@ class _Design:
         picture = (low_part + np.sum(beyond, axis=0))[mask]
         across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
         row, col = np.nonzero(mask)
-        half = 0.5 * float(np.hypot(camera.rows, camera.cols))
-        u = (col + canvas.window[1].start - 0.5 * (camera.cols - 1)) / half
-        v = (row + canvas.window[0].start - 0.5 * (camera.rows - 1)) / half
-        r2 = u * u + v * v
+        u, v, r2 = _from_middle(camera, row + canvas.window[0].start, col + canvas.window[1].start)
         # light that lands further out by s has the picture of a place nearer by s
         outwards, around = -(u * across + v * down), -(u * down - v * across)
         grey = np.clip(picture, 0.0, 1.0)
@@ -476,6 +509,11 @@ class _Design:
         return _Design(
             mask, tuple(bands), table, fixed, inverse, mix, inverse @ (table @ lost), float(np.sqrt(r2.max()))
         )
+
+    def shifts(self, seen: FloatArray) -> FloatArray:
+        """How far the picture is moved: x, y, radial, radial^3, across."""
+        value = self.inverse @ (self.columns @ (seen - self.fixed))
+        return np.asarray(value[len(self.bands) + SHIFT_X : len(self.bands) + ACROSS + 1])
 
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients; their covariance by `temporal`, the variance (pixels,) that repeats average out; and by the rest.
