@@ -61,7 +61,7 @@ TURNED_FLOOR = 1.5e-4
 COLOUR_FLOOR_PX = (
     0.012  # cells of whole pixels alias alike everywhere: what a drawing gets wrong there doesn't average out
 )
-MOVED_PX = 0.03  # a channel further off is drawn where it is
+MOVED_PX = 0.1  # a channel further off is drawn where it is: less shows as well where the blur is not the drawn one
 CERTAIN = 8.0  # standard deviations
 PLACINGS = 4  # steps in which a shifted picture is found
 GRID_STD = 1.3  # of the strongest line's number: the noise's mean is measured, too
