@@ -6,8 +6,9 @@ transfer function. Band by band of frequency and orientation its picture is spli
 
     seen = sum over bands of c_b P_b + rim P (1 - P) + turned T + even + shifts . gradient P + P beyond the bands
 
-by least squares over each channel's own pixels; a channel whose picture lies elsewhere than green's is drawn there. Under the baseline every c_b is 1 and all the rest 0. Drawn and seen by the
-same pixels, aliasing is in both, so that a band holds its own frequencies alone.
+by least squares over each channel's own pixels; a channel whose picture lies elsewhere than green's is drawn there. Under the
+baseline every c_b is 1 and all the rest 0. Drawn and seen by the same pixels, aliasing is in both, so that a band holds its
+own frequencies alone.
 """
 
 from __future__ import annotations
@@ -201,9 +202,10 @@ def _measured(
     for channel in camera.channels:
         design = _Design.of(study, canvas, channel, light, whole, turned)
         moved = design.shifts(whole[window][design.mask])
-        if channel != reference and np.abs(_field(study, design.mask, window, moved)).max() > MOVED_PX:
+        field = _field(study, design.mask, window, moved)
+        if channel != reference and np.abs(field).max() > MOVED_PX:
             # so far out that its slopes don't tell what is lost: drawn anew where it is
-            there = _displaced(warp, design.mask, window, _field(study, design.mask, window, moved))
+            there = _displaced(warp, design.mask, window, field)
             design = _Design.of(study, _Canvas.of(target, there, window), channel, light, whole, turned)
         else:
             moved = np.zeros(len(moved))
