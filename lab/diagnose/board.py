@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import linalg
@@ -40,15 +39,17 @@ REFERENCE_NM = 550.0
 COLOUR_VIEWS = 8  # evenly over the views: a colour's corners cost a fit each
 COLOUR_RINGS = (0.3, 0.6, 1.0)  # half diagonals
 
-_KEPT: WeakKeyDictionary[Study, dict[Side, tuple[list[BoardView], list[Skipped]]]] = WeakKeyDictionary()
-
 
 def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:
     """The boards in the charuco captures of a side, found once, and those that couldn't be found."""
-    kept = _KEPT.setdefault(study, {})
+    kept: dict[Side, tuple[list[BoardView], list[Skipped]]] = study.once(_no_views)
     if side not in kept:
         kept[side] = find_boards(study.recordings, side)
     return kept[side]
+
+
+def _no_views(_: Study) -> dict[Side, tuple[list[BoardView], list[Skipped]]]:
+    return {}
 
 
 def calibration_of(study: Study) -> Calibration:

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,20 +109,9 @@ class Band:
     upper: NDArray[np.bool_]  # nodes of the upper half of the frequencies
 
 
-_KEPT: WeakKeyDictionary[Study, list[list[Pattern]] | NotDetermined] = WeakKeyDictionary()
-
-
 def patterns(study: Study) -> list[list[Pattern]]:
     """Every Bernoulli pattern by channel and part; a list for each (pose, target), which share the light of white and black."""
-    if study not in _KEPT:
-        try:
-            _KEPT[study] = _patterns(study)
-        except NotDetermined as refused:
-            _KEPT[study] = refused
-    found = _KEPT[study]
-    if isinstance(found, NotDetermined):
-        raise found
-    return found
+    return study.once(_patterns)
 
 
 def _patterns(study: Study) -> list[list[Pattern]]:

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from scipy import ndimage
 
+from lab.errors import NotDetermined
 from lab.predict import Field
 from lab.recording import Camera, Capture, RecordingSet
 from sim.camera import CameraModel, Side
@@ -225,10 +226,16 @@ class Study:
     # --- parts that several blocks share ---
 
     def once(self, make: Callable[[Study], T]) -> T:
-        """What `make` finds, made once: several blocks read different numbers off it."""
+        """What `make` finds, or why it can't, made once: several blocks read different numbers off it."""
         if make not in self._made:
-            self._made[make] = make(self)
-        return cast(T, self._made[make])
+            try:
+                self._made[make] = make(self)
+            except NotDetermined as refused:
+                self._made[make] = refused
+        found = self._made[make]
+        if isinstance(found, NotDetermined):
+            raise found
+        return cast(T, found)
 
     @cached_property
     def _before(self) -> dict[str, Capture]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -103,6 +105,16 @@ def test_defocus_changes_the_contrast_as_predicted() -> None:
         n = len(residual)
         chi2 = float(residual @ np.linalg.solve(model.covariance, residual))
         assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
+
+
+def test_what_was_measured_dies_with_its_study() -> None:
+    """A service diagnoses one set after another: thirty megabytes a set would stay for ever."""
+    study = study_of(recorded())
+    contrast_block(study)
+    kept = weakref.ref(study)
+    del study
+    gc.collect()
+    assert kept() is None
 
 
 def test_a_colours_contrast_is_that_of_its_own_place() -> None:
