@@ -286,11 +286,11 @@ class Vignetting(Law):
 
 
 class VignettingDecentre(Law):
-    """A fall-off of 8 % in the corners about a point beside the middle."""
+    """A fall-off of 8 % in the corners about a point beside the middle: further than an optical axis may lie off it."""
 
     name = effect = "vignetting_decentre"
     accepts = frozenset({"vignetting"})
-    variants, unit, nominal, limits = 2, "1", 0.3, (0.05, 0.8)
+    variants, unit, nominal, limits = 2, "1", 0.3, (0.15, 0.8)
 
     def shade(self, x: Array, y: Array) -> Array:
         t = 2 * np.pi * self.u[0]
