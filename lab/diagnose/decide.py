@@ -50,7 +50,7 @@ SAME = 2.0
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
 #: Of what a name gains: as far behind it a rival may lie after a rough fit to be fitted to convergence.
-ROUGH_SHARE = 0.15
+ROUGH_SHARE = 0.05
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
 COMPANION_SHARE = 0.03
 
