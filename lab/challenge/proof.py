@@ -52,7 +52,7 @@ def table(found: ChallengeScore) -> str:
         lines.append(f"| {what} | {_rate(rate)} |")
     for what, share in (
         ("held-out excess chi2 removed, median", found.excess_removed_median),
-        ("the same outside the library, without a name, median", found.outside_excess_removed_median),
+        ("the same outside the library, median", found.outside_excess_removed_median),
     ):
         if share is not None:
             lines.append(f"| {what} | {100 * share:.1f} % |")

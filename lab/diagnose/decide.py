@@ -205,7 +205,7 @@ def _believed(search: Search, current: Fit, report: Callable[[str], None]) -> tu
             if e.name in certain:
                 # a weaker member that left changes nothing about this one's name, but what is left to explain
                 without = _without(search, current, index)
-                explains, closed = _explained(evidence, current, without, _touched(evidence, e))
+                explains, closed = _explained(evidence, current, without, evidence.acted_on(e))
                 kept = replace(certain[e.name], effect=e, std=current.std[index], explains=explains, closed=closed)
                 members.append(kept)
                 continue
@@ -309,7 +309,7 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     likelier, now that both may leave something unknown behind."""
     evidence, effect = search.evidence, fit.effects[index]
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
-    without, touched = _without(search, fit, index), _touched(evidence, effect)
+    without, touched = _without(search, fit, index), evidence.acted_on(effect)
     others = [e for e in search.known if e.name not in fit.names]
     likely = signatures(evidence, evidence.camera, without.effects, others, without.tangents).scores()
     gain = fit.weight - without.weight
@@ -347,11 +347,6 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     first = max((n for n in share if n != "unknown"), key=lambda n: share[n])
     better = fits[first] if share[first] > 2.0 * share[effect.name] else None
     return Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains, closed), better
-
-
-def _touched(evidence: Evidence, effect: Effect) -> list[int]:
-    """The blocks that an effect acts on."""
-    return [i for i, acting in enumerate(evidence.acts(type(effect))) if acting]
 
 
 def _without(search: Search, fit: Fit, index: int) -> Fit:

@@ -166,6 +166,10 @@ class Evidence:
             self._acting[effect] = tuple(block.touched_by(effect) for block in self.blocks)
         return self._acting[effect]
 
+    def acted_on(self, effect: Effect) -> list[int]:
+        """The blocks that an effect acts on."""
+        return [i for i, acting in enumerate(self.acts(type(effect))) if acting]
+
     def _numbered(self, acting: Effects) -> list[_Numbered]:
         """Effects with a number each, which keys can be made of at less cost than of all their values."""
         return [_Numbered(self._numbers.setdefault(e, len(self._numbers)), self.acts(type(e)), e) for e in acting]
@@ -266,8 +270,7 @@ class Evidence:
     def seat(self, effect: Effect, effects: Effects) -> int:
         """The block in which an effect shows most beside the others of a set."""
         others = tuple(e for e in effects if e.name != effect.name)
-        touched = [i for i, acting in enumerate(self.acts(type(effect))) if acting]
-        return max(touched, key=lambda i: self.shown(effect, others, i), default=0)
+        return max(self.acted_on(effect), key=lambda i: self.shown(effect, others, i), default=0)
 
     def pull(self, effects: Effects = (), processes: Mapping[int, FloatArray] | None = None) -> FloatArray:
         """C^-1 (y - m) of the seen numbers, nil at the others, (n,): what any part J P J' of C, times this, has of the residual.

@@ -64,7 +64,7 @@ def improved_model(
     # what is measured is electrons times gain: of another gain, the curves take up the difference
     applied, processes = _applied(evidence, unknown)
     quantities = evidence.quantities(effects, processes)
-    pull = evidence.pull(effects, processes)
+    discrepant = evidence.discrepant(effects, processes)
     share = evidence.camera.conversion_gain_dn_per_e / camera.conversion_gain_dn_per_e
     curves = {
         channel: _scaled(freed, share if freed is not curve else 1.0)
@@ -81,7 +81,7 @@ def improved_model(
             corrections.append(Correction(block.measurement, None, said))
             continue
         at = evidence.slices[gap.index]
-        x, factor, each = _factor(block, gap.kernel @ pull[at], evidence.levelled(effects)[at])
+        x, factor, each = _factor(block, discrepant[at], evidence.levelled(effects)[at])
         if kind == "sensitivity":
             for channel, (wavelength_nm, by) in each.items():
                 if channel in curves:

@@ -189,12 +189,13 @@ def _measured(
     found = []
     for channel in camera.channels:
         design = _Design.of(study, canvas, channel, light, whole, turned)
-        moved = design.shifts(whole[window][design.mask])
-        field = _field(study, design.mask, window, moved)
+        moved = design.coefficients(whole[window][design.mask])[design.shifts]
+        points = _points(design.mask, window)
+        field = _field(camera, points, moved)
         if channel != reference and np.abs(field).max() > MOVED_PX:
             # so far out that its slopes don't tell what is lost: drawn anew where it is
-            there = _displaced(warp, design.mask, window, field)
-            design = _Design.of(study, _Canvas.of(target, there, window), channel, light, whole, turned)
+            there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
+            design = _Design.of(study, _Canvas.of(target, warp.displaced(there), window), channel, light, whole, turned)
         else:
             moved = np.zeros(len(moved))
         area = contrast[window][design.mask]
@@ -212,7 +213,7 @@ def _measured(
         # one for all parts, or what they share could exceed what one of them has
         common = np.mean([c for *_, c in solved], axis=0)
         for value, *_ in solved:
-            value[len(design.bands) + SHIFT_X : len(design.bands) + ACROSS + 1] += moved
+            value[design.shifts] += moved
         for part, (value, shown, _) in zip(parts, solved, strict=True):
             found.append(
                 Pattern(
@@ -224,28 +225,24 @@ def _measured(
     return found
 
 
-def _field(study: Study, mask: NDArray[np.bool_], window: tuple[slice, slice], shifts: FloatArray) -> FloatArray:
-    """Where a pixel sees what would lie at itself without these shifts (x, y, radial, radial^3, across), less where it is: (2, pixels), px."""
+def _points(mask: NDArray[np.bool_], window: tuple[slice, slice]) -> FloatArray:
+    """(x, y) in the frame of a mask's pixels, (pixels, 2)."""
     row, col = np.nonzero(mask)
-    u, v, r2 = _from_middle(study.camera, row + window[0].start, col + window[1].start)
+    return np.column_stack([col + window[1].start, row + window[0].start]).astype(float)
+
+
+def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> FloatArray:
+    """Where a pixel sees what would lie at itself without these shifts (x, y, radial, radial^3, across), less where it is: (2, pixels), px."""
+    u, v, r2 = _from_middle(camera, points)
     x, y, radial, radial3, across = shifts
     outwards = radial + radial3 * r2
     return np.array([x - outwards * u + across * v, y - outwards * v - across * u])
 
 
-def _displaced(warp: ScreenWarp, mask: NDArray[np.bool_], window: tuple[slice, slice], field: FloatArray) -> ScreenWarp:
-    """The warp with a field of displacements (2, pixels), a polynomial of the warp's own order."""
-    row, col = np.nonzero(mask)
-    terms = warp.basis(np.column_stack([col + window[1].start, row + window[0].start]).astype(float))
-    return warp.displaced(np.linalg.lstsq(terms.T, field.T, rcond=1e-12)[0].T)
-
-
-def _from_middle(
-    camera: CameraModel, row: NDArray[Any], col: NDArray[Any]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Columns and rows from the frame's middle, in half diagonals, and the squared distance."""
+def _from_middle(camera: CameraModel, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Along columns and rows from the frame's middle, in half diagonals, and the squared distance."""
     half = 0.5 * float(np.hypot(camera.rows, camera.cols))
-    u, v = (col - 0.5 * (camera.cols - 1)) / half, (row - 0.5 * (camera.rows - 1)) / half
+    u, v = ((points - 0.5 * np.array([camera.cols - 1, camera.rows - 1])) / half).T
     return u, v, u * u + v * v
 
 
@@ -402,8 +399,7 @@ def _refined(
         canvas.picture(part * spectrum)[mask] for part in (_below(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
     )
     picture = picture + np.sum(canvas.beyond(otf, study.camera.fill_factor), axis=0)[mask]
-    row, col = np.nonzero(mask)
-    terms = warp.basis(np.column_stack([col + window[1].start, row + window[0].start]).astype(float))
+    terms = warp.basis(_points(mask, window))
     columns = np.concatenate([across * terms, down * terms, [picture, np.ones_like(picture)]])
     step = np.linalg.lstsq(columns @ columns.T, columns @ (seen[window][mask] - picture), rcond=1e-12)[0]
     return warp.displaced(step[:-2].reshape(2, -1))
@@ -473,8 +469,7 @@ class _Design:
         beyond += canvas.beyond(otf, camera.fill_factor)
         picture = (low_part + np.sum(beyond, axis=0))[mask]
         across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
-        row, col = np.nonzero(mask)
-        u, v, r2 = _from_middle(camera, row + canvas.window[0].start, col + canvas.window[1].start)
+        u, v, r2 = _from_middle(camera, _points(mask, canvas.window))
         # light that lands further out by s has the picture of a place nearer by s
         outwards, around = -(u * across + v * down), -(u * down - v * across)
         grey = np.clip(picture, 0.0, 1.0)
@@ -489,7 +484,7 @@ class _Design:
             around,
         ]
         strong = [part[mask] for part in beyond if np.std(part[mask]) > LEAST_BEYOND]
-        fixed = sum((part[mask] for part in beyond if not np.std(part[mask]) > LEAST_BEYOND), np.zeros(len(row)))
+        fixed = sum((part[mask] for part in beyond if not np.std(part[mask]) > LEAST_BEYOND), np.zeros(len(u)))
         table = np.array(columns + more + strong)
         scale = np.sqrt(np.mean(table**2, axis=1))
         normal = (table / scale[:, None]) @ (table / scale[:, None]).T
@@ -500,17 +495,20 @@ class _Design:
             mask, tuple(bands), table, fixed, inverse, mix, inverse @ (table @ lost), float(np.sqrt(r2.max()))
         )
 
-    def shifts(self, seen: FloatArray) -> FloatArray:
-        """How far the picture is moved: x, y, radial, radial^3, across."""
-        value = self.inverse @ (self.columns @ (seen - self.fixed))
-        return np.asarray(value[len(self.bands) + SHIFT_X : len(self.bands) + ACROSS + 1])
+    @property
+    def shifts(self) -> slice:
+        """Of the coefficients, those by how far the picture is moved: x, y, radial, radial^3, across."""
+        return slice(len(self.bands) + SHIFT_X, len(self.bands) + ACROSS + 1)
+
+    def coefficients(self, seen: FloatArray) -> FloatArray:
+        return np.asarray(self.inverse @ (self.columns @ (seen - self.fixed)))
 
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients; their covariance by `temporal`, the variance (pixels,) that repeats average out; and by the rest.
 
         Pixels scatter unequally: the covariance is that of the residuals as they are (White 1980).
         """
-        value = self.inverse @ (self.columns @ (seen - self.fixed))
+        value = self.coefficients(seen)
         left = seen - self.fixed - value @ self.columns
         spread = self.inverse @ ((self.columns * left**2) @ self.columns.T) @ self.inverse
         shown = self.inverse @ ((self.columns * temporal) @ self.columns.T) @ self.inverse
