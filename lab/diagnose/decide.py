@@ -33,6 +33,8 @@ WELL_EXPLAINED, SURE = 0.95, 0.8
 REMAINDER_SHARE = 0.1
 #: The same of what it leaves in the measurement that shows it most, or of anything from so many nats on: no law's error is as sure.
 OWN_REMAINDER_SHARE, SURE_REMAINDER_NATS = 0.02, 1000.0
+#: Of a name's probability: from which on a rival takes its place.
+LIKELIER = 1.1
 #: Nats that a remainder may have in any case.
 REMAINDER_NATS = 3.0
 #: Of a stronger effect's gain: below that, what acts on the same measurement is taken for an error of its law.
@@ -345,7 +347,7 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     )
     explains, closed = _explained(evidence, fit, without, touched)
     first = max((n for n in share if n != "unknown"), key=lambda n: share[n])
-    better = fits[first] if share[first] > 2.0 * share[effect.name] else None
+    better = fits[first] if share[first] > LIKELIER * share[effect.name] else None
     return Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains, closed), better
 
 

@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import CubicSpline
+from scipy.special import ndtr
 
-from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of, wide_contrast
+from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of
+from lab.diagnose.veils import halos, wide_contrast
 from lab.errors import NotDetermined
 from lab.fit.mtf import SMOOTHING, EdgeGeometry, EdgeMtf, Region, find_edges, measure_edge
 from lab.recording import SlantedEdge
@@ -466,7 +468,12 @@ class _Edges:
         local = [tuple(e.at_place(*p, self._camera) for e in effects) for p in self._places]
         found = {here: self._sights_otf(here) for here in dict.fromkeys(local)}
         table = np.array([found[here] for here in local])
-        return np.asarray(table[self._place, self._sight, self._turn] / wide_contrast(effects))
+        # what is spread widely is of the profile (`_change`): its transfer falls within the first of the quadrature's nodes
+        veiled = np.array(wide_contrast(effects, self._camera))
+        for share, std_px in halos(effects, self._camera):
+            lowest = np.exp(-2.0 * np.square(np.pi * std_px * self._quadrature.frequency))
+            veiled = veiled * (1.0 + share / (1.0 - share) * lowest)
+        return np.asarray(table[self._place, self._sight, self._turn] / veiled)
 
     def _sights_otf(self, effects: tuple[Effect, ...]) -> ComplexArray:
         """(sights, directions, nodes)."""
@@ -536,10 +543,11 @@ class _Edges:
     # --- what changes a profile beside its transfer ---
 
     def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
-        """Change of the profiles (edges, distances) by the effects' shading and by responses that bend."""
+        """Change of the profiles (edges, distances) by the effects' shading, by responses that bend and by halos."""
         shading = tuple(e for e in effects if type(e).illumination is not Effect.illumination)
         bending = tuple(e for e in effects if type(e).response is not Effect.response)
-        if not shading and not bending:
+        spread = halos(effects, self._camera)
+        if not shading and not bending and not spread:
             return None
         light, operators = self._light_profile, self._operators
         change = np.zeros_like(light)
@@ -555,6 +563,8 @@ class _Edges:
             for i, edge in enumerate(self.edges):
                 ratio = self._shade(edge, operators.distance, shading) / operators.shade[i]
                 change[i] += (light[i] + change[i]) * (ratio - 1.0)
+        for share, std_px in spread:
+            change += share / wide_contrast(effects, self._camera) * (ndtr(operators.distance / std_px) - 0.5)
         return change
 
     @cached_property

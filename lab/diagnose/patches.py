@@ -24,8 +24,8 @@ from lab.diagnose.summaries import (
     Study,
     held_out_of,
     rounding_std_dn,
-    wide_contrast,
 )
+from lab.diagnose.veils import Surroundings, even_share, halos, harmonics, wide_contrast
 from lab.errors import NotDetermined
 from lab.predict import Field, mixed_charge
 from lab.recording import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
@@ -58,6 +58,7 @@ class Patch:
     row: float
     col: float
     frame: float  # mean of the whole frame in this channel
+    around: Surroundings  # of the patch in it, px of the plane
     tail: float  # what the point spread adds from the surroundings
     held_out: bool
 
@@ -79,6 +80,7 @@ def chart_block(study: Study) -> Block:
     offset = noise.black + noise.dark_dn_per_s * exposures
     signal = np.maximum(value - offset, 0.1)
     surround = np.array([p.frame for p in points]) - offset  # what a veil carries
+    step = mosaic.step(camera.cfa)
     light = relative_illumination(camera, row, col)
     place = Field.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
@@ -97,8 +99,10 @@ def chart_block(study: Study) -> Block:
         electrons = rates * local * time
         if any(type(e).charge is not Effect.charge for e in effects):
             electrons = electrons * _mixing(study, points, electrons, effects)
-        contrast = wide_contrast(effects)
-        electrons = contrast * electrons + ((1.0 - contrast) * surround + tail) / noise.gain + ambient
+        veil = even_share(effects) * surround
+        for share, std_px in halos(effects, camera):
+            veil = veil + share * (np.array([p.around.mean(std_px / step) for p in points]) - offset)
+        electrons = wide_contrast(effects, camera) * electrons + (veil + tail) / noise.gain + ambient
         out = electrons + noise.dark_dn_per_s / noise.gain * exposures
         for effect in effects:
             out = effect.response(out, camera)
@@ -144,15 +148,19 @@ def patch_levels(study: Study) -> list[Patch]:
             for channel in study.channels:
                 spread = _spread(study, frame, channel, part[0].radiance)
                 mean = float(study.pixels_of(frame, channel).mean())
+                first = mosaic.phases(study.camera.cfa)[channel][0]
+                plane = frame[first[0] :: step, first[1] :: step]
+                low = harmonics(plane)
                 mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))
                 for name, rows, cols, row, col in _patches(part[0]):
                     box = (slice(*rows), slice(*cols))
                     values = frame[box][mask[box]]
                     if values.size < 16 or np.mean(clipped[box][mask[box]]) >= CLIPPED_SHARE:
                         continue
-                    tail = spread[rows[0] // step : rows[1] // step, cols[0] // step : cols[1] // step].mean()
+                    inside = slice(rows[0] // step, rows[1] // step), slice(cols[0] // step, cols[1] // step)
                     points.append(
-                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, mean, float(tail), part[0].id in out)
+                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, mean, Surroundings.of_box(low, plane.shape, *inside),
+                              float(spread[inside].mean()), part[0].id in out)
                     )  # fmt: skip
     return points
 
@@ -271,6 +279,7 @@ def screen_block(study: Study) -> Block:
     value = np.array([p.value for p in points])
     tail, beyond = np.array([p.tail for p in points]), np.array([p.beyond for p in points])
     lift = np.array([p.lift for p in points])
+    step = mosaic.step(camera.cfa)
     covariance = np.diag(np.array([p.std for p in points]) ** 2 + 2 * noise.jitter_dn**2)
     ids = [p.kind for p in points]
     same = np.array([[a == b for b in ids] for a in ids])
@@ -283,8 +292,9 @@ def screen_block(study: Study) -> Block:
     )
 
     def predict(effects: Effects) -> Prediction:
-        contrast = wide_contrast(effects)
         shift = np.zeros(len(points))
+        for share, std_px in halos(effects, camera):
+            shift = shift + share * np.array([p.around.mean(std_px / step) for p in points])
         if any(type(e).response is not Effect.response for e in effects):
             low = np.maximum(tail, 0.0) / noise.gain
             base = np.array([p.black for p in points]) / noise.gain
@@ -295,7 +305,7 @@ def screen_block(study: Study) -> Block:
         copied = [e for e in effects if type(e).image is not Effect.image]
         if copied:
             shift = shift + np.array([_copied(p, copied, camera) for p in points])
-        return Prediction(contrast * tail + (1.0 - contrast) * lift + shift, {})
+        return Prediction(wide_contrast(effects, camera) * tail + even_share(effects) * lift + shift, {})
 
     return Block(
         measurement="screen", axis="level", unit="DN", reach=1e9, value=value, covariance=covariance,
@@ -316,6 +326,7 @@ class _DarkSquares:
     tail: float
     picture: FloatArray  # what the pattern adds to the dark screen, DN, over the channel's plane
     use: NDArray[np.bool_]  # the dark squares' insides in it
+    around: Surroundings  # of these, px of the plane
     beyond: float  # what the tail is uncertain by: light beyond the frame
     lift: float
     white: float
@@ -384,7 +395,7 @@ def _dark_squares(
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
                          float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
-                         (shown - black)[plane], use, 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
+                         (shown - black)[plane], use, Surroundings.of(harmonics((shown - black)[plane]), use), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black)
         )  # fmt: skip
     return found

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -39,14 +39,27 @@ class Signatures:
 
     white: FloatArray  # residual
     columns: list[tuple[type[Effect], tuple[Effect, ...], FloatArray]]
+    table_of: Callable[[Sequence[Effect]], FloatArray]  # signatures of any effects as they stand, (n, effects)
 
     def scores(self) -> list[Score]:
         best: dict[str, Score] = {}
+        plain: dict[str, tuple[float, Effect]] = {}
         for effect, prototypes, table in self.columns:
             value, share = _cone(table, self.white)
             if effect.name not in best or value > best[effect.name].value:
                 best[effect.name] = Score(effect, value, _combined(effect, prototypes, share))
+            if len(prototypes) == 1:
+                found = self._taken(table[:, 0]), prototypes[0]
+                plain[effect.name] = max(plain.get(effect.name, found), found, key=lambda one: one[0])
+        for name, (taken, prototype) in plain.items():
+            # scaled by what a small change promises, a large one may be far off: the prototype itself may lie nearer
+            if taken > 0.0 and taken > self._taken(self.table_of([best[name].start])[:, 0]):
+                best[name] = replace(best[name], start=prototype)
         return sorted(best.values(), key=lambda s: -s.value)
+
+    def _taken(self, signature: FloatArray) -> float:
+        """Of the residual's square, by an effect as it stands; negative where it only adds."""
+        return float(2.0 * signature @ self.white - signature @ signature)
 
     def pairs(self, count: int) -> list[Pair]:
         """The best pairs of two effects by what their signatures take together, highest first.
@@ -114,18 +127,21 @@ def signatures(
     if tangents is not None and tangents.size:
         out = _span(model.white(tangents[seen]))
         white = white - out @ (out.T @ white)
+
+    def table_of(prototypes: Sequence[Effect]) -> FloatArray:
+        raw = np.stack([evidence.mean((*current, p)) - base for p in prototypes], axis=1)[seen]
+        table = model.white(raw)
+        return np.asarray(table - out @ (out.T @ table))
+
     columns = []
     for effect in candidates:
         if not evidence.touched(effect).any():
             continue
         for prototypes in effect.prototypes(camera):
-            raw = np.stack([evidence.mean((*current, p)) - base for p in prototypes], axis=1)[seen]
-            if not np.any(np.abs(raw) > 0):
-                continue
-            table = model.white(raw)
-            table = table - out @ (out.T @ table)
-            columns.append((effect, prototypes, table))
-    return Signatures(white, columns)
+            table = table_of(prototypes)
+            if np.any(table):
+                columns.append((effect, prototypes, table))
+    return Signatures(white, columns, table_of)
 
 
 def _span(table: FloatArray) -> FloatArray:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from lab.diagnose.neighbours import held_out_flats
-from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, wide_contrast
+from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study
+from lab.diagnose.veils import even_share
 from lab.errors import NotDetermined
 from lab.predict import Field
 from sim.camera import CameraModel
@@ -191,7 +192,7 @@ def _shaded(planes: Sequence[_Plane], place: Field, effects: Effects, study: Stu
         light = light * effect.illumination(place.x_um, place.y_um, study.camera)
     light = _cell_means(light)
     # a veil evens out what the lens's fall-off leaves
-    contrast = wide_contrast(effects)
+    contrast = 1.0 - even_share(effects)
     light = contrast * light + (1.0 - contrast) * light.mean()
     found = []
     for plane in planes:

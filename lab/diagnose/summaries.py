@@ -538,8 +538,3 @@ def held_out_of(group: Sequence[Capture], index: int, groups: int) -> set[str]:
 
 def overrides(effect: Effect, hooks: frozenset[str]) -> bool:
     return any(getattr(type(effect), hook) is not getattr(Effect, hook) for hook in hooks)
-
-
-def wide_contrast(effects: Effects) -> float:
-    """Contrast that the effects leave to anything smaller than the frame: the rest of the light is its mean."""
-    return float(np.prod([1.0 - e.veil() for e in effects]))

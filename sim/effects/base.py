@@ -175,6 +175,11 @@ class Effect(Frozen):
         """OPTICS: share of the light that is spread evenly over the whole frame; `transfer` has it too, as a step at f = 0."""
         return 0.0
 
+    def halo(self, camera: CameraModel) -> tuple[float, float]:
+        """OPTICS: share of the light that is spread about its place by a normal distribution, too wide for an edge's surroundings
+        to tell its transfer but narrower than the frame, and its standard deviation in um; `transfer` has it too."""
+        return 0.0, 1.0
+
     def lit(self, electrons: FloatArray, exposure_s: float, elapsed_s: float, camera: CameraModel) -> FloatArray:
         """RIG or CHARGE: mean electrons that light alone makes in the pixels of a whole frame (rows, cols)."""
         return electrons

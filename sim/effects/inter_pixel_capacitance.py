@@ -25,6 +25,10 @@ class InterPixelCapacitance(Crosstalk):
         "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is common to neighbours at all levels of light, but not in the dark."
     )
 
+    def usual_nats(self) -> float:
+        # of hybrid arrays, whose pixels are read through bumps; sensors in one piece of silicon hardly have it
+        return 0.0 if self.share_percent == 0.0 else -2.0
+
     def neighbour_correlation(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
         kernel = self.kernel()
         own, mean = kernel[1, 1], 0.5 * (kernel[0, 1] + kernel[1, 0])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
@@ -12,14 +14,16 @@ from sim.spectrum import FloatArray
 
 
 class VeilingGlare(Effect):
-    """I' = (1 - g) I + g <I>: OTF 1 at zero frequency, 1 - g at every other that a frame holds."""
+    """I' = (1 - g) I + g (1 - h) <I> + g h N * I: OTF 1 at zero frequency, 1 - g at every other that a frame holds but for the
+    lowest, where a share h of the veil lies about its source, by a normal distribution N."""
 
     name: ClassVar[str] = "veiling_glare"
     stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "ISO 9358:1994; ISO 18844:2017"
-    form_tolerance: ClassVar[float] = 0.05
+    form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"chart", "checkerboard", "bernoulli"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"halo_share", "halo_reach"})
+    shown_by: ClassVar[frozenset[str]] = frozenset({"chart", "checkerboard", "bernoulli", "slanted_edge"})
     rivals: ClassVar[frozenset[str]] = frozenset(
         {"ambient_light", "black_level_drift", "ghost", "nonlinearity", "stray_light"}
     )
@@ -34,13 +38,30 @@ class VeilingGlare(Effect):
             "%", "share of the light that is spread over the frame", lower=0.0, upper=50.0, prior=(0.0, 2.0), absent=0.0
         ),
     ] = 0.0
+    halo_share: Annotated[
+        float,
+        Quantity("1", "of that light: what stays about its source", lower=0.0, upper=1.0, prior=(0.0, 0.5), absent=0.0, dispensable=True),
+    ] = 0.0  # fmt: skip
+    halo_reach: Annotated[
+        float,
+        Quantity("1", "standard deviation of what stays, in half diagonals", lower=0.1, upper=1.0, prior=(0.35, 0.15), absent=0.35, dispensable=True),
+    ] = 0.35  # fmt: skip
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return ((cls(share_percent=0.6),), (cls(share_percent=0.6, halo_share=0.7),))
 
     def transfer(
         self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
     ) -> FloatArray | None:
         if self.share_percent == 0.0:
             return None
-        return veil_otf(fx_cy_per_um, fy_cy_per_um, self.veil())
+        even = veil_otf(fx_cy_per_um, fy_cy_per_um, self.veil())
+        return even + veil_otf(fx_cy_per_um, fy_cy_per_um, *self.halo(camera)) - 1.0
 
     def veil(self) -> float:
-        return self.share_percent / 100.0
+        return self.share_percent / 100.0 * (1.0 - self.halo_share)
+
+    def halo(self, camera: CameraModel) -> tuple[float, float]:
+        half_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
+        return self.share_percent / 100.0 * self.halo_share, self.halo_reach * half_um

@@ -100,7 +100,8 @@ def edge_transmittance(
 VEIL_UM = 1e5
 
 
-def veil_otf(fx_cy_per_um: ArrayLike, fy_cy_per_um: ArrayLike, share: float) -> FloatArray:
-    """Transfer of a lens that spreads `share` of the light evenly over the frame: 1 at zero frequency, 1 - share at all that a frame holds."""
+def veil_otf(fx_cy_per_um: ArrayLike, fy_cy_per_um: ArrayLike, share: float, std_um: float = VEIL_UM) -> FloatArray:
+    """Transfer of a lens that spreads `share` of the light by a normal distribution, as it stands evenly over the frame: 1 at zero
+    frequency, 1 - share at all that a frame holds."""
     f2 = np.asarray(fx_cy_per_um, float) ** 2 + np.asarray(fy_cy_per_um, float) ** 2
-    return np.asarray(1.0 - share + share * np.exp(-2.0 * np.pi**2 * VEIL_UM**2 * f2))
+    return np.asarray(1.0 - share + share * np.exp(-2.0 * np.pi**2 * std_um**2 * f2))

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from sim.camera import CameraModel, Geometry, Lens
 from sim.effects.base import Effect, Stage
@@ -68,10 +69,10 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     rest: list[float] = []
     for e in acting or (Effect,):
         if e is Effect:
-            rest += [1.0, 0.02, 0.0, 0.0, 1e4, 0.0, *np.ones(5), *np.zeros(10)]
+            rest += [1.0, 0.02, 0.0, 0.0, 1e4, 0.0, 0.0, *np.ones(5), *np.zeros(10)]
             continue
         rest += [e.drift(600.0), e.exposure(0.02), e.ambient_e_per_s("G", CAMERA) / 1e3, e.offset_dn(600.0, 30.0, CAMERA),
-                 float(e.noise_e2(np.array(9e3), np.array(1e4), CAMERA)), e.veil(), *e.illumination(place, place, CAMERA), *np.ravel(e.image_shift_um(place, 0.5 * place, 620.0, CAMERA) or np.zeros(10))]  # fmt: skip
+                 float(e.noise_e2(np.array(9e3), np.array(1e4), CAMERA)), e.veil(), e.halo(CAMERA)[0], *e.illumination(place, place, CAMERA), *np.ravel(e.image_shift_um(place, 0.5 * place, 620.0, CAMERA) or np.zeros(10))]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
     dark = Exposure(Darkness(), 0.5, temperature_c=32.0)
     after = list(expected_sequence(CAMERA, [Exposure(UniformField(LIGHT), 0.004), dark], acting))
@@ -248,6 +249,17 @@ def test_glare_leaves_an_edge_its_levels_mean() -> None:
     far = np.array([-30.0, 30.0])
     plain, veiled = (edge_profile(CAMERA, "G", LIGHT, 5.0, far, acting) for acting in ((), (one,)))
     np.testing.assert_allclose(veiled - 0.5, 0.96 * (plain - 0.5), atol=2e-3)
+
+
+def test_what_glare_leaves_about_its_source_is_between_the_two() -> None:
+    """Far within the halo an edge's plateaus come as near as by an even veil, far beyond it they stay."""
+    reach_um = 12.0 * CAMERA.pixel_pitch_um
+    reach = reach_um / (0.5 * CAMERA.pixel_pitch_um * np.hypot(CAMERA.rows, CAMERA.cols))
+    one = effect("veiling_glare")(share_percent=4.0, halo_share=1.0, halo_reach=float(reach))
+    assert one.halo(CAMERA) == (0.04, pytest.approx(reach_um))
+    at = np.array([-60.0, -4.0, 4.0, 60.0])
+    plain, veiled = (edge_profile(CAMERA, "G", LIGHT, 5.0, at, acting) for acting in ((), (one,)))
+    np.testing.assert_allclose(veiled, 0.96 * plain + 0.04 * ndtr(at / 12.0), atol=1e-4)
 
 
 def test_infrared_filter_halves_at_its_cut_and_falls() -> None:
