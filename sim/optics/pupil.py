@@ -245,7 +245,8 @@ def _bent(
     if share.size <= FEW:
         safe = np.where(share > 0, share, 1.0) / (wavelength_um * f_number)
         cos, sin = np.where(share > 0, fx / safe, 1.0).ravel(), np.broadcast_to(fy / safe, shape).ravel()
-        return _mean(share.ravel(), cos, sin, wavelength_um, bend).reshape(shape)
+        points = share.ravel(), cos, sin
+        return _mean_of_few(*(part.tobytes() for part in points), wavelength_um, bend).reshape(shape)
     if share.size <= SOME:
         # edges ask for many frequencies in few directions
         directions, which = np.unique(np.round(np.arctan2(fy, fx), 9), return_inverse=True)
@@ -288,6 +289,15 @@ def _mean(
     else:
         ratio = _mean_of_any(half, cos, sin, wavelength_um, bend, int(min(10 + 5.0 * waves, 200)))
     return np.where(share < 1.0, ratio, 1.0)
+
+
+@lru_cache(maxsize=128)
+def _mean_of_few(
+    share: bytes, cos: bytes, sin: bytes, wavelength_um: float, bend: Wavefront
+) -> FloatArray | ComplexArray:
+    """The same of arrays' bytes, kept: whoever changes something else asks for the same again."""
+    half, along, across = (np.frombuffer(part) for part in (share, cos, sin))
+    return _mean(half, along, across, wavelength_um, bend)
 
 
 @lru_cache(maxsize=16)
