@@ -701,6 +701,44 @@ def _print_scenes() -> None:
     out.print(table)
 
 
+@app.command()
+def effects(
+    name: Annotated[str, typer.Argument(metavar="[NAME]", help="one effect, with all that it declares")] = "",
+) -> None:
+    """The library of effects: what a diagnosis can name, and what a camera file can have."""
+    from sim.effects import library
+
+    if not name:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("effect", "acts in", "parameters"):
+            table.add_column(heading)
+        for kind in library.effects().values():
+            table.add_row(kind.name, str(kind.stage), escape(" ".join(kind.quantities())))
+        out.print(table)
+        return
+    try:
+        kind = library.effect(name)
+    except KeyError as unknown:
+        raise InputError(str(unknown.args[0])) from None
+    out.print(escape(f"{kind.name} ({kind.stage}): {kind.sentence}"))
+    table = Table(box=None, pad_edge=False)
+    for heading in ("parameter", "unit", "from", "to", "usual", "absent", "what it is"):
+        table.add_column(heading)
+    for field, quantity in kind.quantities().items():
+        usual = "any" if quantity.prior is None else "{:g} ± {:g}".format(*quantity.prior)
+        limits = ("-" if v is None else f"{v:g}" for v in (quantity.lower, quantity.upper))
+        absent = "-" if quantity.absent is None else f"{quantity.absent:g}"
+        table.add_row(field, quantity.unit, *limits, usual, absent, escape(quantity.meaning))
+    out.print(table)
+    for heading, told in (
+        ("shown by", sorted(kind.shown_by)),
+        ("can look like", sorted(kind.rivals)),
+        ("doesn't depend on", sorted(kind.invariances)),
+        ("after", [kind.reference]),
+    ):
+        out.print(escape(f"{heading}: {', '.join(told) or 'nothing'}"))
+
+
 # --- commands on stations and sessions ---------------------------------------------------------------------------------
 
 

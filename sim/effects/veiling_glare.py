@@ -28,7 +28,7 @@ class VeilingGlare(Effect):
         {"ambient_light", "black_level_drift", "ghost", "nonlinearity", "stray_light"}
     )
     sentence: ClassVar[str] = (
-        "Light scattered in the lens veils the frame: dark patches and dark squares are raised by a share of the frame's mean, "
+        "Light scattered in the lens veils the frame: dark patches and dark squares are raised by a share of the light around them, "
         "while uniform fields stay as they are."
     )
 
@@ -44,7 +44,7 @@ class VeilingGlare(Effect):
     ] = 0.0  # fmt: skip
     halo_reach: Annotated[
         float,
-        Quantity("1", "standard deviation of what stays, in half diagonals", lower=0.1, upper=1.0, prior=(0.35, 0.15), absent=0.35, dispensable=True),
+        Quantity("1", "standard deviation of what stays, in half diagonals", lower=0.2, upper=1.0, prior=(0.35, 0.15), absent=0.35, dispensable=True),
     ] = 0.35  # fmt: skip
 
     @classmethod

@@ -29,6 +29,7 @@ from lab.results import (
 )
 from lab.sequences.calibration import Calibration
 from lab.sequences.dark import DarkSequence
+from sim.effects.library import effects
 
 
 @pytest.fixture(autouse=True)
@@ -219,6 +220,19 @@ def test_diagnosis_with_a_stored_fit(
     (tmp_path / "fit.json").write_text('{"format": "calibench-fit"}')
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 2
     assert "not what --json wrote" in capsys.readouterr().err
+
+
+def test_the_library_tells_what_it_declares(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["effects"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in effects())
+    for name, kind in effects().items():
+        assert cli.main(["effects", name]) == 0
+        told = capsys.readouterr().out
+        assert kind.sentence in told
+        assert all(field in told and q.meaning in told for field, q in kind.quantities().items())
+    assert cli.main(["effects", "glare"]) == 2
+    assert "no effect named 'glare'; there are: adc_nonlinearity" in capsys.readouterr().err
 
 
 def test_a_threshold_needs_more_than_a_few_draws(flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
