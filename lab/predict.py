@@ -16,6 +16,8 @@ from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
+#: Where the maker doesn't say it.
+USUAL_PITCH_UM = 3.5
 #: Where neither fit nor maker gives a sensitivity: (peak, standard deviation in nm), for the colour of edges and screens only.
 TYPICAL_SENSITIVITY_NM = {"R": (600.0, 40.0), "G": (535.0, 40.0), "B": (460.0, 30.0), "Y": (550.0, 90.0)}
 
@@ -60,7 +62,7 @@ def camera_model(
     return CameraModel(
         rows=camera.rows,
         cols=camera.cols,
-        pixel_pitch_um=camera.pixel_pitch_um if camera.pixel_pitch_um is not None else 1.0,
+        pixel_pitch_um=camera.pixel_pitch_um if camera.pixel_pitch_um is not None else USUAL_PITCH_UM,
         fill_factor=camera.fill_factor if camera.fill_factor is not None else 1.0,
         cfa=camera.cfa,
         bit_depth=camera.bit_depth,
@@ -93,7 +95,7 @@ def assumptions(camera: Camera) -> tuple[Assumed, ...]:
     if camera.lens_transmittance is None:
         found.append(Assumed("lens_transmittance", "1"))
     if camera.pixel_pitch_um is None:
-        found.append(Assumed("pixel_pitch_um", "1"))
+        found.append(Assumed("pixel_pitch_um", f"{USUAL_PITCH_UM:g}"))
     if camera.fill_factor is None:
         found.append(Assumed("fill_factor", "1"))
     if not camera.quantum_efficiency:

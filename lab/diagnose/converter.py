@@ -23,6 +23,7 @@ from lab.recording import Flat, Narrowband
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
+SHIFTED_FROM = 4  # steps of codes that no fault of a converter makes: one bit may be stuck, two are a shift
 LEAST_NOISE = 3.0  # codes; below, a smooth curve can't be told from steps
 LEAST_COUNT = 30.0  # of a code that is looked at
 WIDEST = 24  # codes on either side of a smooth curve
@@ -60,6 +61,13 @@ class _Codes:
 def code_block(study: Study) -> Block:
     """Of all even light: steps (DN) where a high bit changes, combs of a few codes' period, and the scatter about a smooth curve."""
     counts = _counted(study)
+    used = np.flatnonzero(sum(c.count for c in counts.values()))
+    apart = int(np.gcd.reduce(used)) if used.size > 1 else 1
+    if apart >= SHIFTED_FROM:
+        raise NotDetermined(
+            "code_density",
+            f"every code is a multiple of {apart}, as of a converter of {int(np.log2(apart))} bits less whose codes were shifted: its steps aren't judged; write the frames as they left the converter",
+        )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
     sets: list[tuple[_Codes, FloatArray, list[_Part]]] = []

@@ -16,6 +16,7 @@ from sim.spectrum import FloatArray, Spectrum
 LEAK_STD = 2.0e-4  # of the curve's peak, alike at all wavelengths: blindness that isn't quite
 MOST_DECIMALS = 6  # of a curve's values; with fewer they are rounded
 CURVE_SCALE_STD = 0.2  # of the sensitivity: holds gain, aperture and lens too
+LEVEL_STD = 0.5  # of all signals where gain, f-number or pitch aren't known, about those recorded
 CURVE_TILT_STD = 0.05  # per 100 nm
 CURVE_BEND_STD = 0.01  # per (100 nm)^2
 CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
@@ -31,7 +32,15 @@ class CurveSlopes:
     are `sim.forward`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
     """
 
-    def __init__(self, study: Study, items: Sequence[tuple[str, str, float, str, Spectrum | None]]) -> None:
+    def __init__(
+        self,
+        study: Study,
+        items: Sequence[tuple[str, str, float, str, Spectrum | None]],
+        measured_e_per_s: FloatArray | None = None,
+        scale: float = 1.0,
+    ) -> None:
+        """`measured_e_per_s` (n,): where gain, f-number or pitch aren't known the level is free about that of these; `scale`: on all
+        rates."""
         self.study, self.items = study, items
         self.kind = items[0][3]
         lights = {path: study.spectrum(path) for path in {item[0] for item in items}}
@@ -52,6 +61,11 @@ class CurveSlopes:
         self._rate = np.array(
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
         )
+        #: Of the rates: what nobody knows of the light's way to the codes.
+        self.scale, self._is_free = scale, measured_e_per_s is not None and not study.level_is_known
+        if measured_e_per_s is not None and self._is_free:
+            self.scale = max(float(measured_e_per_s.sum()), 1e-9) / max(float(self._rate.sum()), 1e-300)
+        self._rate = self._rate * self.scale
         self._per_weight = {
             c: max(
                 (
@@ -125,6 +139,8 @@ class CurveSlopes:
             if mine.any():
                 for i in range(table.shape[1]):
                     named[f"curve:{channel}:{i}"] = np.where(mine, table[:, i], 0.0)
+        if self._is_free:
+            named[f"level:{self.kind}"] = LEVEL_STD * self.rates(effects)
         return named
 
 

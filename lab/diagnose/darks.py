@@ -17,7 +17,17 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, stats
 from scipy.special import betainc, digamma, ndtr, polygamma
 
-from lab.diagnose.summaries import BLACK_FLOOR_DN, Block, Effects, Label, Prediction, Study, held_out_of
+from lab.diagnose.summaries import (
+    BLACK_FLOOR_DN,
+    STATED_BLACK_DN,
+    STATED_BLACK_SHARE,
+    Block,
+    Effects,
+    Label,
+    Prediction,
+    Study,
+    held_out_of,
+)
 from lab.errors import NotDetermined
 from lab.recording import Dark
 from sim.effects.base import Effect, Lines
@@ -25,7 +35,6 @@ from sim.spectrum import FloatArray
 
 Image = NDArray[np.float32]
 
-STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # of a stated black level: what a data sheet may be off by
 TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures are that close are repeats
 CELLS = 4, 6  # of a frame: rows, columns
 CELL_FLOOR_DN = 0.005

@@ -15,7 +15,6 @@ from lab.diagnose.summaries import (
     CLIPPED_SHARE,
     LEVEL_REACH,
     SPECTRAL_HOOKS,
-    TAIL_STD,
     UNIFORM_HOOKS,
     Block,
     Effects,
@@ -85,7 +84,9 @@ def chart_block(study: Study) -> Block:
     place = Field.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
     curves = CurveSlopes(
-        study, [(p.captures[0].radiance, p.channel, p.captures[0].exposure_s, "chart", known[p.name]) for p in points]
+        study,
+        [(p.captures[0].radiance, p.channel, p.captures[0].exposure_s, "chart", known[p.name]) for p in points],
+        signal / noise.gain / exposures,
     )
     names = {n: i for i, n in enumerate(known)}
 
@@ -180,7 +181,7 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
     same = names[:, None] == names
     covariance = np.diag(temporal + noise.jitter_dn**2) + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
     covariance += same * (
-        np.outer(tail, tail) * TAIL_STD**2
+        np.outer(tail, tail) * study.tail_std**2
         + np.outer(signal, signal) * PATCH_STD**2
         + np.outer(perfect, perfect) * PATCH_LEVEL_STD**2
     )
@@ -285,7 +286,7 @@ def screen_block(study: Study) -> Block:
     same = np.array([[a == b for b in ids] for a in ids])
     white = np.array([p.white for p in points])
     covariance += (
-        same * np.outer(tail, tail) * TAIL_STD**2
+        same * np.outer(tail, tail) * study.tail_std**2
         + np.outer(beyond, beyond)
         + np.outer(white, white) * SCREEN_FLOOR**2
         + np.diag(np.square(1e-4 * white))

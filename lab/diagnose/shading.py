@@ -43,8 +43,10 @@ class _Plane:
 
 def shading_block(study: Study) -> Block:
     """Brightest unclipped flats in 6 x 8 cells; fixed patterns as their own spread at a few pixels' scale says, the axis is free."""
-    if study.stated.focal_length_mm is None:
-        raise NotDetermined("flat_field", "the focal length isn't stated: the fall-off of the light isn't known")
+    if study.stated.focal_length_mm is None or study.stated.pixel_pitch_um is None:
+        raise NotDetermined(
+            "flat_field", "the focal length or the pixel pitch isn't stated: the fall-off of the light isn't known"
+        )
     planes = _planes(study)
     if not planes:
         raise NotDetermined("flat_field", "no unclipped flat captures")

@@ -31,9 +31,10 @@ C = TypeVar("C", bound=Capture)
 
 # --- what doesn't average out: floors that the covariance carries beside noise ---------------------------------------------
 LAMP_FLOOR = 1.0e-4  # of a level, common to the channels of a capture
+STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # of a stated black level: what a data sheet may be off by
 BLACK_FLOOR_DN = 0.01  # of a frame's mean: rounding of a quiet camera
 NARROWBAND_FLOOR = 1e-4  # of a level, each channel by itself, one for its repeats
-TAIL_STD = 0.1  # of the light that the baseline's point spread itself sends into dark squares
+TAIL_STD = 0.1  # of the light that the baseline's point spread sends into dark squares and patches
 CLIPPED_SHARE = 2e-4
 USUAL_JITTER_DN = 0.02  # of a dark frame's mean, from repeat to repeat
 WARMTH_STD = 0.1  # of the dark current, a degree: it doubles within 5 to 10 degrees
@@ -188,6 +189,16 @@ class Study:
             self._levels[capture.id] = Levels(mean, pixels, whole)
         return self._levels[capture.id]
 
+    @property
+    def level_is_known(self) -> bool:
+        """Whether the light in front of the lens tells how many DN to expect."""
+        return self.noise.gain_is_known and None not in (self.stated.f_number, self.stated.pixel_pitch_um)
+
+    @property
+    def tail_std(self) -> float:
+        """Of the light that the baseline's point spread itself sends far, which is anything where the lens or the pitch aren't stated."""
+        return 1.0 if None in (self.stated.f_number, self.stated.pixel_pitch_um) else TAIL_STD
+
     @cached_property
     def lamps(self) -> dict[str, int]:
         """Which lamp the flats' radiance files are readings of: one lamp where they differ by less than 1 % in shape and 5 % in
@@ -296,7 +307,8 @@ class NoiseGuess:
 
     black: float
     dark_dn_per_s: float
-    gain: float
+    gain: float  # 1 where nothing tells it
+    gain_is_known: bool
     read_dn: float
     prnu: float
     jitter_dn: float  # of a dark frame's mean
@@ -376,7 +388,12 @@ def noise_guess(study: Study) -> NoiseGuess:
     recordings, stated = study.recordings, study.stated
     black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
     dark, read, jitter = 0.0, 1.0, BLACK_FLOOR_DN
-    black_std, dark_std = 1.0 if stated.black_level_dn is not None else 0.05 * study.camera.white_level_dn, 0.5
+    # the dark current is anything: within reason, what a data sheet says or some tens of electrons
+    expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
+    dark_std = max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5)
+    black_std = 0.05 * study.camera.white_level_dn
+    if stated.black_level_dn is not None:
+        black_std = max(STATED_BLACK_DN, STATED_BLACK_SHARE * black)
     darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
     if darks:
         # at one temperature, at which most captures were taken: what the others change isn't the baseline's
@@ -385,16 +402,13 @@ def noise_guess(study: Study) -> NoiseGuess:
         near = [i for i, away in enumerate(off) if away <= min(off) + ALIKE_C]
         t = np.array([darks[i][0].exposure_s for i in near])
         level = np.array([frames_mean[i].mean() for i in near])
-        black_std, dark_std = 1.0, 0.5
+        black_std = 1.0
         if len(t) > 1 and np.ptp(t) > 0:
             dark, black = (float(v) for v in np.polyfit(t, level, 1))
             dark = max(dark, 0.0)
-            dark_std = max(0.2 * dark, dark_std)
+            dark_std = max(0.2 * dark, 0.5)
         else:
             black = float(level[0])
-            # the dark current is anything: within reason, what a data sheet says or some tens of electrons
-            expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
-            dark_std = max(expected * (stated.conversion_gain_dn_per_e or 1.0), dark_std)
             black_std += dark_std * float(t[0])
         jitter = max(_jitter(study, darks, frames_mean), BLACK_FLOOR_DN)
         first = min((darks[i] for i in near), key=lambda g: g[0].exposure_s)
@@ -409,9 +423,11 @@ def noise_guess(study: Study) -> NoiseGuess:
         use = low if low.sum() > 2 else np.ones_like(low)
         gain = float(np.sum(weight[use] * s[use] * (v[use] - read**2)) / np.sum(weight[use] * s[use] ** 2))
         lamp = level_scatter(repeated_levels(study, black, gain, read))
-    if gain is None or gain <= 0:
-        gain = 1.0
-    return NoiseGuess(black, dark, gain, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
+    if len(signal) < 2 and gain is None:
+        gain = _scene_gain(study, black, read)
+    known = gain is not None and gain > 0
+    gain = gain if gain is not None and known else 1.0
+    return NoiseGuess(black, dark, gain, known, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
 
 
 def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:
@@ -437,6 +453,34 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
                 fixed = max(rough.var() - variance[-1] / len(frames), 0.0)
                 prnu = float(np.sqrt(fixed) / signal[-1]) * 1.006  # of 81 pixels' mean, 1/81 of the variance is missing
     return signal, variance, prnu
+
+
+def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
+    """DN/e by repeats of whatever was seen: temporal variance over signal, of pixels alike in signal; None without repeats."""
+    signal, variance = [], []
+    for group in study.groups(None, lambda c: (c.kind, c.exposure_s, c.gain_db, *_shown(c))):
+        if len(group) < 2 or group[0].kind == "dark":
+            continue
+        one, two = (np.asarray(study.recordings.frame(c), float) - black for c in group[:2])
+        two = two * one.sum() / max(two.sum(), 1e-9)
+        mean, apart = 0.5 * (one + two).ravel(), 0.5 * np.square(one - two).ravel()
+        edges = np.quantile(mean, np.linspace(0.0, 1.0, 9))
+        for low, high in pairwise(edges):
+            alike = (mean >= low) & (mean <= high)
+            if alike.sum() > 200 and high < 0.8 * (study.saturation_dn - black):
+                signal.append(float(mean[alike].mean()))
+                variance.append(float(apart[alike].mean()))
+    s, v = np.array(signal), np.array(variance)
+    if not np.any(s > 0):
+        return None
+    weight = 1.0 / np.maximum(v, 1e-9)
+    return float(np.sum(weight * s * (v - read_dn**2)) / np.sum(weight * s * s))
+
+
+def _shown(capture: Capture) -> tuple[object, ...]:
+    """What was in front of the camera, as far as a capture says it: alike in repeats."""
+    told = capture.model_dump(exclude={"id", "frame", "time", "temperature_c"})
+    return tuple(str(told[key]) for key in sorted(told))
 
 
 def _even_rows(frame: Any, step: int) -> FloatArray:

@@ -186,10 +186,16 @@ def narrowband_block(study: Study) -> Block:
     value = np.array([p[2] for p in points])
     noise = study.noise
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 0.0)
-    curves = CurveSlopes(study, [(c.radiance, channel, c.exposure_s, "narrowband", None) for c, channel, *_ in points])
+    curves = CurveSlopes(
+        study,
+        [(c.radiance, channel, c.exposure_s, "narrowband", None) for c, channel, *_ in points],
+        signal / noise.gain / exposures,
+    )
     every = list(dict.fromkeys(c.radiance for c, *_ in points))
     known = [c for c in study.channels if c in study.camera.quantum_efficiency]
-    whole = CurveSlopes(study, [(path, c, 1.0, "narrowband", None) for path in every for c in known])
+    whole = CurveSlopes(
+        study, [(path, c, 1.0, "narrowband", None) for path in every for c in known], scale=curves.scale
+    )
     covariance = _narrowband_covariance(study, points, signal, curves)
 
     def predict(effects: Effects) -> Prediction:

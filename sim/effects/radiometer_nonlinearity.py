@@ -16,13 +16,15 @@ RIGHT_AT = 0.01
 
 
 class RadiometerNonlinearity(Effect):
-    """What was read as narrowband radiance L of peak P is L (P / 0.01)^a: a detector's response that isn't quite proportional."""
+    """What was read as narrowband radiance L of peak P is L exp(a (p^q - 1) / q), p = P / 0.01: a power of the level, p^a, for q = 0, and
+    for q = 1 an error in proportion to the level, as of a detector that begins to saturate."""
 
     name: ClassVar[str] = "radiometer_nonlinearity"
     stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "CIE 214:2014; S. Yang, I. Vayshenker, X. Li, T. R. Scott, NIST J. Res. 99, 1 (1994)"
-    form_tolerance: ClassVar[float] = 0.15
+    form_tolerance: ClassVar[float] = 0.04
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "orientation", "time"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"growth"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
     rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity"})
     sentence: ClassVar[str] = (
@@ -33,16 +35,22 @@ class RadiometerNonlinearity(Effect):
         float,
         Quantity(
             "%",
-            "true light grows with the reading to the power of 1 + this",
+            "true light grows with the reading, about a peak of 0.01, to the power of 1 + this",
             lower=-30.0,
             upper=30.0,
             prior=(0.0, 1.0),
             absent=0.0,
         ),
     ] = 0.0
+    growth: Annotated[
+        float,
+        Quantity("1", "power of the level with which the error grows", lower=0.0, upper=1.5, prior=(0.0, 0.5), absent=0.0, dispensable=True),
+    ] = 0.0  # fmt: skip
 
     def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
         peak = float(np.max(radiance))
         if self.exponent_percent == 0.0 or kind != "narrowband" or peak <= 0.0:
             return radiance
-        return np.asarray(radiance * (peak / RIGHT_AT) ** (0.01 * self.exponent_percent))
+        level = float(np.log(peak / RIGHT_AT))
+        grown = level if self.growth == 0.0 else float(np.expm1(self.growth * level)) / self.growth
+        return np.asarray(radiance * np.exp(0.01 * self.exponent_percent * grown))

@@ -86,7 +86,7 @@ def test_threshold_holds_its_rate() -> None:
     threshold = first.threshold(np.random.default_rng(0), 0.99)
     exceeded = 0
     for _ in range(300):
-        draw = type(first)(rng.standard_normal(len(first.white)), first.columns)
+        draw = replace(first, white=rng.standard_normal(len(first.white)))
         exceeded += max(s.value for s in draw.scores()) > threshold
     assert exceeded <= 8
 

@@ -1,0 +1,95 @@
+"""Healthy cameras of which the maker says less, or of which less was recorded, or otherwise: what can't be judged is left out, and nothing
+is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lab.diagnose.blocks import evidence_of
+from lab.diagnose.decide import decide
+from lab.diagnose.summaries import Study
+from lab.predict import camera_model
+from lab.recording import Manifest, RecordingSet
+from tests.proof.former import Camera, Plan
+
+
+@cache
+def _whole() -> RecordingSet:
+    return Camera(4242, rows=96, cols=128).record(Plan())
+
+
+Change = Callable[[dict[str, Any]], None]
+
+
+def _changed(change: Change, shift: int = 0) -> RecordingSet:
+    whole = _whole()
+    content = whole.manifest.model_dump(mode="json")
+    change(content)
+    manifest = Manifest.model_validate(content)
+    paths = {getattr(c, key, None) for c in whole.manifest.captures for key in ("radiance", "light_radiance")}
+    paths |= {c.screen.radiance for c in whole.manifest.captures if hasattr(c, "screen")}
+    paths |= set((manifest.cameras["left"].quantum_efficiency or {}).values())
+    frames = {c.frame: whole.frame(c) << shift for c in whole.manifest.captures}
+    targets = {c.target: whole.target(c.target) for c in whole.manifest.captures if hasattr(c, "target")}
+    spectra = {path: whole.spectrum(path) for path in paths if path}
+    return RecordingSet(manifest, frames, spectra, targets, source=whole.source)
+
+
+def _without(*keys: str) -> Change:
+    return lambda content: content["cameras"]["left"].update(dict.fromkeys(keys))
+
+
+def _only(*kinds: str) -> Change:
+    return lambda content: content.update(captures=[c for c in content["captures"] if c["kind"] in kinds])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _only("narrowband"),  # neither gain nor dark current is known then
+        _only("chart"),
+        _only("chart", "slanted_edge"),
+        _without("f_number"),
+        _without("pixel_pitch_um"),
+        _without("focal_length_mm", "lens_transmittance"),
+        _without("black_level_dn"),
+        _without("quantum_efficiency"),
+    ],
+    ids=["narrowband", "chart", "chart and edges", "f-number", "pitch", "lens", "black level", "sensitivity"],
+)
+def test_what_nobody_says_is_no_mismatch(change: Change) -> None:
+    evidence, _ = evidence_of(_changed(change), "left", None)
+    assert evidence is not None
+    found = decide(evidence, np.random.default_rng(1))
+    assert (found.before, found.named, found.abstained) == ((), (), ())
+
+
+def test_the_gain_is_told_by_whatever_was_taken_twice() -> None:
+    """By repeats of a chart to a few per cent: thousands of pixels, but pixels of a level aren't quite alike."""
+    studies = [
+        Study(r, "left", camera_model(r, "left", None, maker_curves=True))
+        for r in (_whole(), _changed(_only("chart")), _changed(_only("narrowband")))
+    ]
+    by_flats, by_chart, by_single = (s.noise for s in studies)
+    assert by_chart.gain_is_known
+    assert by_chart.gain == pytest.approx(by_flats.gain, rel=0.05)
+    assert not by_single.gain_is_known
+
+
+def test_codes_that_were_shifted_are_no_faulty_converter() -> None:
+    def shifted(content: dict[str, Any]) -> None:
+        _only("dark", "flat")(content)
+        camera = content["cameras"]["left"]
+        camera.update(
+            bit_depth=16, black_level_dn=16 * camera["black_level_dn"], white_level_dn=16 * camera["white_level_dn"]
+        )
+
+    evidence, skipped = evidence_of(_changed(shifted, 4), "left", None)
+    assert any("every code is a multiple of 16, as of a converter of 4 bits less" in s.reason for s in skipped)
+    assert evidence is not None
+    assert not decide(evidence, np.random.default_rng(1)).before
