@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import model_validator
@@ -102,6 +103,14 @@ class CameraModel(Frozen):
     def channels(self) -> tuple[str, ...]:
         """Names of the colour channels, in the order R, G, B; `("Y",)` for a MONO sensor."""
         return ("Y",) if self.cfa == "MONO" else ("R", "G", "B")
+
+    @property
+    def half_diagonal_px(self) -> float:
+        return 0.5 * math.hypot(self.rows, self.cols)
+
+    @property
+    def half_diagonal_um(self) -> float:
+        return self.half_diagonal_px * self.pixel_pitch_um
 
 
 class StereoRig(Frozen):

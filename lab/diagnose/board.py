@@ -170,7 +170,7 @@ def _averages(
     away = corners.place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
     radius = np.hypot(*away.T)
     unit = away / np.maximum(radius, 1e-9)[:, None]
-    half = 0.5 * float(np.hypot(camera.rows, camera.cols))
+    half = camera.half_diagonal_px
     rows, labels, counts = [], [], []
     for use, held_out in cells:
         seen = sorted({int(k) for k in corners.view[use]})
@@ -228,7 +228,7 @@ def board_colour_block(study: Study) -> Block:
         raise NotDetermined("board_colour", "no charuco captures")
     views = views[:: max(1, len(views) // COLOUR_VIEWS)]
     camera = study.camera
-    half = 0.5 * float(np.hypot(camera.rows, camera.cols))
+    half = camera.half_diagonal_px
     points: dict[str, list[FloatArray]] = {c: [] for c in study.channels if c != "G"}
     for k, view in enumerate(views):
         fits = channel_corners(study.recordings.frame(view.capture), camera.cfa, view)

@@ -61,12 +61,12 @@ class _Codes:
 def code_block(study: Study) -> Block:
     """Of all even light: steps (DN) where a high bit changes, combs of a few codes' period, and the scatter about a smooth curve."""
     counts = _counted(study)
-    used = np.flatnonzero(sum(c.count for c in counts.values()))
-    apart = int(np.gcd.reduce(used)) if used.size > 1 else 1
+    joined = int(np.bitwise_or.reduce(np.flatnonzero(sum(c.count for c in counts.values()))))
+    apart = joined & -joined  # the largest power of two that divides every code
     if apart >= SHIFTED_FROM:
         raise NotDetermined(
             "code_density",
-            f"every code is a multiple of {apart}, as of a converter of {int(np.log2(apart))} bits less whose codes were shifted: its steps aren't judged; write the frames as they left the converter",
+            f"every code is a multiple of {apart}, as of a converter of {apart.bit_length() - 1} bits less whose codes were shifted: its steps aren't judged; write the frames as they left the converter",
         )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []

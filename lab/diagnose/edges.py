@@ -111,7 +111,7 @@ class _Edge:
 
 
 def _measured(study: Study) -> list[_Edge]:
-    if study.stated.f_number is None or study.stated.pixel_pitch_um is None:
+    if not study.diffraction_is_known:
         raise NotDetermined(
             "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
         )
@@ -469,10 +469,7 @@ class _Edges:
         found = {here: self._sights_otf(here) for here in dict.fromkeys(local)}
         table = np.array([found[here] for here in local])
         # what is spread widely is of the profile (`_change`): its transfer falls within the first of the quadrature's nodes
-        veiled = np.array(wide_contrast(effects, self._camera))
-        for share, std_px in halos(effects, self._camera):
-            lowest = np.exp(-2.0 * np.square(np.pi * std_px * self._quadrature.frequency))
-            veiled = veiled * (1.0 + share / (1.0 - share) * lowest)
+        veiled = wide_contrast(effects, self._camera, self._quadrature.frequency)
         return np.asarray(table[self._place, self._sight, self._turn] / veiled)
 
     def _sights_otf(self, effects: tuple[Effect, ...]) -> ComplexArray:

@@ -24,7 +24,7 @@ from lab.diagnose.summaries import (
     held_out_of,
     rounding_std_dn,
 )
-from lab.diagnose.veils import Surroundings, even_share, halos, harmonics, wide_contrast
+from lab.diagnose.veils import Surroundings, even_share, halo_light, harmonics, wide_contrast
 from lab.errors import NotDetermined
 from lab.predict import Field, mixed_charge
 from lab.recording import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
@@ -57,7 +57,7 @@ class Patch:
     row: float
     col: float
     frame: float  # mean of the whole frame in this channel
-    around: Surroundings  # of the patch in it, px of the plane
+    around: Surroundings  # of the patch in one of its planes, less what no light makes
     tail: float  # what the point spread adds from the surroundings
     held_out: bool
 
@@ -79,7 +79,6 @@ def chart_block(study: Study) -> Block:
     offset = noise.black + noise.dark_dn_per_s * exposures
     signal = np.maximum(value - offset, 0.1)
     surround = np.array([p.frame for p in points]) - offset  # what a veil carries
-    step = mosaic.step(camera.cfa)
     light = relative_illumination(camera, row, col)
     place = Field.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
@@ -100,9 +99,7 @@ def chart_block(study: Study) -> Block:
         electrons = rates * local * time
         if any(type(e).charge is not Effect.charge for e in effects):
             electrons = electrons * _mixing(study, points, electrons, effects)
-        veil = even_share(effects) * surround
-        for share, std_px in halos(effects, camera):
-            veil = veil + share * (np.array([p.around.mean(std_px / step) for p in points]) - offset)
+        veil = even_share(effects) * surround + halo_light([p.around for p in points], effects, camera)
         electrons = wide_contrast(effects, camera) * electrons + (veil + tail) / noise.gain + ambient
         out = electrons + noise.dark_dn_per_s / noise.gain * exposures
         for effect in effects:
@@ -147,11 +144,11 @@ def patch_levels(study: Study) -> list[Patch]:
             frame = steady(study.recordings, part)
             clipped = study.recordings.frame(part[0]) >= study.saturation_dn
             for channel in study.channels:
-                spread = _spread(study, frame, channel, part[0].radiance)
+                first_row, first_col = mosaic.phases(study.camera.cfa)[channel][0]
+                plane = frame[first_row::step, first_col::step]
+                spread = _spread(study, plane, channel, part[0].radiance)
                 mean = float(study.pixels_of(frame, channel).mean())
-                first = mosaic.phases(study.camera.cfa)[channel][0]
-                plane = frame[first[0] :: step, first[1] :: step]
-                low = harmonics(plane)
+                low = harmonics(plane - study.noise.black - study.noise.dark_dn_per_s * part[0].exposure_s)
                 mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))
                 for name, rows, cols, row, col in _patches(part[0]):
                     box = (slice(*rows), slice(*cols))
@@ -188,14 +185,12 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
     return np.asarray(covariance)
 
 
-def _spread(study: Study, frame: FloatArray, channel: str, light: str) -> FloatArray:
+def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatArray:
     """What the baseline's own point spread adds to each place of a plane from its surroundings (DN, on the plane's grid).
 
     The recording stands for the scene: well inside a patch both differ only by what is sought, a fraction of a per cent.
     """
     step = mosaic.step(study.camera.cfa)
-    row, col = mosaic.phases(study.camera.cfa)[channel][0]
-    plane = frame[row::step, col::step]
     picture = np.pad(plane, [(0, n) for n in plane.shape], mode="symmetric")
     fy = np.fft.fftfreq(picture.shape[0], step)[:, None]
     fx = np.fft.rfftfreq(picture.shape[1], step)[None, :]
@@ -280,7 +275,6 @@ def screen_block(study: Study) -> Block:
     value = np.array([p.value for p in points])
     tail, beyond = np.array([p.tail for p in points]), np.array([p.beyond for p in points])
     lift = np.array([p.lift for p in points])
-    step = mosaic.step(camera.cfa)
     covariance = np.diag(np.array([p.std for p in points]) ** 2 + 2 * noise.jitter_dn**2)
     ids = [p.kind for p in points]
     same = np.array([[a == b for b in ids] for a in ids])
@@ -293,9 +287,7 @@ def screen_block(study: Study) -> Block:
     )
 
     def predict(effects: Effects) -> Prediction:
-        shift = np.zeros(len(points))
-        for share, std_px in halos(effects, camera):
-            shift = shift + share * np.array([p.around.mean(std_px / step) for p in points])
+        shift = halo_light([p.around for p in points], effects, camera)
         if any(type(e).response is not Effect.response for e in effects):
             low = np.maximum(tail, 0.0) / noise.gain
             base = np.array([p.black for p in points]) / noise.gain
@@ -327,7 +319,7 @@ class _DarkSquares:
     tail: float
     picture: FloatArray  # what the pattern adds to the dark screen, DN, over the channel's plane
     use: NDArray[np.bool_]  # the dark squares' insides in it
-    around: Surroundings  # of these, px of the plane
+    around: Surroundings  # of these
     beyond: float  # what the tail is uncertain by: light beyond the frame
     lift: float
     white: float
@@ -388,7 +380,8 @@ def _dark_squares(
             np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
             for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))
         )
-        difference = (shown - black)[plane][use]
+        added = (shown - black)[plane]
+        difference = added[use]
         variance = (noise.gain * max(float(black[plane][use].mean()) - noise.black, 0.0) + noise.read_dn**2) * (
             1 / len(part) + 1 / blacks
         )
@@ -396,7 +389,7 @@ def _dark_squares(
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
                          float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
-                         (shown - black)[plane], use, Surroundings.of(harmonics((shown - black)[plane]), use), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
+                         added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
                          float(black[plane][use].mean()) - noise.black)
         )  # fmt: skip
     return found

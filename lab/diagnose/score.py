@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import combinations
 
 import numpy as np
@@ -22,7 +23,12 @@ class Score:
 
     effect: type[Effect]
     value: float
-    start: Effect  # where a refit begins
+    begin: Callable[[], Effect]
+
+    @cached_property
+    def start(self) -> Effect:
+        """Where a refit begins."""
+        return self.begin()
 
 
 @dataclass(frozen=True)
@@ -42,20 +48,25 @@ class Signatures:
     table_of: Callable[[Sequence[Effect]], FloatArray]  # signatures of any effects as they stand, (n, effects)
 
     def scores(self) -> list[Score]:
-        best: dict[str, Score] = {}
-        plain: dict[str, tuple[float, Effect]] = {}
+        best: dict[str, tuple[float, Effect]] = {}
+        plain: dict[str, list[tuple[float, Effect]]] = {}
         for effect, prototypes, table in self.columns:
             value, share = _cone(table, self.white)
-            if effect.name not in best or value > best[effect.name].value:
-                best[effect.name] = Score(effect, value, _combined(effect, prototypes, share))
+            if effect.name not in best or value > best[effect.name][0]:
+                best[effect.name] = value, _combined(effect, prototypes, share)
             if len(prototypes) == 1:
-                found = self._taken(table[:, 0]), prototypes[0]
-                plain[effect.name] = max(plain.get(effect.name, found), found, key=lambda one: one[0])
-        for name, (taken, prototype) in plain.items():
-            # scaled by what a small change promises, a large one may be far off: the prototype itself may lie nearer
-            if taken > 0.0 and taken > self._taken(self.table_of([best[name].start])[:, 0]):
-                best[name] = replace(best[name], start=prototype)
-        return sorted(best.values(), key=lambda s: -s.value)
+                plain.setdefault(effect.name, []).append((self._taken(table[:, 0]), prototypes[0]))
+        found = [
+            Score(type(scaled), value, partial(self._nearest, scaled, plain.get(name, [])))
+            for name, (value, scaled) in best.items()
+        ]
+        return sorted(found, key=lambda s: -s.value)
+
+    def _nearest(self, scaled: Effect, plain: Sequence[tuple[float, Effect]]) -> Effect:
+        """Scaled by what a small change promises, a large one may be far off: a prototype itself may lie nearer."""
+        taken, prototype = max(plain, key=lambda one: one[0], default=(0.0, scaled))
+        is_nearer = taken > 0.0 and taken > self._taken(self.table_of([scaled])[:, 0])
+        return prototype if is_nearer else scaled
 
     def _taken(self, signature: FloatArray) -> float:
         """Of the residual's square, by an effect as it stands; negative where it only adds."""

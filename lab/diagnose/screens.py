@@ -115,7 +115,7 @@ def patterns(study: Study) -> list[list[Pattern]]:
 
 
 def _patterns(study: Study) -> list[list[Pattern]]:
-    if study.stated.f_number is None or study.stated.pixel_pitch_um is None:
+    if not study.diffraction_is_known:
         raise NotDetermined("bernoulli", "f-number or pixel pitch isn't stated: no diffraction to draw patterns with")
     captures: Any = study.recordings.captures
     groups = study.groups(Bernoulli, lambda c: (c.screen.pose, c.target))
@@ -241,7 +241,7 @@ def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> Float
 
 def _from_middle(camera: CameraModel, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Along columns and rows from the frame's middle, in half diagonals, and the squared distance."""
-    half = 0.5 * float(np.hypot(camera.rows, camera.cols))
+    half = camera.half_diagonal_px
     u, v = ((points - 0.5 * np.array([camera.cols - 1, camera.rows - 1])) / half).T
     return u, v, u * u + v * v
 
@@ -768,7 +768,7 @@ def colour_shift_px(
     directions, by the light that each channel detects."""
     camera = study.camera
     wavelength = np.arange(400.0, 721.0, 10.0)
-    half_um = 0.5 * float(np.hypot(camera.rows, camera.cols)) * camera.pixel_pitch_um
+    half_um = camera.half_diagonal_um
     turn = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
     x, y = distance * half_um * np.cos(turn), distance * half_um * np.sin(turn)
     outwards = np.zeros(len(wavelength))

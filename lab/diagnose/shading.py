@@ -194,8 +194,8 @@ def _shaded(planes: Sequence[_Plane], place: Field, effects: Effects, study: Stu
         light = light * effect.illumination(place.x_um, place.y_um, study.camera)
     light = _cell_means(light)
     # a veil evens out what the lens's fall-off leaves
-    contrast = 1.0 - even_share(effects)
-    light = contrast * light + (1.0 - contrast) * light.mean()
+    even = even_share(effects)
+    light = (1.0 - even) * light + even * light.mean()
     found = []
     for plane in planes:
         electrons = light / light.mean() * plane.level_e

@@ -190,14 +190,19 @@ class Study:
         return self._levels[capture.id]
 
     @property
+    def diffraction_is_known(self) -> bool:
+        """Whether f-number and pitch are stated."""
+        return self.stated.f_number is not None and self.stated.pixel_pitch_um is not None
+
+    @property
     def level_is_known(self) -> bool:
         """Whether the light in front of the lens tells how many DN to expect."""
-        return self.noise.gain_is_known and None not in (self.stated.f_number, self.stated.pixel_pitch_um)
+        return self.noise.gain_is_known and self.diffraction_is_known
 
     @property
     def tail_std(self) -> float:
         """Of the light that the baseline's point spread itself sends far, which is anything where the lens or the pitch aren't stated."""
-        return 1.0 if None in (self.stated.f_number, self.stated.pixel_pitch_um) else TAIL_STD
+        return TAIL_STD if self.diffraction_is_known else 1.0
 
     @cached_property
     def lamps(self) -> dict[str, int]:
@@ -418,12 +423,11 @@ def noise_guess(study: Study) -> NoiseGuess:
     signal, variance, prnu = _transfer_points(study, black)
     if len(signal) > 1:
         s, v = np.array(signal), np.array(variance)
-        weight = 1.0 / np.maximum(v, 1e-9)
         low = s < 0.5 * (study.saturation_dn - black)
         use = low if low.sum() > 2 else np.ones_like(low)
-        gain = float(np.sum(weight[use] * s[use] * (v[use] - read**2)) / np.sum(weight[use] * s[use] ** 2))
+        gain = _transfer_slope(s[use], v[use], read)
         lamp = level_scatter(repeated_levels(study, black, gain, read))
-    if len(signal) < 2 and gain is None:
+    elif gain is None:
         gain = _scene_gain(study, black, read)
     known = gain is not None and gain > 0
     gain = gain if gain is not None and known else 1.0
@@ -458,7 +462,7 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
 def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
     """DN/e by repeats of whatever was seen: temporal variance over signal, of pixels alike in signal; None without repeats."""
     signal, variance = [], []
-    for group in study.groups(None, lambda c: (c.kind, c.exposure_s, c.gain_db, *_shown(c))):
+    for group in study.groups(None, lambda c: c.model_dump_json(exclude={"id", "frame", "time", "temperature_c"})):
         if len(group) < 2 or group[0].kind == "dark":
             continue
         one, two = (np.asarray(study.recordings.frame(c), float) - black for c in group[:2])
@@ -470,17 +474,14 @@ def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
             if alike.sum() > 200 and high < 0.8 * (study.saturation_dn - black):
                 signal.append(float(mean[alike].mean()))
                 variance.append(float(apart[alike].mean()))
-    s, v = np.array(signal), np.array(variance)
-    if not np.any(s > 0):
-        return None
-    weight = 1.0 / np.maximum(v, 1e-9)
-    return float(np.sum(weight * s * (v - read_dn**2)) / np.sum(weight * s * s))
+    s = np.array(signal)
+    return _transfer_slope(s, np.array(variance), read_dn) if np.any(s > 0) else None
 
 
-def _shown(capture: Capture) -> tuple[object, ...]:
-    """What was in front of the camera, as far as a capture says it: alike in repeats."""
-    told = capture.model_dump(exclude={"id", "frame", "time", "temperature_c"})
-    return tuple(str(told[key]) for key in sorted(told))
+def _transfer_slope(signal: FloatArray, variance: FloatArray, read_dn: float) -> float:
+    """DN/e: of the line from the read noise through temporal variances over signal, each by its own size."""
+    weight = 1.0 / np.maximum(variance, 1e-9)
+    return float(np.sum(weight * signal * (variance - read_dn**2)) / np.sum(weight * signal**2))
 
 
 def _even_rows(frame: Any, step: int) -> FloatArray:

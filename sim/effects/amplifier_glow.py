@@ -41,7 +41,7 @@ class AmplifierGlow(Effect):
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        half_mm = 0.5 * float(np.hypot(camera.rows, camera.cols)) * camera.pixel_pitch_um * 1e-3
+        half_mm = camera.half_diagonal_um * 1e-3
         return tuple(
             (cls(glow_e_per_s=6.0, reach_mm=float(np.clip(share * half_mm, 0.011, 4.5)), corner=corner),)
             for corner in get_args(Corner)

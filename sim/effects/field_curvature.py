@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
-import numpy as np
-
 from sim.camera import CameraModel
 from sim.effects.aberration import Aberration
 from sim.effects.base import Stage
@@ -59,7 +57,7 @@ class FieldCurvature(Aberration):
         )
 
     def at_place(self, x_um: float, y_um: float, camera: CameraModel) -> Self:
-        half_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
+        half_um = camera.half_diagonal_um
         return self.model_copy(update={"place": (x_um / half_um, y_um / half_um)})
 
     def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:

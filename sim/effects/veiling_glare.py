@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
-import numpy as np
-
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.optics.filters import veil_otf
@@ -63,5 +61,4 @@ class VeilingGlare(Effect):
         return self.share_percent / 100.0 * (1.0 - self.halo_share)
 
     def halo(self, camera: CameraModel) -> tuple[float, float]:
-        half_um = 0.5 * camera.pixel_pitch_um * float(np.hypot(camera.rows, camera.cols))
-        return self.share_percent / 100.0 * self.halo_share, self.halo_reach * half_um
+        return self.share_percent / 100.0 * self.halo_share, self.halo_reach * camera.half_diagonal_um

@@ -79,7 +79,7 @@ class VignettingDecentre(Effect):
         )
 
     def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
-        half = 0.5 * float(np.hypot(camera.rows, camera.cols)) * camera.pixel_pitch_um
+        half = camera.half_diagonal_um
         rho2 = (x_um / half - self.centre_x) ** 2 + (y_um / half - self.centre_y) ** 2
         away = rho2 ** (0.5 * self.exponent) - (self.centre_x**2 + self.centre_y**2) ** (0.5 * self.exponent)
         return np.asarray(1.0 - self.fall_off_percent / 100.0 * away)

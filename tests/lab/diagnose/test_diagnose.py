@@ -14,7 +14,7 @@ from lab.diagnose.decide import decide
 from lab.diagnose.evidence import Evidence, Gaussian, Within, chi2
 from lab.diagnose.locate import look
 from lab.diagnose.refit import Fit, refit
-from lab.diagnose.score import signatures
+from lab.diagnose.score import Signatures, signatures
 from lab.diagnose.search import Search
 from lab.diagnose.summaries import Block, Label, Prediction
 from lab.diagnose.unknown import discrepancy, predictive
@@ -89,6 +89,23 @@ def test_threshold_holds_its_rate() -> None:
         draw = replace(first, white=rng.standard_normal(len(first.white)))
         exceeded += max(s.value for s in draw.scores()) > threshold
     assert exceeded <= 8
+
+
+def test_a_refit_begins_at_the_prototype_that_lies_nearest() -> None:
+    """Ten times the first prototype promises most, but is far off where it isn't small; the second one is half of the residual."""
+    few, many = (effect("hot_pixels")(excess_e_per_s=100.0, share_ppm=ppm) for ppm in (20.0, 200.0))
+    white, promised, near = np.array([10.0, 1.0]), np.array([1.0, 0.0]), np.array([5.0, 1.0])
+
+    def table_of(prototypes: Sequence[Effect]) -> np.ndarray:
+        return np.array([[100.0, 100.0] for _ in prototypes]).T
+
+    columns = [(type(few), (one,), table[:, None]) for one, table in ((few, promised), (many, near))]
+    (score,) = Signatures(white, columns, table_of).scores()
+    assert score.value == pytest.approx(51.0**2 / 26.0)
+    assert score.start == many
+    (score,) = Signatures(white, columns, lambda one: white[:, None]).scores()  # the scaled one is all of it
+    assert score.start.having(excess_e_per_s=100.0) == many
+    assert score.start != many
 
 
 def test_score_of_a_one_sided_effect_is_never_negative() -> None:

@@ -269,6 +269,15 @@ def test_infrared_filter_halves_at_its_cut_and_falls() -> None:
     assert all(a > b for a, b in pairwise(t))
 
 
+def test_a_radiometers_error_is_a_power_or_grows_with_the_level() -> None:
+    weak, strong = (0.002 * np.ones(3), 0.03 * np.ones(3))
+    for growth, exponents in ((0.0, np.log([0.2, 3.0])), (1e-6, np.log([0.2, 3.0])), (1.0, np.array([-0.8, 2.0]))):
+        one = effect("radiometer_nonlinearity")(exponent_percent=5.0, growth=growth)
+        for level, exponent in zip((weak, strong), exponents, strict=True):
+            found = one.radiance(np.array([500.0, 550.0, 600.0]), level, "narrowband")
+            np.testing.assert_allclose(found, level * np.exp(0.05 * exponent), rtol=1e-6)
+
+
 def test_bandwidth_keeps_the_light() -> None:
     """A wider line holds as many watts; the sum at 1 nm of a 14 nm line is exact to 1e-3."""
     wavelength, value = LINE.arrays
