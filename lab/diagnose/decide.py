@@ -321,7 +321,7 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     fits = {effect.name: fit}
     for score in pool[:SCREENED]:
         start = (*fit.effects[:index], score.start, *fit.effects[index + 1 :])
-        rough = search.fitted(start)
+        rough = search.fitted(start, beside=fit)
         near = rough.weight > fit.weight - HOPELESS - ROUGH_SHARE * gain
         fits[score.effect.name] = search.fitted(start, final=True) if near else rough
     weights = {}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from types import MappingProxyType
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -65,12 +66,18 @@ class Fit:
     std: tuple[dict[str, float | None], ...]
     log_likelihood: float
     weight: float
-    tangents: FloatArray  # (n, parameters), slopes of the prediction
+    tangents: FloatArray  # (n, parameters), slopes of the prediction by the coordinates that were fitted
     final: bool = True  # whether it was carried to convergence
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.effects)
+
+    def slopes(self, effects: Effects) -> dict[Coordinate, FloatArray]:
+        """Those by the coordinates of the effects that stand in this set, too, as they are."""
+        fitted = [(e, name) for e, std in zip(self.effects, self.std, strict=True) for name in std]
+        at = dict(zip(fitted, self.tangents.T, strict=True))
+        return {c: at[key] for c in coordinates(effects) if (key := (effects[c.index], c.name)) in at}
 
 
 def coordinates(effects: Effects) -> list[Coordinate]:
@@ -91,13 +98,21 @@ def likelihood(evidence: Evidence, effects: Effects) -> float:
 
 
 def refit(
-    evidence: Evidence, start: Effects, *, passes: int = PASSES, evaluations: int = 12, final: bool = True
+    evidence: Evidence,
+    start: Effects,
+    *,
+    passes: int = PASSES,
+    evaluations: int = 12,
+    final: bool = True,
+    settled: Fit | None = None,
 ) -> Fit:
     """Maximum a posteriori of all parameters of `start`, by Gauss-Newton with bounds; the prior is three times as wide as
     the declared one, as a camera at hand needn't be typical. Standard uncertainties follow from the slopes and hold the form
-    tolerance, as the covariance does. A final fit does without the dispensable parameters where that is worth nearly as much."""
+    tolerance, as the covariance does. A final fit does without the dispensable parameters where that is worth nearly as much.
+    The slopes of members that stand as they do in `settled` are taken from there: they move, but change little by what joins."""
     coords = coordinates(tuple(start))
-    found = _refit(evidence, tuple(start), coords, passes, evaluations, final)
+    known = {} if settled is None else settled.slopes(start)
+    found = _refit(evidence, tuple(start), coords, passes, evaluations, final, known)
     spare = [c for c in coords if c.quantity.dispensable]
     if final and spare:
         without = moved(found.effects, spare, np.zeros(len(spare)))
@@ -113,8 +128,9 @@ def _refit(
     passes: int,
     evaluations: int,
     final: bool,
+    known: Mapping[Coordinate, FloatArray] = MappingProxyType({}),
 ) -> Fit:
-    """Of the parameters `coords`, the others as they are."""
+    """Of the parameters `coords`, the others as they are. `known`: slopes that needn't be taken again."""
     seen = evidence.seen
     if not coords:
         value = likelihood(evidence, effects)
@@ -139,7 +155,10 @@ def _refit(
             # steps of 2 % of a typical size, towards the inside of the bounds
             base = evidence.mean(moved(effects, coords, at))[seen]
             columns = []
-            for k in range(len(at)):
+            for k, c in enumerate(coords):
+                if c in known:
+                    columns.append(-known[c][seen])
+                    continue
                 step = 0.02 * max(scale[k], 0.02 * abs(at[k]))
                 step = -step if at[k] + step > high[k] else step
                 shifted = at.copy()
@@ -209,5 +228,5 @@ def _tangents(
         step = 0.02 * scale[k] * (-1 if u[k] + 0.02 * scale[k] > high[k] else 1)
         shifted = u.copy()
         shifted[k] += step
-        columns.append((evidence.mean(moved(effects, coords, shifted)) - base) / 0.02)
+        columns.append((evidence.mean(moved(effects, coords, shifted)) - base) / step)
     return np.array(columns).T

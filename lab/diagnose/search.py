@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from lab.diagnose.evidence import Evidence
@@ -23,6 +23,22 @@ RIVAL_FROM = 1.2
 FURTHER = 1.5
 #: Nats below the best by which a set may lie and still be gone on from.
 BEHIND = 25.0
+
+
+def _unlike(sets: Sequence[Fit]) -> list[Fit]:
+    """Without those that are a better one with a member exchanged for its declared rival: what they grow into is alike, and the
+    exchange is tried in the end (`Search._exchanged`)."""
+    kept: list[Fit] = []
+    for one in sets:
+        if not any(_is_exchanged(one, better) for better in kept):
+            kept.append(one)
+    return kept
+
+
+def _is_exchanged(one: Fit, other: Fit) -> bool:
+    mine = [e for e in one.effects if e.name not in other.names]
+    theirs = [e for e in other.effects if e.name not in one.names]
+    return len(mine) == len(theirs) == 1 and mine[0].name in type(theirs[0]).rivals
 
 
 @dataclass
@@ -47,7 +63,7 @@ class Search:
             report(f"looking for {'another' if count else 'an'} effect")
             grown = [fit for state in beam for fit in self._grown(state)]
             grown = sorted({frozenset(f.names): f for f in grown}.values(), key=self.worth, reverse=True)
-            beam = [self.fitted(f.effects, final=True) for f in grown[:BEAM]]
+            beam = [self.fitted(f.effects, final=True) for f in _unlike(grown)[:BEAM]]
             beam = sorted(beam, key=self.worth, reverse=True)
             if not beam or self.worth(beam[0]) < self.worth(current) - BEHIND:
                 break
@@ -84,7 +100,7 @@ class Search:
         if not state.effects:
             single = every[0].value if every else self.threshold
             starts += [pair.starts for pair in found.pairs(PAIRS) if pair.value > single + self.threshold]
-        return [self.fitted(start) for start in starts]
+        return [self.fitted(start, beside=state) for start in starts]
 
     def _mended(self, fit: Fit) -> Fit:
         """With members left out or exchanged for a declared rival, while that is worth more."""
@@ -105,11 +121,12 @@ class Search:
         kinds = [e for e in self.known if e.name in rivals and e.name not in fit.names]
         scores = signatures(self.evidence, self.evidence.camera, rest, kinds).scores()
         least = RIVAL_FROM * (fit.weight - without.weight)
-        return [self.fitted((*rest, s.start)) for s in scores if s.value > least]
+        return [self.fitted((*rest, s.start), beside=without) for s in scores if s.value > least]
 
-    def fitted(self, start: Effects, *, final: bool = False, again: bool = False) -> Fit:
+    def fitted(self, start: Effects, *, final: bool = False, again: bool = False, beside: Fit | None = None) -> Fit:
         """A set's fit, made once (a rough one is good to tell sets apart; `final`: to convergence). There are several optima: `again`
-        goes on from `start` whatever was found, once, and keeps the better."""
+        goes on from `start` whatever was found, once, and keeps the better. `beside`: the set that `start` is grown from, whose
+        slopes do for a rough fit."""
         key, begin = frozenset(e.name for e in start), tuple(start)
         known = self.fits.get(key)
         if known is not None and known.final >= final:
@@ -119,7 +136,8 @@ class Search:
         elif known is not None:
             begin = known.effects
         passes, evaluations = (3, 12) if final else (2, 8)
-        made = refit(self.evidence, begin, passes=passes, evaluations=evaluations, final=final)
+        settled = None if final else beside
+        made = refit(self.evidence, begin, passes=passes, evaluations=evaluations, final=final, settled=settled)
         if known is None or known.final < final or made.weight > known.weight:
             self.fits[key] = made
         return self.fits[key]
