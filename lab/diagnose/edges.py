@@ -25,6 +25,7 @@ from scipy.special import ndtr
 from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of
 from lab.diagnose.veils import halos, wide_contrast
 from lab.errors import NotDetermined
+from lab.fit.levels import rounding_waves_dn
 from lab.fit.mtf import SMOOTHING, EdgeGeometry, EdgeMtf, Region, find_edges, measure_edge
 from lab.recording import SlantedEdge
 from sim.effects.base import Effect
@@ -393,7 +394,21 @@ class _Edges:
                     share = 1.0 if i == j else np.sqrt(a.fixed_share * b.fixed_share)
                     out[i * size : (i + 1) * size, j * size : (j + 1) * size] = share * factors[i] @ factors[j].T
                     out[j * size : (j + 1) * size, i * size : (i + 1) * size] = share * factors[j] @ factors[i].T
+        for i, rounded in enumerate(self._rounded.transpose(1, 2, 0)):
+            out[i * size : (i + 1) * size, i * size : (i + 1) * size] += rounded @ rounded.T
         return np.asarray(out + EDGE_FLOOR**2 * np.eye(len(out)))
+
+    @property
+    def _rounded(self) -> FloatArray:
+        """What rounding may do to numbers, (changes, edges, frequencies), one standard deviation each: over a profile whose dark side
+        spreads by less than a code, a saw-tooth of the level, its harmonics of any phase, as no level is known to a fraction of a code."""
+        contrast = np.array([e.measured.light_level - e.measured.dark_level for e in self.edges])[:, None]
+        level_dn = np.maximum(self._light_profile * contrast, 0.0)
+        waves = rounding_waves_dn(level_dn, self._study.noise.spread_dn2(level_dn))
+        base = self.predict(())
+        return np.array([self._numbers(self._reported((), wave / contrast)) - base for wave in waves]).reshape(
+            -1, *base.shape
+        )
 
     # --- the model ---
 

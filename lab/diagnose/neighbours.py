@@ -16,6 +16,7 @@ import numpy as np
 
 from lab.diagnose.summaries import CLIPPED_SHARE, LEVEL_REACH, Block, Effects, Label, Prediction, Study, overrides
 from lab.errors import NotDetermined
+from lab.fit.levels import variance_rounding_std
 from lab.predict import NOISE_NODES
 from sim.camera import Cfa
 from sim.effects.base import Effect
@@ -209,6 +210,8 @@ def variance_block(study: Study) -> Block:
     factor = np.array([p[0].gain for p in points])
     covariance = np.diag(np.square(value) * (np.square([p[4] for p in points]) + VARIANCE_FLOOR**2))
     noise, camera = study.noise, study.camera
+    rounding = [variance_rounding_std(v, (noise.prnu * level) ** 2) for v, level in zip(value, signal, strict=True)]
+    covariance += np.diag(np.square(rounding))
     settings = sorted(set(factor.tolist()))
     light = study.field.light / study.field.light.mean()
 

@@ -22,10 +22,10 @@ from lab.diagnose.summaries import (
     Prediction,
     Study,
     held_out_of,
-    rounding_std_dn,
 )
 from lab.diagnose.veils import Surroundings, even_share, halo_light, harmonics, wide_contrast
 from lab.errors import NotDetermined
+from lab.fit.levels import rounding_std_dn
 from lab.predict import Field, mixed_charge
 from lab.recording import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
 from sim.camera import CameraModel
@@ -173,7 +173,7 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
     channel = np.array([p.channel for p in points])
     perfect = np.array([signal[channel == c].max() / 0.9 for c in channel])  # DN of a perfect diffuser
     temporal = (noise.gain * signal + noise.read_dn**2) / pixels / repeats
-    digits = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
+    digits = rounding_std_dn(noise.spread_dn2(signal))
     fixed = np.sqrt((noise.prnu * signal) ** 2 / pixels + (PATCH_COLOUR_STD * signal) ** 2 + digits**2)
     same = names[:, None] == names
     covariance = np.diag(temporal + noise.jitter_dn**2) + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
@@ -279,11 +279,13 @@ def screen_block(study: Study) -> Block:
     ids = [p.kind for p in points]
     same = np.array([[a == b for b in ids] for a in ids])
     white = np.array([p.white for p in points])
+    channel, digits = np.array([p.channel for p in points]), np.array([p.digits for p in points])
     covariance += (
         same * np.outer(tail, tail) * study.tail_std**2
         + np.outer(beyond, beyond)
         + np.outer(white, white) * SCREEN_FLOOR**2
         + np.diag(np.square(1e-4 * white))
+        + same * (channel[:, None] == channel) * np.outer(digits, digits)
     )
 
     def predict(effects: Effects) -> Prediction:
@@ -324,6 +326,7 @@ class _DarkSquares:
     lift: float
     white: float
     black: float
+    digits: float  # what rounding leaves in the value
 
 
 def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> float:
@@ -382,14 +385,13 @@ def _dark_squares(
         )
         added = (shown - black)[plane]
         difference = added[use]
-        variance = (noise.gain * max(float(black[plane][use].mean()) - noise.black, 0.0) + noise.read_dn**2) * (
-            1 / len(part) + 1 / blacks
-        )
+        lights = np.maximum([float(picture_of[plane][use].mean()) - noise.black for picture_of in (shown, black)], 0.0)
+        variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
         means = [float(study.pixels_of(f, channel).mean()) for f in (shown, black)]
         found.append(
             _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
                          float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
                          added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
-                         float(black[plane][use].mean()) - noise.black)
+                         float(black[plane][use].mean()) - noise.black, float(np.linalg.norm(rounding_std_dn(noise.spread_dn2(lights)))))
         )  # fmt: skip
     return found

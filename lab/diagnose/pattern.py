@@ -143,7 +143,7 @@ def green_block(study: Study) -> Block:
     covariance = np.diag([r.std**2 + GREEN_FLOOR**2 for r in ratios]) + common
     labels = [Label(r.x, "G", r.condition, r.captures, r.held_out) for r in ratios]
     number = CELLS[0] * CELLS[1]
-    for held_out, (image, noise) in images.items():
+    for held_out, (image, noise) in sorted(images.items()):  # what is seen first
         red_rows, blue_rows = _greens(study, image)
         place = _cell_means(red_rows) / _cell_means(blue_rows)
         members = tuple(c.id for u in levels if u.held_out == held_out for c in u.captures)

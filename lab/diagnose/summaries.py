@@ -18,6 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from lab.errors import NotDetermined
+from lab.fit.levels import unrounded
 from lab.predict import Field
 from lab.recording import Camera, Capture, RecordingSet
 from sim.camera import CameraModel, Side
@@ -321,6 +322,10 @@ class NoiseGuess:
     black_std: float  # of the guess
     dark_std: float  # DN/s, of the guess
 
+    def spread_dn2(self, signal_dn: FloatArray) -> FloatArray:
+        """Variance of pixels at a signal before rounding; read noise that rounding hides counts for nothing."""
+        return np.asarray(self.gain * signal_dn + unrounded(self.read_dn**2) + (self.prnu * signal_dn) ** 2)
+
 
 def _saturation(study: Study) -> float:
     """DN from which on a pixel counts as clipped: the converter's highest code, or less where full wells pile up below it.
@@ -555,12 +560,6 @@ def level_scatter(repeats: Sequence[RepeatedLevels]) -> float:
     left = [float(np.sum(np.square(r.away - trend * r.elapsed_s))) - (len(r.away) - 1) * r.noise for r in repeats]
     free = float(sum(w * (len(r.away) - 1) for w, r in zip(weight, repeats, strict=True)))
     return float(np.sqrt(max(float(weight @ left) / free, 0.0))) if free > 0 else 0.0
-
-
-def rounding_std_dn(variance_dn2: FloatArray) -> FloatArray:
-    """Of the mean of many pixels, by rounding to whole DN: exp(-2 pi^2 s^2) / (pi sqrt 2), the root mean square of the first harmonic of
-    the saw-tooth that rounding is, averaged over pixels that spread by s. Quiet cameras of few bits don't dither: up to 0.2 DN."""
-    return np.asarray(np.exp(-2.0 * np.pi**2 * np.maximum(variance_dn2, 0.0)) / (np.pi * np.sqrt(2.0)))
 
 
 def pair_variance(frames: Sequence[Any]) -> float:

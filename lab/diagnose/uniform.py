@@ -24,9 +24,9 @@ from lab.diagnose.summaries import (
     held_out_of,
     overrides,
     repeated_levels,
-    rounding_std_dn,
 )
 from lab.errors import NotDetermined
+from lab.fit.levels import rounding_std_dn
 from lab.predict import collected_electrons, mean_dn
 from lab.recording import Narrowband
 from sim.forward import electron_rate
@@ -121,7 +121,7 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
     repeats = (group[:, None] == group) & (channel_of[:, None] == channel_of)
     covariance = np.diag((noise.gain * signal + noise.read_dn**2) / pixels)
     covariance += repeats * np.outer(signal, signal) * LEVEL_FLOOR**2
-    rounding = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
+    rounding = rounding_std_dn(noise.spread_dn2(signal))
     covariance += repeats * np.outer(rounding, rounding)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])
     scatter = signal * _scatter(study, groups)[group]
@@ -242,7 +242,7 @@ def _narrowband_covariance(
     frame = np.array([c.id for c, *_ in points])
     setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
     reading = np.array([c.radiance for c, *_ in points])
-    digits = rounding_std_dn(noise.gain * signal + noise.read_dn**2 + (noise.prnu * signal) ** 2)
+    digits = rounding_std_dn(noise.spread_dn2(signal))
     own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2 + digits**2)
     expected = curves.rates(()) * exposures
     radiometer = signal * _reading_std(points, signal, shot, expected)

@@ -23,6 +23,8 @@ from sim.spectrum import FloatArray
 
 QUANTISATION_DN2 = 1.0 / 12.0
 HIDDEN_DN2 = 0.30  # a normal variable of less than 0.45 DN may have any variance below this after rounding
+ROUNDING_HARMONICS, WAVE_HARMONICS = 16, 4  # of a saw-tooth
+LEAST_ROUNDING_DN = 1e-3
 DEFECT_SIGMA = 8.0  # a normal pattern of a million pixels doesn't reach that far
 SHADING_DEGREE = 6
 
@@ -142,21 +144,43 @@ class PlaneStatistics:
 
     @property
     def mean_rounding_std(self) -> float:
-        """What rounding may leave in `mean` (DN, a standard uncertainty): that of a normal variable of standard deviation s is off
-        by exp(-2 pi^2 s^2) / pi sin(2 pi mean), which no averaging takes out."""
-        return float(np.exp(-2.0 * np.pi**2 * _unrounded(self.spread)) / np.pi / np.sqrt(2.0))
+        """What rounding may leave in `mean` (DN, a standard uncertainty), which no averaging takes out."""
+        return float(rounding_std_dn(unrounded(self.spread)))
 
 
-def _unrounded(variance: float) -> float:
+def unrounded(variance: FloatArray | float) -> FloatArray:
     """A variance before rounding added its own (DN^2). Below `HIDDEN_DN2` it may be anything down to 0: a still value half way
     between two codes has 1/4."""
-    return variance - QUANTISATION_DN2 if variance >= HIDDEN_DN2 else 0.0
+    return np.asarray(np.where(np.asarray(variance) >= HIDDEN_DN2, np.subtract(variance, QUANTISATION_DN2), 0.0))
+
+
+def rounding_std_dn(variance_dn2: FloatArray | float) -> FloatArray:
+    """Of the mean of many pixels, by rounding to whole DN, where pixels spread by s: of the saw-tooth of the level that rounding is,
+    averaged over them, whose harmonics fall to exp(-2 pi^2 k^2 s^2) / (pi k), the root mean square over all levels.
+
+    0.29 DN without noise, 0.004 DN at s = 0.45 DN: quiet cameras of few bits don't dither.
+    """
+    k = np.arange(1, ROUNDING_HARMONICS + 1)
+    spread = np.maximum(np.asarray(variance_dn2, float), 0.0)[..., None]
+    return np.asarray(np.sqrt(np.sum(np.exp(-4.0 * np.pi**2 * k**2 * spread) / (2.0 * np.pi**2 * k**2), axis=-1)))
+
+
+def rounding_waves_dn(level_dn: FloatArray, variance_dn2: FloatArray) -> list[FloatArray]:
+    """What rounding may leave in means at such levels, where pixels spread by such variances: one standard deviation each. The saw-tooth's
+    first harmonics, cosines and sines, as levels are hardly known to a fraction of a code. Empty where noise dithers."""
+    found: list[FloatArray] = []
+    for k in range(1, WAVE_HARMONICS + 1):
+        size = np.exp(-2.0 * (np.pi * k) ** 2 * np.maximum(variance_dn2, 0.0)) / (np.pi * k * np.sqrt(2.0))
+        if size.max(initial=0.0) < LEAST_ROUNDING_DN:
+            break
+        found += [size * np.cos(2.0 * np.pi * k * level_dn), size * np.sin(2.0 * np.pi * k * level_dn)]
+    return found
 
 
 def variance_rounding_std(temporal: float, spatial: float) -> float:
     """What rounding may leave in a mean temporal variance (DN^2, a standard uncertainty) beside its 1/12: with temporal and spatial
     standard deviations s and t of normal laws, (4 s^2 + 1 / pi^2) exp(-2 pi^2 (s^2 + t^2)) cos(2 pi mean)."""
-    true = _unrounded(temporal)
+    true = unrounded(temporal)
     size = (4.0 * true + 1.0 / np.pi**2) * np.exp(-2.0 * np.pi**2 * (true + max(spatial, 0.0)))
     return float(size / np.sqrt(2.0))
 

@@ -35,6 +35,7 @@ from scipy import linalg, ndimage, sparse, special
 from scipy.interpolate import BSpline, CubicSpline
 
 from lab.errors import NotDetermined
+from lab.fit.levels import rounding_std_dn, rounding_waves_dn, unrounded
 from lab.recording import RecordingSet, SlantedEdge
 from lab.results import MtfCurve, NoiseFit
 from sim.camera import Cfa, Side
@@ -273,11 +274,16 @@ def edge_mtf(
 
 
 def planes_mtf(
-    planes: Sequence[Plane], frequency_cy_per_px: ArrayLike | None = None, noise_std: float | None = None
+    planes: Sequence[Plane],
+    frequency_cy_per_px: ArrayLike | None = None,
+    noise_std: float | None = None,
+    code: float = 0.0,
+    frames: int = 1,
 ) -> EdgeMtf:
     """As `edge_mtf`, from one or more planes that see the same edge with the same blur (the two green ones).
 
-    Each plane is levelled by itself, so that unequal gains don't matter.
+    Each plane is levelled by itself, so that unequal gains don't matter. `code`: what values were rounded to multiples of before a mean
+    of `frames` was taken. A dark side that spreads by less than that stands still, and is less sure than it looks.
     """
     frequency = (
         DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else np.asarray(frequency_cy_per_px, dtype=float)
@@ -297,7 +303,7 @@ def planes_mtf(
             "mtf",
             f"the samples lie {gap:.1f} px apart across the edge: turn the edge by 2 deg or more, or take a longer one",
         )
-    return _measure(planes, near, edge, _reach(planes, edge), frequency, noise_std)
+    return _measure(planes, near, edge, _reach(planes, edge), frequency, noise_std, _Codes(code, frames))
 
 
 # --- samples and the edge -------------------------------------------------------------------------------------------------
@@ -643,8 +649,38 @@ def _knots(width: float, reach: float, step: int) -> Array:
     return np.concatenate([-positive[:0:-1], positive])
 
 
+@dataclass(frozen=True)
+class _Codes:
+    """Values that were rounded to multiples of `size` (their unit; 0: not at all), and then averaged over frames."""
+
+    size: float
+    frames: int
+
+    def std(self, std: float) -> float:
+        """A scatter with the error of rounding."""
+        if not self.size:
+            return std
+        return float(np.hypot(std, self.size * rounding_std_dn(self.frames * (std / self.size) ** 2)))
+
+    def covariance(self, geometry: EdgeGeometry, level: Array, variance: Array) -> Array:
+        """Of the spline's coefficients, by what no repeats take out: of values that scatter by `variance` about `level`, (n,)."""
+        out = np.zeros((geometry.spline.size,) * 2)
+        if self.size:
+            spread = unrounded(np.asarray(self.frames * variance / self.size**2, float))
+            for wave in rounding_waves_dn(np.asarray(level / self.size, float), spread):
+                change = self.size * geometry.coefficients(wave)
+                out += np.outer(change, change)
+        return out
+
+
 def _measure(
-    planes: Sequence[Plane], near: _Samples, edge: _Edge, reach: float, frequency: Array, noise_std: float | None
+    planes: Sequence[Plane],
+    near: _Samples,
+    edge: _Edge,
+    reach: float,
+    frequency: Array,
+    noise_std: float | None,
+    codes: _Codes,
 ) -> EdgeMtf:
     distance, _, _ = edge.distance(near.along, near.across)
     width = _blur_width(near, distance, min(12.0, reach))
@@ -687,7 +723,10 @@ def _measure(
         esf = placed.values(solution[:size])
         residual = value - esf - solution[size:] @ gradients
         if noise_std is None:
-            std_dark, std_light = _robust_std(residual[dark_tail]), _robust_std(residual[light_tail])
+            std_dark, std_light = (
+                codes.std(contrast * _robust_std(residual[tail], codes.size / contrast)) / contrast
+                for tail in (dark_tail, light_tail)
+            )
         else:
             std_dark = std_light = noise_std / contrast
         variance = std_dark**2 + np.clip(esf, 0.0, 1.0) * (std_light**2 - std_dark**2) + NUMERICAL_FLOOR**2
@@ -710,6 +749,9 @@ def _measure(
         normal=normal,
         scatter=normal @ gram[:-1, :-1] @ normal,
         gram=gram,
+    )
+    covariance[:size, :size] += (
+        codes.covariance(geometry, (esf + offset) * contrast, variance * contrast**2) / contrast**2
     )
     freedom = max(np.count_nonzero(used) - len(solution) - len(edge.poly), 1)
     return _described(
@@ -1024,9 +1066,10 @@ def _blur_width(samples: _Samples, distance: Array, reach: float) -> float:
     return float(np.clip((last - first) / 2.563, 0.2, reach / 3.0))
 
 
-def _robust_std(residual: Array) -> float:
-    """Standard deviation without outliers: 1.4826 times the median of the modulus, then clipped at 4 sigma."""
-    rough = 1.4826 * float(np.median(np.abs(residual)))
+def _robust_std(residual: Array, code: float = 0.0) -> float:
+    """Standard deviation without outliers: 1.4826 times the median of the modulus, then clipped at 4 sigma. Of values rounded to
+    multiples of `code` most may be alike, and those of the next code aren't outliers."""
+    rough = max(1.4826 * float(np.median(np.abs(residual))), 0.5 * code)
     kept = residual[np.abs(residual) <= 4.0 * rough + 1e-12]
     return float(np.sqrt(np.mean(kept**2)))
 
@@ -1208,7 +1251,7 @@ def measure_edge(
     mean = np.mean([f.astype(float) for f in frames], axis=0) if len(frames) > 1 else frames[0]
     planes = region_planes(mean, region, camera.cfa, channel, black)
     frequency = DEFAULT_FREQUENCY_CY_PER_PX if frequency_cy_per_px is None else frequency_cy_per_px
-    return planes_mtf(planes, frequency)
+    return planes_mtf(planes, frequency, code=1.0, frames=len(frames))
 
 
 def _found(recordings: RecordingSet, capture: SlantedEdge) -> tuple[FoundEdge, ...]:

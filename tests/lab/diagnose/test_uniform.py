@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.summaries import level_scatter, repeated_levels, rounding_std_dn
+from lab.diagnose.summaries import level_scatter, repeated_levels
 from lab.diagnose.uniform import (
     MOST_SAMPLE_STD,
     RADIOMETER_STD,
@@ -16,6 +16,7 @@ from lab.diagnose.uniform import (
     linearity_block,
     narrowband_block,
 )
+from lab.fit.levels import rounding_std_dn
 from sim.effects.second_order_light import SecondOrderLight
 from sim.spectrum import Spectrum
 from tests.lab.diagnose.on_blocks import UNIFORM, evidence, former, names, rendered, sigmas, study, verdict

@@ -34,7 +34,9 @@ def _changed(change: Change, shift: int = 0) -> RecordingSet:
     paths = {getattr(c, key, None) for c in whole.manifest.captures for key in ("radiance", "light_radiance")}
     paths |= {c.screen.radiance for c in whole.manifest.captures if hasattr(c, "screen")}
     paths |= set((manifest.cameras["left"].quantum_efficiency or {}).values())
-    frames = {c.frame: whole.frame(c) << shift for c in whole.manifest.captures}
+    frames = {
+        c.frame: whole.frame(c) << shift if shift >= 0 else whole.frame(c) >> -shift for c in whole.manifest.captures
+    }
     targets = {c.target: whole.target(c.target) for c in whole.manifest.captures if hasattr(c, "target")}
     spectra = {path: whole.spectrum(path) for path in paths if path}
     return RecordingSet(manifest, frames, spectra, targets, source=whole.source)
@@ -90,3 +92,19 @@ def test_codes_that_were_shifted_are_no_faulty_converter() -> None:
     assert any("every code is a multiple of 16, as of a converter of 4 bits less" in s.reason for s in skipped)
     assert evidence is not None
     assert not decide(evidence, np.random.default_rng(1)).before
+
+
+def test_codes_too_coarse_for_the_noise_are_no_mismatch() -> None:
+    """Eight of twelve bits: dark frames and edges' dark sides are one code or two throughout."""
+
+    def coarse(content: dict[str, Any]) -> None:
+        camera = content["cameras"]["left"]
+        camera.update(bit_depth=8, black_level_dn=camera["black_level_dn"] / 16, white_level_dn=255.0)
+        if camera["conversion_gain_dn_per_e"] is not None:
+            camera["conversion_gain_dn_per_e"] /= 16
+
+    evidence, _ = evidence_of(_changed(coarse, -4), "left", None)
+    assert evidence is not None
+    assert {"slanted_edge", "screen", "noise"} <= {b.measurement for b in evidence.blocks}
+    found = decide(evidence, np.random.default_rng(1))
+    assert (found.before, found.named, found.abstained) == ((), (), ())
