@@ -52,6 +52,8 @@ DEPARTURE_STD = 0.5
 UNEVEN_STD, UNEVEN_PX = 0.003, 50.0
 #: Edges whose directions differ by less are of one direction, deg.
 ALIKE_DEG = 0.35
+#: Of light of which nothing is said: what its spectrum may differ from an even one by, over 150 nm and in a part of it.
+TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
 #: Wavelengths at which aberrated transfers are formed, and at which the perfect lens's, which has the cutoff's kink, is.
 WAVELENGTHS, FINE_WAVELENGTHS = 10, 48
 HIGHEST_CY_PER_PX = 10.0
@@ -425,9 +427,12 @@ class _Edges:
         """Transfer functions at `frequencies`, (edges, frequencies), of what the estimators report."""
         return np.asarray(rows[:, 2:] / rows[:, :1] + self._level)
 
-    def _reported(self, effects: tuple[Effect, ...], more: FloatArray | None = None) -> FloatArray:
-        """Of the model, (edges, rows), its profiles where the recorded ones lie: noise and lopsided blurs move them."""
-        otf, change = self._otf(effects), self._change(effects)
+    def _reported(
+        self, effects: tuple[Effect, ...], more: FloatArray | None = None, otf: ComplexArray | None = None
+    ) -> FloatArray:
+        """Of the model, (edges, rows), its profiles where the recorded ones lie: noise and lopsided blurs move them. `more` and `otf`:
+        of the profiles on top, and the transfer functions in place of the effects'."""
+        otf, change = self._otf(effects) if otf is None else otf, self._change(effects)
         if more is not None:
             change = more if change is None else change + more
         f = self._quadrature.frequency
@@ -613,7 +618,8 @@ class _Edges:
 
     @cached_property
     def slopes(self) -> dict[str, FloatArray]:
-        """By what is free: the bend of the light on the target, one for each region, direction and light."""
+        """By what is free: the bend of the light on the target, one for each region, direction and light; and the colour of light of which
+        nothing is said."""
         base = self.predict(())
         bend = self._light_profile * np.square(self._operators.distance / UNEVEN_PX) * UNEVEN_STD
         moved = self._numbers(self._reported((), bend))
@@ -622,7 +628,28 @@ class _Edges:
         for k, setting in enumerate(dict.fromkeys(settings)):
             mine = np.array([s == setting for s in settings])[:, None]
             found[f"edge light:{k}"] = np.where(mine, moved - base, 0.0).ravel()
+        for k, change in enumerate(self._other_colours()):
+            moved = self._numbers(self._reported((), otf=self._baseline + change[self._sight, self._turn]))
+            found[f"edge colour:{k}"] = (moved - base).ravel()
         return found
+
+    def _other_colours(self) -> FloatArray:
+        """By how much the sights' transfers, (ways, sights, directions, nodes), may differ where nothing is said of their light and that of
+        equal energy stands for it: by its tilt, and in parts of the spectrum by themselves. A standard deviation each."""
+        blind = np.array([light is None for _, light in self._lit])
+        shape = len(blind), *self._frequencies[0].shape
+        if not blind.any():
+            return np.zeros((0, *shape))
+        wavelength_nm = np.arange(300.0, 1101.0, 5.0)
+        middle = np.arange(wavelength_nm[0], wavelength_nm[-1] + 1.0, PART_NM)[:, None]
+        parts = 1.0 + PART_STD * np.maximum(1.0 - np.abs(wavelength_nm - middle) / PART_NM, 0.0)
+        tilted = 1.0 + TILT_STD * np.clip((wavelength_nm - 550.0) / 150.0, -1.5, 1.5)
+        ways = [Spectrum.of(wavelength_nm, value) for value in (tilted, *parts)]
+        sights = [(channel, way if light is None else light) for way in [None, *ways] for channel, light in self._lit]
+        nodes, shares = common_wavelengths(self._camera, sights, count=FINE_WAVELENGTHS)
+        apart = shares.reshape(len(ways) + 1, len(self._lit), -1)
+        whole = np.array([np.real(transfer_at(self._camera, float(w), *self._frequencies)) for w in nodes])
+        return np.tensordot(apart[1:] - apart[:1], whole, 1)
 
 
 def _relative(scatter: FloatArray, rows: FloatArray) -> FloatArray:
