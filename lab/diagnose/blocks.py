@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
 
 from lab.camera_file import CameraFile
 from lab.diagnose.board import BOARD_BLOCKS
@@ -24,6 +27,8 @@ from lab.predict import assumptions, camera_model
 from lab.recording import RecordingSet
 from lab.results import CameraFit, FitResult, Skipped
 from sim.camera import Side
+from sim.effects.pixel_aperture import PixelAperture
+from sim.spectrum import FloatArray
 
 #: Makers of blocks, in the order of the report; one that a recording set doesn't allow is left out with a reason.
 BLOCKS: tuple[Callable[[Study], Block], ...] = (
@@ -45,6 +50,10 @@ BLOCKS: tuple[Callable[[Study], Block], ...] = (
     *STEREO_BLOCKS,
 )
 
+#: Apertures that a pixel may have whose fill factor nobody states: the least side (px), how many are tried, what they are told by.
+LEAST_SIDE, APERTURES, APERTURE_DIRECTIONS = 0.5, 10, 4
+#: What is left free of a quantity that had to be assumed.
+FREE_BESIDE = {"fill_factor": ", but contrast may be that of any aperture"}
 #: Of the full well: from here on pixels of a noisy level are cut off.
 _NEAR_FULL = 0.985
 
@@ -59,7 +68,11 @@ def evidence_of(
     camera_fit = fit.cameras.get(side) if fit is not None else None
     camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
     skipped = [
-        Skipped(step=f"diagnose {a.quantity}", reason=f"neither stated nor fitted; taken as {a.value}", side=side)
+        Skipped(
+            step=f"diagnose {a.quantity}",
+            reason=f"neither stated nor fitted; taken as {a.value}{FREE_BESIDE.get(a.quantity, '')}",
+            side=side,
+        )
         for a in assumptions(recordings.camera(side))
     ]
     study = Study(recordings, side, camera, _saturation_dn(camera_fit))
@@ -72,7 +85,22 @@ def evidence_of(
             skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
     blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]
     always = baseline.effects if baseline is not None else ()
-    return (Evidence(tuple(blocks), study.camera, always) if blocks else None), tuple(skipped)
+    if not blocks:
+        return None, tuple(skipped)
+    evidence = Evidence(tuple(blocks), study.camera, always)
+    if study.stated.fill_factor is None and baseline is None:
+        evidence = replace(evidence, unstated=_any_aperture(evidence))
+    return evidence, tuple(skipped)
+
+
+def _any_aperture(evidence: Evidence) -> dict[str, FloatArray]:
+    """Slopes that span what an aperture of any side does beside that of the whole pixel: its principal directions over even sides."""
+    camera, sides = evidence.camera, np.linspace(LEAST_SIDE, 1.0, APERTURES, endpoint=False)
+    lowest = PixelAperture.quantities()["side_change_um"].lower or -np.inf
+    effects = [PixelAperture(side_change_um=max(lowest, (s - 1.0) * camera.pixel_pitch_um)) for s in sides]
+    changes = np.array([evidence.mean((e,)) for e in effects]) - evidence.mean()
+    _, size, direction = np.linalg.svd(changes / np.sqrt(APERTURES), full_matrices=False)
+    return {f"aperture:{k}": size[k] * direction[k] for k in range(APERTURE_DIRECTIONS) if size[k] > 0.0}
 
 
 def _saturation_dn(fit: CameraFit | None) -> float | None:

@@ -133,11 +133,13 @@ class _Numbered(NamedTuple):
 @dataclass
 class Evidence:
     """The blocks of one side, in one vector. Predictions are kept, as most effects act on a few blocks only. `always`: effects that
-    the baseline has; they act first, and their laws may be wrong like those of others."""
+    the baseline has; they act first, and their laws may be wrong like those of others. `unstated`: slopes, (n,) per prior standard
+    deviation, by what nobody states and no block leaves free by itself."""
 
     blocks: tuple[Block, ...]
     camera: CameraModel
     always: tuple[Effect, ...] = ()
+    unstated: Mapping[str, FloatArray] = field(default_factory=dict)
     _kept: dict[tuple[int, ...], Prediction] = field(default_factory=dict)
     _laws: dict[tuple[bytes, tuple[int, ...]], Within] = field(default_factory=dict)
     _numbers: dict[Effect, int] = field(default_factory=dict)
@@ -190,7 +192,7 @@ class Evidence:
 
     def _columns(self, effects: Effects) -> dict[str, FloatArray]:
         """Slopes by every free quantity, (n,) each, per prior standard deviation; one that several blocks share is one column."""
-        columns: dict[str, FloatArray] = {}
+        columns = {name: slope.copy() for name, slope in self.unstated.items()}
         acting = self._numbered((*self.always, *effects))
         for index, at in enumerate(self.slices):
             for name, column in self._prediction(index, acting).slopes.items():

@@ -11,6 +11,8 @@ from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
+NULL = 1e-6  # of a transfer
+
 
 class PixelAperture(Effect):
     """Side of the square aperture changed by a few um: OTF factor sinc(w' fx) sinc(w' fy) / (sinc(w fx) sinc(w fy))."""
@@ -62,8 +64,8 @@ class PixelAperture(Effect):
         ratio = np.ones(np.broadcast_shapes(np.shape(fx_cy_per_um), np.shape(fy_cy_per_um)))
         for f in (fx_cy_per_um, fy_cy_per_um):
             below = np.sinc(side * f)
-            # beside the stated aperture's nulls the ratio has no value: there the pixel's own transfer is next to nothing
+            # at the stated aperture's nulls the ratio has no value, beside them it is large: the pixel's own transfer makes up for it
             ratio = ratio * np.where(
-                np.abs(below) > 0.02, np.sinc(new * f) / np.where(np.abs(below) > 0.02, below, 1.0), 1.0
+                np.abs(below) > NULL, np.sinc(new * f) / np.where(np.abs(below) > NULL, below, 1.0), 1.0
             )
         return ratio

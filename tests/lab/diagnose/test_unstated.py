@@ -58,8 +58,9 @@ def _only(*kinds: str) -> Change:
         _only("chart", "slanted_edge"),
         _without("f_number"),
         _without("pixel_pitch_um"),
+        _without("fill_factor"),
     ],
-    ids=["narrowband", "chart", "chart and edges", "f-number", "pitch"],
+    ids=["narrowband", "chart", "chart and edges", "f-number", "pitch", "fill factor"],
 )
 def test_what_nobody_says_is_no_mismatch(change: Change) -> None:
     evidence, _ = evidence_of(_changed(change), "left", None)
