@@ -192,7 +192,7 @@ class Evidence:
 
     def _columns(self, effects: Effects) -> dict[str, FloatArray]:
         """Slopes by every free quantity, (n,) each, per prior standard deviation; one that several blocks share is one column."""
-        columns = {name: slope.copy() for name, slope in self.unstated.items()}
+        columns = dict(self.unstated)
         acting = self._numbered((*self.always, *effects))
         for index, at in enumerate(self.slices):
             for name, column in self._prediction(index, acting).slopes.items():

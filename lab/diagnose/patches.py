@@ -385,7 +385,7 @@ def _dark_squares(
         )
         added = (shown - black)[plane]
         difference = added[use]
-        lights = np.maximum([float(picture_of[plane][use].mean()) - noise.black for picture_of in (shown, black)], 0.0)
+        lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
         variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
         means = [float(study.pixels_of(f, channel).mean()) for f in (shown, black)]
         found.append(
