@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from lab.diagnose import pattern
 from lab.diagnose.decide import decide
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.locate import look
@@ -47,6 +48,19 @@ def test_a_mono_camera_has_no_greens() -> None:
 def test_greens_don_t_see_slopes_of_light(law: Law) -> None:
     block = green_block(_study(771013, (law,)))
     assert _chi2(block) < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
+
+
+def test_the_seen_image_comes_first_whichever_frames_were_read_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    study = _study(771013)
+    levels, images = pattern.flats(study)
+    assert set(images) == {False, True}
+    found = []
+    for order in ((False, True), (True, False)):
+        turned = levels, {held_out: images[held_out] for held_out in order}
+        monkeypatch.setattr(pattern, "flats", lambda _, turned=turned: turned)
+        found.append(green_block(study))
+    assert found[0].labels == found[1].labels
+    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
 
 
 def test_unlike_greens_are_named_and_measured() -> None:
