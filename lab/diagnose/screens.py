@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -83,7 +83,7 @@ class Pattern:
     shown: FloatArray  # covariance by what differs from repeat to repeat
     common: FloatArray  # ... and by what white, black and drawing share
     mix: FloatArray  # (bands, 4 bands): what the halves of the bands, then their phases, contribute to the bands' coefficients
-    greys: FloatArray  # as `value`: what the coefficients become where every grey v is shown as v^2
+    shown_by: Callable[[Effects], FloatArray]  # as `value`: by how much the coefficients change where a screen shows greys otherwise
     levels_e: tuple[float, float]  # electrons of black and of white
     light: Spectrum | None
     turned: Callable[
@@ -195,9 +195,10 @@ def _measured(
         if channel != reference and np.abs(field).max() > MOVED_PX:
             # so far out that its slopes don't tell what is lost: drawn anew where it is
             there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
-            design = _Design.of(study, _Canvas.of(target, warp.displaced(there), window), channel, light, whole, turned)
+            drawn = _Canvas.of(target, warp.displaced(there), window)
+            design = _Design.of(study, drawn, channel, light, whole, turned)
         else:
-            moved = np.zeros(len(moved))
+            drawn, moved = canvas, np.zeros(len(moved))
         area = contrast[window][design.mask]
         exposure = group[0].exposure_s
         levels = (
@@ -205,6 +206,7 @@ def _measured(
             float(np.nanmean(white[window][design.mask])) * exposure / study.noise.gain,
         )
         turned_by = _turned_by(study, design, whole, window)
+        shown_by = _shown_by(study, design, drawn)
         solved = []
         for part, picture in zip(parts, seen, strict=True):
             dn = np.maximum(picture[window][design.mask] * area + black[window][design.mask], 0.0) * exposure
@@ -218,7 +220,7 @@ def _measured(
             found.append(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
-                    value=value, shown=shown, common=common, mix=design.mix, greys=design.greys, levels_e=levels, light=light,
+                    value=value, shown=shown, common=common, mix=design.mix, shown_by=shown_by, levels_e=levels, light=light,
                     turned=turned_by, reach=design.reach,
                 )
             )  # fmt: skip
@@ -262,6 +264,22 @@ def _turned_by(
         return float(weight @ (after - before))
 
     return coefficient
+
+
+def _shown_by(study: Study, design: _Design, canvas: _Canvas) -> Callable[[Effects], FloatArray]:
+    """What effects on a screen's light do to a pattern's coefficients: it is drawn as the screen shows it, over the lit screen."""
+    none = np.zeros(len(design.inverse))
+
+    @lru_cache(maxsize=8)
+    def changed(acting: tuple[Effect, ...]) -> FloatArray:
+        change = canvas.picture((canvas.as_shown(acting, study.camera) - canvas.low) * design.passed)
+        return np.asarray(design.inverse @ (design.columns @ change[design.mask]))
+
+    def coefficients(effects: Effects) -> FloatArray:
+        acting = tuple(e for e in effects if type(e).screen is not Effect.screen)
+        return changed(acting) if acting else none
+
+    return coefficients
 
 
 def _window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -> tuple[slice, slice]:
@@ -320,10 +338,16 @@ class _Canvas:
         """The picture's transform below half a cycle a pixel: (rows, cols / 2 + 1), as of the window's own pixels."""
         return self._below(self.drawn)
 
-    @cached_property
-    def bent(self) -> NDArray[np.complex128]:
-        """The same of the picture with all greys squared."""
-        return self._below(np.asarray(fft.rfft2(self.fine**2)))
+    def as_shown(self, effects: Effects, camera: CameraModel) -> NDArray[np.complex128]:
+        """As `low`, of the picture as a screen with effects shows it, over its lit state there."""
+        y, x = (
+            (w.start + (np.arange(n) + 0.5) / OVERSAMPLE - 0.5 * whole) * camera.pixel_pitch_um
+            for w, n, whole in zip(self.window, self.fine.shape, (camera.rows, camera.cols), strict=True)
+        )
+        shown, lit = self.fine, np.ones_like(self.fine)
+        for effect in effects:
+            shown, lit = (effect.screen(part, x[None, :], y[:, None], camera) for part in (shown, lit))
+        return self._below(np.asarray(fft.rfft2(shown / lit)))
 
     def _below(self, whole: NDArray[np.complex128]) -> NDArray[np.complex128]:
         rows, cols = self.shape
@@ -429,7 +453,7 @@ class _Design:
     fixed: FloatArray
     inverse: FloatArray  # of the normal matrix
     mix: FloatArray  # (bands, 4 bands): what the halves of the bands, then their phases, contribute to the bands' coefficients
-    greys: FloatArray
+    passed: FloatArray  # the transfer that the picture was drawn with: (rows, cols / 2 + 1)
     reach: float
 
     @staticmethod
@@ -489,10 +513,9 @@ class _Design:
         scale = np.sqrt(np.mean(table**2, axis=1))
         normal = (table / scale[:, None]) @ (table / scale[:, None]).T
         inverse = np.linalg.inv(normal) / np.outer(scale, scale)
-        lost = canvas.picture(canvas.bent * passed - spectrum)[mask]
         mix = (inverse @ (table @ np.array(halves + turned_halves).T))[: len(bands)]
         return _Design(
-            mask, tuple(bands), table, fixed, inverse, mix, inverse @ (table @ lost), float(np.sqrt(r2.max()))
+            mask, tuple(bands), table, fixed, inverse, mix, passed, float(np.sqrt(r2.max()))
         )
 
     @property
@@ -627,7 +650,7 @@ def _contrasts(study: Study, p: Pattern, effects: Effects, plain: NDArray[np.com
     changed = _transfer(study, p, effects)
     ratio = _in_place(p, changed / np.where(np.abs(plain) > 1e-3, plain, np.inf))
     halves = np.concatenate([_halves(p, np.real(ratio)), _halves(p, np.imag(ratio))])
-    return p.mix @ halves + _greyness(effects, study) * p.greys[: len(p.bands)]
+    return p.mix @ halves + p.shown_by(effects)[: len(p.bands)]
 
 
 def _halves(p: Pattern, at_nodes: FloatArray) -> list[float]:
@@ -657,19 +680,6 @@ def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex12
     return ratio
 
 
-def _greyness(effects: Effects, study: Study) -> float:
-    """By how much the screen darkens greys, over what squaring them would do: rims' mean light decides."""
-    if all(type(e).screen is Effect.screen for e in effects):
-        return 0.0
-    grey = np.linspace(0.0, 1.0, 41)
-    # a pattern that lies over all greys alike averages out
-    x, y = np.meshgrid(np.arange(24) * 0.37, np.arange(24) * 0.37) * np.array(study.camera.pixel_pitch_um)
-    shown = np.broadcast_to(grey[:, None, None], (len(grey), *x.shape))
-    for effect in effects:
-        shown = effect.screen(shown, x, y, study.camera)
-    return float(np.trapezoid(grey - shown.mean((1, 2)), grey) / np.trapezoid(grey - grey**2, grey))
-
-
 def rim_block(study: Study) -> Block:
     """What rims between lit and dark cells lack or have too much of: greys that screen or camera show otherwise."""
     found = patterns(study)
@@ -680,7 +690,7 @@ def rim_block(study: Study) -> Block:
         mean = np.zeros(len(points))
         bent = any(type(e).response is not Effect.response for e in effects)
         for k, (_, p, b) in enumerate(points):
-            mean[k] = _greyness(effects, study) * p.greys[b]
+            mean[k] = p.shown_by(effects)[b]
             if bent:
                 low, high = p.levels_e
                 out = np.array([low, 0.5 * (low + high), high])

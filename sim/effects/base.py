@@ -121,7 +121,8 @@ class Effect(Frozen):
         return 0.0
 
     def screen(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
-        """RIG: light of a screen, 0..1 of its lit state, where a pattern asks for `share`; by place on the sensor (um from its centre)."""
+        """RIG: light of a screen, 0..1 of its lit state, where a pattern asks for `share` (rows, cols); by place on the sensor (um from
+        its centre, in equal steps along columns, x, and rows, y)."""
         return share
 
     def scene_gain(self) -> float:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
+#: Nats by which rims that are only wider, with greys as asked for, are less likely than a gamma's: that is a blurred screen.
+BLURRED_NATS = 20.0
+SURE_POWER = 0.3  # |logarithm of the exponent| from which on greys are off without a doubt
+
 
 class ScreenGamma(Effect):
-    """light = share ** exponent of the lit state. A pattern of lit and dark cells has greys only at their rims, where the screen
-    resamples it; how wide these are isn't stated, and drawings take a sample: the exponent is good to tens of per cent."""
+    """light = (share about its place, by a Gaussian of `rim_px`) ** exponent of the lit state. A pattern of lit and dark cells has
+    greys only at their rims, where the screen resamples it: the steeper the power and the wider the rims, the smaller are lit cells.
+    How wide rims are isn't stated, and drawings take a sample: the exponent is good to tens of per cent."""
 
     name: ClassVar[str] = "screen_gamma"
     stage: ClassVar[Stage] = Stage.RIG
@@ -23,6 +29,7 @@ class ScreenGamma(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "level", "orientation", "time"}
     )
+    shapes: ClassVar[frozenset[str]] = frozenset({"rim_px"})
     shown_by: ClassVar[frozenset[str]] = frozenset({"checkerboard", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity"})
     sentence: ClassVar[str] = (
@@ -33,8 +40,37 @@ class ScreenGamma(Effect):
     exponent: Annotated[
         float, Quantity("1", "power of what is asked for", lower=0.2, upper=5.0, prior=(1.0, 1.0), absent=1.0)
     ] = 1.0
+    rim_px: Annotated[
+        float,
+        Quantity(
+            "px",
+            "standard deviation of the rims between cells, as the screen resamples its picture, in the camera's pixels",
+            lower=0.0,
+            upper=1.5,
+            prior=(0.0, 0.3),
+            absent=0.0,
+            slope_power=2,
+            dispensable=True,
+        ),
+    ] = 0.0
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        wide = tuple((cls(exponent=e, rim_px=0.4),) for e in (0.5, 2.0))
+        return ((cls(exponent=0.7), cls(exponent=1.3)), *wide)
+
+    def usual_nats(self) -> float:
+        if self.rim_px == 0.0:
+            return 0.0
+        return -BLURRED_NATS * max(1.0 - abs(float(np.log(self.exponent))) / SURE_POWER, 0.0)
 
     def screen(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
         if self.exponent == 1.0:
             return share
-        return np.asarray(np.clip(share, 0.0, 1.0) ** self.exponent)
+        asked = share
+        if self.rim_px > 0.0:
+            steps = float(np.ptp(y_um)) / (share.shape[0] - 1), float(np.ptp(x_um)) / (share.shape[1] - 1)
+            asked = gaussian_filter(
+                share, [self.rim_px * camera.pixel_pitch_um / step for step in steps], mode="nearest"
+            )
+        return np.asarray(np.clip(asked, 0.0, 1.0) ** self.exponent)

@@ -81,10 +81,9 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     electronics = [np.broadcast_to(more, frame.shape).ravel() for more in (*after, out.added_e, out.added_e2)]
     codes = levels if out.codes is None else out.codes(levels)
     shared = np.zeros(41) if out.neighbours is None else np.broadcast_to(out.neighbours(levels), 41)
-    shown, pair = np.linspace(0.0, 1.0, 5), [1.0, 0.0]
+    shown, pair = np.tile(np.linspace(0.0, 1.0, 5), (5, 1)), [1.0, 0.0]
     for e in acting:
-        shown = e.screen(shown, place, 0.5 * place, CAMERA)
-        shown = np.ravel(e.image(np.reshape(shown, (1, -1)), CAMERA))
+        shown = e.image(e.screen(shown, place[None, :], 0.5 * place[:, None], CAMERA), CAMERA)
         pair = [pair[0] * e.scene_gain(), pair[1] + e.capture_delay_s()]
     full = np.zeros((7, 3))
     full[3, 1] = 2.0 * CAMERA.full_well_e
@@ -97,7 +96,7 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
             np.array(rates) / max(rates),
             frame.ravel() / frame.max(),
             rest,
-            shown,
+            shown.ravel(),
             pair,
         ]
         + [values / 100.0 for values in (*electronics, codes, full.ravel(), 100.0 * shared)]

@@ -9,6 +9,7 @@ from sim.camera import CameraModel, Lens
 from sim.effects.ambient_light import AmbientLight
 from sim.effects.non_uniform_illumination import NonUniformIllumination
 from sim.effects.radiometer_nonlinearity import RIGHT_AT, RadiometerNonlinearity
+from sim.effects.screen_gamma import ScreenGamma
 from sim.effects.second_order_light import SecondOrderLight
 from sim.effects.source_drift import SourceDrift
 from sim.effects.vignetting import Vignetting
@@ -80,3 +81,18 @@ def test_the_room_s_colour_leaves_green_as_it_is() -> None:
     one = AmbientLight(rate_e_per_s=100.0, red_over_blue=4.0)
     assert [one.ambient_e_per_s(c, CAMERA) for c in "RGB"] == pytest.approx([200.0, 100.0, 50.0])
     assert one.ambient_e_per_s("Y", CAMERA) == 100.0
+
+
+def test_a_screen_s_gamma_moves_the_edges_of_lit_cells() -> None:
+    """(1 + erf(x / s sqrt 2)) / 2 to the fifth: the mean of the largest of five normal numbers, 1.1630 s inside; with no power rims
+    stay as they are asked for, and a blur without a power is unlikely to be a gamma."""
+    x_um = (np.arange(400) - 199.5)[None, :] * 0.05 * CAMERA.pixel_pitch_um
+    step = np.broadcast_to(x_um > 0, (4, 400)).astype(float)
+    y_um = np.arange(4)[:, None] * 0.05 * CAMERA.pixel_pitch_um
+    shown = ScreenGamma(exponent=5.0, rim_px=0.4).screen(step, x_um, y_um, CAMERA)
+    lost_px = 0.05 * float((step - shown)[0].sum())
+    assert abs(lost_px - 1.16296 * 0.4) < 0.002  # samples of 0.05 px
+    assert ScreenGamma(rim_px=0.4).screen(step, x_um, y_um, CAMERA) is step
+    assert (
+        ScreenGamma(exponent=1.05, rim_px=0.4).usual_nats() < -10.0 < ScreenGamma(exponent=2.0, rim_px=0.4).usual_nats()
+    )
