@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -152,16 +153,40 @@ def common_wavelengths(
     below 0. Transfers of broad and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's
     cutoff, which is no polynomial in the wavelength, 5e-4).
     """
-    found = []
-    for channel, radiance in sights:
-        wavelength_nm, weight = _detected(camera, channel, [(radiance, None)], effects, kind)
-        # a sight without light is that of equal energy
-        found.append(_otf_weight(camera, channel, wavelength_nm, weight[0]))
+    found = _seen_light(camera, sights, effects, kind)
     # sights have most of their wavelengths in common: each once
     position, which = np.unique(np.concatenate([at for at, _ in found]), return_inverse=True)
     pooled = np.bincount(which, np.concatenate([part for _, part in found])) / len(found)
     nodes, _ = gauss_rule(position, pooled, count)
     return nodes, np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
+
+
+def wavelength_shares(
+    camera: CameraModel,
+    sights: Sequence[tuple[str, Spectrum | None]],
+    wavelength_nm: FloatArray,
+    effects: Sequence[Effect] = (),
+    kind: str = "slanted_edge",
+) -> FloatArray:
+    """How much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean over the light that it
+    detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight."""
+    shares = np.empty((len(sights), len(wavelength_nm)))
+    for one, (at, part) in zip(shares, _seen_light(camera, sights, effects, kind), strict=True):
+        left = np.clip(np.searchsorted(wavelength_nm, at) - 1, 0, len(wavelength_nm) - 2)
+        on = np.clip((at - wavelength_nm[left]) / (wavelength_nm[left + 1] - wavelength_nm[left]), 0.0, 1.0)
+        one[:] = np.bincount(left, part * (1.0 - on), len(one)) + np.bincount(left + 1, part * on, len(one))
+    return shares
+
+
+def _seen_light(
+    camera: CameraModel, sights: Sequence[tuple[str, Spectrum | None]], effects: Sequence[Effect], kind: str
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Of each sight, wavelengths (nm) and how much each counts, sum 1; a sight without light is that of equal energy."""
+    found = []
+    for channel, radiance in sights:
+        wavelength_nm, weight = _detected(camera, channel, [(radiance, None)], effects, kind)
+        found.append(_otf_weight(camera, channel, wavelength_nm, weight[0]))
+    return found
 
 
 def transfer_at(
@@ -515,9 +540,8 @@ def _detected(
 
     The second is (lights, wavelengths), or (angles, lights, wavelengths) where `sin_theta` is (angles,).
     """
-    curves = [_efficiency(camera, channel)]
-    curves += [curve for light in lights for curve in light if curve is not None]
-    wavelength_nm, width = quadrature(curves)
+    curves = (curve for light in lights for curve in light if curve is not None)
+    wavelength_nm, width = _rule(_efficiency(camera, channel), *curves)
     seen: dict[int, FloatArray] = {}
     rows = []
     for radiance, reflectance in lights:
@@ -532,6 +556,15 @@ def _detected(
     angles = np.asarray(sin_theta, float)[..., None, None]
     factor = responsivity(camera, channel, wavelength_nm, effects, angles) * width
     return wavelength_nm, photons_from_energy(wavelength_nm, np.stack(rows)) * factor
+
+
+@lru_cache(maxsize=256)
+def _rule(*curves: Spectrum) -> tuple[FloatArray, FloatArray]:
+    """`quadrature` of curves that whoever changes the effects asks for again."""
+    rule = quadrature(curves)
+    for part in rule:
+        part.flags.writeable = False
+    return rule
 
 
 def _check_radiance(wavelength_nm: FloatArray, radiance: FloatArray) -> None:

@@ -17,6 +17,7 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import CubicSpline
@@ -29,10 +30,10 @@ from lab.fit.levels import rounding_waves_dn
 from lab.fit.mtf import SMOOTHING, EdgeGeometry, EdgeMtf, Region, find_edges, measure_edge
 from lab.recording import SlantedEdge
 from sim.effects.base import Effect
-from sim.forward import common_wavelengths, electron_rate, transfer_at
+from sim.forward import common_wavelengths, electron_rate, transfer_at, wavelength_shares
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
-from sim.spectrum import FloatArray, Spectrum
+from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares
 
 ComplexArray = NDArray[np.complex128]
 
@@ -50,12 +51,13 @@ PLAIN = np.array([0.25])  # cy/px, of the estimator's own transfer function, whi
 DEPARTURE_STD = 0.5
 #: Of the light on the target, left free: its bend across the edge, of the level at `UNEVEN_PX` from it.
 UNEVEN_STD, UNEVEN_PX = 0.003, 50.0
+UNEVEN_ORDER = 4  # of the polynomial that shading along the distance is
 #: Edges whose directions differ by less are of one direction, deg.
 ALIKE_DEG = 0.35
 #: Of light of which nothing is said: what its spectrum may differ from an even one by, over 150 nm and in a part of it.
 TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
-#: Wavelengths at which aberrated transfers are formed, and at which the perfect lens's, which has the cutoff's kink, is.
-WAVELENGTHS, FINE_WAVELENGTHS = 10, 48
+#: Wavelengths at which aberrated transfers are formed; and those at which the perfect lens's, which has the cutoff's kink, is.
+WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
 HIGHEST_CY_PER_PX = 10.0
 GRID_PX, FINE_PX = 0.05, 0.0125
 KEPT = 64
@@ -458,10 +460,10 @@ class _Edges:
         even[:, half - count + 1 : half + 1] = quadrature.even[:, ::-1]
         real, imaginary = self._at[0].T @ odd, (self._at[1] / quadrature.frequency[:, None]).T @ even
         estimators, found = [], []
-        for edge, otf in zip(self.edges, self._baseline, strict=True):
+        for k, (edge, otf) in enumerate(zip(self.edges, self._baseline, strict=True)):
             contrast = max(edge.measured.light_level - edge.measured.dark_level, 1e-9)
             offset = max(edge.measured.dark_level, 0.0) / contrast
-            shade = self._shade(edge, distance, ())
+            shade = self._shade(k, distance, ())
             rising = np.real(otf) @ odd + (np.imag(otf) / quadrature.frequency) @ even
             profile = (0.5 + offset + rising) * shade - offset
             slope = np.gradient(profile, distance)
@@ -515,13 +517,21 @@ class _Edges:
         if spectral not in self._spectral:
             if len(self._spectral) >= KEPT:
                 self._spectral.pop(next(iter(self._spectral)))
-            fx, fy = self._frequencies
-            few, share = common_wavelengths(self._camera, self._lit, spectral, count=WAVELENGTHS)
-            many, fine = common_wavelengths(self._camera, self._lit, spectral, count=FINE_WAVELENGTHS)
-            kink = np.tensordot(fine, [transfer_at(self._camera, float(w), fx, fy) for w in many], 1)
-            kink = kink - np.tensordot(share, [transfer_at(self._camera, float(w), fx, fy) for w in few], 1)
-            self._spectral[spectral] = few, share, kink
+            grid, perfect = self._perfect
+            fine = wavelength_shares(self._camera, self._lit, grid, spectral)
+            few, _ = gauss_rule(grid, fine.mean(axis=0), WAVELENGTHS)
+            share = lagrange_shares(grid, fine, few)
+            between = np.array([np.interp(few, grid, one) for one in np.eye(len(grid))]).T
+            self._spectral[spectral] = few, share, np.tensordot(fine - share @ between, perfect, 1)
         return self._spectral[spectral]
+
+    @cached_property
+    def _perfect(self) -> tuple[FloatArray, ComplexArray]:
+        """Wavelengths (w,), nm, and the lens's and the pixel's transfer at each without effects, (w, directions, nodes)."""
+        curves = self._camera.quantum_efficiency.values()
+        low, high = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
+        grid = np.linspace(low, high, 2 + int((high - low) / FINE_NM))
+        return grid, np.array([transfer_at(self._camera, float(w), *self._frequencies) for w in grid])
 
     def _mixed(self, otf: ComplexArray, moving: tuple[Effect, ...]) -> ComplexArray:
         """Charge that moves between pixels of different colours: neighbours' edges, weighted by their light."""
@@ -577,8 +587,8 @@ class _Edges:
                     bent = e.response(bent, self._camera)
                 change[i] += np.interp(light[i], level, bent / scale) - light[i]
         if shading:
-            for i, edge in enumerate(self.edges):
-                ratio = self._shade(edge, operators.distance, shading) / operators.shade[i]
+            for i in range(len(self.edges)):
+                ratio = self._shade(i, operators.distance, shading) / operators.shade[i]
                 change[i] += (light[i] + change[i]) * (ratio - 1.0)
         for share, std_px in spread:
             change += share / wide_contrast(effects, self._camera) * (ndtr(operators.distance / std_px) - 0.5)
@@ -595,26 +605,35 @@ class _Edges:
         profile[:, half - count + 1 : half + 1] = -rising[:, ::-1]
         return np.asarray((0.5 + profile + self._operators.offset[:, None]) * self._operators.shade)
 
-    def _shade(self, edge: _Edge, distance: FloatArray, effects: Effects) -> FloatArray:
-        """Light over the distance from the edge, averaged along it, of that at the edge."""
-        row0, col0, row1, col1 = edge.region
-        every = max(1, (row1 - row0) // 40), max(1, (col1 - col0) // 40)
-        row, col = np.meshgrid(
-            np.arange(row0, row1, every[0], dtype=float), np.arange(col0, col1, every[1], dtype=float), indexing="ij"
-        )
-        camera = self._camera
-        light = np.asarray(relative_illumination(camera, row, col), float)
-        axis, pitch = optical_axis_px(camera), camera.pixel_pitch_um
+    def _shade(self, edge: int, distance: FloatArray, effects: Effects) -> FloatArray:
+        """Light over the distance from an edge, averaged along it, of that at the edge."""
+        x_um, y_um, light, fit = self._lighting[edge]
         for e in effects:
-            light = light * e.illumination((col - axis[1]) * pitch, (row - axis[0]) * pitch, camera)
-        turn = np.deg2rad(edge.direction_deg)
-        middle = 0.5 * (row0 + row1 - 1), 0.5 * (col0 + col1 - 1)
-        away = np.cos(turn) * (col - middle[1]) + np.sin(turn) * (row - middle[0])
-        near = np.abs(away) < edge.measured.geometry.reach_px
-        # a mean over all that lies at the same distance, however long the edge is there
-        terms = np.polynomial.polynomial.polyfit(away[near] / UNEVEN_PX, light[near], 4)
-        x = np.clip(distance, -edge.measured.geometry.reach_px, edge.measured.geometry.reach_px) / UNEVEN_PX
-        return np.asarray(np.polynomial.polynomial.polyval(x, terms / terms[0]))
+            light = light * e.illumination(x_um, y_um, self._camera)
+        terms = fit @ light
+        reach = self.edges[edge].measured.geometry.reach_px
+        return np.asarray(polynomial.polyval(np.clip(distance, -reach, reach) / UNEVEN_PX, terms / terms[0]))
+
+    @cached_property
+    def _lighting(self) -> list[tuple[FloatArray, ...]]:
+        """Of every edge: places around it, (points,) um from the optical axis; the baseline's light there; and (terms, points), which take
+        light to a polynomial in the distance: a mean over all that lies at the same distance, however long the edge is there."""
+        camera = self._camera
+        axis, pitch = optical_axis_px(camera), camera.pixel_pitch_um
+        found: list[tuple[FloatArray, ...]] = []
+        for edge in self.edges:
+            row0, col0, row1, col1 = edge.region
+            every = max(1, (row1 - row0) // 40), max(1, (col1 - col0) // 40)
+            row, col = (a.astype(float) for a in np.mgrid[row0 : row1 : every[0], col0 : col1 : every[1]])
+            turn = np.deg2rad(edge.direction_deg)
+            middle = 0.5 * (row0 + row1 - 1), 0.5 * (col0 + col1 - 1)
+            away = np.cos(turn) * (col - middle[1]) + np.sin(turn) * (row - middle[0])
+            near = np.abs(away) < edge.measured.geometry.reach_px
+            row, col = row[near], col[near]
+            light = np.asarray(relative_illumination(camera, row, col), float)
+            fit = np.linalg.pinv(polynomial.polyvander(away[near] / UNEVEN_PX, UNEVEN_ORDER))
+            found.append(((col - axis[1]) * pitch, (row - axis[0]) * pitch, light, fit))
+        return found
 
     @cached_property
     def slopes(self) -> dict[str, FloatArray]:

@@ -31,7 +31,7 @@ from lab.fit.screen import ScreenWarp, register
 from lab.recording import Bernoulli, Black, Capture, Checkerboard, White
 from sim.camera import CameraModel
 from sim.effects.base import Effect
-from sim.forward import optical_transfer
+from sim.forward import common_wavelengths, optical_transfer, transfer_at
 from sim.optics.diffraction import aperture_otf
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
@@ -83,7 +83,7 @@ class Pattern:
     shown: FloatArray  # covariance by what differs from repeat to repeat
     common: FloatArray  # ... and by what white, black and drawing share
     mix: FloatArray  # (bands, 4 bands): what the halves of the bands, then their phases, contribute to the bands' coefficients
-    shown_by: Callable[[Effects], FloatArray]  # as `value`: by how much the coefficients change where a screen shows greys otherwise
+    shown_by: Callable[[Effects], FloatArray]  # as `value`: what screens that show greys otherwise change
     levels_e: tuple[float, float]  # electrons of black and of white
     light: Spectrum | None
     turned: Callable[
@@ -185,10 +185,12 @@ def _measured(
     for _ in range(REFINEMENTS):
         warp = _refined(study, whole, target, warp, window, reference, light)
     canvas = _Canvas.of(target, warp, window)
+    # one set of frequencies for all channels, so that an effect's transfer is formed once
+    laid = np.sum([np.square(np.abs(canvas.low * _passed(study, canvas, c, light))) for c in camera.channels], axis=0)
     turned = ndimage.gaussian_filter(np.nan_to_num(whole), TURNED_BLUR_PX)[::-1, ::-1]
     found = []
     for channel in camera.channels:
-        design = _Design.of(study, canvas, channel, light, whole, turned)
+        design = _Design.of(study, canvas, channel, light, whole, turned, laid)
         moved = design.coefficients(whole[window][design.mask])[design.shifts]
         points = _points(design.mask, window)
         field = _field(camera, points, moved)
@@ -196,7 +198,7 @@ def _measured(
             # so far out that its slopes don't tell what is lost: drawn anew where it is
             there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
             drawn = _Canvas.of(target, warp.displaced(there), window)
-            design = _Design.of(study, drawn, channel, light, whole, turned)
+            design = _Design.of(study, drawn, channel, light, whole, turned, laid)
         else:
             drawn, moved = canvas, np.zeros(len(moved))
         area = contrast[window][design.mask]
@@ -405,6 +407,14 @@ def _lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline
     return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
 
 
+def _passed(study: Study, canvas: _Canvas, channel: str, light: Spectrum | None) -> FloatArray:
+    """The baseline's transfer at a canvas's frequencies, (rows, cols / 2 + 1)."""
+    fy, fx = canvas.frequencies
+    return np.asarray(
+        _lens_otf(study, channel, light)(np.hypot(fx, fy)) * aperture_otf(fx, fy, study.camera.fill_factor)
+    )
+
+
 def _refined(
     study: Study,
     seen: FloatArray,
@@ -417,7 +427,7 @@ def _refined(
     """The registration from the corners, improved by the pattern itself: a step of Gauss and Newton's method."""
     canvas, otf = _Canvas.of(target, warp, window), _lens_otf(study, channel, light)
     fy, fx = canvas.frequencies
-    spectrum = canvas.low * otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, study.camera.fill_factor)
+    spectrum = canvas.low * _passed(study, canvas, channel, light)
     mask = _pixels(study, canvas, channel, seen)
     picture, across, down = (
         canvas.picture(part * spectrum)[mask] for part in (_below(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
@@ -458,13 +468,20 @@ class _Design:
 
     @staticmethod
     def of(
-        study: Study, canvas: _Canvas, channel: str, light: Spectrum | None, seen: FloatArray, turned: FloatArray
+        study: Study,
+        canvas: _Canvas,
+        channel: str,
+        light: Spectrum | None,
+        seen: FloatArray,
+        turned: FloatArray,
+        laid: FloatArray,
     ) -> _Design:
+        """`laid`: where bands' nodes lie, the power that is their weight: (rows, cols / 2 + 1)."""
         camera = study.camera
         fy, fx = canvas.frequencies
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
         otf = _lens_otf(study, channel, light)
-        passed = otf(radius) * aperture_otf(fx, fy, camera.fill_factor)
+        passed = _passed(study, canvas, channel, light)
         spectrum = canvas.low * passed
         mask = _pixels(study, canvas, channel, seen)
         power = np.abs(spectrum) ** 2
@@ -488,7 +505,7 @@ class _Design:
                 low_part += picture
                 columns.append(picture[mask])
                 halves += [piece[mask] for piece in pieces]
-                bands.append(_band(part, radius, away, middle, power, (low, high), whole=not i))
+                bands.append(_band(part, radius, away, middle, laid, power, (low, high), whole=not i))
         beyond = [canvas.picture(np.where((radius >= RINGS_CY_PER_PX[-1]) & _below(canvas), spectrum, 0.0))]
         beyond += canvas.beyond(otf, camera.fill_factor)
         picture = (low_part + np.sum(beyond, axis=0))[mask]
@@ -514,9 +531,7 @@ class _Design:
         normal = (table / scale[:, None]) @ (table / scale[:, None]).T
         inverse = np.linalg.inv(normal) / np.outer(scale, scale)
         mix = (inverse @ (table @ np.array(halves + turned_halves).T))[: len(bands)]
-        return _Design(
-            mask, tuple(bands), table, fixed, inverse, mix, passed, float(np.sqrt(r2.max()))
-        )
+        return _Design(mask, tuple(bands), table, fixed, inverse, mix, passed, float(np.sqrt(r2.max())))
 
     @property
     def shifts(self) -> slice:
@@ -550,30 +565,31 @@ def _band(
     radius: FloatArray,
     away: FloatArray,
     middle: float,
+    laid: FloatArray,
     power: FloatArray,
     ends: tuple[float, float],
     *,
     whole: bool,
 ) -> Band:
-    """Nodes where the band's power is: its cells, gathered by radius and angle."""
-    r, a, p = radius[part], away[part], power[part]
+    """Nodes where the power `laid` is in a band, its cells gathered by radius and angle, and the shares of `power` there."""
+    r, a = radius[part], away[part]
+    on, p = (np.where(r > 0, at[part], 0.0) for at in (laid, power))  # the mean isn't blurred
     span = np.pi if whole else np.pi / SECTORS
     i = np.minimum(((r - ends[0]) / (ends[1] - ends[0]) * NODES[0]).astype(int), NODES[0] - 1)
     j = np.clip(((a / span + 0.5) * NODES[1]).astype(int), 0, NODES[1] - 1)
     cell = i * NODES[1] + j
-    p = np.where(r > 0, p, 0.0)  # the mean isn't blurred
-    total = np.bincount(cell, p, NODES[0] * NODES[1])
+    total = np.bincount(cell, on, NODES[0] * NODES[1])
     keep = total > 0
-    at_r = np.bincount(cell, p * r, len(total))[keep] / total[keep]
-    at_a = middle + np.bincount(cell, p * a, len(total))[keep] / total[keep]
-    share = total[keep] / total.sum()
+    at_r = np.bincount(cell, on * r, len(total))[keep] / total[keep]
+    at_a = middle + np.bincount(cell, on * a, len(total))[keep] / total[keep]
+    share = np.bincount(cell, p, len(total))[keep] / max(float(p.sum()), 1e-300)
     return Band(
         float(share @ at_r),
         float(np.rad2deg(middle)),
         at_r * np.cos(at_a),
         at_r * np.sin(at_a),
         share,
-        float(total.sum()),
+        float(p.sum()),
         np.flatnonzero(keep) // NODES[1] >= NODES[0] // 2,
     )
 
@@ -600,18 +616,24 @@ def contrast_block(study: Study) -> Block:
     covariance = _joint(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
     scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
     # drawn alike and seen in the same light, what is held out has its twin's prediction
-    sights: dict[tuple[str, Spectrum | None, int], tuple[Pattern, list[int], list[int]]] = {}
+    poses: list[dict[str, tuple[Pattern, list[int], list[int]]]] = [{} for _ in found]
     for k, (number, p, b) in enumerate(places):
-        _, members, parts = sights.setdefault((p.channel, p.light, number), (p, [], []))
+        _, members, parts = poses[number].setdefault(p.channel, (p, [], []))
         members.append(k)
         parts.append(b)
-    plain = [_transfer(study, p, ()) for p, _, _ in sights.values()]
+    poses = [sights for sights in poses if sights]
+    plain = [_transfers(study, sights, ()) for sights in poses]
+    weights = {id(p): _node_weights(p) for sights in poses for p, *_ in sights.values()}
 
     def predict(effects: Effects) -> Prediction:
         mean = np.ones(len(places))
         if effects:
-            for (p, members, parts), before in zip(sights.values(), plain, strict=True):
-                mean[members] = _contrasts(study, p, effects, before)[parts]
+            for sights, before in zip(poses, plain, strict=True):
+                changed = _transfers(study, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
+                for (p, members, parts), ratio in zip(sights.values(), changed, strict=True):
+                    placed, (real, imaginary) = _in_place(p, ratio), weights[id(p)]
+                    kept = real @ np.real(placed) + imaginary @ np.imag(placed) + p.shown_by(effects)[: len(real)]
+                    mean[members] = kept[parts]
             mean[~np.isfinite(mean)] = 1.0
         slopes = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
         for name in dict.fromkeys(scales):
@@ -639,31 +661,30 @@ def _joint(places: Sequence[tuple[int, Pattern, int]], study: Study) -> FloatArr
     return table
 
 
-def _transfer(study: Study, p: Pattern, effects: Effects) -> NDArray[np.complex128]:
-    """At the frequencies of all bands, one after another."""
-    fx, fy = np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])
-    return optical_transfer(study.camera, p.channel, p.light, fx, fy, effects, "bernoulli")
+def _transfers(
+    study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
+) -> NDArray[np.complex128]:
+    """Of a pose's channels at the frequencies of all bands, one after another: (channels, nodes)."""
+    first = next(iter(sights.values()))[0]
+    fx, fy = np.concatenate([b.fx for b in first.bands]), np.concatenate([b.fy for b in first.bands])
+    lit = [(channel, first.light) for channel in sights]
+    nodes, shares = common_wavelengths(study.camera, lit, effects, "bernoulli")
+    whole = [transfer_at(study.camera, float(w), fx, fy, effects) for w in nodes]
+    return np.asarray(np.tensordot(shares, np.array(whole), 1), complex)
 
 
-def _contrasts(study: Study, p: Pattern, effects: Effects, plain: NDArray[np.complex128]) -> FloatArray:
-    """Contrast in every band with the effects over that without, whose transfer is `plain`, where the pattern comes to lie."""
-    changed = _transfer(study, p, effects)
-    ratio = _in_place(p, changed / np.where(np.abs(plain) > 1e-3, plain, np.inf))
-    halves = np.concatenate([_halves(p, np.real(ratio)), _halves(p, np.imag(ratio))])
-    return p.mix @ halves + p.shown_by(effects)[: len(p.bands)]
-
-
-def _halves(p: Pattern, at_nodes: FloatArray) -> list[float]:
-    """Means over the lower and the upper half of every band."""
-    halves, start = [], 0
-    for band in p.bands:
-        own = at_nodes[start : start + len(band.fx)]
+def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray]:
+    """What a transfer's real and its imaginary part at all bands' nodes do to the bands' coefficients, (bands, nodes) each: by its means
+    over the lower and the upper half of every band."""
+    halves = np.zeros((2 * len(p.bands), sum(len(b.fx) for b in p.bands)))
+    start = 0
+    for k, band in enumerate(p.bands):
+        own = slice(start, start + len(band.fx))
         start += len(band.fx)
-        whole = float(band.share @ own)
-        for use in (~band.upper, band.upper):
-            total = float(band.share[use].sum())
-            halves.append(float(band.share[use] @ own[use]) / total if total > 0 else whole)
-    return halves
+        for row, use in zip(halves[2 * k : 2 * k + 2], (~band.upper, band.upper), strict=True):
+            share = np.where(use, band.share, 0.0)
+            row[own] = share / share.sum() if share.sum() > 0 else band.share
+    return p.mix[:, : len(halves)] @ halves, p.mix[:, len(halves) :] @ halves
 
 
 def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex128]:

@@ -198,9 +198,18 @@ def narrowband_block(study: Study) -> Block:
     )
     covariance = _narrowband_covariance(study, points, signal, curves)
 
+    def slopes_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
+        """By what is free; `share`: DN over electrons a second on axis."""
+        slopes = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+        return slopes | {k: v * share for k, v in curves.slopes(effects).items()}
+
     def predict(effects: Effects) -> Prediction:
         camera = study.camera
         rates = curves.rates(effects)
+        if not any(overrides(e, UNIFORM_HOOKS | SEQUENCE_HOOKS) for e in effects):
+            # what acts on the light's colours alone leaves signals in proportion to its rates
+            share = noise.gain * float(study.field.light.mean()) * exposures
+            return Prediction(noise.black + noise.dark_dn_per_s * exposures + share * rates, slopes_of(effects, share))
         lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
         mean, share = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
@@ -219,9 +228,7 @@ def narrowband_block(study: Study) -> Block:
             carried = noise.gain * study.carried_e(capture, channel, effects)
             mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
             share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
-        slopes = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
-        slopes |= {k: v * share for k, v in curves.slopes(effects).items()}
-        return Prediction(mean, slopes)
+        return Prediction(mean, slopes_of(effects, share))
 
     return Block(
         measurement="narrowband", axis="wavelength", unit="nm", reach=25.0, value=value, covariance=covariance,

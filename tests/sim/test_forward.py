@@ -11,7 +11,19 @@ from sim import forward
 from sim.camera import CameraModel, Geometry, Lens
 from sim.effects import library
 from sim.effects.base import Effect, Stage
-from sim.forward import Exposure, edge_profile, electron_rate, expected, kernel, optical_transfer, responsivity, sample
+from sim.effects.infrared_cut_filter import InfraredCutFilter
+from sim.forward import (
+    Exposure,
+    common_wavelengths,
+    edge_profile,
+    electron_rate,
+    expected,
+    kernel,
+    optical_transfer,
+    responsivity,
+    sample,
+    wavelength_shares,
+)
 from sim.optics.diffraction import aperture_otf, diffraction_otf
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.scene import (
@@ -559,6 +571,19 @@ def test_a_lens_is_diffraction_limited_unless_it_says_otherwise(
 
     monkeypatch.setattr(forward, "_transfer_at", before)
     np.testing.assert_array_equal(now, expected(colour_camera, exposure, effects))
+
+
+def test_wavelengths_share_a_sight_s_light(colour_camera: CameraModel, lamp: Spectrum) -> None:
+    """Means of what is linear in the wavelength are those of the detected light, and an effect on its colour is in them."""
+    grid = np.linspace(380.0, 780.0, 90)
+    sights = [(channel, light) for channel in "RGB" for light in (lamp, None)]
+    shares = wavelength_shares(colour_camera, sights, grid)
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0, rtol=1e-12)
+    nodes, few = common_wavelengths(colour_camera, sights)
+    np.testing.assert_allclose(shares @ grid, few @ nodes, rtol=1e-10)
+    cut = InfraredCutFilter(cut_wavelength_nm=600.0, width_nm=1.0)
+    without_red = wavelength_shares(colour_camera, sights, grid, (cut,))
+    assert np.all(without_red[:, grid > 615.0].sum(axis=1) < 1e-5)  # e^-12 of a width's light behind the edge
 
 
 def test_magnification_dims_a_whole_frame_as_in_iset(colour_camera: CameraModel, lamp: Spectrum) -> None:

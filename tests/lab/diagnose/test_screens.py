@@ -12,13 +12,14 @@ import pytest
 from lab.diagnose.decide import Verdict, decide
 from lab.diagnose.evidence import Evidence
 from lab.diagnose.patches import screen_block
-from lab.diagnose.screens import SCREEN_BLOCKS, colour_block, contrast_block, grid_block, turned_block
+from lab.diagnose.screens import SCREEN_BLOCKS, colour_block, contrast_block, grid_block, rim_block, turned_block
 from lab.diagnose.summaries import Block, Study
 from lab.errors import NotDetermined
 from lab.predict import camera_model
 from lab.recording import RecordingSet
 from sim.effects.defocus import Defocus
 from sim.effects.ghost import Ghost
+from sim.effects.screen_gamma import ScreenGamma
 from tests.proof.former import Camera, Law, Plan
 from tests.proof.former import laws as concealed
 
@@ -69,6 +70,7 @@ FOUND: list[tuple[Law, str]] = [
     (concealed.Ghost(2.0, 1, 5), "ghost"),
     (concealed.ScreenPixelStructure(8.0, 0, 5), "screen_pixel_structure"),
     (concealed.ScreenGamma(1.5, 0, 5), "screen_gamma"),
+    (concealed.ScreenGamma(4.0, 1, 5), "screen_gamma"),
     (concealed.LateralColour(3.0, 0, 5), "lateral_chromatic_aberration"),
 ]
 
@@ -93,6 +95,21 @@ def test_a_copy_of_the_image_falls_into_the_dark_squares() -> None:
     more = block.predict((Ghost(share_percent=1.0),)).mean - block.predict(()).mean
     assert np.all(more > 0.0)
     assert np.all(more < 0.011 * block.scale)
+
+
+def test_a_steep_gamma_over_wide_rims_is_predicted() -> None:
+    """v^5 on rims of a standard deviation of 0.4 px: lit cells of 4 px lose a quarter of their width. Contrast comes out within noise,
+    what rims lack to 5 %."""
+    study = study_of(recorded(concealed.ScreenGamma(4.0, 1, 5)))
+    effect = ScreenGamma(exponent=5.0, rim_px=0.4)
+    contrasts = Evidence((contrast_block(study),), study.camera)
+    n, covariance = len(contrasts.value), contrasts.gaussian().covariance
+    for effects, low, high in (((), 5.0, 1e9), ((effect,), 0.0, 1.0)):
+        residual = contrasts.value - contrasts.mean(effects)
+        chi2 = float(residual @ np.linalg.solve(covariance, residual))
+        assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
+    rims = rim_block(study)
+    np.testing.assert_allclose(rims.predict((effect,)).mean, rims.value, rtol=0.05)
 
 
 def test_defocus_changes_the_contrast_as_predicted() -> None:
