@@ -1,0 +1,15 @@
+"""What holds for the whole suite."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+# Whoever starts the suite in the background may have it ignore Ctrl-C, and with it the commands that tests interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Those that state how long they may take come first: one alone at the end would keep the other worker waiting."""
+    items.sort(key=lambda item: item.get_closest_marker("timeout") is None)
