@@ -16,6 +16,7 @@ from lab.diagnose.search import FURTHER, RIVAL_FROM, SCREENED, Search
 from lab.diagnose.unknown import Discrepancy, discrepancy, predictive
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
+from sim.effects.other_f_number import OtherFNumber
 from sim.spectrum import FloatArray
 
 FALSE_ALARM_RATE = 0.01
@@ -55,6 +56,10 @@ HOPELESS = 30.0
 ROUGH_SHARE = 0.05
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
 COMPANION_SHARE = 0.03
+#: Nats by which it is less likely that an f-number or a pitch is stated wrongly than that a model lacks an effect; the least factor by
+#: which numbers are misstated, and where its search begins.
+MISSTATED_NATS, MISSTATED_FROM, OTHER_RATIOS = 10.0, 1.1, (0.75, 1.35)
+SURE_NATS = 30.0  # by which they have to be likelier than a name, so that its rivals aren't weighed any more
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,7 @@ class Candidate:
     gain: float  # nats over the same set without it
     explains: float = 1.0  # share of the excess chi2 in the measurements it acts on
     closed: bool = True  # whether what is left there is within noise and the law's tolerance
+    remark: str = ""  # what it looks like that isn't physics
 
     @property
     def unknown(self) -> float:
@@ -312,9 +318,13 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     evidence, effect = search.evidence, fit.effects[index]
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     without, touched = _without(search, fit, index), evidence.acted_on(effect)
+    gain = fit.weight - without.weight
+    misstated = _misstated(search, fit, index)
+    if misstated is not None and misstated.weight - MISSTATED_NATS > fit.weight + SURE_NATS:
+        remark = _as_if(evidence, misstated)
+        return Candidate(effect, fit.std[index], 0.0, (("unknown", 1.0),), gain, remark=remark), None
     others = [e for e in search.known if e.name not in fit.names]
     likely = signatures(evidence, evidence.camera, without.effects, others, without.tangents).scores()
-    gain = fit.weight - without.weight
     pool = [
         s for s in likely if s.value > (DECLARED_FROM if s.effect.name in type(effect).rivals else RIVAL_FROM) * gain
     ]
@@ -339,6 +349,8 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
         + sum(discrepancy(evidence, bare, i).gain for i in touched)
     )
     weights["unknown"] = max(alone, without.weight + sum(discrepancy(evidence, refitted, i).gain for i in touched))
+    if misstated is not None:
+        weights["unknown"] = max(weights["unknown"], misstated.weight - MISSTATED_NATS)
     top = max(weights.values())
     share = {name: float(np.exp(w - top)) for name, w in weights.items()}
     total = sum(share.values())
@@ -348,7 +360,31 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     explains, closed = _explained(evidence, fit, without, touched)
     first = max((n for n in share if n != "unknown"), key=lambda n: share[n])
     better = fits[first] if share[first] > LIKELIER * share[effect.name] else None
-    return Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains, closed), better
+    remark = "" if misstated is None or misstated.weight - MISSTATED_NATS < top else _as_if(evidence, misstated)
+    candidate = Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains, closed, remark)
+    return candidate, better
+
+
+def _misstated(search: Search, fit: Fit, index: int) -> Fit | None:
+    """The set with the lens at another f-number in the place of an effect that blurs, where that is far from the stated one: nothing
+    that a model lacks, and easily taken for a blur."""
+    evidence, effect = search.evidence, fit.effects[index]
+    if type(effect).transfer is Effect.transfer:
+        return None
+    rest = (*fit.effects[:index], *fit.effects[index + 1 :])
+    starts = [(*rest, OtherFNumber(ratio=ratio)) for ratio in OTHER_RATIOS]
+    tried = search.fitted(max(starts, key=lambda s: likelihood(evidence, s)), beside=fit)
+    if tried.weight < fit.weight - HOPELESS:
+        return None
+    tried = search.fitted(tried.effects, final=True)
+    other = next(e for e in tried.effects if isinstance(e, OtherFNumber))
+    return tried if abs(np.log(other.ratio)) > np.log(MISSTATED_FROM) else None
+
+
+def _as_if(evidence: Evidence, misstated: Fit) -> str:
+    ratio = next(e.ratio for e in misstated.effects if isinstance(e, OtherFNumber))
+    stated, pitch = evidence.camera.lens.f_number, evidence.camera.pixel_pitch_um
+    return f"as if the lens worked at f/{stated * ratio:.3g} in place of f/{stated:.3g}, or the pixels' pitch were {pitch / ratio:.3g} um in place of {pitch:.3g}"
 
 
 def _without(search: Search, fit: Fit, index: int) -> Fit:

@@ -356,11 +356,11 @@ def correlations(
     size = 2 * reach + 1
     offset = np.arange(size) - reach
     found = np.zeros(len(PAIRS))
-    weights: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+    weights: dict[tuple[int, int], FloatArray] = {}  # (shot and read noise, size, size)
     for phase in np.ndindex(period, period):
         row, col = (phase[0] + offset) % period, (phase[1] + offset) % period
         own, g = variance[np.ix_(row, col)], taken[np.ix_(row, col)]
-        shifted = sum(np.roll(own, s, axis) for s in (1, -1) for axis in (0, 1))
+        shifted = _four_neighbours(own)
         norm = 1.0 / np.sqrt(1.0 + np.square(g) * shifted / np.maximum(own, 1e-12))
         read = np.zeros((size, size))
         middle = taps.shape[0] // 2
@@ -368,19 +368,26 @@ def correlations(
             read[reach + (i - middle) * period, reach + (j - middle) * period] = tap
         shot = read * norm
         passed = read * norm * g
-        shot = shot + sum(np.roll(passed, s, axis) for s in (1, -1) for axis in (0, 1))
-        weights[phase] = shot * np.sqrt(own), read * np.sqrt(read_e2)
-    total = {p: float(np.sum(s * s) + np.sum(r * r)) + rounding_e2 for p, (s, r) in weights.items()}
+        shot = shot + _four_neighbours(passed)
+        weights[phase] = np.stack([shot * np.sqrt(own), read * np.sqrt(read_e2)])
+    total = {p: float(np.vdot(w, w)) + rounding_e2 for p, w in weights.items()}
     for k, lags in enumerate(PAIRS.values()):
         parts = []
-        for phase, (shot, read) in weights.items():
+        for phase, here in weights.items():
             for down, right in lags:
                 other = (phase[0] + down) % period, (phase[1] + right) % period
-                there_shot, there_read = (np.roll(w, (down, right), (0, 1)) for w in weights[other])
-                common = float(np.sum(shot * there_shot) + np.sum(read * there_read))
-                parts.append(common / np.sqrt(total[phase] * total[other]))
+                mine = here[:, max(down, 0) : size + min(down, 0), max(right, 0) : size + min(right, 0)]
+                theirs = weights[other][:, max(-down, 0) : size - max(down, 0), max(-right, 0) : size - max(right, 0)]
+                parts.append(float(np.sum(mine * theirs)) / np.sqrt(total[phase] * total[other]))
         found[k] = np.mean(parts)
     return found
+
+
+def _four_neighbours(values: FloatArray) -> FloatArray:
+    """Sum of each pixel's four neighbours, nothing beyond the rim."""
+    wide = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
+    wide[1:-1, 1:-1] = values
+    return np.asarray(wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:])
 
 
 def _phase_of(cfa: Cfa) -> dict[str, tuple[int, int]]:

@@ -192,17 +192,19 @@ def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]
         before = float(residual @ np.linalg.solve(model.covariance[only], residual))
         after = float(residual @ np.linalg.solve(model.plus(gap.index, gap.kernel).covariance[only], residual))
         where = describe(evidence, model, part)[0] if part is not None else "along the whole axis"
+        near = [c for c in verdict.abstained if block.touched_by(type(c.effect))]
         families = [
             f"{c.effect.name} ({100 * c.probability:.0f} %)"
             + "".join(f", {n} ({100 * p:.0f} %)" for n, p in c.rivals[:3])
-            for c in verdict.abstained
-            if block.touched_by(type(c.effect))
+            for c in near
         ]
         family = (
             f"; nearest of the library, none of them likely enough to be named: {'; '.join(families)}"
             if families
             else ""
         )
+        remarked = max((c for c in near if c.remark), key=lambda c: c.gain, default=None)
+        family += f"; it looks {remarked.remark}: check what is stated of both" if remarked is not None else ""
         found.append(
             Unexplained(
                 side=side,

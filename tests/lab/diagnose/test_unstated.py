@@ -3,6 +3,7 @@ is found."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.diagnose import diagnose
 from lab.diagnose.blocks import evidence_of
 from lab.diagnose.decide import decide
 from lab.diagnose.summaries import Study
@@ -125,3 +127,23 @@ def test_codes_too_coarse_for_the_noise_are_no_mismatch() -> None:
     assert {"slanted_edge", "screen", "noise"} <= {b.measurement for b in evidence.blocks}
     found = decide(evidence, np.random.default_rng(1))
     assert (found.before, found.named, found.abstained) == ((), (), ())
+
+
+@pytest.mark.parametrize(("key", "factor"), [("f_number", 0.7), ("pixel_pitch_um", 1.25)])
+def test_what_is_stated_wrongly_is_no_blur(key: str, factor: float) -> None:
+    """Edges tell of N / pitch alone: what comes out of both is true to 3 %, and no aberration has the name."""
+
+    def edges(content: dict[str, Any]) -> None:
+        _only("dark", "flat", "slanted_edge")(content)
+        content["cameras"]["left"][key] *= factor
+
+    result = diagnose(_changed(edges, seed=48))
+    assert not result.effects
+    camera = _whole(48).manifest.cameras["left"]
+    (said,) = {u.shape for u in result.unexplained if u.measurement == "slanted_edge"}
+    found = re.search(r"f/([0-9.]+) in place of .* pitch were ([0-9.]+) um", said)
+    assert found is not None, said
+    stated = camera.model_copy(update={key: getattr(camera, key) * factor})
+    truth = camera.f_number / camera.pixel_pitch_um
+    assert float(found[1]) / stated.pixel_pitch_um == pytest.approx(truth, rel=0.03)
+    assert stated.f_number / float(found[2]) == pytest.approx(truth, rel=0.03)

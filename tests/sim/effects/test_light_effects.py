@@ -8,12 +8,14 @@ import pytest
 from sim.camera import CameraModel, Lens
 from sim.effects.ambient_light import AmbientLight
 from sim.effects.non_uniform_illumination import NonUniformIllumination
+from sim.effects.other_f_number import OtherFNumber
 from sim.effects.radiometer_nonlinearity import RIGHT_AT, RadiometerNonlinearity
 from sim.effects.screen_gamma import ScreenGamma
 from sim.effects.second_order_light import SecondOrderLight
 from sim.effects.source_drift import SourceDrift
 from sim.effects.vignetting import Vignetting
 from sim.effects.vignetting_decentre import VignettingDecentre
+from sim.forward import optical_transfer
 from sim.spectrum import Spectrum
 
 WAVELENGTH = np.arange(380.0, 961.0)
@@ -96,3 +98,14 @@ def test_a_screen_s_gamma_moves_the_edges_of_lit_cells() -> None:
     assert (
         ScreenGamma(exponent=1.05, rim_px=0.4).usual_nats() < -10.0 < ScreenGamma(exponent=2.0, rim_px=0.4).usual_nats()
     )
+
+
+def test_another_f_number_has_its_own_diffraction() -> None:
+    f = np.linspace(0.0, 0.5, 21)
+    wide, narrow = (CAMERA.model_copy(update={"lens": Lens(f_number=n, focal_length_mm=8.0)}) for n in (4.0, 5.6))
+    light = Spectrum.of([400.0, 700.0], [1.0, 1.0])
+    got, wanted = (
+        optical_transfer(camera, CAMERA.channels[0], light, f, 0.6 * f, effects)
+        for camera, effects in ((wide, (OtherFNumber(ratio=1.4),)), (narrow, ()))
+    )
+    np.testing.assert_allclose(got, wanted, atol=1e-4)  # wavelengths are the same, the kink at a cutoff isn't
