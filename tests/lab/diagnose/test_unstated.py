@@ -129,7 +129,9 @@ def test_codes_too_coarse_for_the_noise_are_no_mismatch() -> None:
     assert (found.before, found.named, found.abstained) == ((), (), ())
 
 
-@pytest.mark.parametrize(("key", "factor"), [("f_number", 0.7), ("pixel_pitch_um", 1.25)])
+@pytest.mark.parametrize(
+    ("key", "factor"), [("f_number", 0.7), pytest.param("pixel_pitch_um", 1.25, marks=pytest.mark.slow)]
+)
 def test_what_is_stated_wrongly_is_no_blur(key: str, factor: float) -> None:
     """Edges tell of N / pitch alone: what comes out of both is true to 3 %, and no aberration has the name."""
 
