@@ -36,7 +36,15 @@ from sim.scene.scenes import Darkness, KnifeEdge, Scene, ScreenPattern, Spectral
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
 from sim.sensor.electrons import FixedPattern, ReadOut
-from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, photons_from_energy, quadrature
+from sim.spectrum import (
+    FloatArray,
+    Spectrum,
+    gauss_rule,
+    lagrange_shares,
+    linear_shares,
+    photons_from_energy,
+    quadrature,
+)
 
 ComplexArray = NDArray[np.complex128]
 
@@ -170,12 +178,8 @@ def wavelength_shares(
 ) -> FloatArray:
     """How much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean over the light that it
     detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight."""
-    shares = np.empty((len(sights), len(wavelength_nm)))
-    for one, (at, part) in zip(shares, _seen_light(camera, sights, effects, kind), strict=True):
-        left = np.clip(np.searchsorted(wavelength_nm, at) - 1, 0, len(wavelength_nm) - 2)
-        on = np.clip((at - wavelength_nm[left]) / (wavelength_nm[left + 1] - wavelength_nm[left]), 0.0, 1.0)
-        one[:] = np.bincount(left, part * (1.0 - on), len(one)) + np.bincount(left + 1, part * on, len(one))
-    return shares
+    seen = _seen_light(camera, sights, effects, kind)
+    return np.array([linear_shares(at, part, wavelength_nm) for at, part in seen])
 
 
 def _seen_light(

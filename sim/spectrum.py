@@ -179,6 +179,15 @@ def gauss_rule(position: FloatArray, weight: FloatArray, count: int) -> tuple[Fl
     return centre + half * values, vectors[0] ** 2
 
 
+def linear_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
+    """(nodes,): how much each of the nodes, ascending, counts in sum weight x g, for g given at the nodes and linear between them;
+    positions beyond count for the outermost. The shares add up to the weights' sum."""
+    left = np.clip(np.searchsorted(nodes, position) - 1, 0, len(nodes) - 2)
+    on = np.clip((position - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
+    lower, upper = np.bincount(left, weight * (1.0 - on), len(nodes)), np.bincount(left + 1, weight * on, len(nodes))
+    return np.asarray(lower + upper, float)
+
+
 def lagrange_shares(position: FloatArray, weight: FloatArray, nodes: FloatArray) -> FloatArray:
     """(curves, nodes): how much each node counts in sum weight x g, for g given at the nodes only and taken as the polynomial
     through them. `weight` is (curves, positions); the shares of a curve add up to its sum, exactly."""

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from lab.diagnose.summaries import SPECTRAL_HOOKS, Effects, Study, overrides
 from sim.effects.base import Effect
 from sim.forward import electron_rate
-from sim.spectrum import FloatArray, Spectrum
+from sim.spectrum import FloatArray, Spectrum, linear_shares
 
 LEAK_STD = 2.0e-4  # of the curve's peak, alike at all wavelengths: blindness that isn't quite
 MOST_DECIMALS = 6  # of a curve's values; with fewer they are rounded
@@ -89,9 +89,7 @@ class CurveSlopes:
         for i, (path, channel, *_) in enumerate(self.items):
             samples, value = self.study.camera.quantum_efficiency[channel].arrays
             share = self.radiance[path] * self._level[i] / (LEAK_STD * value.max())
-            at = np.clip(np.searchsorted(samples, self.wavelength) - 1, 0, len(samples) - 2)
-            upper = np.clip((self.wavelength - samples[at]) / (samples[at + 1] - samples[at]), 0.0, 1.0)
-            each = np.bincount(at, share * (1 - upper), len(samples)) + np.bincount(at + 1, share * upper, len(samples))
+            each = linear_shares(self.wavelength, share, samples)
             found.append(
                 _last_place(value) / np.sqrt(12.0) * self._per_weight[channel] * float(np.sqrt(np.sum(each**2)))
             )

@@ -319,9 +319,8 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     without, touched = _without(search, fit, index), evidence.acted_on(effect)
     gain = fit.weight - without.weight
-    misstated = _misstated(search, fit, index)
-    if misstated is not None and misstated.weight - MISSTATED_NATS > fit.weight + SURE_NATS:
-        remark = _as_if(evidence, misstated)
+    misstated, remark = _misstated(search, fit, index)
+    if misstated > fit.weight + SURE_NATS:
         return Candidate(effect, fit.std[index], 0.0, (("unknown", 1.0),), gain, remark=remark), None
     others = [e for e in search.known if e.name not in fit.names]
     likely = signatures(evidence, evidence.camera, without.effects, others, without.tangents).scores()
@@ -348,9 +347,8 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
         + (fit.weight - fit.log_likelihood)
         + sum(discrepancy(evidence, bare, i).gain for i in touched)
     )
-    weights["unknown"] = max(alone, without.weight + sum(discrepancy(evidence, refitted, i).gain for i in touched))
-    if misstated is not None:
-        weights["unknown"] = max(weights["unknown"], misstated.weight - MISSTATED_NATS)
+    located = without.weight + sum(discrepancy(evidence, refitted, i).gain for i in touched)
+    weights["unknown"] = max(alone, located, misstated)
     top = max(weights.values())
     share = {name: float(np.exp(w - top)) for name, w in weights.items()}
     total = sum(share.values())
@@ -360,31 +358,31 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     explains, closed = _explained(evidence, fit, without, touched)
     first = max((n for n in share if n != "unknown"), key=lambda n: share[n])
     better = fits[first] if share[first] > LIKELIER * share[effect.name] else None
-    remark = "" if misstated is None or misstated.weight - MISSTATED_NATS < top else _as_if(evidence, misstated)
+    remark = remark if misstated >= top else ""
     candidate = Candidate(effect, fit.std[index], share[effect.name] / total, rivals, gain, explains, closed, remark)
     return candidate, better
 
 
-def _misstated(search: Search, fit: Fit, index: int) -> Fit | None:
-    """The set with the lens at another f-number in the place of an effect that blurs, where that is far from the stated one: nothing
-    that a model lacks, and easily taken for a blur."""
+def _misstated(search: Search, fit: Fit, index: int) -> tuple[float, str]:
+    """Weight of the set with the lens at another f-number in the place of an effect that blurs, less what that is unlikelier by, and what
+    it looks like; -inf where it is as stated to `MISSTATED_FROM`. It is nothing that a model lacks, and easily taken for a blur."""
     evidence, effect = search.evidence, fit.effects[index]
     if type(effect).transfer is Effect.transfer:
-        return None
+        return -np.inf, ""
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     starts = [(*rest, OtherFNumber(ratio=ratio)) for ratio in OTHER_RATIOS]
     tried = search.fitted(max(starts, key=lambda s: likelihood(evidence, s)), beside=fit)
     if tried.weight < fit.weight - HOPELESS:
-        return None
+        return -np.inf, ""
     tried = search.fitted(tried.effects, final=True)
-    other = next(e for e in tried.effects if isinstance(e, OtherFNumber))
-    return tried if abs(np.log(other.ratio)) > np.log(MISSTATED_FROM) else None
-
-
-def _as_if(evidence: Evidence, misstated: Fit) -> str:
-    ratio = next(e.ratio for e in misstated.effects if isinstance(e, OtherFNumber))
+    ratio = next(e.ratio for e in tried.effects if isinstance(e, OtherFNumber))
+    if abs(np.log(ratio)) <= np.log(MISSTATED_FROM):
+        return -np.inf, ""
     stated, pitch = evidence.camera.lens.f_number, evidence.camera.pixel_pitch_um
-    return f"as if the lens worked at f/{stated * ratio:.3g} in place of f/{stated:.3g}, or the pixels' pitch were {pitch / ratio:.3g} um in place of {pitch:.3g}"
+    return (
+        tried.weight - MISSTATED_NATS,
+        f"as if the lens worked at f/{stated * ratio:.3g} in place of f/{stated:.3g}, or the pixels' pitch were {pitch / ratio:.3g} um in place of {pitch:.3g}",
+    )
 
 
 def _without(search: Search, fit: Fit, index: int) -> Fit:

@@ -33,7 +33,7 @@ from sim.effects.base import Effect
 from sim.forward import common_wavelengths, electron_rate, transfer_at, wavelength_shares
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
-from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares
+from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 
 ComplexArray = NDArray[np.complex128]
 
@@ -521,8 +521,8 @@ class _Edges:
             fine = wavelength_shares(self._camera, self._lit, grid, spectral)
             few, _ = gauss_rule(grid, fine.mean(axis=0), WAVELENGTHS)
             share = lagrange_shares(grid, fine, few)
-            between = np.array([np.interp(few, grid, one) for one in np.eye(len(grid))]).T
-            self._spectral[spectral] = few, share, np.tensordot(fine - share @ between, perfect, 1)
+            missed = fine - np.array([linear_shares(few, own, grid) for own in share])
+            self._spectral[spectral] = few, share, np.tensordot(missed, perfect, 1)
         return self._spectral[spectral]
 
     @cached_property

@@ -186,7 +186,8 @@ def _measured(
         warp = _refined(study, whole, target, warp, window, reference, light)
     canvas = _Canvas.of(target, warp, window)
     # one set of frequencies for all channels, so that an effect's transfer is formed once
-    laid = np.sum([np.square(np.abs(canvas.low * _passed(study, canvas, c, light))) for c in camera.channels], axis=0)
+    otfs = [_lens_otf(study, channel, light) for channel in camera.channels]
+    laid = np.sum([np.square(np.abs(canvas.low * canvas.passed(otf, camera.fill_factor))) for otf in otfs], axis=0)
     turned = ndimage.gaussian_filter(np.nan_to_num(whole), TURNED_BLUR_PX)[::-1, ::-1]
     found = []
     for channel in camera.channels:
@@ -365,6 +366,11 @@ class _Canvas:
         """fy (rows, 1) and fx (1, cols / 2 + 1), cy/px."""
         return fft.fftfreq(self.shape[0])[:, None], fft.rfftfreq(self.shape[1])[None, :]
 
+    def passed(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
+        """Transfer of a lens and of the pixel at these frequencies, (rows, cols / 2 + 1)."""
+        fy, fx = self.frequencies
+        return np.asarray(otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, fill_factor))
+
     def picture(self, spectrum: NDArray[np.complex128]) -> FloatArray:
         """Back to the window's pixels."""
         return np.asarray(fft.irfft2(spectrum, self.shape))
@@ -407,14 +413,6 @@ def _lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline
     return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
 
 
-def _passed(study: Study, canvas: _Canvas, channel: str, light: Spectrum | None) -> FloatArray:
-    """The baseline's transfer at a canvas's frequencies, (rows, cols / 2 + 1)."""
-    fy, fx = canvas.frequencies
-    return np.asarray(
-        _lens_otf(study, channel, light)(np.hypot(fx, fy)) * aperture_otf(fx, fy, study.camera.fill_factor)
-    )
-
-
 def _refined(
     study: Study,
     seen: FloatArray,
@@ -427,7 +425,7 @@ def _refined(
     """The registration from the corners, improved by the pattern itself: a step of Gauss and Newton's method."""
     canvas, otf = _Canvas.of(target, warp, window), _lens_otf(study, channel, light)
     fy, fx = canvas.frequencies
-    spectrum = canvas.low * _passed(study, canvas, channel, light)
+    spectrum = canvas.low * canvas.passed(otf, study.camera.fill_factor)
     mask = _pixels(study, canvas, channel, seen)
     picture, across, down = (
         canvas.picture(part * spectrum)[mask] for part in (_below(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
@@ -481,7 +479,7 @@ class _Design:
         fy, fx = canvas.frequencies
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
         otf = _lens_otf(study, channel, light)
-        passed = _passed(study, canvas, channel, light)
+        passed = canvas.passed(otf, camera.fill_factor)
         spectrum = canvas.low * passed
         mask = _pixels(study, canvas, channel, seen)
         power = np.abs(spectrum) ** 2
