@@ -55,8 +55,8 @@ class CurveSlopes:
         self._curve = photons * np.array([curve[c] for _, c, *_ in items])
         # of a sensitivity that is the same at all wavelengths
         self._level = photons * np.array([[LEAK_STD * max(camera.quantum_efficiency[c].value)] for _, c, *_ in items])
-        self._all_radiance = np.array([self.radiance[path] for path, *_ in items])
-        self._weight = self._all_radiance * self._curve
+        radiance = np.array([self.radiance[path] for path, *_ in items])
+        self._weight, self._all_level = radiance * self._curve, radiance * self._level
         self._total = self._weight.sum(1)
         self._rate = np.array(
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
@@ -104,23 +104,23 @@ class CurveSlopes:
         """Rates (n,) and the modes' shares in them (n, modes)."""
         spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
         if spectral not in self._kept:
-            weight, level = self._weight, self._all_radiance * self._level
+            weight, level = self._weight, self._all_level
             if any(type(e).radiance is not Effect.radiance for e in spectral):
                 lit = dict(self.radiance)
                 for effect in spectral:
                     lit = {path: effect.radiance(self.wavelength, value, self.kind) for path, value in lit.items()}
                 changed = np.array([lit[path] for path, *_ in self.items])
                 weight, level = changed * self._curve, changed * self._level
+            through = np.ones_like(self.wavelength)
             for effect in spectral:
-                through = effect.transmittance(self.wavelength, np.asarray(0.0))
-                weight, level = weight * through, level * through
-            total = weight.sum(1)
+                through = through * effect.transmittance(self.wavelength, np.asarray(0.0))
+            total = weight @ through
             rate = self._rate * total / np.maximum(self._total, 1e-300)
-            table = np.column_stack([weight @ self._modes.T, (weight * self._between).sum(1)])
+            table = np.column_stack([weight @ (self._modes * through).T, (weight * self._between) @ through])
             shares = table / np.maximum(total, 1e-300)[:, None]
             if len(self._kept) > 500:
                 self._kept.clear()
-            leak = level.sum(1) * np.array([self._per_weight[c] for _, c, *_ in self.items])
+            leak = level @ through * np.array([self._per_weight[c] for _, c, *_ in self.items])
             self._kept[spectral] = rate, np.column_stack([rate[:, None] * shares, leak])
         return self._kept[spectral]
 

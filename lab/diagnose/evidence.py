@@ -82,11 +82,13 @@ class Gaussian:
 
     @cached_property
     def _ties(self) -> tuple[FloatArray, FloatArray]:
-        """Left singular vectors and values of D^-1/2 F."""
-        if self.free.shape[1] == 0:
-            return np.zeros((len(self.mean), 0)), np.zeros(0)
-        u, s, _ = np.linalg.svd(self._split(self.free), full_matrices=False)
-        return u, s
+        """Left singular vectors and values of D^-1/2 F, from the few by few products of its columns: what is lost beside the largest
+        value is far below 1, next to which only they count."""
+        split = self._split(self.free)
+        square, v = eigh(split.T @ split) if split.shape[1] else (np.zeros(0), np.zeros((0, 0)))
+        counts = square > 1e-12 + 1e-15 * float(square.max(initial=0.0))
+        s = np.sqrt(square[counts])
+        return (split @ v[:, counts]) / s, s
 
     def _split(self, table: FloatArray) -> FloatArray:
         """D^-1/2 times vectors, block by block; blocks on which they are nil cost nothing."""

@@ -41,11 +41,13 @@ def residual_pictures(
             continue
         capture = max(captures, key=lambda c: (c.id in held_out, _usable(recordings, c, improved.camera)))
         try:
-            before, after = (
-                _residual(recordings, replay, capture, effects) for effects in (evidence.always, improved.effects)
+            before, *changed = (
+                _residual(recordings, replay, capture, effects)
+                for effects in dict.fromkeys((evidence.always, tuple(improved.effects)))
             )
         except (NotDetermined, ValueError):
             continue
+        after = changed[0] if changed else before
         yield ResidualPicture(
             side=side, kind=kind, capture=capture.id, held_out=capture.id in held_out, before=_rows(before), after=_rows(after)
         )  # fmt: skip

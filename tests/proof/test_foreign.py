@@ -62,6 +62,7 @@ def named(concealed: tuple[Law, ...]) -> set[str]:
     return {str(law.effect) for law in concealed}
 
 
+@pytest.mark.slow  # the fresh cases try the like every day
 @pytest.mark.parametrize(("name", "concealed", "cfa"), CASES, ids=[c[0] for c in CASES])
 def test_one_effect_by_another_law_is_named_alone(name: str, concealed: tuple[Law, ...], cfa: str) -> None:
     result = diagnose(Camera(900, concealed, cfa=cfa).record())

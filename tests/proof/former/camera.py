@@ -362,6 +362,7 @@ class Camera:
         inside = (np.arange(PARTS) + 0.5) / PARTS / FINE - 0.5 / FINE
         middle = (self.rows - 1) / 2, (self.cols - 1) / 2
         coarse = [np.linspace(-2.0, n + 1.0, n // 6 + 4) for n in (self.rows, self.cols)]
+        framed = np.pad(target.astype(float), 1)  # beyond the target there is nothing
         pictures: dict[str, Array] = {}
         for ch in self.qe:
             if pictures and not self._moves:
@@ -378,9 +379,13 @@ class Camera:
                     )
                 i = np.floor((down * np.cos(t) - right * np.sin(t)) / cell_px + target.shape[0] / 2).astype(np.int32)
                 j = np.floor((down * np.sin(t) + right * np.cos(t)) / cell_px + target.shape[1] / 2).astype(np.int32)
-                ok = (i >= 0) & (i < target.shape[0]) & (j >= 0) & (j < target.shape[1])
-                cells = target[np.clip(i, 0, target.shape[0] - 1), np.clip(j, 0, target.shape[1] - 1)]
-                fine += np.where(ok, cells, 0.0) / PARTS**2
+                np.clip(i, -1, target.shape[0], out=i)
+                np.clip(j, -1, target.shape[1], out=j)
+                i += 1
+                j += 1
+                i *= framed.shape[1]
+                i += j
+                fine += framed.take(i) / PARTS**2
             for law in self.laws:
                 fine = law.screen(fine, r, c)
             pictures[ch] = fine
@@ -617,7 +622,8 @@ def poisson(mean: Array, z: Array) -> Array:
         m = mean[small]
         # pdtrik gives the k at which the distribution reaches p, between the integers; none below P(0)
         p = np.clip(ndtr(z[small]), 1e-12, 1 - 1e-12)
-        none = (m <= 0) | (p <= np.exp(-m))
-        k = pdtrik(np.where(none, 0.999, p), np.where(none, 1.0, m))
-        out[small] = np.where(none, 0.0, np.ceil(k - 1e-9))
+        some = (m > 0) & (p > np.exp(-m))
+        k = np.zeros_like(m)
+        k[some] = np.ceil(pdtrik(p[some], m[some]) - 1e-9)
+        out[small] = k
     return np.maximum(out, 0.0)
