@@ -622,6 +622,7 @@ class Unexplained(Frozen):
     chi2_after: float
     n: int
     correction: str = ""  # what stands for it in the improved model, in words
+    check: str = ""  # what is stated of the camera that the recordings speak against, as a sentence
 
 
 class HeldOut(Frozen):

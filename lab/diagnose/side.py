@@ -204,7 +204,6 @@ def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]
             else ""
         )
         remarked = max((c for c in near if c.remark), key=lambda c: c.gain, default=None)
-        family += f"; it looks {remarked.remark}: check what is stated of both" if remarked is not None else ""
         found.append(
             Unexplained(
                 side=side,
@@ -219,6 +218,7 @@ def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]
                 chi2_after=after,
                 n=len(index),
                 correction=correction.said,
+                check=f"It looks {remarked.remark}: check what is stated of both." if remarked is not None else "",
             )
         )
     return found

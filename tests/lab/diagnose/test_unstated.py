@@ -142,7 +142,7 @@ def test_what_is_stated_wrongly_is_no_blur(key: str, factor: float) -> None:
     result = diagnose(_changed(edges, seed=48))
     assert not result.effects
     camera = _whole(48).manifest.cameras["left"]
-    (said,) = {u.shape for u in result.unexplained if u.measurement == "slanted_edge"}
+    (said,) = {u.check for u in result.unexplained if u.measurement == "slanted_edge"}
     found = re.search(r"f/([0-9.]+) in place of .* pitch were ([0-9.]+) um", said)
     assert found is not None, said
     stated = camera.model_copy(update={key: getattr(camera, key) * factor})
