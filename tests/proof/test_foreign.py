@@ -37,6 +37,7 @@ def test_healthy_camera_of_another_image_former_is_believed() -> None:
     assert not result.mismatches
 
 
+@pytest.mark.slow  # the main job and the fresh cases find both every day
 def test_two_effects_of_another_image_former_are_named() -> None:
     """Truth: 1.9 um along rows and columns, cut at 652 nm; wanted within 5 % and 3 nm."""
     result = _shared("foreign_two_effects")

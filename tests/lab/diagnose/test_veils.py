@@ -26,7 +26,7 @@ def test_surroundings_are_what_a_filter_leaves(std_px: float) -> None:
     assert box.mean(std_px) == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("variant", [0, 1, 2])
+@pytest.mark.parametrize("variant", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_glare_has_its_name_whatever_its_reach(variant: int) -> None:
     """Evenly spread; half of it within a halo of a quarter of the frame; fading from the middle."""
     law = concealed.VeilingGlare(2.0, variant, 9)
