@@ -62,7 +62,7 @@ def test_the_command(session: Path, tmp_path: Path, name: str) -> None:
             Row("wall clock, as busy as this machine is", wall, WANTED_S[name], "s", "wanted on two free cores"),
             Row("CPU", cpu, 2.0 * WANTED_S[name], "s", "two cores for as long"),
             Row("of that in the kernel", after.ru_stime - before.ru_stime, None, "s"),
-            Row("memory", memory / 2**30, WANTED_BYTES / 2**30, "GiB", "wanted"),
+            Row("memory of the largest process", memory / 2**30, WANTED_BYTES / 2**30, "GiB", "wanted"),
         ],
     )
     found = json.loads((tmp_path / "found.json").read_text())

@@ -645,6 +645,12 @@ class RecordingSet:
                     self._held -= self._cache.popitem(last=False)[1].nbytes
         return frame
 
+    def let_go(self) -> None:
+        """Free the frames that are kept for being read again."""
+        with self._lock:
+            self._cache.clear()
+            self._held = 0
+
     def spectrum(self, path: str) -> Spectrum:
         """The spectrum that the manifest calls `path`."""
         try:

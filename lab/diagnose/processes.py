@@ -42,6 +42,7 @@ def in_processes(
 ) -> list[SideFindings]:
     """What every side shows, in the order of the sides. `report` is called in the caller's thread; what it raises, or what a
     process raised, ends all of them. Raises InputError where a process was ended from outside."""
+    recordings.let_go()  # every side reads its own, while this process waits
     said: queue.SimpleQueue[tuple[Side, Any]] = queue.SimpleQueue()
     found: dict[Side, SideFindings] = {}
     with contextlib.ExitStack() as stack:

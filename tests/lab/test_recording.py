@@ -137,6 +137,9 @@ def test_frames_are_read_only_and_the_cache_keeps_to_its_size(folder: Path) -> N
     assert small.frame(first) is kept
     small.frame(second)
     assert small.frame(first) is not kept
+    kept = small.frame(first)
+    small.let_go()
+    assert small.frame(first) is not kept
 
 
 def test_a_set_travels_to_another_process(folder: Path) -> None:
