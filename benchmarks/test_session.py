@@ -6,6 +6,7 @@ looked through. Wanted on two cores: 90 s for the fits, 240 s for the diagnosis 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -16,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+import psutil
 import pytest
 
 from benchmarks.table import Row, show
@@ -42,18 +44,31 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def _most_held_bytes(command: list[str]) -> int:
+    """Run a command: the most that it and its processes held together, shared pages counted once, looked at twice a second."""
+    most = 0
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
+        while running.poll() is None:
+            held = 0
+            with contextlib.suppress(psutil.NoSuchProcess):
+                first = psutil.Process(running.pid)
+                for one in (first, *first.children(recursive=True)):
+                    held += one.memory_full_info().pss
+            most = max(most, held)
+            time.sleep(0.5)
+    assert running.returncode == 0
+    return most
+
+
 @pytest.mark.parametrize("name", WANTED_S)
 def test_the_command(session: Path, tmp_path: Path, name: str) -> None:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begun = time.perf_counter()
     command = [sys.executable, "-m", "lab.cli", name, str(session), "--json", str(tmp_path / "found.json")]
-    subprocess.run(command, check=True, capture_output=True)
+    memory = _most_held_bytes(command)
     wall = time.perf_counter() - begun
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    memory = (
-        1024 * after.ru_maxrss
-    )  # the greatest of all processes that have ended: this one's, or a smaller session's making
     captures = json.loads((session / "manifest.json").read_text())["captures"]
     frames = len({capture["frame"] for capture in captures})
     show(
@@ -62,7 +77,7 @@ def test_the_command(session: Path, tmp_path: Path, name: str) -> None:
             Row("wall clock, as busy as this machine is", wall, WANTED_S[name], "s", "wanted on two free cores"),
             Row("CPU", cpu, 2.0 * WANTED_S[name], "s", "two cores for as long"),
             Row("of that in the kernel", after.ru_stime - before.ru_stime, None, "s"),
-            Row("memory of the largest process", memory / 2**30, WANTED_BYTES / 2**30, "GiB", "wanted"),
+            Row("memory of all its processes", memory / 2**30, WANTED_BYTES / 2**30, "GiB", "wanted"),
         ],
     )
     found = json.loads((tmp_path / "found.json").read_text())

@@ -148,9 +148,11 @@ def _summary(
         for m in mismatches
     ]
     lines += [e.statement for e in effects]
-    for u in unexplained:
-        lines.append(f"Not explained: {u.measurement.replace('_', ' ')} of the {u.side} camera, {u.where}: {u.shape}.")
-        lines += [u.check] if u.check else []
+    lines += [
+        f"Not explained: {u.measurement.replace('_', ' ')} of the {u.side} camera, {u.where}: {u.shape}."
+        for u in unexplained
+    ]
+    lines += dict.fromkeys(u.check for u in unexplained if u.check)
     if held_out is not None and held_out.chi2_after < held_out.chi2_before:
         lines.append(
             f"On captures that neither choice nor fit has seen, chi2 falls from {held_out.chi2_before:.0f} to {held_out.chi2_after:.0f} for {held_out.n} numbers."

@@ -35,19 +35,17 @@ def residual_pictures(
     """One of each kind that there is and that tells what stood before the camera; the baseline has the effects that it always had."""
     replay = Replay(recordings, side, improved.camera)
     held_out = set(evidence.captures(True))
+    stages = evidence.always, tuple(improved.effects)  # the same where nothing was found
     for kind in KINDS:
         captures = [c for c in replay.captures if c.kind == kind]
         if not captures:
             continue
         capture = max(captures, key=lambda c: (c.id in held_out, _usable(recordings, c, improved.camera)))
         try:
-            before, *changed = (
-                _residual(recordings, replay, capture, effects)
-                for effects in dict.fromkeys((evidence.always, tuple(improved.effects)))
-            )
+            drawn = {effects: _residual(recordings, replay, capture, effects) for effects in {*stages}}
         except (NotDetermined, ValueError):
             continue
-        after = changed[0] if changed else before
+        before, after = (drawn[effects] for effects in stages)
         yield ResidualPicture(
             side=side, kind=kind, capture=capture.id, held_out=capture.id in held_out, before=_rows(before), after=_rows(after)
         )  # fmt: skip

@@ -218,7 +218,9 @@ def _unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]
                 chi2_after=after,
                 n=len(index),
                 correction=correction.said,
-                check=f"It looks {remarked.remark}: check what is stated of both." if remarked is not None else "",
+                check=f"The {side} camera looks {remarked.remark}: check what is stated of both."
+                if remarked is not None
+                else "",
             )
         )
     return found

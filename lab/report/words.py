@@ -61,7 +61,7 @@ def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: Diag
         if diagnosis.unexplained:
             places = sorted({f"{item.measurement.replace('_', ' ')} ({item.side})" for item in diagnosis.unexplained})
             yield f"Without a name so far: {', '.join(places)}."
-            yield from (f"{u.side.capitalize()} camera: {u.check}" for u in diagnosis.unexplained if u.check)
+            yield from dict.fromkeys(u.check for u in diagnosis.unexplained if u.check)
         named = {side for effect in diagnosis.effects for side in effect.sides}
         clean = [
             side for side in fit.cameras if side not in named and not any(m.side == side for m in diagnosis.mismatches)

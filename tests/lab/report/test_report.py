@@ -148,15 +148,16 @@ def test_mismatch_without_a_name(small_set: Callable[..., RecordingSet], made_up
     fit, validation, diagnosis = made_up()
     nameless = Unexplained(
         side="left", measurement="flat", axis="time", where="0..10 s", shape="a slow fall", significance_sigma=9.1,
-        chi2_before=300.0, chi2_after=98.0, n=100, check="It looks as if the pitch were 3 um: check it.",
+        chi2_before=300.0, chi2_after=98.0, n=100, check="The left camera looks as if the pitch were 3 um: check it.",
     )  # fmt: skip
-    changed = diagnosis.model_copy(update={"verdict": "unexplained", "effects": (), "unexplained": (nameless,)})
+    changed = diagnosis.model_copy(
+        update={"verdict": "unexplained", "effects": (), "unexplained": (nameless, nameless)}
+    )
     page = Page(render_report(recordings, fit, validation, changed, provenance_of(recordings)))
     assert "no effect in the library accounts for" in page.text
     assert "a slow fall" in page.text
-    assert page.text.index("Left camera: It looks as if the pitch were 3 um: check it.") < page.text.index(
-        "a slow fall"
-    )
+    assert page.text.count(nameless.check) == 1  # whatever the number of measurements that say so
+    assert page.text.index(nameless.check) < page.text.index("a slow fall")
 
 
 def test_text_from_outside_stays_text(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:

@@ -342,13 +342,9 @@ class Camera:
             )
             fine = np.zeros((self.rows * FINE, self.cols * FINE))
             for y, x in itertools.product(inside, inside):
-                i = np.floor(down(fine_row + y, fine_col + x) + texture.shape[0] / 2).astype(np.int32)
-                j = np.floor(across(fine_row + y, fine_col + x) + texture.shape[1] / 2).astype(np.int32)
-                ok = (i >= 0) & (i < texture.shape[0]) & (j >= 0) & (j < texture.shape[1])
-                fine += (
-                    np.where(ok, texture[np.clip(i, 0, texture.shape[0] - 1), np.clip(j, 0, texture.shape[1] - 1)], 0.0)
-                    / 4
-                )
+                i = down(fine_row + y, fine_col + x) + texture.shape[0] / 2
+                j = across(fine_row + y, fine_col + x) + texture.shape[1] / 2
+                fine += squares_at(texture, i, j) / 4
             pictures[ch] = fine
         filtered = self._filtered(pictures, radiance, FINE)
         return {ch: self.rate(radiance, ch) * (0.04 + 0.86 * image) for ch, image in filtered.items()}
@@ -362,7 +358,6 @@ class Camera:
         inside = (np.arange(PARTS) + 0.5) / PARTS / FINE - 0.5 / FINE
         middle = (self.rows - 1) / 2, (self.cols - 1) / 2
         coarse = [np.linspace(-2.0, n + 1.0, n // 6 + 4) for n in (self.rows, self.cols)]
-        framed = np.pad(target.astype(float), 1)  # beyond the target there is nothing
         pictures: dict[str, Array] = {}
         for ch in self.qe:
             if pictures and not self._moves:
@@ -377,15 +372,9 @@ class Camera:
                     down, right = (
                         RectBivariateSpline(*coarse, m)(*at) - o for m, o in zip(sources, middle, strict=True)
                     )
-                i = np.floor((down * np.cos(t) - right * np.sin(t)) / cell_px + target.shape[0] / 2).astype(np.int32)
-                j = np.floor((down * np.sin(t) + right * np.cos(t)) / cell_px + target.shape[1] / 2).astype(np.int32)
-                np.clip(i, -1, target.shape[0], out=i)
-                np.clip(j, -1, target.shape[1], out=j)
-                i += 1
-                j += 1
-                i *= framed.shape[1]
-                i += j
-                fine += framed.take(i) / PARTS**2
+                i = (down * np.cos(t) - right * np.sin(t)) / cell_px + target.shape[0] / 2
+                j = (down * np.sin(t) + right * np.cos(t)) / cell_px + target.shape[1] / 2
+                fine += squares_at(target, i, j) / PARTS**2
             for law in self.laws:
                 fine = law.screen(fine, r, c)
             pictures[ch] = fine
@@ -611,6 +600,16 @@ def pair(left: Camera, right: Camera, plan: Plan, name: str = "pair") -> Recordi
     return RecordingSet(
         Manifest.model_validate(whole), left.frames | right.frames, left.spectra | right.spectra, targets, source=name
     )
+
+
+def squares_at(picture: Array, row: Array, col: Array) -> Array:
+    """The squares of a picture in which places lie, its first corner at (0, 0); nothing beyond it."""
+    framed = np.pad(picture.astype(float), 1)
+    i, j = (
+        np.clip(np.floor(at).astype(np.int32), -1, count) + 1
+        for at, count in zip((row, col), picture.shape, strict=True)
+    )
+    return np.asarray(framed[i, j])
 
 
 def poisson(mean: Array, z: Array) -> Array:
