@@ -8,11 +8,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from benchmarks.table import Row, show
 from lab.camera_file import default_camera
+from mocks.bench import Bench
 from sim.sensor.electrons import FixedPattern, dn_moments, sample_from
 
-#: CPU time that one frame may take.
+#: CPU time that one frame may take, and one of the mock bench's.
 LIMIT_MS = 60.0
+MOCK_LIMIT_MS = 40.0
 
 
 def _cpu_ms(work: Callable[[], object], repeats: int = 7) -> float:
@@ -49,3 +52,10 @@ def test_a_noisy_frame() -> None:
         print(f"{name:>10} {frame:8.1f} {bare:14.1f} {bare + normal:9.1f} {both:8.1f}")
         worst = max(worst, frame)
     print(f"worst {worst:.1f} ms, asked for {LIMIT_MS:g} ms")
+
+
+@pytest.mark.slow
+def test_a_frame_of_the_mock_bench() -> None:
+    bench = Bench()
+    frame = _cpu_ms(lambda: bench.expose("left", 0.001))
+    show("the mock bench", [Row("one frame of 640 x 480 px", frame, MOCK_LIMIT_MS, "CPU ms", "limit")])

@@ -148,8 +148,8 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def _do(self, statement: str) -> None:
         """A command: its echo, and its status byte once it is done."""
-        self._say(statement)
         try:
+            self._say(statement)
             status = self._line(statement, self.move_timeout_s)
         except Interrupted:
             self._transport.resume()

@@ -61,7 +61,7 @@ class ScriptedPeer:
     def close(self) -> None:
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
-        self._thread.join(5)
+        self._thread.join(30)
 
 
 @pytest.fixture
@@ -89,11 +89,11 @@ def served() -> Iterator[Callable[..., str]]:
         options = {"faults": parse_faults(faults), "announce": lambda address: listening.set()}
         threads.append(threading.Thread(target=serve, args=(grammar, endpoint, stop), kwargs=options))
         threads[-1].start()
-        assert listening.wait(5)
+        assert listening.wait(30)
         return endpoint.address
 
     yield start
     stop.set()
     for thread in threads:
-        thread.join(5)
+        thread.join(30)
         assert not thread.is_alive()

@@ -100,7 +100,7 @@ def test_a_light_that_cannot_be_is_refused_in_one_line(tmp_path: Path, text: str
     assert says in line
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.text(alphabet="wavelength_nm,radiance_sr2\n0123456789.-+eE \r\"'\x00\ufeff", max_size=80), st.booleans())
 def test_any_text_is_a_light_or_an_input_error(text: str, headed: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -265,7 +265,7 @@ def test_an_npz_cube_that_cannot_be_is_refused_in_one_line(
     assert says in line
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(st.integers(0, 10_000), st.integers(0, 255), st.integers(0, 10_000))
 def test_a_damaged_npz_is_a_cube_or_an_input_error(at: int, byte: int, length: int) -> None:
     buffer = io.BytesIO()
@@ -281,7 +281,7 @@ def test_a_damaged_npz_is_a_cube_or_an_input_error(at: int, byte: int, length: i
             assert "\n" not in str(error)
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(st.data())
 def test_a_damaged_envi_header_is_a_cube_or_an_input_error(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -38,10 +38,10 @@ def served() -> Iterator[Callable[[Grammar], str]]:
         announce = {"announce": lambda address: listening.set()}
         threads.append(threading.Thread(target=serve, args=(grammar, endpoint, stop), kwargs=announce))
         threads[-1].start()
-        assert listening.wait(5)
+        assert listening.wait(30)
         return endpoint.address
 
     yield start
     stop.set()
     for thread in threads:
-        thread.join(5)
+        thread.join(30)

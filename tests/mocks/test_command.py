@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -55,7 +54,7 @@ def test_a_mock_alone_answers_at_its_link_and_leaves_nothing_behind(start: Start
     link = tmp_path / "radiometer"
     process = start("mock", "specbos1211", "--link", str(link))
     assert lines_until_ready(process) == [f"ready {link}"]
-    with serial.Serial(str(link), 921600, timeout=5) as port:
+    with serial.Serial(str(link), 921600, timeout=30) as port:
         port.write(b"*idn?\r")
         assert port.read_until(b"\r") == b"JETI_SB1211\r"
         port.write(b"*init\r")
@@ -64,20 +63,22 @@ def test_a_mock_alone_answers_at_its_link_and_leaves_nothing_behind(start: Start
         x, y, z = (float(port.read_until(b"\r").split()[1]) for _ in range(3))
     assert x > y > z > 0  # a tungsten lamp
     process.send_signal(signal.SIGTERM)
-    assert process.wait(5) == 0
+    assert process.wait(30) == 0
     assert not link.is_symlink()
 
 
 def test_a_mock_alone_answers_on_a_tcp_port(start: Start) -> None:
     process = start("mock", "cornerstone260", "--tcp", "127.0.0.1:0", "--fault", "half@2")
     (ready,) = lines_until_ready(process)
-    with serial.serial_for_url(ready.removeprefix("ready "), timeout=0.3) as port:
+    with serial.serial_for_url(ready.removeprefix("ready "), timeout=30) as port:
         port.write(b"WAVE?\r\n")
-        assert port.read(100) == b"WAVE?\r\n0\r\n"
+        assert port.read(10) == b"WAVE?\r\n0\r\n"
         port.write(b"GRAT?\n")
-        assert port.read(100) == b"GRAT?\n1,1200"
+        assert port.read(12) == b"GRAT?\n1,1200"
+        port.timeout = 0.3
+        assert port.read(1) == b""
     process.send_signal(signal.SIGINT)
-    assert process.wait(5) == 0
+    assert process.wait(30) == 0
 
 
 @pytest.mark.parametrize(
@@ -147,11 +148,9 @@ def test_the_bench_ends_with_its_parent(start: Start) -> None:
     assert re.fullmatch(r"monochromator cornerstone260 socket://127\.0\.0\.1:\d+", lines[0])
     assert process.poll() is None
     assert process.stdin is not None
-    begun = time.monotonic()
     process.stdin.close()
     process.stdin = None
     assert process.wait(10) == 0
-    assert time.monotonic() - begun < 5
 
 
 KEYS = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)

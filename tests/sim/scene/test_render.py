@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim import forward
@@ -51,7 +51,6 @@ def test_half_plane_of_a_line_along_an_axis_is_linear() -> None:
     np.testing.assert_allclose(half_plane(d, 1.0, 1.0) + half_plane(-d, 1.0, 1.0), 1.0)
 
 
-@settings(deadline=None)  # the first one loads or compiles the loops
 @given(
     st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=4, max_size=4),
     st.floats(0, 6.28),
@@ -210,7 +209,6 @@ def test_area_drawn_coarse_is_the_mean_of_area_drawn_fine(scene: Scene) -> None:
 
 
 @given(st.floats(-720, 720), st.floats(-40, 40))
-@settings(deadline=None)
 def test_an_edge_of_any_angle_cuts_squares_exactly(angle_deg: float, offset_px: float) -> None:
     grid = Grid(20, 24, 2, 3)
     drawn = covered(edge(angle_deg, offset_px), grid)
