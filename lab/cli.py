@@ -37,7 +37,6 @@ from lab.errors import DeviceError, InputError, NotDetermined
 from lab.fit import Progress as Advance
 from lab.fit import fit_recording_set
 from lab.recording import RecordingError, RecordingSet
-from lab.report.figures import by_side, measured, stereo_figures
 from lab.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
 from sim.camera import Side
 
@@ -261,6 +260,8 @@ def _print_skipped(skipped: tuple[Skipped, ...]) -> None:
 
 
 def _print_fit(recordings: RecordingSet, fit: FitResult) -> None:
+    from lab.report.figures import by_side, stereo_figures
+
     sides = list(fit.cameras)
     table = Table(box=None, pad_edge=False)
     table.add_column("quantity")
@@ -313,6 +314,8 @@ def _print_diagnosis(diagnosis: DiagnosisResult) -> None:
 
 
 def _print_comparison(comparison: ComparisonResult, every: bool) -> None:
+    from lab.report.figures import measured
+
     shown = [row for row in comparison.changes if every or row.changed]
     table = Table(box=None, pad_edge=False)
     for heading in ("quantity", "side", "where", "A", "B", "B - A", "sigma", "changed"):

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 from scipy.spatial.transform import Rotation
 
 from lab.fit.pinhole import COUNT, NAMES, intrinsics_of_fit, project, unproject
@@ -98,7 +98,7 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
 
 
 def _sigma(p_value: float) -> float:
-    return float(stats.norm.isf(max(p_value, 1e-300) / 2.0))
+    return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
 
 
 def _sidak_part(rate: float, number: int) -> float:
@@ -195,7 +195,7 @@ def _rows(a: _Numbers, b: _Numbers, side: Side | None) -> Iterator[Change]:
     if not len(known):
         return
     score = np.abs(value_b - value_a)[known] / std[known]
-    chances = 2.0 * stats.norm.sf(score)
+    chances = 2.0 * special.ndtr(-score)
     several = len(known) > FEW
     places = [int(np.argmax(score))] if several else range(len(known))
     for at in places:
@@ -316,7 +316,7 @@ def _turned(a: StereoFit, b: StereoFit) -> Iterator[Change]:
             b_std=std_b,
             difference=float(turn[k]),
             difference_std=std,
-            significance_sigma=_sigma(2.0 * float(stats.norm.sf(abs(turn[k]) / std))),
+            significance_sigma=_sigma(2.0 * float(special.ndtr(-abs(turn[k]) / std))),
             changed=False,
         )
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from lab.camera_file import CameraFile
 from lab.diagnose.evidence import chi2
@@ -74,7 +74,7 @@ def _check(
             "n": len(residual),
             "chi2": value,
             "rms_relative_percent": 100.0 * float(np.sqrt(np.mean(relative**2))),
-            "passed": bool(value <= stats.chi2.ppf(PASSED_QUANTILE, len(residual))),
+            "passed": bool(value <= special.chdtri(len(residual), 1.0 - PASSED_QUANTILE)),
         }
     )
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
-from scipy.signal import convolve2d
 
 from sim.camera import CameraModel
 from sim.effects.aberration import Aberration
@@ -507,12 +506,12 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
 
 def processing_kernel(camera: CameraModel, effects: Sequence[Effect]) -> FloatArray | None:
     """Kernel of all filters that the effects run over each colour's plane, one after the other; None for none."""
-    whole: FloatArray | None = None
-    for effect in effects:
-        kernel = effect.processing(camera)
-        if kernel is not None:
-            whole = kernel if whole is None else np.asarray(convolve2d(whole, kernel))
-    return whole
+    kernels = [kernel for effect in effects if (kernel := effect.processing(camera)) is not None]
+    if len(kernels) > 1:
+        from scipy.signal import convolve2d  # here: the library takes a while to load
+
+        return np.asarray(reduce(convolve2d, kernels))
+    return kernels[0] if kernels else None
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------

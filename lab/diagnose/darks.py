@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage, stats
+from scipy import fft, ndimage, special
 from scipy.special import betainc, digamma, ndtr, polygamma
 
 from lab.diagnose.summaries import (
@@ -845,9 +845,9 @@ def _rooted(counts: FloatArray) -> FloatArray:
 def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
     """Chance (1 where many are expected), and what the expected counts themselves are uncertain by."""
     number = np.arange(60.0)
-    share = stats.poisson.pmf(number, np.minimum(expected, 20.0)[:, None])
-    mean = share @ _rooted(number)
-    chance = share @ np.square(_rooted(number)) - mean**2
+    mean = np.minimum(expected, 20.0)[:, None]
+    share = np.exp(special.xlogy(number, mean) - mean - special.gammaln(number + 1.0))
+    chance = share @ np.square(_rooted(number)) - np.square(share @ _rooted(number))
     return np.diag(chance + COUNT_STD**2 + np.square(_rooted(expected + uncertain) - _rooted(expected)))
 
 
@@ -999,14 +999,14 @@ def blinking_block(study: Study) -> Block:
 
 
 def _blink_edges(freedom: int) -> FloatArray:
-    return np.asarray(float(stats.chi2.isf(BLINK_CHANCE, freedom)) * np.array(BLINK_EDGES))
+    return np.asarray(float(special.chdtri(freedom, BLINK_CHANCE)) * np.array(BLINK_EDGES))
 
 
 def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray) -> FloatArray:
     """Probability that a chi-squared variable is above the edges, (n, edges): exact where it is central, else its cube root is
     taken as normal (Abdel-Aty 1954)."""
     if not np.any(noncentral):
-        return np.asarray(stats.chi2.sf(edges[None, :], freedom[:, None]))
+        return np.asarray(special.chdtrc(freedom[:, None], edges[None, :]))
     a = (freedom + noncentral)[:, None]
     b = (noncentral / (freedom + noncentral))[:, None]
     variance = 2.0 * (1.0 + b) / (9.0 * a)
@@ -1022,7 +1022,7 @@ def _hot_above(study: Study, part: Sequence[Frames], out: bool, rate: FloatArray
     mean, variance = factor @ count, 2.0 * np.square(factor) @ count
     scale = variance / (2.0 * mean)
     freedom = mean / scale
-    return np.asarray(stats.chi2.sf(edges[None, :] / scale[:, None], freedom[:, None]))
+    return np.asarray(special.chdtrc(freedom[:, None], edges[None, :] / scale[:, None]))
 
 
 def _jump_above(

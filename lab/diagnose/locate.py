@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from lab.diagnose.evidence import Evidence, Gaussian, chi2
 from lab.diagnose.summaries import Block
@@ -36,7 +36,7 @@ class Slice:
     def significance_sigma(self) -> float:
         """Of a normal distribution, one-sided."""
         if self.log_probability > -650.0:
-            return float(max(stats.norm.isf(np.exp(self.log_probability)), 0.0))
+            return float(max(-special.ndtri(np.exp(self.log_probability)), 0.0))
         twice = -2.0 * self.log_probability
         return float(np.sqrt(twice - np.log(2.0 * np.pi * twice)))  # of the tail exp(-z^2 / 2) / (z sqrt(2 pi))
 
@@ -62,9 +62,9 @@ def look(evidence: Evidence, model: Gaussian) -> list[Slice]:
 
 def _log_tail(value: float, n: int) -> float:
     """Logarithm of the probability of a larger chi2 with n degrees of freedom; far out by the tail's leading term."""
-    exact = float(stats.chi2.logsf(value, n))
-    if np.isfinite(exact):
-        return exact
+    exact = float(special.chdtrc(n, value))
+    if exact > 0.0:
+        return float(np.log(exact))
     return float(-0.5 * value + (0.5 * n - 1.0) * np.log(0.5 * value) - special.gammaln(0.5 * n))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from lab.diagnose.decide import Verdict
 from lab.diagnose.evidence import chi2, conditional
@@ -83,7 +83,9 @@ def measurement_fits(side: Side, verdict: Verdict) -> Iterator[MeasurementFit]:
 
 def detectable(threshold: float, rate: float = SEEN_RATE) -> float:
     """Non-centrality of an effect whose score exceeds the threshold with that probability: P(chi2_1(lambda) > threshold) = rate."""
-    return float(optimize.brentq(lambda x: stats.ncx2.sf(threshold, 1, x) - rate, 1e-6, 10.0 * threshold + 100.0))
+    return float(
+        optimize.brentq(lambda x: 1.0 - special.chndtr(threshold, 1, x) - rate, 1e-6, 10.0 * threshold + 100.0)
+    )
 
 
 def visibility(side: Side, verdict: Verdict) -> Iterator[Visibility]:
@@ -114,7 +116,7 @@ def visibility(side: Side, verdict: Verdict) -> Iterator[Visibility]:
             smallest=_smallest(library()[name], members, need),
             nearest=nearest,
             cosine=cosine,
-            told_apart=float(stats.norm.cdf(0.5 * np.sqrt(need * (1.0 - cosine**2)))),
+            told_apart=float(special.ndtr(0.5 * np.sqrt(need * (1.0 - cosine**2)))),
         )
 
 

@@ -16,7 +16,7 @@ from itertools import combinations
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from lab.diagnose.curves import CURVE_ROUGH_STD, freed_curve
 from lab.diagnose.decide import Candidate, Verdict
@@ -111,7 +111,7 @@ def proposals(recordings: RecordingSet, side: Side, verdict: Verdict) -> tuple[P
                 capture=design.words,
                 rivals=nearest,
                 distance=distance,
-                told_apart=float(norm.cdf(np.sqrt(0.5 * distance))),
+                told_apart=float(ndtr(np.sqrt(0.5 * distance))),
             ),
             design.plan,
         )
@@ -185,7 +185,7 @@ def _means(h: Hypothesis, light: Spectrum, kind: str, exposure_s: float, elapsed
     """Mean electrons of uniform light by channel, after the read-out."""
     rates = {c: electron_rate(h.camera, c, light, h.effects, kind) for c in h.camera.channels}
     collected = collected_electrons(
-        h.camera, rates, exposure_s, h.effects, field=Field.of(h.camera), elapsed_s=elapsed_s
+        h.camera, rates, exposure_s, h.effects, field=Field.of(h.camera).under(h.camera, h.effects), elapsed_s=elapsed_s
     )
     gain = h.camera.conversion_gain_dn_per_e
     return {c: value / gain for c, value in mean_dn(h.camera, collected, h.effects).items()}

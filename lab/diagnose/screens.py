@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage, stats
+from scipy import fft, ndimage, special
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of
@@ -833,7 +833,7 @@ class _Line:
     def normal(self, power: float) -> float:
         """The standard normal number that is as rare as the largest of `places` exponential numbers being `power`."""
         rare = np.log(self.places) - power  # logarithm of the probability, far out
-        normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else float(stats.norm.isf(-np.expm1(-np.exp(rare))))
+        normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else -float(special.ndtri(-np.expm1(-np.exp(rare))))
         # beyond any doubt what matters is the order of magnitude
         return normal if normal < CERTAIN else CERTAIN * (1.0 + float(np.log(normal / CERTAIN)))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from sim.spectrum import FloatArray
 
@@ -44,7 +44,7 @@ def least_squares(basis: FloatArray, values: FloatArray, std: FloatArray) -> tup
 
 def inflation(chi2: float, freedom: int, p: float = 0.01) -> float:
     """Factor on a covariance: chi2 per degree of freedom where chance explains it with less than `p`, else 1."""
-    if freedom < 1 or stats.chi2.sf(chi2, freedom) > p:
+    if freedom < 1 or special.chdtrc(freedom, chi2) > p:
         return 1.0
     return max(1.0, chi2 / freedom)
 
@@ -74,7 +74,7 @@ def linearity(light: FloatArray, signal: FloatArray, signal_std: FloatArray) -> 
     std = 100.0 * signal_std / model
     error = np.abs(deviation)
     z = error / np.maximum(std, 1e-12)
-    folded = std * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z**2) + error * (1.0 - 2.0 * stats.norm.cdf(-z))
+    folded = std * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z**2) + error * (1.0 - 2.0 * special.ndtr(-z))
     scatter = chi2 / max(len(light) - 2, 1)
     return Linearity(
         float(solution[0]),

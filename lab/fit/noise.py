@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from lab.errors import NotDetermined
 from lab.fit.emva1288 import Recorded
@@ -194,7 +194,7 @@ class _Curve:
 
     @property
     def likely(self) -> bool:
-        return self.freedom < 1 or bool(stats.chi2.sf(self.chi2, self.freedom) > SCATTER_CHANCE)
+        return self.freedom < 1 or bool(special.chdtrc(self.freedom, self.chi2) > SCATTER_CHANCE)
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ class _Points:
         for index, group in enumerate((~light, light)):
             freedom = float(np.sum(1.0 - curve.leverage[group])) if group.any() else 0.0
             chi2 = float(np.sum((curve.residual[group] / curve.std[group]) ** 2))
-            active[index] = freedom >= 1.0 and bool(stats.chi2.sf(chi2, freedom) < SCATTER_CHANCE)
+            active[index] = freedom >= 1.0 and bool(special.chdtrc(freedom, chi2) < SCATTER_CHANCE)
         for _ in range(40):
             before = list(squares)
             for index, group in enumerate((~light, light)):
@@ -871,7 +871,7 @@ class _Evaluation:
             freedom += len(frames) - 1
         if freedom == 0:
             return 0.0, 0.0, 0.0, 1.0
-        chance = float(stats.chi2.sf(chi2, freedom))
+        chance = float(special.chdtrc(freedom, chi2))
         if chance > 1e-4 or relative <= 0:
             return 0.0, float(np.sqrt(square / freedom)), float(np.sqrt(expected / freedom)), chance
         return (
@@ -1170,7 +1170,7 @@ class _Evaluation:
         if len(values) < 2:
             return
         mean = np.average(values, weights=weights)
-        if stats.chi2.sf(float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2)), len(values) - 1) < 1e-4:
+        if special.chdtrc(len(values) - 1, float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2))) < 1e-4:
             listed = ", ".join(f"{name} {value:.4g}" for name, value in zip(self.names, values, strict=False))
             self._remark(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")
 

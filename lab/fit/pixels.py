@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from lab.errors import NotDetermined
 from lab.fit.levels import QUANTISATION_DN2, BoolArray, Float32Array, Stack, defective_pixels, shading
@@ -112,7 +112,7 @@ def read_noise_distribution(dark: DarkPixels, gain_dn_per_e: float) -> ReadNoise
     if mean < 0.24:
         return None
     # Tails would decide alone otherwise: noisy pixels are counted, not averaged.
-    limit = mean * stats.chi2.isf(NOISY_CHANCE / count, nu) / nu
+    limit = mean * special.chdtri(nu, NOISY_CHANCE / count) / nu
     usual = variance[variance <= limit]
     middle = float(usual.mean())
     rest = (usual / middle - 1.0) ** 2

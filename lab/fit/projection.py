@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 from scipy.spatial.transform import Rotation
 
 from lab.fit.pinhole import cross_matrices, intrinsics_of_fit, project, project_slopes, unproject
@@ -62,12 +62,12 @@ class Difference:
         if not open_ones.any():
             return 1.0 if self.rms_px < 10 * FLOOR_PX else 0.0
         along = directions[:, open_ones].T @ self.vectors_px.ravel()
-        return float(stats.chi2.sf(np.sum((along / spread[open_ones]) ** 2), int(open_ones.sum())))
+        return float(special.chdtrc(int(open_ones.sum()), np.sum((along / spread[open_ones]) ** 2)))
 
     @property
     def significance_sigma(self) -> float:
         """`p_value` as that many standard deviations of a normal distribution, two-sided."""
-        return float(stats.norm.isf(max(self.p_value, 1e-300) / 2.0))
+        return -float(special.ndtri(max(self.p_value, 1e-300) / 2.0))
 
 
 def grid(shape: tuple[int, int]) -> tuple[Array, Array]:

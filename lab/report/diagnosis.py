@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from lab.diagnose.looked_at import detectable
 from lab.report.charts import Figure, axis, layout
@@ -42,7 +42,7 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
 
 def mood(chi2: float, n: int) -> str:
     """The class of a chi2's cell: marked where noise alone leaves less in 99.9 % of all cases."""
-    return "open" if n and chi2 > stats.chi2.ppf(MARKED_QUANTILE, n) else ""
+    return "open" if n and chi2 > special.chdtri(n, 1.0 - MARKED_QUANTILE) else ""
 
 
 def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) -> list[ResidualCurve]:

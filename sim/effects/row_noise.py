@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect, Lines, Stage
@@ -93,5 +92,7 @@ def _alike(white: FloatArray, correlation: float) -> FloatArray:
     """White noise (rows, 1) of variance 1 as a stationary process of first order, of variance 1."""
     if correlation == 0.0:
         return white
+    from scipy.signal import lfilter  # here: the library takes a while to load
+
     fresh = np.sqrt(1.0 - correlation**2)
     return np.asarray(lfilter([fresh], [1.0, -correlation], np.vstack([white[:1] / fresh, white[1:]]), axis=0))

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from sim.spectrum import FloatArray
 
@@ -40,13 +40,13 @@ def draw_poisson(mean: Float32Array, rng: np.random.Generator) -> Float32Array:
 def _tables() -> tuple[FloatArray, NDArray[np.int64]]:
     """Distribution functions of Poisson variables of means 0..9, (10, counts), and for each 1/256 of a probability the first
     count whose distribution function lies above it, (10, 256)."""
-    share = stats.poisson(np.arange(FROM_NORMAL)[:, None]).cdf(np.arange(_COUNTS))
+    share = special.pdtr(np.arange(_COUNTS), np.arange(float(FROM_NORMAL))[:, None])
     share[:, -1] = 1.0
     guide = np.stack([np.searchsorted(row, np.arange(_GUIDE) / _GUIDE, side="right") for row in share])
     return share, guide
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill(
     mean: Float32Array, drawn: Float32Array, rng: np.random.Generator, share: FloatArray, guide: NDArray[np.int64]
 ) -> None:
