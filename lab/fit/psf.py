@@ -20,11 +20,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, overload
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, ndimage, stats
+from scipy import linalg, ndimage, special
 from scipy.interpolate import RectBivariateSpline
-from scipy.signal import fftconvolve
 
 from lab.errors import NotDetermined
 from lab.fit.screen import MATCH, ScreenWarp, busiest_quadrilateral, register
@@ -118,6 +118,8 @@ def estimate_kernel(
             raise NotDetermined(
                 "psf", f"{int((~np.isfinite(picture)).sum())} pixels of the {name} picture aren't finite"
             )
+    from scipy.signal import fftconvolve  # here: the library takes a while to load
+
     normal = normal_equations(u, b, support)
     found = solve_kernel(normal, support, noise_std, rounds=1, solves=BRIEF_SOLVES)
     inner = np.s_[support // 2 : u.shape[0] - support // 2, support // 2 : u.shape[1] - support // 2]
@@ -684,8 +686,8 @@ def radial_symmetry(parts: Sequence[ScreenKernel], axis_px: tuple[float, float])
         kernels=len(parts),
         chi2=chi2,
         degrees_of_freedom=freedom,
-        probability=float(stats.chi2.sf(chi2, freedom)),
-        symmetric=chi2 < float(stats.chi2.ppf(0.999, freedom)),
+        probability=float(special.chdtrc(freedom, chi2)),
+        symmetric=chi2 < float(special.chdtri(freedom, 0.001)),
         variance_on_axis_px2=float(solution[0]),
         radial_growth_px2=float(solution[1]),
         tangential_growth_px2=float(solution[2]),
@@ -920,7 +922,8 @@ class _Drawn:
         taps = _taps(lambda f: np.sinc(f / oversample) ** -2, 0.6, oversample, 2)
         for axis in (0, 1):
             picture = ndimage.correlate1d(picture, taps, axis=axis, mode="nearest")
-        around = ndimage.gaussian_filter(picture, 1.0 * oversample * support_px, mode="nearest", truncate=3.0)
+        wide = oversample * support_px
+        around = cv2.GaussianBlur(picture, (6 * wide + 1,) * 2, wide, borderType=cv2.BORDER_REPLICATE)
 
         coarse = np.gradient(at[:, :, 0])
         margin = (support_px / 2.0 + 2.0) * float(np.hypot(coarse[0].mean(), coarse[1].mean())) / 8.0  # cells
@@ -964,12 +967,14 @@ class _Drawn:
         s, h = self.support, self.support // 2
         size = s * s + 1
         gram, right = np.zeros((size, size)), np.zeros(size)
-        windows = np.lib.stride_tricks.sliding_window_view(self.picture, (s, s))
+        # turned by 180 degrees, as the kernel is against the picture
+        windows = np.lib.stride_tricks.sliding_window_view(self.picture[::-1, ::-1], (s, s))
+        last = np.array(windows.shape[:2]) - 1
         for start in range(0, len(self.row), 4096):
             part = slice(start, start + 4096)
             row, col, value = self.oversample * self.row[part], self.oversample * self.col[part], self.value[part]
             design = np.empty((len(row), size))
-            design[:, :-1] = windows[row - h, col - h][:, ::-1, ::-1].reshape(len(row), -1)
+            design[:, :-1] = windows[last[0] - row + h, last[1] - col + h].reshape(len(row), -1)
             design[:, -1] = self.around[row, col]
             gram += design.T @ design
             right += value @ design
@@ -977,6 +982,8 @@ class _Drawn:
 
     def blurred(self, estimate: KernelEstimate) -> Array:
         """The picture through the kernel, on its own samples."""
+        from scipy.signal import fftconvolve  # here: the library takes a while to load
+
         return np.asarray(
             (1.0 - estimate.far) * fftconvolve(self.picture, estimate.kernel, mode="same") + estimate.far * self.around
         )
@@ -1025,27 +1032,13 @@ class _Drawn:
 def area_drawn(target: Array, cell_x: Array, cell_y: Array) -> Array:
     """Mean of the pattern over a sample's square around points at `cell_x`, `cell_y` (cells); dark outside. The square is
     taken as aligned with the cells: its turn counts in second order only. A square may hold any number of cells."""
-    rows, cols = target.shape
-    table = np.zeros(
-        (rows + 1, cols + 1)
-    )  # summed areas: the integral from the corner, exact by bilinear interpolation
-    table[1:, 1:] = target.cumsum(axis=0).cumsum(axis=1)
+    from sim.scene.area import aligned_means  # here: the compiler's library takes a while to load
 
-    def ends(cell: Array, limit: int) -> tuple[Array, Array, float]:
-        by_row, by_col = np.gradient(cell[::16, ::16])
-        spread = float(np.abs(by_row).mean() + np.abs(by_col).mean()) / 16.0
-        return np.clip(cell - 0.5 * spread, 0.0, limit), np.clip(cell + 0.5 * spread, 0.0, limit), spread
-
-    def integral(y: Array, x: Array) -> Array:
-        i, j = np.minimum(y.astype(np.int64), rows - 1), np.minimum(x.astype(np.int64), cols - 1)
-        down, across = y - i, x - j
-        upper = table[i, j] * (1.0 - across) + table[i, j + 1] * across
-        lower = table[i + 1, j] * (1.0 - across) + table[i + 1, j + 1] * across
-        return np.asarray(upper * (1.0 - down) + lower * down)
-
-    (left, right, wide), (top, bottom, high) = ends(cell_x, cols), ends(cell_y, rows)
-    total = integral(bottom, right) - integral(bottom, left) - integral(top, right) + integral(top, left)
-    return np.asarray(total / (wide * high))
+    table = np.pad(target.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    wide, high = (
+        float(sum(np.abs(part).mean() for part in np.gradient(cell[::16, ::16]))) / 16.0 for cell in (cell_x, cell_y)
+    )
+    return np.asarray(aligned_means(table, cell_x, cell_y, wide, high))
 
 
 # --- the prior -------------------------------------------------------------------------------------------------------------

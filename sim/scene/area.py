@@ -78,7 +78,7 @@ def _mean(pattern, u, v, u_across, u_down, v_across, v_down, lit, surround):  # 
     return _mean_parts(pattern, u, v, u_across, u_down, v_across, v_down, lit, surround)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def project_means(pattern, back, row, col, step, divide, lit, surround, out):  # type: ignore[no-untyped-def]
     """Means of a pattern's cells over the squares at `row` x `col` (px, `step` wide), into `out`.
 
@@ -112,7 +112,7 @@ def project_means(pattern, back, row, col, step, divide, lit, surround, out):  #
             out[i, j] = total / count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-untyped-def]
     """As `project_means`, for squares at given pattern points `u`, `v`, a frame of one square wider than needed all round;
     (rows x divide + 2, cols x divide + 2) for `out` of (rows, cols)."""
@@ -136,7 +136,32 @@ def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-
             out[i, j] = total / count
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
+def _integral(table, v, u):  # type: ignore[no-untyped-def]
+    """Of the pattern from its corner to (u, v) within it, by its table of summed areas."""
+    i, j = min(int(v), table.shape[0] - 2), min(int(u), table.shape[1] - 2)
+    down, across = v - i, u - j
+    upper = table[i, j] * (1.0 - across) + table[i, j + 1] * across
+    lower = table[i + 1, j] * (1.0 - across) + table[i + 1, j + 1] * across
+    return upper * (1.0 - down) + lower * down
+
+
+@njit(cache=True, nogil=True)
+def aligned_means(table, u, v, wide, high):  # type: ignore[no-untyped-def]
+    """Means over squares along the cells, `wide` x `high` of them, about pattern points `u`, `v`; nil outside the pattern, of which
+    `table` (rows + 1, cols + 1) holds the summed areas. A square may hold any number of cells."""
+    rows, cols = table.shape[0] - 1.0, table.shape[1] - 1.0
+    out = np.empty(u.shape)
+    for i in range(u.shape[0]):
+        for j in range(u.shape[1]):
+            left, right = min(max(u[i, j] - 0.5 * wide, 0.0), cols), min(max(u[i, j] + 0.5 * wide, 0.0), cols)
+            top, bottom = min(max(v[i, j] - 0.5 * high, 0.0), rows), min(max(v[i, j] + 0.5 * high, 0.0), rows)
+            total = _integral(table, bottom, right) - _integral(table, bottom, left)
+            out[i, j] = (total - _integral(table, top, right) + _integral(table, top, left)) / (wide * high)
+    return out
+
+
+@njit(cache=True, nogil=True)
 def means_down(values, edges, begin, end, surround):  # type: ignore[no-untyped-def]
     """Means down the rows between neighbouring `edges` (ascending) of what is values[j] from j + begin to j + end and `surround`
     elsewhere, column by column: (edges - 1, columns)."""
