@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtri
@@ -168,6 +168,14 @@ class Field:
         pitch = camera.pixel_pitch_um
         return Field((col - col0) * pitch, (row - row0) * pitch, relative_illumination(camera, row, col))
 
+    def under(self, camera: CameraModel, effects: Sequence[Effect]) -> Field:
+        """The same points in the light that the effects leave of it there."""
+        light = self.light
+        for effect in effects:
+            if type(effect).illumination is not Effect.illumination:
+                light = light * effect.illumination(self.x_um, self.y_um, camera)
+        return replace(self, light=light)
+
 
 def collected_electrons(
     camera: CameraModel,
@@ -179,18 +187,17 @@ def collected_electrons(
     elapsed_s: float = 0.0,
 ) -> dict[str, FloatArray]:
     """Mean electrons (points of `field`,) by channel in uniform light of `rates` (e/s on axis, with the effects on radiance
-    and transmittance in them), dark current included; effects on exposure, source, place and charge are applied here."""
-    light = field.light
+    and transmittance in them), dark current included; effects on exposure, source and charge are applied here, those on place in
+    `Field.under`."""
     time, drift = exposure_s, 1.0
     ambient = dict.fromkeys(rates, 0.0)
     for effect in effects:
-        light = light * effect.illumination(field.x_um, field.y_um, camera)
         time = effect.exposure(time)
         drift *= effect.drift(elapsed_s)
         for channel in ambient:
             ambient[channel] += effect.ambient_e_per_s(channel, camera)
     dark = camera.dark_current_e_per_s * exposure_s
-    electrons = {c: rate * drift * time * light + ambient[c] * exposure_s for c, rate in rates.items()}
+    electrons = {c: rate * drift * time * field.light + ambient[c] * exposure_s for c, rate in rates.items()}
     mixed = mixed_charge({c: rates.get(c, 1.0) for c in camera.channels}, exposure_s, effects, camera)
     return {c: e * mixed.get(c, 1.0) + dark for c, e in electrons.items()}
 

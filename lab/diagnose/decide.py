@@ -52,8 +52,9 @@ CLOSE = 100.0
 SAME = 2.0
 #: Nats by which a rival lags that no discrepancy beside it brings back.
 HOPELESS = 30.0
-#: Of what a name gains: as far behind it a rival may lie after a rough fit to be fitted to convergence.
-ROUGH_SHARE = 0.05
+#: As far behind a name a rival may lie after a rough fit to be fitted to convergence: a share of what the name gains, but no more than
+#: so many nats and so many times what the rival's next step promises.
+ROUGH_SHARE, ROUGH_NATS, ROUGH_STEPS = 0.05, 100.0, 10.0
 #: What an effect has to gain of what a stronger one beside it does to the same measurement: less may be an error of that one's law.
 COMPANION_SHARE = 0.03
 #: Nats by which it is less likely that an f-number or a pitch is stated wrongly than that a model lacks an effect; the least factor by
@@ -331,7 +332,8 @@ def _weighed(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | Non
     for score in pool[:SCREENED]:
         start = (*fit.effects[:index], score.start, *fit.effects[index + 1 :])
         rough = search.fitted(start, beside=fit)
-        near = rough.weight > fit.weight - HOPELESS - ROUGH_SHARE * gain
+        behind = min(ROUGH_SHARE * gain, ROUGH_NATS + ROUGH_STEPS * rough.ahead)
+        near = rough.weight > fit.weight - HOPELESS - behind
         fits[score.effect.name] = search.fitted(start, final=True) if near else rough
     weights = {}
     for name, tried in fits.items():

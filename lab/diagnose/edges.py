@@ -11,10 +11,11 @@ shading and a response that bends are in it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -23,7 +24,7 @@ from scipy import sparse
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
-from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of
+from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of, overrides
 from lab.diagnose.veils import halos, wide_contrast
 from lab.errors import NotDetermined
 from lab.fit.levels import rounding_waves_dn
@@ -60,7 +61,23 @@ TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
 WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
 HIGHEST_CY_PER_PX = 10.0
 GRID_PX, FINE_PX = 0.05, 0.0125
+#: Of what an edge's prediction consists of: most that a refit changes leaves most of it as it was.
 KEPT = 64
+BLURRING_HOOKS = frozenset({"transfer"})
+CHANGING_HOOKS = frozenset({"illumination", "response", "halo", "veil"})
+
+K = TypeVar("K")
+V = TypeVar("V")
+_Key = tuple[Effect, ...]
+
+
+def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
+    """What stands in `store`, made if it doesn't; the oldest goes first."""
+    if key not in store:
+        if len(store) >= KEPT:
+            store.pop(next(iter(store)))
+        store[key] = make()
+    return store[key]
 
 
 def edge_block(study: Study) -> Block:
@@ -279,11 +296,11 @@ class _Operators:
     def report(self, otf: ComplexArray, frequency: FloatArray, change: FloatArray | None = None) -> FloatArray:
         """What is reported, (edges, rows), of the model's transfer functions (edges, nodes); `change` of the profile (edges, distances)
         beside them."""
-        rows = self.constant + np.einsum("erk,ek->er", self.odd, np.real(otf), optimize=True)
+        rows = self.constant + (self.odd @ np.real(otf)[..., None])[..., 0]
         if np.any(np.imag(otf)):
-            rows = rows + np.einsum("erk,ek->er", self.even, np.imag(otf) / frequency, optimize=True)
+            rows = rows + (self.even @ (np.imag(otf) / frequency)[..., None])[..., 0]
         if change is not None:
-            rows = rows + np.einsum("erd,ed->er", self.profile, change, optimize=True)
+            rows = rows + (self.profile @ change[..., None])[..., 0]
         return np.asarray(rows)
 
 
@@ -368,7 +385,10 @@ class _Edges:
         #: cy/px of the numbers, real parts and then imaginary ones.
         self.frequencies = np.concatenate([REAL_AT, IMAGINARY_AT]) * top
         self._at = _shapes(self._quadrature, top)
-        self._spectral: dict[tuple[Effect, ...], tuple[FloatArray, FloatArray, ComplexArray]] = {}
+        self._spectral: dict[_Key, tuple[FloatArray, FloatArray, ComplexArray]] = {}
+        self._blurred: dict[tuple[_Key, _Key], ComplexArray] = {}
+        self._changes: dict[_Key, FloatArray | None] = {}
+        self._numbers_of: dict[_Key, FloatArray] = {}
         self._baseline = self._otf(())
         estimators, self._operators = self._estimated(reach)
         self._recorded = np.array([e.value for e in estimators])
@@ -380,7 +400,6 @@ class _Edges:
         )  # fmt: skip
         self.value = self._numbers(self._recorded)
         self._noise = [_relative(e.scatter, row) for e, row in zip(estimators, self._recorded, strict=True)]
-        self._kept: dict[tuple[Effect, ...], FloatArray] = {}
 
     def _light(self, path: str | None) -> Spectrum | None:
         return self._study.spectrum(path) if path else None
@@ -419,11 +438,7 @@ class _Edges:
     def predict(self, effects: Effects) -> FloatArray:
         """Numbers of all edges, (edges, frequencies)."""
         key = tuple(effects)
-        if key not in self._kept:
-            if len(self._kept) >= KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._numbers(self._reported(key))
-        return self._kept[key]
+        return _kept(self._numbers_of, key, lambda: self._numbers(self._reported(key)))
 
     def _numbers(self, rows: FloatArray) -> FloatArray:
         """Transfer functions at `frequencies`, (edges, frequencies), of what the estimators report."""
@@ -502,10 +517,14 @@ class _Edges:
         nodes, shares, kink = self._wavelengths(spectral)
         fx, fy = self._frequencies
         moving = tuple(e for e in effects if type(e).charge is not Effect.charge and self._camera.cfa != "MONO")
-        optical = tuple(e for e in effects if e not in moving)
-        whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical) for w in nodes])
-        otf = np.tensordot(shares, whole, 1) + kink
-        return self._mixed(otf, moving) if moving else np.asarray(otf, complex)
+        optical = tuple(e for e in effects if e not in moving and overrides(e, BLURRING_HOOKS))
+
+        def blurred() -> ComplexArray:
+            whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical) for w in nodes])
+            return np.asarray(np.tensordot(shares, whole, 1) + kink, complex)
+
+        otf = _kept(self._blurred, (spectral, optical), blurred)
+        return self._mixed(otf, moving) if moving else otf
 
     @cached_property
     def _frequencies(self) -> tuple[FloatArray, FloatArray]:
@@ -514,16 +533,16 @@ class _Edges:
 
     def _wavelengths(self, spectral: tuple[Effect, ...]) -> tuple[FloatArray, FloatArray, ComplexArray]:
         """A few wavelengths (w,), their shares (sights, w), and what these few miss of the perfect lens's transfer."""
-        if spectral not in self._spectral:
-            if len(self._spectral) >= KEPT:
-                self._spectral.pop(next(iter(self._spectral)))
+
+        def worked_out() -> tuple[FloatArray, FloatArray, ComplexArray]:
             grid, perfect = self._perfect
             fine = wavelength_shares(self._camera, self._lit, grid, spectral)
             few, _ = gauss_rule(grid, fine.mean(axis=0), WAVELENGTHS)
             share = lagrange_shares(grid, fine, few)
             missed = fine - np.array([linear_shares(few, own, grid) for own in share])
-            self._spectral[spectral] = few, share, np.tensordot(missed, perfect, 1)
-        return self._spectral[spectral]
+            return few, share, np.tensordot(missed, perfect, 1)
+
+        return _kept(self._spectral, spectral, worked_out)
 
     @cached_property
     def _perfect(self) -> tuple[FloatArray, ComplexArray]:
@@ -571,6 +590,10 @@ class _Edges:
 
     def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
         """Change of the profiles (edges, distances) by the effects' shading, by responses that bend and by halos."""
+        changing = tuple(e for e in effects if overrides(e, CHANGING_HOOKS))
+        return _kept(self._changes, changing, lambda: self._changed(changing))
+
+    def _changed(self, effects: tuple[Effect, ...]) -> FloatArray | None:
         shading = tuple(e for e in effects if type(e).illumination is not Effect.illumination)
         bending = tuple(e for e in effects if type(e).response is not Effect.response)
         spread = halos(effects, self._camera)

@@ -68,6 +68,7 @@ class Fit:
     weight: float
     tangents: FloatArray  # (n, parameters), slopes of the prediction by the coordinates that were fitted
     final: bool = True  # whether it was carried to convergence
+    ahead: float = 0.0  # nats that one more step of all its coordinates promises
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -180,7 +181,7 @@ def _refit(
         )
         before, u = u, result.x
         jacobian = result.jac[: -len(coords)]
-        if turn and np.all(np.abs(u - before) < 1e-3 * scale):
+        if np.all(np.abs(u - before) < 1e-3 * scale):
             break
     best = moved(effects, coords, u)
     curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)
@@ -198,7 +199,19 @@ def _refit(
     prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
     prior += sum(_usual_nats(e, s) for e, s in zip(best, std, strict=True))
     tangents = _tangents(evidence, best, coords, u, scale, high)
-    return Fit(best, tuple(std), value, value + prior - PARAMETER_NATS * len(coords), tangents, final)
+    ahead = _ahead(evidence, best, tangents, (u - prior_centre) / prior_std, prior_std)
+    return Fit(best, tuple(std), value, value + prior - PARAMETER_NATS * len(coords), tangents, final, ahead)
+
+
+def _ahead(
+    evidence: Evidence, effects: Effects, tangents: FloatArray, from_prior: FloatArray, prior_std: FloatArray
+) -> float:
+    """Half of Newton's decrement, g' (J'J + P)^-1 g / 2: what a step to the optimum would gain were the prediction linear and
+    without bounds."""
+    model = evidence.seen_gaussian(effects)
+    slopes = model.white(tangents[evidence.seen])
+    gradient = slopes.T @ model.white((evidence.value - evidence.mean(effects))[evidence.seen]) - from_prior / prior_std
+    return float(0.5 * gradient @ np.linalg.pinv(slopes.T @ slopes + np.diag(1.0 / prior_std**2)) @ gradient)
 
 
 def _usual_nats(effect: Effect, std: dict[str, float | None]) -> float:

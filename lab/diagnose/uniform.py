@@ -71,14 +71,14 @@ def linearity_block(study: Study) -> Block:
     covariance = _level_covariance(study, groups, points, signal)
 
     def predict(effects: Effects) -> Prediction:
-        camera = study.camera
         changed = relative
         if any(overrides(e, SPECTRAL_HOOKS) for e in effects):
             changed = {}
             for (path, channel), share in relative.items():
-                below = electron_rate(camera, channel, study.spectrum(path))
-                above = electron_rate(camera, channel, study.spectrum(path), effects)
+                below = electron_rate(study.camera, channel, study.spectrum(path))
+                above = electron_rate(study.camera, channel, study.spectrum(path), effects)
                 changed[path, channel] = share * (above / below if below > 0 else 1.0)
+        field = study.field.under(study.camera, effects)
         mean, lit = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
         for i, (capture, channel, _, _) in enumerate(points):
@@ -86,9 +86,9 @@ def linearity_block(study: Study) -> Block:
                 lamp, elapsed = study.lamps[capture.radiance], study.elapsed_s(capture)
                 rates = {c: rate[lamp, c] * changed[capture.radiance, c] for c in study.channels if (lamp, c) in rate}
                 collected = collected_electrons(
-                    camera, rates, capture.exposure_s, effects, field=study.field, elapsed_s=elapsed
+                    study.camera, rates, capture.exposure_s, effects, field=field, elapsed_s=elapsed
                 )
-                done[capture.id] = mean_dn(camera, collected, effects)
+                done[capture.id] = mean_dn(study.camera, collected, effects)
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
             carried = noise.gain * study.carried_e(capture, channel, effects)
             mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
@@ -211,6 +211,7 @@ def narrowband_block(study: Study) -> Block:
             share = noise.gain * float(study.field.light.mean()) * exposures
             return Prediction(noise.black + noise.dark_dn_per_s * exposures + share * rates, slopes_of(effects, share))
         lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
+        field = study.field.under(camera, effects)
         mean, share = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
         for i, (capture, channel, _, _) in enumerate(points):
@@ -221,7 +222,7 @@ def narrowband_block(study: Study) -> Block:
                     by_channel,
                     capture.exposure_s,
                     effects,
-                    field=study.field,
+                    field=field,
                     elapsed_s=study.elapsed_s(capture),
                 )
                 done[capture.id] = mean_dn(camera, electrons, effects)

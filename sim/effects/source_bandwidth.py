@@ -10,6 +10,9 @@ from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
+#: Gauss-Hermite's: the mean over them of shifted spectra is the convolution.
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
+
 
 class SourceBandwidth(Effect):
     """Narrowband radiance convolved with a Gaussian of the stated standard deviation."""
@@ -41,9 +44,7 @@ class SourceBandwidth(Effect):
     def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
         if self.width_nm == 0.0 or kind != "narrowband":
             return radiance
-        # Gauss-Hermite nodes of the additional width: the mean over them is the convolution
-        node, weight = np.polynomial.hermite_e.hermegauss(15)
         shifted = [
-            np.interp(wavelength_nm - self.width_nm * x, wavelength_nm, radiance, left=0.0, right=0.0) for x in node
+            np.interp(wavelength_nm - self.width_nm * x, wavelength_nm, radiance, left=0.0, right=0.0) for x in _NODES
         ]
-        return np.asarray(weight @ np.array(shifted) / weight.sum())
+        return np.asarray(_WEIGHTS @ np.array(shifted) / _WEIGHTS.sum())
