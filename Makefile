@@ -20,7 +20,7 @@ run: $(STAMP)
 	$(BIN)/calibench run --out calibench-data $(ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 3 -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
 
 serve: $(STAMP)
 	$(BIN)/calibench serve $(ARGS)
