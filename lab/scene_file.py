@@ -217,23 +217,18 @@ def _npz(file: Path) -> tuple[str, FloatArray, NDArray[Any]]:
 def _envi(file: Path) -> tuple[str, FloatArray, NDArray[Any]]:
     """As `_npz`, of an ENVI image; its samples scaled to the unit that the quantity's name says."""
     header, values = _envi_samples(file)
-    unit = header.get("data units", "").lower().replace(" ", "")
-    if unit not in ENVI_UNITS:
-        raise InputError(
-            f"data units is '{header.get('data units', '')}'; write one of {', '.join(ENVI_UNITS)} into the header"
-        )
+    unit, length = (str(header.get(key, "")) for key in ("data units", "wavelength units"))  # a list, where in braces
+    quantity, factor = ENVI_UNITS.get(unit.lower().replace(" ", ""), ("", 1.0))
+    if not quantity:
+        raise InputError(f"data units is '{unit[:60]}'; write one of {', '.join(ENVI_UNITS)} into the header")
     lengths = {"nanometers": 1.0, "nm": 1.0, "micrometers": 1e3, "um": 1e3}
-    length = header.get("wavelength units", "").lower()
-    if length not in lengths:
-        raise InputError(
-            f"wavelength units is '{header.get('wavelength units', '')}'; write nanometers or micrometers into the header"
-        )
-    wavelength_nm = _numbers(header, "wavelength") * lengths[length]
-    quantity, factor = ENVI_UNITS[unit]
+    if length.lower() not in lengths:
+        raise InputError(f"wavelength units is '{length[:60]}'; write nanometers or micrometers into the header")
+    wavelength_nm = _numbers(header, "wavelength") * lengths[length.lower()]
     if quantity == REFLECTANCE and "reflectance scale factor" in header:
         (scale,) = _numbers(header, "reflectance scale factor")
-        if not scale > 0:
-            raise InputError(f"reflectance scale factor is {scale}, below the limit of 0; correct the header")
+        if not 0 < scale < np.inf:
+            raise InputError(f"reflectance scale factor is {scale}, not a number above 0; correct the header")
         factor /= scale
     return quantity, wavelength_nm, values if factor == 1.0 else values * factor
 

@@ -61,7 +61,7 @@ TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
 WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
 HIGHEST_CY_PER_PX = 10.0
 GRID_PX, FINE_PX = 0.05, 0.0125
-#: Of what an edge's prediction consists of: most that a refit changes leaves most of it as it was.
+#: Predictions that are kept, and as many of their parts: a step of a refit leaves the others as they were.
 KEPT = 64
 BLURRING_HOOKS = frozenset({"transfer"})
 CHANGING_HOOKS = frozenset({"illumination", "response", "halo", "veil"})

@@ -137,6 +137,12 @@ def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-
 
 
 @njit(cache=True, inline="always")
+def _within(place, limit):  # type: ignore[no-untyped-def]
+    """Held to 0..limit; what is no number is 0, as it must not become an index."""
+    return min(place, limit) if place > 0.0 else 0.0
+
+
+@njit(cache=True, inline="always")
 def _integral(table, v, u):  # type: ignore[no-untyped-def]
     """Of the pattern from its corner to (u, v) within it, by its table of summed areas."""
     i, j = min(int(v), table.shape[0] - 2), min(int(u), table.shape[1] - 2)
@@ -154,8 +160,8 @@ def aligned_means(table, u, v, wide, high):  # type: ignore[no-untyped-def]
     out = np.empty(u.shape)
     for i in range(u.shape[0]):
         for j in range(u.shape[1]):
-            left, right = min(max(u[i, j] - 0.5 * wide, 0.0), cols), min(max(u[i, j] + 0.5 * wide, 0.0), cols)
-            top, bottom = min(max(v[i, j] - 0.5 * high, 0.0), rows), min(max(v[i, j] + 0.5 * high, 0.0), rows)
+            left, right = _within(u[i, j] - 0.5 * wide, cols), _within(u[i, j] + 0.5 * wide, cols)
+            top, bottom = _within(v[i, j] - 0.5 * high, rows), _within(v[i, j] + 0.5 * high, rows)
             total = _integral(table, bottom, right) - _integral(table, bottom, left)
             out[i, j] = (total - _integral(table, top, right) + _integral(table, top, left)) / (wide * high)
     return out

@@ -208,6 +208,12 @@ def test_a_scaled_reflectance_is_scaled_back(tmp_path: Path) -> None:
     [
         (("data units = W/m^2/sr/nm", "data units = DN"), "data units is 'DN'"),
         (("wavelength units = Nanometers", "wavelength units = Unknown"), "wavelength units is 'Unknown'"),
+        (("data units = W/m^2/sr/nm", "data units = {}"), "data units is '"),
+        (("wavelength units = Nanometers", "wavelength units = {nm, nm}"), "wavelength units is '"),
+        (
+            ("data units = W/m^2/sr/nm", "data units = Reflectance\nreflectance scale factor = inf"),
+            "scale factor is inf",
+        ),
         (("450", "750"), "must ascend"),
         (("450", "first"), "not numbers"),
         (("lines = 4", "lines = 400"), "bytes where the header asks for"),
