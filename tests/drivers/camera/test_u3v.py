@@ -158,7 +158,7 @@ def bench() -> Bench:
     return bench
 
 
-def camera_of(device: U3vDevice, timeout_s: float = 10.0, **settings: object) -> U3vCamera:
+def camera_of(device: U3vDevice, timeout_s: float = 60.0, **settings: object) -> U3vCamera:
     """Patient, for a busy machine, but where a fault is to be waited for."""
     found = usb.core.find(backend=InProcessBackend([device]))
     return U3vCamera("usb://mock", device=found, timeout_s=timeout_s, **settings)  # type: ignore[arg-type]
@@ -170,7 +170,8 @@ def device(bench: Bench) -> U3vDevice:
 
 
 @pytest.fixture
-def impatient(device: U3vDevice) -> Iterator[U3vCamera]:
+def impatient(device: U3vDevice, bench: Bench) -> Iterator[U3vCamera]:
+    bench.expose("left", 0.002)  # the first is drawn, and its loops compiled, for longer than that time-out
     with camera_of(device, timeout_s=0.8) as camera:
         camera.configure(0.002)
         yield camera
