@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import constants
 from scipy.special import expit
 
-from mocks.imaging import SCREEN_OVERSAMPLE, Edge, Imager, Pose, corners_px
+from mocks.imaging import SCREEN_OVERSAMPLE, Edge, Imager, Pose, compile_loops, corners_px
 from mocks.truth import AIR_C, COLS, DISTANCE_MM, PITCH_UM, ROWS, SELF_HEATING_C, SIDES, Truth, hidden_truth
 from sim.camera import Side
 from sim.effects.base import Effect
@@ -399,6 +399,11 @@ class Bench:
     def sensor(self, side: Side) -> tuple[int, int, float]:
         """What a camera's own registers say of its sensor: rows, columns, distance of neighbouring pixels (um)."""
         return ROWS, COLS, PITCH_UM
+
+    def compile_loops(self) -> None:
+        """Before the first frame is asked for; no frame changes by it."""
+        for camera in self._truth.cameras.values():
+            compile_loops(camera)
 
     def expose(self, side: Side, exposure_s: float, gain_db: float = 0.0, start_s: float | None = None) -> UInt16Array:
         """One raw frame, (rows, cols) DN, of what stands in front now.

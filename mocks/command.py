@@ -155,6 +155,7 @@ def _start_bench(
     from mocks.usb import SERIAL_NUMBERS, serve_usbip, stereo_pair
 
     place = Bench(seed=seed, real_time_factor=max(0.0, real_time))
+    place.compile_loops()
     running.callback(stop.set)
     display_at, display_table = line.display_settings()
     addresses: dict[str, dict[str, Any]] = {
