@@ -29,11 +29,13 @@ from numpy.typing import NDArray
 from scipy import constants
 from scipy.special import expit
 
-from mocks.imaging import SCREEN_OVERSAMPLE, Edge, Imager, Pose, compile_loops, corners_px
+from mocks.imaging import SCREEN_OVERSAMPLE, Edge, Imager, Pose, corners_px
 from mocks.truth import AIR_C, COLS, DISTANCE_MM, PITCH_UM, ROWS, SELF_HEATING_C, SIDES, Truth, hidden_truth
 from sim.camera import Side
 from sim.effects.base import Effect
+from sim.scene.render import Grid, cells, quadrilateral
 from sim.sensor.electrons import sample_from
+from sim.sensor.shot import draw_poisson
 from sim.spectrum import FloatArray, Spectrum
 
 UInt16Array = NDArray[np.uint16]
@@ -401,9 +403,12 @@ class Bench:
         return ROWS, COLS, PITCH_UM
 
     def compile_loops(self) -> None:
-        """Before the first frame is asked for; no frame changes by it."""
-        for camera in self._truth.cameras.values():
-            compile_loops(camera)
+        """Those that patterns, charts and shot noise are drawn with: on a new installation that takes as long as a camera's driver waits
+        for its first frame. No frame changes by it."""
+        square = np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 1.0, 0.0])
+        cells(np.ones((2, 2)), _SCREEN.warp(self._truth.cameras["left"]), Grid(4, 4, 1, 0), 0.0)
+        quadrilateral(np.arange(2.0), np.arange(2.0), 1.0, *square)
+        draw_poisson(np.ones((2, 2), np.float32), np.random.default_rng(0))
 
     def expose(self, side: Side, exposure_s: float, gain_db: float = 0.0, start_s: float | None = None) -> UInt16Array:
         """One raw frame, (rows, cols) DN, of what stands in front now.

@@ -23,7 +23,6 @@ from sim.scene import colorchecker
 from sim.scene.render import Grid, cells, quadrilateral
 from sim.scene.warp import Warp
 from sim.sensor.mosaic import assemble
-from sim.sensor.shot import draw_poisson
 from sim.spectrum import FloatArray, Spectrum
 
 OVERSAMPLE, SCREEN_OVERSAMPLE, MARGIN_PX = 3, 4, 16
@@ -219,13 +218,6 @@ class Imager:
             * (np.exp(2j * np.pi * move * fx) / np.sinc(fx / fine))[None, :],
             np.complex64,
         )
-
-
-def compile_loops(camera: HiddenCamera) -> None:
-    """Have the loops compiled that patterns and shot noise are drawn with: on a new installation that takes as long as a camera's
-    driver waits for its first frame."""
-    cells(np.ones((2, 2)), FACING.warp(camera), Grid(4, 4, 1, 0), 0.0)
-    draw_poisson(np.ones((2, 2), np.float32), np.random.default_rng(0))
 
 
 def corners_px(warp: Warp, width: float, height: float) -> FloatArray:

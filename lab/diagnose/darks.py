@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage, special
-from scipy.special import betainc, digamma, ndtr, polygamma
+from scipy import fft, ndimage
+from scipy.special import betainc, chdtrc, chdtri, digamma, gammaln, ndtr, polygamma, xlogy
 
 from lab.diagnose.summaries import (
     BLACK_FLOOR_DN,
@@ -846,7 +846,7 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
     """Chance (1 where many are expected), and what the expected counts themselves are uncertain by."""
     number = np.arange(60.0)
     mean = np.minimum(expected, 20.0)[:, None]
-    share = np.exp(special.xlogy(number, mean) - mean - special.gammaln(number + 1.0))
+    share = np.exp(xlogy(number, mean) - mean - gammaln(number + 1.0))
     chance = share @ np.square(_rooted(number)) - np.square(share @ _rooted(number))
     return np.diag(chance + COUNT_STD**2 + np.square(_rooted(expected + uncertain) - _rooted(expected)))
 
@@ -999,14 +999,14 @@ def blinking_block(study: Study) -> Block:
 
 
 def _blink_edges(freedom: int) -> FloatArray:
-    return np.asarray(float(special.chdtri(freedom, BLINK_CHANCE)) * np.array(BLINK_EDGES))
+    return np.asarray(float(chdtri(freedom, BLINK_CHANCE)) * np.array(BLINK_EDGES))
 
 
 def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray) -> FloatArray:
     """Probability that a chi-squared variable is above the edges, (n, edges): exact where it is central, else its cube root is
     taken as normal (Abdel-Aty 1954)."""
     if not np.any(noncentral):
-        return np.asarray(special.chdtrc(freedom[:, None], edges[None, :]))
+        return np.asarray(chdtrc(freedom[:, None], edges[None, :]))
     a = (freedom + noncentral)[:, None]
     b = (noncentral / (freedom + noncentral))[:, None]
     variance = 2.0 * (1.0 + b) / (9.0 * a)
@@ -1022,7 +1022,7 @@ def _hot_above(study: Study, part: Sequence[Frames], out: bool, rate: FloatArray
     mean, variance = factor @ count, 2.0 * np.square(factor) @ count
     scale = variance / (2.0 * mean)
     freedom = mean / scale
-    return np.asarray(special.chdtrc(freedom[:, None], edges[None, :] / scale[:, None]))
+    return np.asarray(chdtrc(freedom[:, None], edges[None, :] / scale[:, None]))
 
 
 def _jump_above(

@@ -24,7 +24,7 @@ from scipy import sparse
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
-from lab.diagnose.summaries import Block, Effects, Label, Prediction, Study, held_out_of, overrides
+from lab.diagnose.summaries import SPECTRAL_HOOKS, Block, Effects, Label, Prediction, Study, held_out_of, overrides
 from lab.diagnose.veils import halos, wide_contrast
 from lab.errors import NotDetermined
 from lab.fit.levels import rounding_waves_dn
@@ -511,9 +511,7 @@ class _Edges:
 
     def _sights_otf(self, effects: tuple[Effect, ...]) -> ComplexArray:
         """(sights, directions, nodes)."""
-        spectral = tuple(
-            e for e in effects if type(e).transmittance is not Effect.transmittance or type(e).radiance is not Effect.radiance
-        )  # fmt: skip
+        spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
         nodes, shares, kink = self._wavelengths(spectral)
         fx, fy = self._frequencies
         moving = tuple(e for e in effects if type(e).charge is not Effect.charge and self._camera.cfa != "MONO")

@@ -31,7 +31,6 @@ from lab.recording import Bernoulli, Black, Capture, Chart, Checkerboard, Record
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.forward import optical_transfer
-from sim.optics.illumination import relative_illumination
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -79,7 +78,6 @@ def chart_block(study: Study) -> Block:
     offset = noise.black + noise.dark_dn_per_s * exposures
     signal = np.maximum(value - offset, 0.1)
     surround = np.array([p.frame for p in points]) - offset  # what a veil carries
-    light = relative_illumination(camera, row, col)
     place = Field.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
     curves = CurveSlopes(
@@ -91,9 +89,8 @@ def chart_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
-        local, time, ambient = light, exposures, np.zeros(len(points))
+        local, time, ambient = place.under(camera, effects).light, exposures, np.zeros(len(points))
         for effect in effects:
-            local = local * effect.illumination(place.x_um, place.y_um, camera)
             time = np.array([effect.exposure(float(t)) for t in time])
             ambient = ambient + np.array([effect.ambient_e_per_s(p.channel, camera) for p in points]) * exposures
         electrons = rates * local * time

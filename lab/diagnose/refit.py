@@ -195,22 +195,22 @@ def _refit(
         std[c.index][c.name] = (
             su if power == 1 else min(su / max(power * away ** (power - 1), 1e-12), su ** (1.0 / power))
         )
-    value = likelihood(evidence, best)
+    model = evidence.seen_gaussian(best)
+    value = model.log_likelihood(evidence.seen_value)
     prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
     prior += sum(_usual_nats(e, s) for e, s in zip(best, std, strict=True))
     tangents = _tangents(evidence, best, coords, u, scale, high)
-    ahead = _ahead(evidence, best, tangents, (u - prior_centre) / prior_std, prior_std)
+    ahead = _ahead(model, evidence.seen_value, tangents[seen], (u - prior_centre) / prior_std, prior_std)
     return Fit(best, tuple(std), value, value + prior - PARAMETER_NATS * len(coords), tangents, final, ahead)
 
 
 def _ahead(
-    evidence: Evidence, effects: Effects, tangents: FloatArray, from_prior: FloatArray, prior_std: FloatArray
+    model: Gaussian, seen_value: FloatArray, tangents: FloatArray, from_prior: FloatArray, prior_std: FloatArray
 ) -> float:
     """Half of Newton's decrement, g' (J'J + P)^-1 g / 2: what a step to the optimum would gain were the prediction linear and
     without bounds."""
-    model = evidence.seen_gaussian(effects)
-    slopes = model.white(tangents[evidence.seen])
-    gradient = slopes.T @ model.white((evidence.value - evidence.mean(effects))[evidence.seen]) - from_prior / prior_std
+    slopes = model.white(tangents)
+    gradient = slopes.T @ model.white(seen_value - model.mean) - from_prior / prior_std
     return float(0.5 * gradient @ np.linalg.pinv(slopes.T @ slopes + np.diag(1.0 / prior_std**2)) @ gradient)
 
 

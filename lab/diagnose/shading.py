@@ -189,10 +189,7 @@ def _cell_means(value: FloatArray) -> FloatArray:
 
 def _shaded(planes: Sequence[_Plane], place: Field, effects: Effects, study: Study) -> FloatArray:
     """Cells of every plane relative to their mean, (planes x cells,)."""
-    light = place.light
-    for effect in effects:
-        light = light * effect.illumination(place.x_um, place.y_um, study.camera)
-    light = _cell_means(light)
+    light = _cell_means(place.under(study.camera, effects).light)
     # a veil evens out what the lens's fall-off leaves
     even = even_share(effects)
     light = (1.0 - even) * light + even * light.mean()

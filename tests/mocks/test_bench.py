@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -394,6 +397,40 @@ class TestHidden:
         plain, default = hidden_truth(1, {}).cameras["left"], hidden_truth(1).cameras["left"]
         assert plain.model == default.model
         assert plain.effects == ()
+
+
+COMPILED = """
+import sys
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from mocks.bench import Bench
+
+
+def kinds():
+    names = [name for name in sys.modules if name.startswith("sim.")]
+    loops = [loop for name in names for loop in vars(sys.modules[name]).values() if isinstance(loop, Dispatcher)]
+    return {loop.py_func.__qualname__: len(loop.signatures) for loop in loops if loop.signatures}
+
+
+bench = Bench()
+bench.compile_loops()
+before = kinds()
+assert before
+bench.set_shutter(True)
+bench.show(np.eye(8, dtype=np.uint8), 8)
+for target in ("cap", "sphere", "colorchecker", "edge-1", "screen", "charuco-01"):
+    bench.place(target)
+    for side in ("left", "right"):
+        bench.expose(side, 0.001)
+assert kinds() == before, (before, kinds())
+"""
+
+
+def test_no_frame_waits_for_a_compiler() -> None:
+    """In a process of its own: another test may have had the loops compiled."""
+    subprocess.run([sys.executable, "-c", COMPILED], check=True, cwd=Path(__file__).parents[2], timeout=120)
 
 
 def test_clock_is_virtual_unless_asked() -> None:
