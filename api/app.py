@@ -30,10 +30,10 @@ from api.security import (
 )
 from api.service import Here, Limits, Service
 from api.upload import Inbox
+from lab.capture.session import Progress
+from lab.capture.station import Drivers, Station, drivers_of
+from lab.capture.store import Store
 from lab.jobs import JobRunner
-from lab.session import Progress
-from lab.station import Drivers, Station, drivers_of
-from lab.store import Store
 
 PREFIX = "/api/v1"
 PAGES = Path(__file__).parent / "pages"

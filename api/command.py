@@ -14,7 +14,7 @@ from api.keys import Permission, check_bind, create_key, is_loopback, stored_key
 from lab.errors import InputError
 
 if TYPE_CHECKING:
-    from lab.store import Store
+    from lab.capture.store import Store
 
 commands = typer.Typer()
 key = typer.Typer(no_args_is_help=True, help="Keys for the REST service.")
@@ -28,7 +28,7 @@ _ANY = ("0.0.0.0", "::", "")  # addresses of this computer that are nobody's nam
 
 
 def _store(folder: Path | None) -> Store:
-    from lab.store import Settings, Store
+    from lab.capture.store import Settings, Store
 
     return Store.open(Settings() if folder is None else Settings(data=folder))
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from lab.errors import InputError
 
 if TYPE_CHECKING:
-    from lab.store import Store
+    from lab.capture.store import Store
 
 KEY_PREFIX = "calibench_"
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})

@@ -12,11 +12,11 @@ from collections.abc import AsyncIterator, Callable
 import anyio
 
 from api.errors import Conflict
+from lab.capture.sequences.calibration import Calibration
+from lab.capture.session import CaptureSession, Progress
+from lab.capture.station import Drivers, Station, drivers_of
+from lab.capture.store import Store
 from lab.errors import DeviceError, InputError
-from lab.sequences.calibration import Calibration
-from lab.session import CaptureSession, Progress
-from lab.station import Drivers, Station, drivers_of
-from lab.store import Store
 
 log = logging.getLogger(__name__)
 RUNS = frozenset({"running", "paused"})

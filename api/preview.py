@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.recording import Camera
+from lab.formats.recording_set import Camera
 from sim.sensor.mosaic import planes
 
 #: sRGB's curve is near enough a power of this.

@@ -1,4 +1,4 @@
-"""What the service says and takes, beyond the results of `lab.results`, which are the same as on the command line."""
+"""What the service says and takes, beyond the results of `lab.formats.results`, which are the same as on the command line."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from api.keys import Permission
-from lab.session import Progress
-from lab.store import Run
+from lab.capture.session import Progress
+from lab.capture.store import Run
 from sim.camera import Side
 
 #: Databases that forget the time zone give back UTC.

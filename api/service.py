@@ -14,11 +14,11 @@ from api.keys import Permission
 from api.live import LiveSessions
 from api.security import Demand, Gate
 from api.upload import Inbox
+from lab.capture.session import Progress
+from lab.capture.station import Station, read_station
+from lab.capture.store import SessionInfo, Store
 from lab.errors import InputError
 from lab.jobs import JobInfo, JobRunner, ReportFile
-from lab.session import Progress
-from lab.station import Station, read_station
-from lab.store import SessionInfo, Store
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from lab import recording
 from lab.errors import InputError
-from lab.recording import Manifest, RecordingSet
+from lab.formats import recording_set as recording
+from lab.formats.recording_set import Manifest, RecordingSet
 
 _CHUNK = 1 << 20
 _ID = re.compile(r"[0-9a-f]{16}")

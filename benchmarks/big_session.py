@@ -14,10 +14,10 @@ import numpy as np
 
 import mocks.bench
 import mocks.truth
-from lab.recording import AnyCapture, Manifest
-from lab.sequences.calibration import full_calibration
-from lab.sequences.steps import FindExposure, FixedExposure, RelativeExposure, Step
-from lab.station import Station
+from lab.capture.sequences.calibration import full_calibration
+from lab.capture.sequences.steps import FindExposure, FixedExposure, RelativeExposure, Step
+from lab.capture.station import Station
+from lab.formats.recording_set import AnyCapture, Manifest
 from sim.camera import Geometry, Side
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import Spectrum

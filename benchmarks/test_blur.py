@@ -28,7 +28,7 @@ from lab.fit.psf import (
     normal_equations,
     photographed_kernel,
 )
-from lab.recording import Bernoulli, Screen
+from lab.formats.recording_set import Bernoulli, Screen
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, expected_electrons, kernel
 from sim.optics.imaging import MeasuredPsf

@@ -20,7 +20,7 @@ from scipy import fft, ndimage, signal
 from scipy.interpolate import CubicSpline
 
 from benchmarks.table import Row, show
-from lab.camera_file import default_camera
+from lab.formats.camera_file import default_camera
 from sim import forward
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, sample

@@ -18,7 +18,7 @@ from lab.fit.geometry import calibrate, calibrate_robustly, fit_geometry, geomet
 from lab.fit.pinhole import intrinsics_of
 from lab.fit.projection import difference, grid, grid_points, points_at
 from lab.fit.stereo import fit_stereo
-from lab.importers import read_checkerboard_pairs
+from lab.formats.importers import read_checkerboard_pairs
 from tests.lab.fit import conftest as drawn
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 

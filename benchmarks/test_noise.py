@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from lab.fit.noise import fit_noise, fit_transfer
-from lab.importers.emva1288 import read_emva1288
-from lab.recording import Camera, Manifest, RecordingSet
-from lab.results import NoiseFit
+from lab.formats.importers.emva1288 import read_emva1288
+from lab.formats.recording_set import Camera, Manifest, RecordingSet
+from lab.formats.results import NoiseFit
 
 ROOT = Path(__file__).parents[1]
 CCD = ROOT.parent / "shared" / "data" / "emva1288_ccd"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.table import Row, show
-from lab.camera_file import default_camera
+from lab.formats.camera_file import default_camera
 from mocks.bench import Bench
 from sim.sensor.electrons import FixedPattern, dn_moments, sample_from
 

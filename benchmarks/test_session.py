@@ -21,12 +21,12 @@ import psutil
 import pytest
 
 from benchmarks.table import Row, show
-from lab import recording
 from lab.fit.geometry import fit_geometry
 from lab.fit.mtf import fit_mtf
 from lab.fit.noise import fit_noise
 from lab.fit.psf import fit_psf_field
 from lab.fit.spectral import fit_spectral
+from lab.formats import recording_set as recording
 
 T = TypeVar("T")
 WANTED_S, WANTED_BYTES = {"fit": 90.0, "diagnose": 240.0}, 3 << 30

@@ -19,10 +19,10 @@ from typing import Any, Literal, TypeVar
 import sqlalchemy as sa
 from pydantic import BaseModel, ConfigDict
 
+from lab.capture.store import JobRow, JobState, Lock, Store, now
 from lab.errors import InputError, NotDetermined
-from lab.recording import RecordingSet, read
-from lab.results import DiagnosisResult, FitResult, ValidationResult
-from lab.store import JobRow, JobState, Lock, Store, now
+from lab.formats.recording_set import RecordingSet, read
+from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from sim.parameters import Frozen
 
 M = TypeVar("M", bound=BaseModel)
@@ -105,7 +105,7 @@ class _Task:
         return fit_recording_set(self.recordings, self.progress)
 
     def validate(self) -> ValidationResult:
-        from lab.validate import validate
+        from lab.predict.validate import validate
 
         return validate(self.recordings, self._latest("fit", FitResult, self.fit))
 

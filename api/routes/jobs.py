@@ -11,8 +11,8 @@ from api.events import described, stream, watched
 from api.schemas import Job, JobStart
 from api.security import REPORT_POLICY
 from api.service import CALIBRATE, READ, Here, HexId, Service, SessionId
+from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.jobs import JobInfo
-from lab.results import DiagnosisResult, FitResult, ValidationResult
 
 router = APIRouter()
 

@@ -10,7 +10,7 @@ from api.errors import answers
 from api.schemas import Recordings
 from api.service import CALIBRATE, READ, Here, HexId
 from api.upload import TooMuch, receive
-from lab.recording import Manifest
+from lab.formats.recording_set import Manifest
 
 router = APIRouter()
 TYPES = ("application/zip", "application/x-zip-compressed", "application/octet-stream")

@@ -17,12 +17,12 @@ from api.live import LiveSession
 from api.preview import preview_png
 from api.schemas import Capture, SequenceName, Session, SessionDetail, SessionResume, SessionStart, Station
 from api.service import OPERATE, READ, Here, RegistryId, Service, SessionId
+from lab.capture.sequences.calibration import Calibration, full_calibration
+from lab.capture.session import Progress
+from lab.capture.station import Station as LabStation
+from lab.capture.store import CaptureInfo, SessionInfo, npy_bytes
 from lab.errors import InputError
-from lab.recording import Kind
-from lab.sequences.calibration import Calibration, full_calibration
-from lab.session import Progress
-from lab.station import Station as LabStation
-from lab.store import CaptureInfo, SessionInfo, npy_bytes
+from lab.formats.recording_set import Kind
 from sim.camera import Side
 
 router = APIRouter()

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import lab
-from lab import recording
 from lab.challenge.truth import Seals, Truth, Truths, digest, load, purpose_of, salted, seal, store
 from lab.errors import InputError
+from lab.formats import recording_set as recording
 
 #: What all files of a challenge are dated, s since 1970: when one was written says nothing.
 FILE_TIME_S = 1_772_442_000

@@ -12,7 +12,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from lab.challenge.truth import load, store
-from lab.results import DiagnosisResult
+from lab.formats.results import DiagnosisResult
 from sim.parameters import Frozen
 
 
@@ -37,8 +37,8 @@ def _peak_mib() -> float:
 
 def run_case(folder: Path) -> CaseRun:
     """Diagnose one recording set as `lab.diagnose` does."""
-    from lab import recording
     from lab.diagnose import diagnose
+    from lab.formats import recording_set as recording
 
     with contextlib.suppress(OSError):  # Linux: the peak begins anew
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")

@@ -13,7 +13,7 @@ from scipy.special import betaincinv
 
 from lab.challenge.run import CaseRun
 from lab.challenge.truth import Purpose, Seals, Truth, Truths, digest, seal
-from lab.results import DiagnosisResult
+from lab.formats.results import DiagnosisResult
 from sim.parameters import Frozen
 
 CONFIDENCE = 0.95

@@ -12,14 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from lab.camera_file import CameraFile
-from lab.diagnose.blocks import BLOCKS
-from lab.diagnose.findings import merged
-from lab.diagnose.next_capture import Proposal
+from lab.diagnose.measurements.blocks import BLOCKS
+from lab.diagnose.outcome.findings import merged
+from lab.diagnose.outcome.next_capture import Proposal
 from lab.diagnose.processes import in_processes
 from lab.diagnose.side import SideFindings, diagnose_side
-from lab.recording import RecordingSet
-from lab.results import DiagnosisResult, FitResult
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import DiagnosisResult, FitResult
 from sim.camera import Side
 
 __all__ = ["BLOCKS", "Diagnosis", "Progress", "diagnose", "examine"]

@@ -18,11 +18,11 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any
 
-from lab.camera_file import CameraFile
 from lab.diagnose.side import SideFindings
 from lab.errors import InputError
-from lab.recording import RecordingSet
-from lab.results import FitResult
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import FitResult
 from sim.camera import Side
 
 #: How often (s) a waiting main thread wakes to let Python run signal handlers.

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.camera_file import CameraFile
-from lab.diagnose.blocks import evidence_of
-from lab.diagnose.bootstrap import healthy_draws, image_threshold
-from lab.diagnose.decide import FALSE_ALARM_RATE, Candidate, Verdict, decide
-from lab.diagnose.evidence import Evidence
-from lab.diagnose.improved import Correction, improved_model
-from lab.diagnose.locate import describe
-from lab.diagnose.looked_at import measurement_fits, places, visibility
-from lab.diagnose.next_capture import Proposal, proposals
-from lab.diagnose.pictures import residual_pictures
-from lab.diagnose.summaries import Block
-from lab.recording import RecordingSet
-from lab.results import (
+from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
+from lab.diagnose.inference.decide import FALSE_ALARM_RATE, Candidate, Verdict, decide
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.locate import describe
+from lab.diagnose.measurements.blocks import evidence_of
+from lab.diagnose.measurements.summaries import Block
+from lab.diagnose.outcome.improved import Correction, improved_model
+from lab.diagnose.outcome.looked_at import measurement_fits, places, visibility
+from lab.diagnose.outcome.next_capture import Proposal, proposals
+from lab.diagnose.outcome.pictures import residual_pictures
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import (
     FitResult,
     HeldOut,
     MeasurementFit,

@@ -8,8 +8,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from lab.errors import NotDetermined
-from lab.recording import RecordingSet
-from lab.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
 from sim.camera import Side
 
 #: Called with what was just done and the share of the work that is done, 0..1; from any thread, one call at a time.

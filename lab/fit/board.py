@@ -24,8 +24,8 @@ from scipy import ndimage
 from scipy.special import erf
 
 from lab.errors import NotDetermined
-from lab.recording import Charuco, RecordingSet
-from lab.results import Skipped
+from lab.formats.recording_set import Charuco, RecordingSet
+from lab.formats.results import Skipped
 from sim.camera import Side
 from sim.sensor.mosaic import phases, planes
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from lab.fit.levels import QUANTISATION_DN2, BoolArray, Level, PlaneStatistics, SpatialVariance
 from lab.fit.lines import DarkLine, dark_line, inflation, linearity, root
-from lab.results import Emva1288, Emva1288Points
+from lab.formats.results import Emva1288, Emva1288Points
 from sim.spectrum import FloatArray
 
 HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise

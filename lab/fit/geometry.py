@@ -35,8 +35,8 @@ from lab.fit.bundle import (
 )
 from lab.fit.pinhole import COUNT, NAMES, distortion_of, matrix_of, project_slopes, unproject
 from lab.fit.projection import Difference, difference, grid, grid_points, points_at, projection_std
-from lab.recording import RecordingSet
-from lab.results import (
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import (
     BoardWarp,
     ChannelGeometry,
     CrossValidation,

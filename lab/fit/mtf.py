@@ -36,8 +36,8 @@ from scipy.interpolate import BSpline, CubicSpline
 
 from lab.errors import NotDetermined
 from lab.fit.levels import rounding_std_dn, rounding_waves_dn, unrounded
-from lab.recording import RecordingSet, SlantedEdge
-from lab.results import MtfCurve, NoiseFit
+from lab.formats.recording_set import RecordingSet, SlantedEdge
+from lab.formats.results import MtfCurve, NoiseFit
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period

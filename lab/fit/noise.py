@@ -36,8 +36,8 @@ from lab.fit.emva1288 import figures as emva1288_figures
 from lab.fit.levels import DEFECT_SIGMA, HIDDEN_DN2, QUANTISATION_DN2, Level, defective_pixels
 from lab.fit.lines import DarkLine, Linearity, dark_line, inflation, least_squares, linearity, root
 from lab.fit.pixels import DarkPixels, read_noise_distribution, taken
-from lab.recording import Camera, Capture, Dark, Flat, RecordingSet
-from lab.results import ChannelNoise, DarkCurrentTemperature, Emva1288, NoiseFit, PhotonTransfer
+from lab.formats.recording_set import Camera, Capture, Dark, Flat, RecordingSet
+from lab.formats.results import ChannelNoise, DarkCurrentTemperature, Emva1288, NoiseFit, PhotonTransfer
 from sim.camera import Side
 from sim.spectrum import FloatArray, Spectrum
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.results import GeometryFit
+from lab.formats.results import GeometryFit
 
 Array = NDArray[np.floating[Any]]
 

@@ -12,8 +12,8 @@ from scipy import special
 from lab.errors import NotDetermined
 from lab.fit.levels import QUANTISATION_DN2, BoolArray, Float32Array, Stack, defective_pixels, shading
 from lab.fit.lines import root
-from lab.recording import Dark, Flat, RecordingSet
-from lab.results import Defect, PixelDefects, ReadNoiseDistribution
+from lab.formats.recording_set import Dark, Flat, RecordingSet
+from lab.formats.results import Defect, PixelDefects, ReadNoiseDistribution
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray

@@ -21,7 +21,7 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from lab.fit.pinhole import cross_matrices, intrinsics_of_fit, project, project_slopes, unproject
-from lab.results import GeometryFit
+from lab.formats.results import GeometryFit
 
 Array = NDArray[np.floating[Any]]
 

@@ -28,8 +28,8 @@ from scipy.interpolate import RectBivariateSpline
 
 from lab.errors import NotDetermined
 from lab.fit.screen import MATCH, ScreenWarp, busiest_quadrilateral, register
-from lab.recording import Bernoulli, Camera, RecordingSet
-from lab.results import NoiseFit, PsfKernel, PsfSymmetry
+from lab.formats.recording_set import Bernoulli, Camera, RecordingSet
+from lab.formats.results import NoiseFit, PsfKernel, PsfSymmetry
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import phases, planes
 from sim.sensor.mosaic import step as period

@@ -23,8 +23,8 @@ from scipy import linalg, optimize, special
 
 from lab.errors import NotDetermined
 from lab.fit.lines import DarkLine, dark_line
-from lab.recording import Capture, Flat, Narrowband, RecordingSet
-from lab.results import MakerDeparture, NoiseFit, SpectralFit
+from lab.formats.recording_set import Capture, Flat, Narrowband, RecordingSet
+from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
 from sim.camera import Side
 from sim.optics.illumination import irradiance_factor
 from sim.sensor.mosaic import phases, step

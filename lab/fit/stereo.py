@@ -33,8 +33,8 @@ from lab.fit.pinhole import (
     unproject,
 )
 from lab.fit.projection import grid, grid_points
-from lab.recording import RecordingSet
-from lab.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]

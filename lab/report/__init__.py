@@ -15,15 +15,9 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from lab.errors import InputError
-from lab.rawfile import replacing
-from lab.recording import RecordingSet
-from lab.report import charts, geometry, words
-from lab.report import diagnosis as diagnosis_page
-from lab.report.emva import data_sheets
-from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
-from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
-from lab.report.provenance import Provenance, installed_versions, provenance_of
-from lab.results import (
+from lab.formats.raw_file import replacing
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import (
     Check,
     DiagnosisResult,
     FitResult,
@@ -33,6 +27,12 @@ from lab.results import (
     Skipped,
     ValidationResult,
 )
+from lab.report import charts, geometry, words
+from lab.report import diagnosis as diagnosis_page
+from lab.report.emva import data_sheets
+from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
+from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
+from lab.report.provenance import Provenance, installed_versions, provenance_of
 from sim.camera import Side
 
 __all__ = ["Provenance", "installed_versions", "provenance_of", "render_report", "write_report"]

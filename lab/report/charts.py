@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from lab.recording import RecordingSet
-from lab.report.figures import measured
-from lab.results import (
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import (
     Check,
     DiagnosisResult,
     NoiseFit,
@@ -19,6 +18,7 @@ from lab.results import (
     ResidualCurve,
     SpectralFit,
 )
+from lab.report.figures import measured
 from sim.camera import Side
 
 Figure = dict[str, Any]

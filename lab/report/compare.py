@@ -10,11 +10,11 @@ import numpy as np
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
+from lab.formats.results import Change, ComparisonResult, ProjectionChange
 from lab.report import page_environment, write_page
 from lab.report.charts import AFTER, BEFORE, Figure, axis, layout
 from lab.report.figures import measured
 from lab.report.geometry import frame_layout, lines_of_vectors
-from lab.results import Change, ComparisonResult, ProjectionChange
 
 SHOWN = 40  # rows of the chart: those that changed, and the most significant of the rest
 LEAST_SIGMA = 0.02  # where a logarithmic axis ends

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from lab.diagnose.looked_at import detectable
+from lab.diagnose.outcome.looked_at import detectable
+from lab.formats.results import DiagnosisResult, Place, ResidualCurve, ResidualPicture, Visibility
 from lab.report.charts import Figure, axis, layout
 from lab.report.figures import SHOWN_UNITS
 from lab.report.pictures import difference_picture
-from lab.results import DiagnosisResult, Place, ResidualCurve, ResidualPicture, Visibility
 from sim.camera import Side
 from sim.effects.library import effects as library
 

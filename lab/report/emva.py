@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from lab.errors import NotDetermined
 from lab.fit.pixels import pixel_maps, taken
-from lab.recording import Dark, Flat, RecordingSet
+from lab.formats.recording_set import Dark, Flat, RecordingSet
+from lab.formats.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
 from lab.report.charts import AFTER, BEFORE, CHANNEL, Figure, Trace, axis, layout
 from lab.report.figures import NOISE, measured
 from lab.report.maps import MAPS
 from lab.report.pictures import map_picture, png_data_uri
-from lab.results import ChannelNoise, Emva1288, Emva1288Points, FitResult, NoiseFit, PixelDefects
 from sim.camera import Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray

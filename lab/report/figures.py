@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from lab.recording import Camera
-from lab.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
+from lab.formats.recording_set import Camera
+from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
 from sim.camera import Side
 
 #: Field of `NoiseFit` -> (name, unit), in the order of the table; the maker's value has the same field name.

@@ -13,11 +13,11 @@ from scipy.spatial import ConvexHull, QhullError
 from lab.errors import InputError, NotDetermined
 from lab.fit.board import luminance
 from lab.fit.stereo import rectification_maps
-from lab.recording import RecordingSet
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.figures import measured
 from lab.report.pictures import png_data_uri
-from lab.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
 from sim.camera import Side
 from sim.spectrum import FloatArray
 

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from lab.lens import LensResult, TracedPrescription
+from lab.predict.lens import LensResult, TracedPrescription
 from lab.report import page_environment, write_page
 from lab.report.charts import Figure, Trace, axis, layout
 from lab.report.pictures import kernel_picture

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lab.errors import InputError
 from lab.fit.pixels import PixelMaps
-from lab.rawfile import replacing
+from lab.formats.raw_file import replacing
 from lab.report.pictures import map_picture, png
 
 #: Field of `PixelMaps` -> (title, unit).

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lab.recording import Camera
-from lab.results import Patch
+from lab.formats.recording_set import Camera
+from lab.formats.results import Patch
 from sim.sensor.mosaic import planes
 
 DISPLAY_GAMMA = 2.2

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 
-from lab.recording import RecordingSet, manifest_json
+from lab.formats.recording_set import RecordingSet, manifest_json
 from sim.parameters import Frozen
 
 #: The distributions whose version can change a number.

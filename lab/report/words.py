@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ParameterValue, ValidationResult
 from lab.report.figures import measured
-from lab.results import Check, DiagnosisResult, FitResult, NamedEffect, ParameterValue, ValidationResult
 
 #: Verdict -> (what stands on the badge, its mood, the headline).
 VERDICTS = {

@@ -19,8 +19,8 @@ import uvicorn
 from api.app import create_app
 from api.keys import Permission, create_key
 from api.service import Limits
-from lab.recording import Manifest, RecordingSet
-from lab.store import Store
+from lab.capture.store import Store
+from lab.formats.recording_set import Manifest, RecordingSet
 from tests.lab.fake_bench import BLACK, COLS, ROWS, WHITE, Bench
 
 STATION = f"""

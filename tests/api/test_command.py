@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 
 from api.command import commands
 from api.keys import stored_keys
+from lab.capture.store import Store
 from lab.cli import main
-from lab.store import Store
 
 KEY = re.compile(r"calibench_[A-Za-z0-9_-]{43}")
 

@@ -19,8 +19,8 @@ from api.keys import (
     new_key,
     stored_keys,
 )
+from lab.capture.store import Store
 from lab.errors import InputError
-from lab.store import Store
 
 SOMEONE = StoredKey("someone", Permission.READ, digest("x"))
 

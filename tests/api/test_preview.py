@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from api.preview import GAMMA, preview_png
-from lab.recording import Camera
+from lab.formats.recording_set import Camera
 from sim.sensor.mosaic import phases
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.recording import Manifest, RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet
 from sim.spectrum import Spectrum
 
 ROWS, COLS = 24, 32

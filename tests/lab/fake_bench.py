@@ -20,7 +20,7 @@ from drivers.instrument import Identity
 from drivers.monochromator.base import Monochromator
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
 from drivers.stage.base import Stage
-from lab.station import Drivers, Station
+from lab.capture.station import Drivers, Station
 from sim.spectrum import Spectrum
 
 ROWS, COLS, BLACK, WHITE = 24, 32, 64, 4095
@@ -232,8 +232,8 @@ class FakeCamera(_Fake, Camera):
 
 
 if __name__ == "__main__":
-    from lab.session import CaptureSession
-    from lab.store import Store
+    from lab.capture.session import CaptureSession
+    from lab.capture.store import Store
 
     bench = Bench(float(sys.argv[3]) if len(sys.argv) > 3 else 0.0)
     CaptureSession(

@@ -13,12 +13,12 @@ import sqlalchemy as sa
 from distributed import LocalCluster
 
 import lab.jobs
+from lab.capture.sequences.calibration import Calibration
+from lab.capture.sequences.dark import DarkSequence
+from lab.capture.session import CaptureSession
+from lab.capture.store import JobRow, Store
 from lab.errors import InputError, NotDetermined
 from lab.jobs import JobInfo, JobRunner, ReportFile
-from lab.sequences.calibration import Calibration
-from lab.sequences.dark import DarkSequence
-from lab.session import CaptureSession
-from lab.store import JobRow, Store
 from tests.lab import fake_bench
 
 

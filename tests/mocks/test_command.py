@@ -16,7 +16,7 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.station import drivers_of, read_station
+from lab.capture.station import drivers_of, read_station
 from mocks.command import station_toml
 
 Start = Callable[..., subprocess.Popen[str]]

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab import recording
 from lab.challenge.make import make
 from lab.challenge.run import run_all
 from lab.challenge.score import broken_seals, score
@@ -28,7 +27,8 @@ from lab.challenge.truth import (
 )
 from lab.cli import main
 from lab.errors import InputError
-from lab.results import DiagnosisResult
+from lab.formats import recording_set as recording
+from lab.formats.results import DiagnosisResult
 from tests.proof.former import LISTED, OUTSIDE
 from tests.proof.former.draw import FAULTS, SHARES, draw, kind_of
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from lab.diagnose import diagnose
-from lab.recording import read
-from lab.results import DiagnosisResult
+from lab.formats.recording_set import read
+from lab.formats.results import DiagnosisResult
 from tests.proof.former import Camera, Law
 from tests.proof.former.laws import (
     ChargeDiffusion,

@@ -15,7 +15,7 @@ import pytest
 
 from lab.challenge.truth import FIRST_FRESH_SEED, Kind, SaltedTruth, Truth, canonical, purpose_of, salted, seal
 from lab.diagnose import diagnose
-from lab.results import DiagnosisResult
+from lab.formats.results import DiagnosisResult
 from tests.proof.former import Law
 from tests.proof.former.draw import Case, draw
 from tests.proof.former.laws import (

@@ -10,7 +10,7 @@ from lab.challenge.proof import confusion, table, write_page
 from lab.challenge.run import CaseRun
 from lab.challenge.score import ChallengeScore, Rate, score
 from lab.challenge.truth import Concealed, Kind, Seals, Truth, Truths, salted, seal
-from lab.results import DiagnosisResult, HeldOut, NamedEffect, ParameterValue, Rival
+from lab.formats.results import DiagnosisResult, HeldOut, NamedEffect, ParameterValue, Rival
 
 
 def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, accepts: tuple[str, ...] = ()) -> Truth:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.blocks import evidence_of
-from lab.diagnose.bootstrap import healthy_draws
-from lab.diagnose.score import signatures
+from lab.diagnose.inference.bootstrap import healthy_draws
+from lab.diagnose.inference.score import signatures
+from lab.diagnose.measurements.blocks import evidence_of
 from sim.effects.library import effects
 from tests.proof.former import Camera, Plan
 

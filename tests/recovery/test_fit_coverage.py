@@ -11,8 +11,8 @@ import pytest
 from lab.fit.levels import Level, level_statistics
 from lab.fit.noise import noise_fit
 from lab.fit.spectral import estimate_sensitivity
-from lab.recording import Camera
-from lab.results import NoiseFit
+from lab.formats.recording_set import Camera
+from lab.formats.results import NoiseFit
 from sim.camera import CameraModel, Lens
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum

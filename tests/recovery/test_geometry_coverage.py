@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from lab.compare import compare
 from lab.fit.board import CornerFits
+from lab.fit.compare import compare
 from lab.fit.geometry import calibrate_robustly, channel_geometry, cross_validation, geometry_result
 from lab.fit.pinhole import intrinsics_of
 from lab.fit.projection import difference, grid, grid_points, points_at
 from lab.fit.stereo import Pair, depth_std, solve_rig
-from lab.results import CameraFit, FitResult
+from lab.formats.results import CameraFit, FitResult
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 DRAWS, VARIANCE_DRAWS = 400, 800

@@ -16,8 +16,8 @@ from lab.fit.levels import Level, Stack
 from lab.fit.lines import linearity
 from lab.fit.noise import noise_fit
 from lab.fit.pixels import DarkPixels
-from lab.recording import Camera
-from lab.results import NoiseFit
+from lab.formats.recording_set import Camera
+from lab.formats.results import NoiseFit
 from sim.sensor.mosaic import planes
 
 DRAWS = 300

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from lab.fit.spectral import fit_spectral
-from lab.recording import Manifest, RecordingSet
-from lab.results import NoiseFit
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.results import NoiseFit
 from sim.forward import Exposure, sample
 from sim.scene import Darkness, UniformField
 from sim.scene.light import colour_science

@@ -13,8 +13,8 @@ import pytest
 import lab.jobs
 from api.security import REPORT_POLICY
 from lab.errors import InputError
+from lab.formats.results import CameraFit, FitResult, NoiseFit
 from lab.jobs import ReportFile
-from lab.results import CameraFit, FitResult, NoiseFit
 from tests.api.conftest import Running, events, until
 
 FIT = FitResult(source="x", cameras={"left": CameraFit(noise=NoiseFit(read_noise_e=2.0, read_noise_e_std=0.1))})

@@ -14,9 +14,9 @@ import pytest
 
 import lab.jobs
 from api.service import Limits
-from lab import recording
-from lab.recording import RecordingSet
-from lab.results import FitResult
+from lab.formats import recording_set as recording
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import FitResult
 from tests.api.conftest import Running, serving, until
 
 Change = Callable[[zipfile.ZipFile], None]

@@ -184,7 +184,7 @@ def test_stopping_the_service_leaves_sessions_resumable(tmp_path: Path) -> None:
         until(client, f"/api/v1/sessions/{session_id}", lambda now: now["steps_done"] > 1)
         bench = running.bench
     assert not bench.opened and "close monochromator" in bench.log
-    from lab.store import Store
+    from lab.capture.store import Store
 
     store = Store(tmp_path)
     info = store.session(session_id)

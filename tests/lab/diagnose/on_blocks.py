@@ -7,11 +7,11 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
-from lab.diagnose.decide import Verdict, decide
-from lab.diagnose.evidence import Evidence, chi2
-from lab.diagnose.summaries import Block, Study
-from lab.predict import camera_model
-from lab.recording import Manifest, RecordingSet
+from lab.diagnose.inference.decide import Verdict, decide
+from lab.diagnose.inference.evidence import Evidence, chi2
+from lab.diagnose.measurements.summaries import Block, Study
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.forward import Exposure, electron_rate, sample

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from lab.diagnose import diagnose
-from lab.diagnose.decide import decide
-from lab.diagnose.evidence import Evidence, Gaussian, Within, chi2
-from lab.diagnose.locate import look
-from lab.diagnose.refit import Fit, refit
-from lab.diagnose.score import Signatures, signatures
-from lab.diagnose.search import Search
-from lab.diagnose.summaries import Block, Label, Prediction
-from lab.diagnose.unknown import discrepancy, predictive
-from lab.recording import Manifest, RecordingSet
+from lab.diagnose.inference.decide import decide
+from lab.diagnose.inference.evidence import Evidence, Gaussian, Within, chi2
+from lab.diagnose.inference.locate import look
+from lab.diagnose.inference.refit import Fit, refit
+from lab.diagnose.inference.score import Signatures, signatures
+from lab.diagnose.inference.search import Search
+from lab.diagnose.inference.unknown import discrepancy, predictive
+from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.formats.recording_set import Manifest, RecordingSet
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import effect, effects

@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from lab.diagnose import diagnose, examine
-from lab.importers import read_foreign
-from lab.recording import inspect
+from lab.formats.importers import read_foreign
+from lab.formats.recording_set import inspect
 from tests.proof.former import Camera, Plan
 from tests.proof.former import laws as concealed_laws
 

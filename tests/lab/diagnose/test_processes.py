@@ -16,7 +16,7 @@ import pytest
 
 from lab.diagnose import diagnose
 from lab.errors import InputError
-from lab.recording import Manifest, RecordingSet, read, write
+from lab.formats.recording_set import Manifest, RecordingSet, read, write
 
 ROWS, COLS, BLACK_DN = 40, 48, 64.0
 

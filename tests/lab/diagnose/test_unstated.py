@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from lab.diagnose import diagnose
-from lab.diagnose.blocks import evidence_of
-from lab.diagnose.decide import decide
-from lab.diagnose.summaries import Study
-from lab.predict import camera_model
-from lab.recording import Manifest, RecordingSet
+from lab.diagnose.inference.decide import decide
+from lab.diagnose.measurements.blocks import evidence_of
+from lab.diagnose.measurements.summaries import Study
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.predict.camera_model import camera_model
 from tests.proof.former import Camera, Plan
 
 

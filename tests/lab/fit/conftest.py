@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.fit.geometry import fit_geometry
-from lab.recording import Camera, Charuco, Manifest, RecordingSet
-from lab.results import GeometryFit
+from lab.formats.recording_set import Camera, Charuco, Manifest, RecordingSet
+from lab.formats.results import GeometryFit
 
 SHAPE = (300, 400)
 OVER = 3  # rays a pixel and axis

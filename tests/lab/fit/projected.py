@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.fit.board import BoardView, board_points
-from lab.recording import Charuco
+from lab.formats.recording_set import Charuco
 
 SHAPE = (960, 1280)
 Array = NDArray[np.floating[Any]]

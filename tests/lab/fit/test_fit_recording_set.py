@@ -9,8 +9,8 @@ import pytest
 
 from lab.errors import InputError, NotDetermined
 from lab.fit import fit_recording_set
-from lab.recording import RecordingSet
-from lab.results import FitResult, GeometryFit, NoiseFit, StereoFit
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import FitResult, GeometryFit, NoiseFit, StereoFit
 
 STEPS = ("noise", "spectral", "mtf", "psf", "geometry", "stereo")
 

@@ -19,8 +19,8 @@ from lab.fit.geometry import (
     fit_geometry,
     geometry_result,
 )
-from lab.recording import RecordingSet
-from lab.results import GeometryFit
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import GeometryFit
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 

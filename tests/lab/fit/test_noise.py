@@ -13,9 +13,9 @@ from lab.errors import NotDetermined
 from lab.fit.levels import Level, defective_pixels, level_statistics, shading
 from lab.fit.lines import dark_line, linearity
 from lab.fit.noise import fit_noise, fit_transfer, noise_fit, temperature_law
-from lab.importers.emva1288 import read_emva1288
-from lab.recording import Camera, Manifest, RecordingSet, read
-from lab.results import NoiseFit
+from lab.formats.importers.emva1288 import read_emva1288
+from lab.formats.recording_set import Camera, Manifest, RecordingSet, read
+from lab.formats.results import NoiseFit
 from sim.sensor.mosaic import planes
 
 DATA = Path(__file__).parents[4] / "shared" / "data"

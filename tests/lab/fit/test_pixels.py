@@ -13,8 +13,8 @@ import pytest
 from lab.errors import NotDetermined
 from lab.fit.levels import Stack
 from lab.fit.pixels import DarkPixels, PixelMaps, pixel_maps, read_noise_distribution
-from lab.importers.images import read_image
-from lab.recording import Camera, Manifest, RecordingSet
+from lab.formats.importers.images import read_image
+from lab.formats.recording_set import Camera, Manifest, RecordingSet
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "llanos_colorchecker"
 SHAPE = (48, 64)

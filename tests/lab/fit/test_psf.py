@@ -29,7 +29,7 @@ from lab.fit.psf import (
     screen_pictures,
 )
 from lab.fit.screen import register, target_corners
-from lab.recording import Bernoulli, Black, Camera, Checkerboard, Manifest, RecordingSet, Screen, White
+from lab.formats.recording_set import Bernoulli, Black, Camera, Checkerboard, Manifest, RecordingSet, Screen, White
 
 
 def by_area(light, support, over=8):

@@ -11,8 +11,8 @@ import pytest
 from lab.errors import NotDetermined
 from lab.fit.noise import fit_noise
 from lab.fit.spectral import MIN_LIGHTS, compare_curves, estimate_sensitivity, fit_spectral
-from lab.recording import Camera, Manifest, RecordingSet, read
-from lab.results import NoiseFit, SpectralFit
+from lab.formats.recording_set import Camera, Manifest, RecordingSet, read
+from lab.formats.results import NoiseFit, SpectralFit
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, sample
 from sim.scene import Darkness, UniformField

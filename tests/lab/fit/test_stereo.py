@@ -12,7 +12,7 @@ import pytest
 from lab.errors import NotDetermined
 from lab.fit.geometry import calibrate_robustly, fit_geometry, geometry_result
 from lab.fit.stereo import Pair, fit_pairs, fit_stereo, rectification_maps
-from lab.recording import Camera, Charuco, Manifest, RecordingSet
+from lab.formats.recording_set import Camera, Charuco, Manifest, RecordingSet
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 PAIRS = Path(__file__).parents[3].parent / "shared" / "data" / "opencv_stereo"

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from lab.results import (
+from lab.formats.results import (
     CameraFit,
     Check,
     Curve,

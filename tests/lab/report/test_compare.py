@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from lab.errors import InputError
+from lab.formats.results import Change, ComparisonResult, ProjectionChange, Skipped
 from lab.report.compare import projection_vectors, render_comparison, significances, write_comparison
-from lab.results import Change, ComparisonResult, ProjectionChange, Skipped
 from tests.lab.report.test_report import Page
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from lab.formats.results import DiagnosisResult, NamedEffect, Place, ResidualCurve, ResidualPicture, Visibility
 from lab.report.diagnosis import context, mood, place_maps, worst_of_each
-from lab.results import DiagnosisResult, NamedEffect, Place, ResidualCurve, ResidualPicture, Visibility
 
 PLACES = tuple(
     Place(side="left", measurement=m, axis=axis, where=where, n=10, chi2_before=before, chi2_after=9.0, sigma_before=sigma, sigma_after=0.0)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from lab.fit.noise import fit_noise
-from lab.recording import Camera, Manifest, RecordingSet
+from lab.formats.recording_set import Camera, Manifest, RecordingSet
+from lab.formats.results import CameraFit, FitResult
 from lab.report import render_report
 from lab.report.emva import data_sheets, spectrogram
 from lab.report.provenance import provenance_of
-from lab.results import CameraFit, FitResult
 
 SHAPE = (64, 96)
 

@@ -10,7 +10,8 @@ import pytest
 
 from lab.fit.geometry import calibrate_robustly, geometry_result
 from lab.fit.stereo import Pair, fit_pairs
-from lab.recording import Camera, Manifest, RecordingSet
+from lab.formats.recording_set import Camera, Manifest, RecordingSet
+from lab.formats.results import ChannelGeometry, GeometryFit
 from lab.report.geometry import (
     charts_by_side,
     coverage,
@@ -21,7 +22,6 @@ from lab.report.geometry import (
     rectified_picture,
     residual_vectors,
 )
-from lab.results import ChannelGeometry, GeometryFit
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from lab.errors import InputError
-from lab.recording import Camera, RecordingSet
+from lab.formats.recording_set import Camera, RecordingSet
+from lab.formats.results import CameraFit, FitResult, MakerDeparture, Patch, SpectralFit, Unexplained
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.figures import by_side, measured, rotation_vector_mrad
 from lab.report.pictures import (
@@ -24,7 +25,6 @@ from lab.report.pictures import (
     png_data_uri,
     trimmed_margin,
 )
-from lab.results import CameraFit, FitResult, MakerDeparture, Patch, SpectralFit, Unexplained
 
 MadeUp = Callable[..., Any]
 

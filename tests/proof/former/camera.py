@@ -21,7 +21,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, RectBivariateSpline, RegularGridInterpolator
 from scipy.special import ndtr, pdtrik
 
-from lab.recording import Manifest, RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet
 from sim.spectrum import Spectrum
 
 from .laws import FULL_CODE, WL, Array, Law

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lab.challenge.truth import Concealed, Kind, Truth
-from lab.recording import Manifest, RecordingSet
+from lab.formats.recording_set import Manifest, RecordingSet
 from sim.spectrum import Spectrum
 
 from .camera import Camera, Plan

@@ -13,11 +13,11 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from lab.diagnose import BLOCKS
-from lab.diagnose.evidence import Evidence
-from lab.diagnose.summaries import Study
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.measurements.summaries import Study
 from lab.errors import NotDetermined
-from lab.predict import camera_model
-from lab.recording import RecordingSet
+from lab.formats.recording_set import RecordingSet
+from lab.predict.camera_model import camera_model
 
 
 def evidence(recordings: RecordingSet) -> Evidence | None:

@@ -1,0 +1,24 @@
+"""Alembic's entry: upgrades the connection that `lab.capture.store` hands over, or the URL in CALIBENCH_DATABASE_URL."""
+
+from __future__ import annotations
+
+from alembic import context
+from sqlalchemy import create_engine
+
+from lab.capture.store import Base, Settings
+
+
+def run() -> None:
+    connection = context.config.attributes.get("connection")
+    if connection is not None:
+        context.configure(connection=connection, target_metadata=Base.metadata, render_as_batch=True)
+        with context.begin_transaction():
+            context.run_migrations()
+        return
+    with create_engine(Settings().url).connect() as own:
+        context.configure(connection=own, target_metadata=Base.metadata, render_as_batch=True)
+        with context.begin_transaction():
+            context.run_migrations()
+
+
+run()

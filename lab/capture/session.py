@@ -1,0 +1,449 @@
+"""Run a session on a station: every step once, whatever comes between.
+
+bluesky's RunEngine runs the plan; the journal in the registry says which steps are done. A run that ended early (Ctrl-C, an
+instrument that failed, kill -9, a power cut) is resumed by running the session again: finished steps are not taken again, and
+the others are taken whole.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import platform
+import signal
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import bluesky.preprocessors as bpp
+import bluesky.run_engine
+import numpy as np
+from bluesky.run_engine import RunEngine
+from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, TransitionError
+
+from drivers.errors import InstrumentError
+from drivers.instrument import Identity
+from lab.capture.devices import Instruments, Taken, in_thread, take
+from lab.capture.sequences.calibration import Calibration, full_calibration
+from lab.capture.sequences.steps import Step
+from lab.capture.station import Drivers, Station, drivers_of
+from lab.capture.store import JournalEntry, Run, SessionInfo, Store, now
+from lab.errors import DeviceError, InputError
+from sim.parameters import Frozen
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+# A library's place: whoever wants bluesky's log configures it; its last resort would write tracebacks over progress bars.
+logging.getLogger("bluesky").addHandler(logging.NullHandler())
+# The RunEngine announces pauses and aborts on stdout, which belongs to the command line.
+bluesky.run_engine.__dict__["print"] = lambda *words, **_: log.debug(" ".join(map(str, words)))
+
+#: How often (s) a waiting main thread wakes to let Python run signal handlers.
+WAKE_S = 0.1
+
+PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
+
+
+class Progress(Frozen):
+    """Where a session stands. `done` of `total` steps are in the journal; `what` is under way; times in s."""
+
+    session: str
+    state: Literal["connecting", "running", "paused", "packing", "interrupted", "failed", "finished"]
+    what: str
+    sequence: str = ""
+    done: int
+    total: int
+    elapsed_s: float
+    left_s: float | None = None
+    remark: str | None = None
+
+
+class _Pace:
+    """Estimates the time left from how long the steps of each sequence took in this run."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, list[float]] = defaultdict(list)
+
+    def add(self, step: Step, seconds: float) -> None:
+        self.spent[step.sequence].append(seconds)
+
+    def left_s(self, to_do: list[Step]) -> float | None:
+        every = [seconds for spent in self.spent.values() for seconds in spent]
+        if not every:
+            return None
+        mean = float(np.mean(every))
+        return float(
+            sum(float(np.mean(self.spent[step.sequence])) if step.sequence in self.spent else mean for step in to_do)
+        )
+
+
+class _Writes:
+    """Lets a run write until it is over. An abort doesn't end the threads that wait for instruments: one that comes back
+    late must not touch the files and steps of the run after."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._over = False
+
+    def do(self, write: Callable[[], T]) -> T:
+        """Write now. Raises InstrumentError after `close`."""
+        with self._lock:
+            if self._over:
+                raise InstrumentError("came back after the run had ended; what it brought is dropped")
+            return write()
+
+    def close(self) -> None:
+        """Wait for what is being written, and let nothing more through."""
+        with self._lock:
+            self._over = True
+
+
+class CaptureSession:
+    """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
+
+    `station`: the one that the session began on, unless its instruments have moved to other addresses since. `on_progress`
+    is called from a thread of the run; what it raises ends the run.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        session_id: str,
+        *,
+        station: Station | None = None,
+        on_progress: Callable[[Progress], None] | None = None,
+        connect: Callable[[Station], Drivers] = drivers_of,
+    ) -> None:
+        self.store, self.id = store, session_id
+        self.station = station or store.station(session_id)
+        self._on_progress = on_progress
+        self._connect = connect
+        self._engine: RunEngine | None = None
+        self._control = threading.Condition()
+        self._ended_by: str | None = None
+        self._resume_asked = False
+        self._began_s = time.monotonic()
+        self._pace = _Pace()
+        self._entries: list[JournalEntry] = []
+        self._done = 0
+        self._writes = _Writes()
+
+    @classmethod
+    def start(
+        cls,
+        store: Store,
+        station: Station,
+        calibration: Calibration | None = None,
+        *,
+        quick: bool = False,
+        name: str = "",
+        notes: str = "",
+        on_progress: Callable[[Progress], None] | None = None,
+        connect: Callable[[Station], Drivers] = drivers_of,
+    ) -> CaptureSession:
+        """Register a new session, by default of everything that the station can do; `run` it then.
+
+        Raises InputError if the station lacks what the calibration needs.
+        """
+        chosen = calibration or full_calibration(station, quick)
+        steps = chosen.steps(station)
+        if not steps:
+            raise InputError("station: nothing to capture with; add instruments and targets to the station file")
+        session_id = store.create_session(
+            station,
+            steps,
+            calibration=chosen.model_dump(mode="json", exclude_none=True),
+            patterns=chosen.patterns(station),
+            name=name,
+            notes=notes,
+        )
+        return cls(store, session_id, on_progress=on_progress, connect=connect)
+
+    # --- from other threads ------------------------------------------------------------------------------------------------
+
+    def pause(self) -> None:
+        """Pause when the step under way is done: the shutter closes, the screen goes dark, all lines stay open."""
+        with self._control:
+            engine = self._engine
+        if engine is not None and engine.state == "running":
+            with contextlib.suppress(TransitionError):
+                engine.request_pause(defer=True)
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        with self._control:
+            self._resume_asked = True
+            self._control.notify_all()
+
+    def abort(self, reason: str = "aborted") -> None:
+        """End the run now. The step under way is dropped, finished ones stay; running the session again goes on from there."""
+        with self._control:
+            if self._ended_by is None:
+                self._ended_by = reason
+            engine = self._engine
+            self._control.notify_all()
+        if engine is not None and engine.state == "running":
+            with contextlib.suppress(TransitionError):
+                engine.abort(reason)
+
+    # --- the run -----------------------------------------------------------------------------------------------------------
+
+    def run(self) -> SessionInfo:
+        """Take every step that isn't in the journal yet, and pack the session.
+
+        Raises DeviceError if an instrument fails (what was finished is kept, the shutter closed), InputError if another
+        process runs the session or the disk is full, and KeyboardInterrupt on Ctrl-C, after everything is safe. A run that
+        `abort` ended returns with the state "interrupted".
+        """
+        lock = self.store.lock(self.id)
+        if not lock.acquire():
+            raise InputError(f"session {self.id}: another process runs it; wait for that, or end it")
+        try:
+            with self._signals() as interrupted:
+                self._run()
+            if interrupted.is_set():
+                raise KeyboardInterrupt
+        finally:
+            lock.release()
+        return self.store.session(self.id)
+
+    def _run(self) -> None:
+        self._began_s = time.monotonic()
+        swept = self.store.sweep(self.id)
+        if swept:
+            log.info("session %s: took away %d files of steps that weren't finished", self.id, len(swept))
+        self._entries = self.store.journal(self.id)
+        self._done = sum(entry.finished is not None for entry in self._entries)
+        try:
+            if self._done < len(self._entries):
+                self._capture()
+            if self._ended_by is None:
+                self._tell("packing", "packing the session")
+                self.store.close_session(self.id, lambda what, share: self._tell("packing", f"{what}, {share:.0%}"))
+                self._tell("finished", "done")
+                return
+        except BaseException as error:
+            self.store.set_state(self.id, "failed", error=str(error) or type(error).__name__)
+            self._tell("failed", str(error), quietly=True)
+            raise
+        self.store.set_state(self.id, "interrupted", error=self._ended_by)
+        self._tell("interrupted", self._ended_by or "")
+
+    def _capture(self) -> None:
+        """Connect, run the plan, and leave everything safe."""
+        self._tell("connecting", "connecting to the instruments")
+        self._writes = _Writes()
+        instruments = Instruments(
+            self.station,
+            self._connect(self.station),
+            write_frame=lambda path, side, frame: self._writes.do(
+                lambda: self.store.write_frame(self.id, path, side, frame)
+            ),
+            write_spectrum=lambda path, spectrum: self._writes.do(
+                lambda: self.store.write_spectrum(self.id, path, spectrum)
+            ),
+            cells=self.store.recording_set(self.id).target,
+        )
+        failure: BaseException | None = None
+        try:
+            identities = instruments.connect()
+            self._check_identities(identities)
+            self.store.set_state(self.id, "running", run=_provenance(identities))
+            self._drive(instruments)
+        except BaseException as error:
+            failure = error
+        self._writes.close()
+        complaints = instruments.make_safe()
+        instruments.close()
+        if failure is not None:
+            raise _plain(failure, complaints) from failure
+        if complaints:
+            raise DeviceError("; ".join(complaints))
+
+    def _check_identities(self, identities: dict[str, Identity]) -> None:
+        """A session has one set of instruments. Raises InputError if one was exchanged since the run before."""
+        for run in self.store.runs(self.id)[-1:]:
+            for name, identity in identities.items():
+                before = run.instruments.get(name, {}).get("serial_number", "")
+                if before and identity.serial_number and before != identity.serial_number:
+                    raise InputError(
+                        f"session {self.id}: {name} has the serial number {identity.serial_number}, the session began with "
+                        f"{before}; connect that one again or start a new session"
+                    )
+
+    def _drive(self, instruments: Instruments) -> None:
+        """Run the plan on a RunEngine of its own, through pauses, to its end."""
+        engine = RunEngine({}, context_managers=[], during_task=_Wakeful())
+        documents = self.store.folder(self.id) / "documents.jsonl"
+        engine.subscribe(lambda name, document: _append(documents, name, document))
+
+        async def in_a_thread(message: Any) -> Any:
+            return await _awaited(message.kwargs["call"])
+
+        engine.register_command("in_a_thread", in_a_thread)
+        with self._control:
+            self._engine = engine
+        try:
+            go: Callable[[], Any] = lambda: engine(self._plan(instruments), session=self.id)  # noqa: E731
+            while True:
+                with contextlib.suppress(RunEngineInterrupted):
+                    go()
+                if engine.state != "paused":
+                    return  # at its end, or aborted
+                self.store.set_state(self.id, "paused")
+                self._tell("paused", "paused: the shutter is closed")
+                with self._control:
+                    while not self._control.wait_for(lambda: self._resume_asked or self._ended_by is not None, WAKE_S):
+                        pass
+                    self._resume_asked = False
+                    ended = self._ended_by is not None
+                if ended:
+                    engine.abort(self._ended_by)
+                    return
+                self.store.set_state(self.id, "running")
+                go = engine.resume
+        except BaseException:
+            if self._ended_by is not None:
+                return  # what an abort breaks off is no failure of its own
+            raise
+        finally:
+            with self._control:
+                self._engine = None
+            engine.loop.call_soon_threadsafe(engine.loop.stop)
+            engine._th.join(5.0)  # the RunEngine has no way to end its thread
+            if not engine.loop.is_running():
+                engine.loop.close()
+
+    def _plan(self, instruments: Instruments) -> Generator[Msg, Any, None]:
+        results: dict[str, dict[str, Any]] = {}
+        entries = self._entries
+
+        def steps() -> Generator[Msg, Any, None]:
+            yield Msg("open_run", None)
+            for at, entry in enumerate(entries):
+                step = entry.step
+                if entry.finished is not None:
+                    results[step.id] = entry.result
+                    continue
+                yield Msg("checkpoint")  # where a pause takes hold: between steps
+                if self._ended_by is not None:
+                    break
+                self._tell("running", step.what, step.sequence, [other.step for other in entries[at:]])
+                started, began_s = now(), time.monotonic()
+                taken: Taken = yield from take(step, instruments, results)
+                yield Msg("in_a_thread", None, call=lambda s=step, t=taken, b=started: self._keep(s, t, b))
+                results[step.id] = taken.result
+                self._done += 1
+                self._pace.add(step, time.monotonic() - began_s)
+                if "skipped" in taken.result:
+                    self._tell("running", step.what, step.sequence, remark=f"left out: {taken.result['skipped']}")
+            yield Msg("close_run", None)
+
+        def leave() -> Generator[Msg, Any, None]:
+            yield Msg("in_a_thread", None, call=instruments.make_safe)
+
+        yield from bpp.finalize_wrapper(steps(), leave)
+
+    def _keep(self, step: Step, taken: Taken, started: Any) -> None:
+        self._writes.do(
+            lambda: self.store.finish_step(self.id, step.id, started, taken.result, taken.files, taken.captures)
+        )
+
+    def _tell(
+        self,
+        state: Any,
+        what: str,
+        sequence: str = "",
+        to_do: list[Step] | None = None,
+        remark: str | None = None,
+        quietly: bool = False,
+    ) -> None:
+        if self._on_progress is None:
+            return
+        progress = Progress(
+            session=self.id,
+            state=state,
+            what=what,
+            sequence=sequence,
+            done=self._done,
+            total=len(self._entries),
+            elapsed_s=time.monotonic() - self._began_s,
+            left_s=self._pace.left_s(to_do) if to_do else None,
+            remark=remark,
+        )
+        try:
+            self._on_progress(progress)
+        except Exception:
+            if not quietly:
+                raise
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[threading.Event]:
+        """In the main thread, Ctrl-C and SIGTERM end the run in good order; elsewhere signals aren't ours."""
+        asked = threading.Event()
+        if threading.current_thread() is not threading.main_thread():
+            yield asked
+            return
+
+        def end(number: int, frame: Any) -> None:
+            asked.set()
+            # Not in the handler itself: the main thread may hold the lock that `abort` takes.
+            threading.Thread(target=self.abort, args=(f"ended by {signal.Signals(number).name}",), daemon=True).start()
+
+        before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield asked
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
+    """Waits for a plan's end, waking now and then: Python runs signal handlers in the main thread alone, and a signal that
+    the kernel hands to another thread doesn't wake this one from a wait without an end."""
+
+    def block(self, blocking_event: threading.Event) -> None:
+        while not blocking_event.wait(WAKE_S):
+            pass
+
+
+async def _awaited(call: Callable[[], Any]) -> Any:
+    return await asyncio.wrap_future(in_thread(call))
+
+
+def _append(file: Path, name: str, document: dict[str, Any]) -> None:
+    """One of bluesky's documents as a line of JSON."""
+    with file.open("a", encoding="utf-8") as lines:
+        lines.write(json.dumps([name, document], default=str) + "\n")
+
+
+def _plain(error: BaseException, complaints: list[str]) -> BaseException:
+    """What went wrong as one of our errors, with what didn't get safe."""
+    while isinstance(error, FailedStatus) and error.__cause__ is not None:
+        error = error.__cause__
+    unsafe = [line for line in complaints if line not in str(error)]
+    tail = f"; not brought into a safe state: {'; '.join(unsafe)}" if unsafe else ""
+    if isinstance(error, DeviceError | InstrumentError):
+        return DeviceError(f"{error}{tail}")
+    if isinstance(error, OSError):
+        where = error.filename or "the data folder"
+        return InputError(f"{where}: can't be written ({error.strerror}); make room, then resume the session{tail}")
+    if isinstance(error, InputError):
+        return InputError(f"{error}{tail}")
+    return error
+
+
+def _provenance(identities: dict[str, Identity]) -> Run:
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return Run(
+        started=now(), instruments={name: vars(identity) for name, identity in identities.items()}, versions=versions
+    )

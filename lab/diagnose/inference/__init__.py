@@ -1,0 +1,1 @@
+"""From measurements to probabilities: evidence, score, search, refit, decision."""

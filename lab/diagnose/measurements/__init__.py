@@ -1,0 +1,1 @@
+"""What the diagnosis measures, one file a kind of measurement."""

@@ -1,0 +1,110 @@
+"""What is looked at: the list of measurements, and one side's evidence made of those that its recordings allow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.measurements.board import BOARD_BLOCKS
+from lab.diagnose.measurements.converter import code_block
+from lab.diagnose.measurements.darks import DARK_BLOCKS
+from lab.diagnose.measurements.edges import edge_block
+from lab.diagnose.measurements.flicker import flicker_block
+from lab.diagnose.measurements.neighbours import neighbour_block, variance_block
+from lab.diagnose.measurements.patches import chart_block, screen_block
+from lab.diagnose.measurements.pattern import green_block, line_block
+from lab.diagnose.measurements.screens import SCREEN_BLOCKS
+from lab.diagnose.measurements.shading import shading_block
+from lab.diagnose.measurements.stereo import STEREO_BLOCKS
+from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.measurements.uniform import linearity_block, narrowband_block
+from lab.errors import NotDetermined
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import CameraFit, FitResult, Skipped
+from lab.predict.camera_model import assumptions, camera_model
+from sim.camera import Side
+from sim.effects.pixel_aperture import PixelAperture
+from sim.spectrum import FloatArray
+
+#: Makers of blocks, in the order of the report; one that a recording set doesn't allow is left out with a reason.
+BLOCKS: tuple[Callable[[Study], Block], ...] = (
+    *DARK_BLOCKS,
+    linearity_block,
+    flicker_block,
+    variance_block,
+    neighbour_block,
+    code_block,
+    green_block,
+    line_block,
+    shading_block,
+    narrowband_block,
+    chart_block,
+    edge_block,
+    screen_block,
+    *SCREEN_BLOCKS,
+    *BOARD_BLOCKS,
+    *STEREO_BLOCKS,
+)
+
+#: Apertures that a pixel may have whose fill factor nobody states: the least side (px), how many are tried, what they are told by.
+LEAST_SIDE, APERTURES, APERTURE_DIRECTIONS = 0.5, 10, 4
+#: What is left free of a quantity that had to be assumed.
+FREE_BESIDE = {"fill_factor": ", but contrast may be that of any aperture"}
+#: Of the full well: from here on pixels of a noisy level are cut off.
+_NEAR_FULL = 0.985
+
+
+def evidence_of(
+    recordings: RecordingSet, side: Side, fit: FitResult | None = None, baseline: CameraFile | None = None
+) -> tuple[Evidence | None, tuple[Skipped, ...]]:
+    """One side's measurements against its baseline, and what couldn't be looked at; None where nothing could.
+
+    `baseline`: a camera with its effects in place of the maker's word and the fit.
+    """
+    camera_fit = fit.cameras.get(side) if fit is not None else None
+    camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
+    skipped = [
+        Skipped(
+            step=f"diagnose {a.quantity}",
+            reason=f"neither stated nor fitted; taken as {a.value}{FREE_BESIDE.get(a.quantity, '')}",
+            side=side,
+        )
+        for a in assumptions(recordings.camera(side))
+    ]
+    study = Study(recordings, side, camera, _saturation_dn(camera_fit))
+    skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for _, reason in study.stale]
+    blocks = []
+    for make in BLOCKS:
+        try:
+            blocks.append(make(study))
+        except NotDetermined as refused:
+            skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
+    blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]
+    always = baseline.effects if baseline is not None else ()
+    if not blocks:
+        return None, tuple(skipped)
+    evidence = Evidence(tuple(blocks), study.camera, always)
+    if study.stated.fill_factor is None and baseline is None:
+        evidence = replace(evidence, unstated=_any_aperture(evidence))
+    return evidence, tuple(skipped)
+
+
+def _any_aperture(evidence: Evidence) -> dict[str, FloatArray]:
+    """Slopes that span what an aperture of any side does beside that of the whole pixel: its principal directions over even sides."""
+    camera, sides = evidence.camera, np.linspace(LEAST_SIDE, 1.0, APERTURES, endpoint=False)
+    lowest = PixelAperture.quantities()["side_change_um"].lower or -np.inf
+    effects = [PixelAperture(side_change_um=max(lowest, (s - 1.0) * camera.pixel_pitch_um)) for s in sides]
+    changes = np.array([evidence.mean((e,)) for e in effects]) - evidence.mean()
+    _, size, direction = np.linalg.svd(changes / np.sqrt(APERTURES), full_matrices=False)
+    return {f"aperture:{k}": size[k] * direction[k] for k in range(APERTURE_DIRECTIONS) if size[k] > 0.0}
+
+
+def _saturation_dn(fit: CameraFit | None) -> float | None:
+    noise = fit.noise if fit is not None else None
+    if noise is None or noise.full_well_e is None or noise.conversion_gain_dn_per_e is None:
+        return None
+    return (noise.black_level_dn or 0.0) + _NEAR_FULL * noise.full_well_e * noise.conversion_gain_dn_per_e

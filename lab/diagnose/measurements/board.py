@@ -1,0 +1,313 @@
+"""Boards: where a camera's corners lie off its geometry, by place in the frame, and each colour's corners off green's.
+
+Focal length, principal point, the boards' poses and their warp are fitted freely, so never a finding. So is Brown's distortion
+(k1 k2 p1 p2 k3) where nothing says what it should be: a maker's data say nothing of it, and a lens that distorts is no sick lens.
+It is judged where a camera that was calibrated before is held against its boards: then its distortion is the baseline, and what
+the boards show beyond it is `distortion` along the radius and `decentre` across it. A fit of the very same boards explains them
+within noise, and leaves nothing to find.
+
+What is left of the corners is averaged over cells of the frame. An effect's shifts go through the same fit: what poses and focal
+length take up of them doesn't count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from lab.diagnose.measurements.screens import COLOUR_FLOOR_PX, colour_shift_px
+from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
+from lab.errors import NotDetermined
+from lab.fit.board import BoardView, channel_corners, find_boards
+from lab.fit.bundle import Bundle, Solution
+from lab.fit.geometry import MODELS, Calibration, calibrate_robustly, free_intrinsics, sights_of
+from lab.fit.pinhole import NAMES, intrinsics_of
+from lab.formats.results import Skipped
+from sim.camera import Side
+from sim.spectrum import FloatArray
+
+ROWS, COLS = 3, 4  # cells of the frame
+FEWEST_CORNERS = 6  # of a cell
+CELL_FLOOR_PX = 0.006
+#: What a distortion that was calibrated before may have changed by, at the frame's corner and by each term.
+CALIBRATED_STD_PX = 0.05
+HELD_OUT_FROM = 6  # views: of as many or more, every third is held out
+REFERENCE_NM = 550.0
+COLOUR_VIEWS = 8  # evenly over the views: a colour's corners cost a fit each
+COLOUR_RINGS = (0.3, 0.6, 1.0)  # half diagonals
+
+
+def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:
+    """The boards in the charuco captures of a side, found once, and those that couldn't be found."""
+    kept: dict[Side, tuple[list[BoardView], list[Skipped]]] = study.once(_no_views)
+    if side not in kept:
+        kept[side] = find_boards(study.recordings, side)
+    return kept[side]
+
+
+def _no_views(_: Study) -> dict[Side, tuple[list[BoardView], list[Skipped]]]:
+    return {}
+
+
+def calibration_of(study: Study) -> Calibration:
+    """The side's camera by its own boards."""
+    views, missed = views_of(study, study.side)
+    if not views and not missed:
+        raise NotDetermined("boards", "no charuco captures")
+    try:
+        return calibrate_robustly(views, (study.camera.rows, study.camera.cols), study.side)
+    except NotDetermined as refused:
+        raise NotDetermined("boards", refused.reason) from refused
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """All corners of a calibrated camera about its solution: residuals (n, 2), and what the fit takes up of any shifts."""
+
+    place: FloatArray  # (n, 2), (x, y) px
+    left: FloatArray  # (n, 2), seen less predicted
+    taken: FloatArray  # (2 n, k), orthonormal: shifts in its span are the fit's
+    noise_px: float
+    view: FloatArray  # (n,) number of its view
+
+    @staticmethod
+    def of(views: Sequence[BoardView], solution: Solution, bundle: Bundle) -> _Corners:
+        shared, by_pose = bundle.slopes(solution.state)
+        n = len(shared)
+        free = shared.reshape(2 * n, -1)
+        poses = np.zeros((2 * n, 6 * len(views)))
+        for k, part in enumerate(bundle.parts):
+            poses[2 * part.start : 2 * part.stop, 6 * k : 6 * k + 6] = by_pose[part].reshape(-1, 6)
+        whole = np.concatenate([free, poses], axis=1)
+        size = np.linalg.norm(whole, axis=0)
+        u, s, _ = linalg.svd(whole[:, size > 0] / size[size > 0], full_matrices=False)
+        return _Corners(
+            place=np.concatenate([v.image_px for v in views]),
+            left=np.asarray(bundle.residuals(solution.state), float),
+            taken=np.asarray(u[:, s > 1e-9 * s[0]]),
+            noise_px=solution.noise_px,
+            view=np.concatenate([np.full(len(v.index), k) for k, v in enumerate(views)]),
+        )
+
+
+def board_block(study: Study) -> Block:
+    """Mean shift of corners off the fitted camera, along and across the radius, by cell of the frame."""
+    found = calibration_of(study)
+    known = study.camera.geometry
+    views, state, shape = found.views, found.solution.state, found.shape
+    if known is None:
+        free = found.solution.free[0] | free_intrinsics(MODELS[-1])
+    else:
+        free = free_intrinsics(())
+        # the optical axis and the focal length are the boards', the distortion that of the calibration before
+        fixed = intrinsics_of(known.camera_matrix, known.distortion)
+        start = np.array([np.concatenate([state.intrinsics[0, :4], fixed[4:]])])
+        state = replace(state, intrinsics=start)
+    bundle = Bundle(sights_of(views), free[None, :], shape)
+    solution = bundle.solve(state)
+    corners = _Corners.of(views, solution, bundle)
+    noise_px = min(corners.noise_px, found.solution.noise_px)
+    cells = _cells(study, corners, len(views))
+    if not cells:
+        raise NotDetermined("boards", f"no part of the frame holds {FEWEST_CORNERS} corners")
+    mean, labels, views_of_cell = _averages(study, corners, cells)
+    projected = mean - (mean @ corners.taken) @ corners.taken.T
+    covariance = noise_px**2 * projected @ projected.T
+    covariance += np.diag(np.full(len(labels), CELL_FLOOR_PX**2))
+    covariance += np.diag(_between_views(corners, mean, noise_px) / np.maximum(views_of_cell, 1.0))
+    slopes = {} if known is None else _calibrated(corners, projected, solution, shape)
+    captures = [v.capture.id for v in views]
+
+    def predict(effects: Effects) -> Prediction:
+        shifts = shifts_px(study, corners.place, effects)
+        return Prediction(projected @ shifts.ravel(), slopes)
+
+    return Block(
+        measurement="boards", axis="field", unit="half diagonals", reach=0.4, value=mean @ corners.left.ravel(),
+        covariance=covariance,
+        labels=tuple(Label(r, "Y", way, tuple(captures[k] for k in used), out) for r, way, used, out in labels),
+        hooks=frozenset({"image_shift_um"}), predict=predict, scale=np.ones(len(labels)), conditions="direction",
+        conditions_words="corners",
+    )  # fmt: skip
+
+
+def shifts_px(study: Study, place: FloatArray, effects: Effects) -> FloatArray:
+    """By how much light at `place` (n, 2), (x, y) px, lands off the baseline's place, px: (n, 2)."""
+    camera = study.camera
+    pitch = camera.pixel_pitch_um
+    x, y = ((place[:, k] - 0.5 * (n - 1)) * pitch for k, n in ((0, camera.cols), (1, camera.rows)))
+    total = np.zeros_like(place)
+    for effect in effects:
+        shift = effect.image_shift_um(x, y, REFERENCE_NM, camera)
+        if shift is not None:
+            total += np.column_stack(shift) / pitch
+    return total
+
+
+def _cells(study: Study, corners: _Corners, views: int) -> list[tuple[np.ndarray, bool]]:
+    """Corners (n,) of each cell of the frame, of views that choice may see and of those held out."""
+    camera = study.camera
+    row = np.clip((corners.place[:, 1] + 0.5) / camera.rows * ROWS, 0, ROWS - 1e-9).astype(int)
+    col = np.clip((corners.place[:, 0] + 0.5) / camera.cols * COLS, 0, COLS - 1e-9).astype(int)
+    out = (corners.view % 3 == 1) & (views >= HELD_OUT_FROM)
+    found = []
+    for cell in range(ROWS * COLS):
+        for held_out in (False, True):
+            use = (row * COLS + col == cell) & (out == held_out)
+            if use.sum() >= FEWEST_CORNERS:
+                found.append((use, held_out))
+    return found
+
+
+def _averages(
+    study: Study, corners: _Corners, cells: Sequence[tuple[np.ndarray, bool]]
+) -> tuple[FloatArray, list[tuple[float, str, list[int], bool]], FloatArray]:
+    """Weights (cells x 2, 2 n) that average shifts along and across the radius; labels; views in each."""
+    camera = study.camera
+    away = corners.place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
+    radius = np.hypot(*away.T)
+    unit = away / np.maximum(radius, 1e-9)[:, None]
+    half = camera.half_diagonal_px
+    rows, labels, counts = [], [], []
+    for use, held_out in cells:
+        seen = sorted({int(k) for k in corners.view[use]})
+        for way, direction in (("along the radius", unit), ("across it", unit[:, ::-1] * [-1.0, 1.0])):
+            rows.append(np.where(use[:, None], direction / use.sum(), 0.0).ravel())
+            labels.append((float(radius[use].mean() / half), way, seen, held_out))
+            counts.append(float(len(seen)))
+    return np.array(rows), labels, np.array(counts)
+
+
+def _between_views(corners: _Corners, mean: FloatArray, noise_px: float) -> float:
+    """Variance by which a view's mean over a cell scatters beyond its corners' noise: prints, motion, shading."""
+    excess, count = 0.0, 0
+    for weight in mean:
+        members = weight.reshape(-1, 2)
+        for k in np.unique(corners.view[np.any(members != 0, axis=1)]):
+            part = np.where((corners.view == k)[:, None], members, 0.0)
+            total = float(np.linalg.norm(part, axis=1).sum())
+            n = int(np.any(part != 0, axis=1).sum())
+            if n >= 4:
+                excess += float(np.sum(part * corners.left) / total) ** 2 - noise_px**2 / n
+                count += 1
+    return max(excess / count, 0.0) if count else 0.0
+
+
+def _calibrated(
+    corners: _Corners, projected: FloatArray, solution: Solution, shape: tuple[int, int]
+) -> dict[str, FloatArray]:
+    """Slopes by the terms of a distortion that was calibrated before, each as large as `CALIBRATED_STD_PX` at the frame's corner."""
+    intrinsics = solution.state.intrinsics[0]
+    focal = float(intrinsics[0])
+    x, y = ((corners.place[:, k] - intrinsics[2 + k]) / focal for k in (0, 1))
+    r2 = x * x + y * y
+    corner = 0.25 * float(np.hypot(*shape)) ** 2 / focal**2
+    terms = {
+        "k1": (x * r2, y * r2, corner**1.5),
+        "k2": (x * r2**2, y * r2**2, corner**2.5),
+        "k3": (x * r2**3, y * r2**3, corner**3.5),
+        "p1": (2 * x * y, r2 + 2 * y * y, 3 * corner),
+        "p2": (r2 + 2 * x * x, 2 * x * y, 3 * corner),
+    }
+    return {
+        f"boards:{name}": CALIBRATED_STD_PX / size * projected @ np.column_stack([dx, dy]).ravel()
+        for name, (dx, dy, size) in terms.items()
+        if name in NAMES
+    }
+
+
+def board_colour_block(study: Study) -> Block:
+    """How far out red and blue corners of boards lie against green's, by distance from the frame's middle."""
+    if "G" not in study.channels:
+        raise NotDetermined("board_colour", "one channel: nothing to hold it against")
+    views, missed = views_of(study, study.side)
+    if not views and not missed:
+        raise NotDetermined("board_colour", "no charuco captures")
+    views = views[:: max(1, len(views) // COLOUR_VIEWS)]
+    camera = study.camera
+    half = camera.half_diagonal_px
+    points: dict[str, list[FloatArray]] = {c: [] for c in study.channels if c != "G"}
+    for k, view in enumerate(views):
+        fits = channel_corners(study.recordings.frame(view.capture), camera.cfa, view)
+        away = view.image_px - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
+        radius = np.hypot(*away.T)
+        for channel, gathered in points.items():
+            use = fits[channel].trusted & fits["G"].trusted & (radius > 0.05 * half)
+            gap = (fits[channel].points - fits["G"].points)[use]
+            unit = (away / np.maximum(radius, 1e-9)[:, None])[use]
+            n = int(use.sum())
+            gathered.append(np.column_stack([radius[use] / half, unit, gap, np.full(n, k)]))
+    values, variances, labels = [], [], []
+    for channel, parts in points.items():
+        for held_out in (False, True):
+            table = np.concatenate(
+                [p for i, p in enumerate(parts) if (i % 3 == 1 and len(parts) >= 3) == held_out] or [np.zeros((0, 6))]
+            )
+            found = _rings(table)
+            ids = tuple(v.capture.id for i, v in enumerate(views) if (i % 3 == 1 and len(views) >= 3) == held_out)
+            for r, value, variance in found:
+                values.append(value)
+                variances.append(variance + COLOUR_FLOOR_PX**2)
+                labels.append(Label(r, channel, "outwards", ids, held_out))
+    if not values:
+        raise NotDetermined("board_colour", "too few corners are clear in every colour")
+    light = None
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(labels))
+        if effects:
+            mean = np.array(
+                [colour_shift_px(study, label.channel, label.x, light, effects, "charuco") for label in labels]
+            )
+        return Prediction(mean, {})
+
+    return Block(
+        measurement="board_colour", axis="field", unit="half diagonals", reach=0.5, value=np.array(values),
+        covariance=np.diag(variances), labels=tuple(labels), hooks=frozenset({"image_shift_um"}), predict=predict,
+        scale=np.ones(len(values)),
+    )  # fmt: skip
+
+
+def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
+    """Mean distance, outward shift and its variance in rings of corners; a shift that the whole frame shares is a prism's, and out."""
+    if len(table) < 4 * FEWEST_CORNERS:
+        return []
+    radius, unit, gap, view = table[:, 0], table[:, 1:3], table[:, 3:5], table[:, 5]
+    # together: gap = shared + unit s(r), s in steps of the rings
+    edges = (0.0, *COLOUR_RINGS[:-1], np.inf)
+    which = np.digitize(radius, edges[1:-1])
+    used = [k for k in range(len(COLOUR_RINGS)) if (which == k).sum() >= FEWEST_CORNERS]
+    keep = np.isin(which, used)
+    columns = [
+        np.column_stack([np.ones(len(table)), np.zeros(len(table))]),
+        np.column_stack([np.zeros(len(table)), np.ones(len(table))]),
+    ]
+    columns += [np.where((which == k)[:, None], unit, 0.0) for k in used]
+    design = np.array([c[keep].ravel() for c in columns]).T
+    seen = gap[keep].ravel()
+    solution, *_ = np.linalg.lstsq(design, seen, rcond=None)
+    rest = seen - design @ solution
+    inside = np.abs(rest) < 6.0 * 1.4826 * float(np.median(np.abs(rest))) + 1e-9
+    solution, *_ = np.linalg.lstsq(design[inside], seen[inside], rcond=None)
+    rest = np.where(inside, seen - design @ solution, 0.0)
+    inverse = np.linalg.pinv(design[inside].T @ design[inside])
+    # corners of one view share its errors: scatter by view (clustered)
+    groups = np.repeat(view[keep], 2)
+    meat = np.zeros_like(inverse)
+    for k in np.unique(groups):
+        score = design[groups == k].T @ rest[groups == k]
+        meat += np.outer(score, score)
+    plain = float(np.mean(rest[inside] ** 2)) * inverse
+    spread = inverse @ meat @ inverse
+    found = []
+    for i, k in enumerate(used):
+        at = 2 + i
+        found.append((float(radius[which == k].mean()), float(solution[at]), float(max(spread[at, at], plain[at, at]))))
+    return found
+
+
+#: Makers of blocks, in the order of the report.
+BOARD_BLOCKS = (board_block, board_colour_block)

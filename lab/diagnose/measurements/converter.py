@@ -1,0 +1,309 @@
+"""How often each code comes: what even light leaves of a converter's steps.
+
+Frames of even light, taken together, are spread over their codes as smoothly as their noise and shading make them: by more than the
+noise's own standard deviation at that level. What departs from a smooth curve over that distance is the converter's, or of
+whatever handled the codes after it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.linalg import block_diag
+from scipy.special import ndtr
+
+from lab.diagnose.measurements.neighbours import held_out_flats
+from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, held_out_of
+from lab.errors import NotDetermined
+from lab.formats.recording_set import Flat, Narrowband
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+SHIFTED_FROM = 4  # steps of codes that no fault of a converter makes: one bit may be stuck, two are a shift
+LEAST_NOISE = 3.0  # codes; below, a smooth curve can't be told from steps
+LEAST_COUNT = 30.0  # of a code that is looked at
+WIDEST = 24  # codes on either side of a smooth curve
+DEGREE = 4
+LEAST_CODES = 24
+#: Boundaries at which the highest bits change, and what a step there is worth at least (DN): smooth curves' own error.
+SIXTEENTHS = 16
+NEAR, FAR = (
+    4,
+    1.3,
+)  # codes about a boundary; of the noise's standard deviation, the distance over which the curve is fitted
+STEP_FLOOR = 0.02
+COMB_FLOOR = 3e-4
+SCATTER_FLOOR = 0.03  # of a chi2's number of codes
+#: Periods of combs that are looked at, in cycles a code.
+COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
+AROUND = 9  # pixels a side of a colour's plane, whose mean is the light's own course
+PARTS = 4  # of the range of codes, whose scatter is looked at by itself
+FINE = 8  # samples a code of the converter's law
+
+
+@dataclass(frozen=True)
+class _Codes:
+    """Codes that can be looked at, how often each came, how often by the light alone, and what a smooth curve makes of it."""
+
+    first: int
+    count: FloatArray
+    expected: FloatArray
+    smooth: FloatArray
+    rough: sparse.csr_array  # identity less smoothing
+    noise: FloatArray  # standard deviation of the light's noise, codes
+    used: np.ndarray  # codes that come often enough, and whose neighbours are all there
+
+
+def code_block(study: Study) -> Block:
+    """Of all even light: steps (DN) where a high bit changes, combs of a few codes' period, and the scatter about a smooth curve."""
+    counts = _counted(study)
+    joined = int(np.bitwise_or.reduce(np.flatnonzero(sum(c.count for c in counts.values()))))
+    apart = joined & -joined  # the largest power of two that divides every code
+    if apart >= SHIFTED_FROM:
+        raise NotDetermined(
+            "code_density",
+            f"every code is a multiple of {apart}, as of a converter of {apart.bit_length() - 1} bits less whose codes were shifted: its steps aren't judged; write the frames as they left the converter",
+        )
+    labels: list[Label] = []
+    places: list[tuple[float, float]] = []
+    sets: list[tuple[_Codes, FloatArray, list[_Part]]] = []
+    values, covariances = [], []
+    for held_out in (False, True):
+        codes = _prepared(study, counts[held_out])
+        if codes is None:
+            continue
+        (steps, boundaries), parts = _steps(study, codes), _scattered(codes)
+        combs, names = _combs(codes)
+        residual = codes.rough @ codes.count
+        values += [
+            steps @ codes.count,
+            combs @ codes.count,
+            np.array([p.excess(residual) - p.number / p.chi2_std for p in parts]),
+        ]
+        linear = np.vstack([steps, combs])
+        floor = np.concatenate([np.full(len(steps), STEP_FLOOR), np.full(len(combs), COMB_FLOOR)])
+        covariances += [
+            (linear * np.maximum(codes.expected, 1.0)) @ linear.T + np.diag(np.square(floor)),
+            np.diag([1.0 + (SCATTER_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
+        ]
+        members = tuple(counts[held_out].captures)
+        labels += [
+            Label(float(codes.first + b), "step", f"code {codes.first + b}", members, held_out) for b in boundaries
+        ]
+        labels += [Label(x, "comb", words, members, held_out) for x, words in names]
+        for p in parts:
+            low, high = codes.first + p.at.start, codes.first + p.at.stop - 1
+            labels.append(Label(0.5 * (low + high), "scatter", f"codes {low} to {high}", members, held_out))
+        # combs of other periods and phases have nothing in common, one of the same is the same everywhere
+        far = 10.0 * study.camera.white_level_dn
+        places += [(float(codes.first + b), 0.0) for b in boundaries]
+        places += [(0.0, far * k) for k in range(len(names))]
+        places += [(label.x, 0.0) for label in labels[len(places) :]]
+        sets.append((codes, linear, parts))
+    if not labels:
+        raise NotDetermined(
+            "code_density", f"no even light over {LEAST_CODES} codes and more whose noise exceeds {LEAST_NOISE:g} codes"
+        )
+
+    def predict(effects: Effects) -> Prediction:
+        found = []
+        for codes, linear, parts in sets:
+            change = codes.smooth * (_widths(codes, effects, study) - 1.0)
+            moved = codes.rough @ change
+            found += [linear @ change, np.array([p.excess(moved) for p in parts])]
+        return Prediction(np.concatenate(found), {})
+
+    return Block(
+        measurement="code_density", axis="level", unit="DN", reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
+        covariance=block_diag(*covariances), labels=tuple(labels), hooks=frozenset({"codes"}), predict=predict, scale=np.ones(len(labels)),
+        along=np.array(places),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """How often each code comes in some frames, and how often it would by the light's own course and noise."""
+
+    count: FloatArray
+    expected: FloatArray
+    captures: list[str]
+
+    def take(self, study: Study, capture: Any) -> None:
+        frame = study.recordings.frame(capture)
+        self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
+        for plane in mosaic.planes(frame, study.camera.cfa).values():
+            _expect(np.asarray(plane, np.float32), study, self.expected)
+        self.captures.append(capture.id)
+
+
+def _expect(plane: Any, study: Study, expected: FloatArray) -> None:
+    """Add a plane's pixels, spread normally about the mean over those around: by what they depart from it, in proportion to the root of
+    the signal."""
+    surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
+    own = AROUND**2 / (AROUND**2 - 1.0)
+    signal = max(float(surface.mean()) - study.noise.black, 1.0)
+    variance = own * float(np.mean(np.square(plane - surface), dtype=float))
+    level, number = np.unique(np.rint(surface).astype(int), return_counts=True)
+    shift = np.bincount(
+        np.rint(surface).astype(int).ravel() - level[0], (surface - np.rint(surface)).ravel().astype(float)
+    )
+    for k, n in zip(level, number, strict=True):
+        middle = k + shift[k - level[0]] / n
+        sigma = np.sqrt(max(variance * max(middle - study.noise.black, 1.0) / signal, 1e-2))
+        low, high = max(int(middle - 6.0 * sigma), 0), min(int(middle + 6.0 * sigma) + 1, len(expected) - 1)
+        if low < high:
+            edges = (np.arange(low, high + 2) - 0.5 - middle) / sigma
+            expected[low : high + 1] += n * np.diff(ndtr(edges))
+
+
+def _counted(study: Study) -> dict[bool, _Counts]:
+    """Of frames of even light, seen (False) and held out."""
+    size = int(study.camera.white_level_dn) + 1
+    counts = {out: _Counts(np.zeros(size), np.zeros(size), []) for out in (False, True)}
+    out = set(study.once(held_out_flats))
+    groups = study.groups(Narrowband, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    out |= set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
+    for kind in (Flat, Narrowband):
+        for capture in study.recordings.captures(kind, study.side):
+            if not capture.gain_db:
+                counts[capture.id in out].take(study, capture)
+    return counts
+
+
+def _prepared(study: Study, counts: _Counts) -> _Codes | None:
+    """The codes to look at, None where they are too few."""
+    level = np.arange(len(counts.count), dtype=float)
+    noise = np.sqrt(np.maximum(study.noise.gain * (level - study.noise.black), 0.0) + study.noise.read_dn**2)
+    high = min(float(study.saturation_dn), float(len(level) - 1))
+    usable = (noise >= LEAST_NOISE) & (level < high - 6.0 * noise)
+    if usable.sum() < LEAST_CODES:
+        return None
+    first, last = int(np.flatnonzero(usable)[0]), int(np.flatnonzero(usable)[-1])
+    count, expected, noise = (a[first : last + 1] for a in (counts.count, counts.expected, noise))
+    half = np.clip(noise.astype(int), 3, WIDEST)
+    index = np.arange(len(count))
+    inside = (index >= half) & (index < len(count) - half)
+    weights, columns, rows = [], [], []
+    for width in np.unique(half):
+        at = index[inside & (half == width)]
+        own = -_smoothing(int(width))
+        own[width] += 1.0
+        rows.append(np.repeat(at, len(own)))
+        columns.append((at[:, None] + np.arange(-width, width + 1)).ravel())
+        weights.append(np.tile(own, len(at)))
+    if not rows:
+        return None
+    rough = sparse.csr_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(len(count), len(count))
+    )
+    smooth = np.maximum(count - rough @ count, 0.0)
+    used = inside & (smooth >= LEAST_COUNT)
+    if used.sum() < LEAST_CODES:
+        return None
+    return _Codes(first, count, expected, smooth, rough, noise, used)
+
+
+@cache
+def _smoothing(half: int) -> FloatArray:
+    """Weights of the value in the middle of the polynomial nearest to 2 `half` + 1 values."""
+    x = np.arange(-half, half + 1) / half
+    return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
+
+
+def _combs(codes: _Codes) -> tuple[FloatArray, list[tuple[float, str]]]:
+    """Weights of the counts that give the amplitudes of combs, relative to a smooth curve, and (code, words) of each."""
+    index = np.arange(len(codes.count))
+    table, names = [], []
+    for f in COMBS:
+        use = codes.used & (codes.noise >= max(LEAST_NOISE, 1.2 / f))
+        total = float(codes.smooth[use].sum())
+        if use.sum() < LEAST_CODES:
+            continue
+        for turn in (0.0, 0.25) if f < 0.5 else (0.0,):
+            wave = np.cos(2.0 * np.pi * (f * (index + codes.first) - turn)) * use
+            table.append(2.0 / total * (codes.rough.T @ wave))
+            names.append((codes.first + float(index[use].mean()), f"every {1 / f:.3g} codes"))
+    return np.array(table).reshape(len(table), len(index)), names
+
+
+def _steps(study: Study, codes: _Codes) -> tuple[FloatArray, list[int]]:
+    """Weights of the counts that give how many codes' worth is missing in 2 `NEAR` codes about a multiple of a sixteenth of the
+    converter's range, against the parabola through what counts and `expected` differ by on either side; and these codes."""
+    full = 2.0**study.camera.bit_depth
+    table, at = [], []
+    for k in range(1, SIXTEENTHS):
+        boundary = int(k * full / SIXTEENTHS) - codes.first
+        if not 0 <= boundary < len(codes.count):
+            continue
+        far = max(8, round(FAR * float(codes.noise[boundary])))
+        low, high = boundary - NEAR - far, boundary + NEAR + far
+        if low < 0 or high > len(codes.count) or codes.expected[low:high].min() < LEAST_COUNT:
+            continue
+        x = (np.arange(low, high) - boundary + 0.5) / (NEAR + far)
+        outer = np.abs(x) * (NEAR + far) > NEAR
+        basis = np.vander(x, 3, increasing=True)
+        expected = codes.expected[low:high]
+        weight = np.sqrt(expected[outer])
+        fit = (basis[~outer] @ np.linalg.pinv(basis[outer] * weight[:, None]) * weight).sum(0)
+        share = np.empty(len(x))
+        share[~outer], share[outer] = -1.0, fit
+        weights = np.zeros(len(codes.count))
+        weights[low:high] = share / expected
+        table.append(weights)
+        at.append(boundary)
+    return np.array(table).reshape(len(table), len(codes.count)), at
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of the range: its codes, how many of them count, each residual's variance (infinite where it doesn't count), and the
+    standard deviation of the residuals' chi2."""
+
+    at: slice
+    number: int
+    variance: FloatArray
+    chi2_std: float
+
+    def excess(self, residual: FloatArray) -> float:
+        """chi2 in its own standard deviations."""
+        return float(np.sum(np.square(residual[self.at]) / self.variance)) / self.chi2_std
+
+
+def _scattered(codes: _Codes) -> list[_Part]:
+    variance = np.asarray(codes.rough.power(2) @ np.maximum(codes.smooth, 1.0))
+    found = []
+    for part in np.array_split(np.flatnonzero(codes.used), PARTS):
+        if len(part) < LEAST_CODES:
+            continue
+        at = slice(int(part[0]), int(part[-1]) + 1)
+        kept = codes.used[at]
+        row = codes.rough[[int(part[len(part) // 2])]].toarray().ravel()
+        row = row[np.flatnonzero(row)]
+        shared = np.correlate(row, row, mode="full") / float(row @ row)
+        number = int(kept.sum())
+        found.append(
+            _Part(at, number, np.where(kept, variance[at], np.inf), float(np.sqrt(2.0 * number * np.sum(shared**2))))
+        )
+    return found
+
+
+def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
+    """How much of the converter's input each code takes, 1 of an even one."""
+    margin = 64
+    size = len(codes.count)
+    x = (np.arange((size + 2 * margin) * FINE) + 0.5) / FINE - 0.5 + codes.first - margin
+    for effect in effects:
+        x = effect.codes(x, study.camera)
+    # each sample stands for an interval of its output, which may lie across the border of two codes
+    top = x + 0.5 / FINE - codes.first
+    code = np.rint(top).astype(int)
+    above = np.clip((top - code + 0.5) * FINE, 0.0, 1.0)
+    found = np.zeros(size + 1)
+    for at, share in ((code, above), (code - 1, 1.0 - above)):
+        inside = (at >= 0) & (at < size)
+        found += np.bincount(at[inside], share[inside], minlength=size + 1)
+    return found[:size] / FINE

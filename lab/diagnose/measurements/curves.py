@@ -1,0 +1,192 @@
+"""What is free of the maker's sensitivity curves: a scale, a tilt, a bend, a smooth few per mille, and a little everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from lab.diagnose.measurements.summaries import SPECTRAL_HOOKS, Effects, Study, overrides
+from sim.effects.base import Effect
+from sim.forward import electron_rate
+from sim.spectrum import FloatArray, Spectrum, linear_shares
+
+LEAK_STD = 2.0e-4  # of the curve's peak, alike at all wavelengths: blindness that isn't quite
+MOST_DECIMALS = 6  # of a curve's values; with fewer they are rounded
+CURVE_SCALE_STD = 0.2  # of the sensitivity: holds gain, aperture and lens too
+LEVEL_STD = 0.5  # of all signals where gain, f-number or pitch aren't known, about those recorded
+CURVE_TILT_STD = 0.05  # per 100 nm
+CURVE_BEND_STD = 0.01  # per (100 nm)^2
+CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
+CURVE_STEP_NM = 2.5  # of a curve that is written out
+
+
+class CurveSlopes:
+    """Electron rates of a list of (light, channel), and their slopes by what is free of the maker's curves.
+
+    Per channel: scale, tilt, bend, a rough part on knots with a squared-exponential prior, a leak, and what the curve does between
+    the samples that the maker gives. The slope by a factor
+    (1 + d(w)) on the curve is the rate with the curve times d: exact, as the rate is linear in the curve. The baseline's rates
+    are `sim.forward`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
+    """
+
+    def __init__(
+        self,
+        study: Study,
+        items: Sequence[tuple[str, str, float, str, Spectrum | None]],
+        measured_e_per_s: FloatArray | None = None,
+        scale: float = 1.0,
+    ) -> None:
+        """`measured_e_per_s` (n,): where gain, f-number or pitch aren't known the level is free about that of these; `scale`: on all
+        rates."""
+        self.study, self.items = study, items
+        self.kind = items[0][3]
+        lights = {path: study.spectrum(path) for path in {item[0] for item in items}}
+        camera = study.camera
+        low = min(light.arrays[0][0] for light in lights.values())
+        high = max(light.arrays[0][-1] for light in lights.values())
+        self.wavelength = np.arange(np.floor(low), np.ceil(high) + 1.0)
+        self.radiance = {path: light.at(self.wavelength) for path, light in lights.items()}
+        curve = {c: q.at(self.wavelength) for c, q in camera.quantum_efficiency.items()}
+        ones = np.ones_like(self.wavelength)
+        photons = np.array([self.wavelength * (r.at(self.wavelength) if r is not None else ones) for *_, r in items])
+        self._curve = photons * np.array([curve[c] for _, c, *_ in items])
+        # of a sensitivity that is the same at all wavelengths
+        self._level = photons * np.array([[LEAK_STD * max(camera.quantum_efficiency[c].value)] for _, c, *_ in items])
+        radiance = np.array([self.radiance[path] for path, *_ in items])
+        self._weight, self._all_level = radiance * self._curve, radiance * self._level
+        self._total = self._weight.sum(1)
+        self._rate = np.array(
+            [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
+        )
+        #: Of the rates: what nobody knows of the light's way to the codes.
+        self.scale, self._is_free = scale, measured_e_per_s is not None and not study.level_is_known
+        if measured_e_per_s is not None and self._is_free:
+            self.scale = max(float(measured_e_per_s.sum()), 1e-9) / max(float(self._rate.sum()), 1e-300)
+        self._rate = self._rate * self.scale
+        self._per_weight = {
+            c: max(
+                (
+                    rate / total
+                    for rate, total, item in zip(self._rate, self._total, items, strict=True)
+                    if item[1] == c and total > 0
+                ),
+                default=0.0,
+            )
+            for c in curve
+        }
+        self._kept: dict[tuple[Effect, ...], tuple[FloatArray, FloatArray]] = {}
+        self._modes = curve_modes(self.wavelength)
+        between = {c: _between_samples(q, self.wavelength) for c, q in camera.quantum_efficiency.items()}
+        self._between = np.array([between[c] for _, c, *_ in items])
+
+    @cached_property
+    def rounding(self) -> FloatArray:
+        """Standard deviation of the electrons a second that the rounding of the curves' values leaves open, (n,): each value by itself."""
+        found = []
+        for i, (path, channel, *_) in enumerate(self.items):
+            samples, value = self.study.camera.quantum_efficiency[channel].arrays
+            share = self.radiance[path] * self._level[i] / (LEAK_STD * value.max())
+            each = linear_shares(self.wavelength, share, samples)
+            found.append(
+                _last_place(value) / np.sqrt(12.0) * self._per_weight[channel] * float(np.sqrt(np.sum(each**2)))
+            )
+        return np.array(found)
+
+    @cached_property
+    def sample_shares(self) -> FloatArray:
+        """Relative slopes of the baseline's rates by the light's relative value in each nanometre, (n, wavelengths): rows' sums are 1."""
+        return np.asarray(self._weight / np.maximum(self._total, 1e-300)[:, None])
+
+    def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
+        """Rates (n,) and the modes' shares in them (n, modes)."""
+        spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
+        if spectral not in self._kept:
+            weight, level = self._weight, self._all_level
+            if any(type(e).radiance is not Effect.radiance for e in spectral):
+                lit = dict(self.radiance)
+                for effect in spectral:
+                    lit = {path: effect.radiance(self.wavelength, value, self.kind) for path, value in lit.items()}
+                changed = np.array([lit[path] for path, *_ in self.items])
+                weight, level = changed * self._curve, changed * self._level
+            through = np.ones_like(self.wavelength)
+            for effect in spectral:
+                through = through * effect.transmittance(self.wavelength, np.asarray(0.0))
+            total = weight @ through
+            rate = self._rate * total / np.maximum(self._total, 1e-300)
+            table = np.column_stack([weight @ (self._modes * through).T, (weight * self._between) @ through])
+            shares = table / np.maximum(total, 1e-300)[:, None]
+            if len(self._kept) > 500:
+                self._kept.clear()
+            leak = level @ through * np.array([self._per_weight[c] for _, c, *_ in self.items])
+            self._kept[spectral] = rate, np.column_stack([rate[:, None] * shares, leak])
+        return self._kept[spectral]
+
+    def rates(self, effects: Effects) -> FloatArray:
+        """Electrons a second on axis, (n,)."""
+        return self._under(effects)[0]
+
+    def slopes(self, effects: Effects) -> dict[str, FloatArray]:
+        """By the free quantities, in electrons a second."""
+        table = self._under(effects)[1]
+        named = {}
+        for channel in self.study.channels:
+            mine = np.array([item[1] == channel for item in self.items])
+            if mine.any():
+                for i in range(table.shape[1]):
+                    named[f"curve:{channel}:{i}"] = np.where(mine, table[:, i], 0.0)
+        if self._is_free:
+            named[f"level:{self.kind}"] = LEVEL_STD * self.rates(effects)
+        return named
+
+
+def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
+    """What is free of every curve: relative changes of one prior standard deviation each, (modes, wavelengths)."""
+    knots = np.arange(380.0, 781.0, 20.0)
+    cov = CURVE_ROUGH_STD**2 * np.exp(-0.5 * ((knots[:, None] - knots) / CURVE_ROUGH_NM) ** 2)
+    size, vector = np.linalg.eigh(cov)
+    keep = size > 1e-3 * size.max()
+    modes = [
+        np.full_like(knots, CURVE_SCALE_STD),
+        CURVE_TILT_STD * (knots - 560.0) / 100.0,
+        CURVE_BEND_STD * ((knots - 560.0) / 100.0) ** 2,
+    ]
+    modes += [vector[:, i] * np.sqrt(size[i]) for i in np.flatnonzero(keep)[::-1]]
+    return np.array([np.interp(wavelength_nm, knots, mode) for mode in modes])
+
+
+def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) -> Spectrum:
+    """A maker's curve with what is free of it at `quantities` (as `CurveSlopes.slopes` names them, in prior standard deviations); the
+    same curve where none is among them."""
+    names = [name for name in quantities if name.startswith(f"curve:{channel}:")]
+    if not names:
+        return curve
+    low, high = curve.wavelength_nm[0], curve.wavelength_nm[-1]
+    grid = np.union1d(np.array(curve.wavelength_nm), np.arange(np.ceil(low), high, CURVE_STEP_NM))
+    relative = np.vstack([curve_modes(grid), _between_samples(curve, grid)]) * curve.at(grid)
+    changes = np.vstack([relative, np.full_like(grid, LEAK_STD * max(curve.value))])
+    value = curve.at(grid) + sum(quantities[name] * changes[int(name.rsplit(":", 1)[1])] for name in names)
+    return Spectrum.of(grid, np.clip(value, 0.0, 1.0))
+
+
+def _last_place(value: FloatArray) -> float:
+    """The step in which a curve's values are given: 10^-d for d decimals."""
+    for decimals in range(1, MOST_DECIMALS):
+        if np.all(np.abs(value * 10**decimals - np.round(value * 10**decimals)) < 1e-3):
+            return float(10.0**-decimals)
+    return float(10.0**-MOST_DECIMALS)
+
+
+def _between_samples(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:
+    """Relative difference of a cubic spline through a curve's samples from the straight lines between them.
+
+    A data sheet in steps of 5 nm doesn't say which it is; at a colour filter's foot they differ by some per cent.
+    """
+    if len(curve.wavelength_nm) < 4:
+        return np.zeros_like(wavelength_nm)
+    straight = curve.at(wavelength_nm)
+    spline = CubicSpline(curve.wavelength_nm, curve.value)(wavelength_nm)
+    inside = straight > 1e-4 * max(curve.value)
+    return np.where(inside, np.clip(spline / np.where(inside, straight, 1.0) - 1.0, -0.2, 0.2), 0.0)

@@ -1,0 +1,731 @@
+"""Slanted edges: the transfer function that the estimator reports, and the same of a model at the same geometry.
+
+The MTF's estimator finds the edge and its noise, and leaves the normal equations of the profile's spline. Of these few numbers
+are taken: by how much the transfer function departs from the baseline's at some frequencies (`_Estimator`), by weighted least
+squares without a prior, so that all is linear in the pixels' values and the covariance is true.
+
+A prediction goes through the same at the recording's geometry (`_Operators`): transfer functions of the model at the nodes of a
+quadrature become the edge's profile, the profile the right side of the normal equations, this the reported numbers. So
+shading and a response that bends are in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+from numpy.polynomial import polynomial
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.interpolate import CubicSpline
+from scipy.special import ndtr
+
+from lab.diagnose.measurements.summaries import (
+    SPECTRAL_HOOKS,
+    Block,
+    Effects,
+    Label,
+    Prediction,
+    Study,
+    held_out_of,
+    overrides,
+)
+from lab.diagnose.measurements.veils import halos, wide_contrast
+from lab.errors import NotDetermined
+from lab.fit.levels import rounding_waves_dn
+from lab.fit.mtf import SMOOTHING, EdgeGeometry, EdgeMtf, Region, find_edges, measure_edge
+from lab.formats.recording_set import SlantedEdge
+from sim.effects.base import Effect
+from sim.forward import common_wavelengths, electron_rate, transfer_at, wavelength_shares
+from sim.optics.illumination import optical_axis_px, relative_illumination
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
+
+ComplexArray = NDArray[np.complex128]
+
+EDGE_FLOOR = 3e-4  # of the contrast: numerical floor of the edge estimator and the model's wavelength sampling
+#: Where the transfer function is measured, in shares of the highest frequency: its real part, and its imaginary one; this is nil
+#: up to `STILL`, as a phase in proportion to frequency only moves the edge.
+REAL_AT = np.array([0.04, 0.09, 0.15, 0.22, 0.30, 0.39, 0.49, 0.60, 0.72, 0.86, 1.0])
+IMAGINARY_AT = np.array([0.28, 0.42, 0.57, 0.72, 0.86, 1.0])
+STILL = 0.14
+#: The highest frequency, cy/px, but not beyond this share of the lens's cutoff.
+HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE = 1.15, 0.95
+ASIDE, APART_CY_PER_PX = ", asymmetry", 100.0
+PLAIN = np.array([0.25])  # cy/px, of the estimator's own transfer function, which isn't used here
+#: Departures from the baseline's transfer that count as likely: next to nothing is said of what no sample tells.
+DEPARTURE_STD = 0.5
+#: Of the light on the target, left free: its bend across the edge, of the level at `UNEVEN_PX` from it.
+UNEVEN_STD, UNEVEN_PX = 0.003, 50.0
+UNEVEN_ORDER = 4  # of the polynomial that shading along the distance is
+#: Edges whose directions differ by less are of one direction, deg.
+ALIKE_DEG = 0.35
+#: Of light of which nothing is said: what its spectrum may differ from an even one by, over 150 nm and in a part of it.
+TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
+#: Wavelengths at which aberrated transfers are formed; and those at which the perfect lens's, which has the cutoff's kink, is.
+WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
+HIGHEST_CY_PER_PX = 10.0
+GRID_PX, FINE_PX = 0.05, 0.0125
+#: Predictions that are kept, and as many of their parts: a step of a refit leaves the others as they were.
+KEPT = 64
+BLURRING_HOOKS = frozenset({"transfer"})
+CHANGING_HOOKS = frozenset({"illumination", "response", "halo", "veil"})
+
+K = TypeVar("K")
+V = TypeVar("V")
+_Key = tuple[Effect, ...]
+
+
+def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
+    """What stands in `store`, made if it doesn't; the oldest goes first."""
+    if key not in store:
+        if len(store) >= KEPT:
+            store.pop(next(iter(store)))
+        store[key] = make()
+    return store[key]
+
+
+def edge_block(study: Study) -> Block:
+    """Transfer function of every slanted edge by channel: its real part, which is contrast, and its imaginary part about the
+    profile's own middle, which only a lopsided blur has.
+
+    The light side's noise is larger than the dark side's, so that the two parts' errors go together.
+    """
+    edges = _Edges(study)
+    x = edges.frequencies
+
+    def predict(effects: Effects) -> Prediction:
+        return Prediction(edges.predict(effects).ravel(), edges.slopes)
+
+    return Block(
+        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=edges.value.ravel(),
+        covariance=edges.covariance,
+        labels=tuple(
+            Label(float(f), e.channel, e.orientation + (ASIDE if k >= len(REAL_AT) else ""), tuple(c.id for c in e.part), e.held_out)
+            for e in edges.edges for k, f in enumerate(x)
+        ),
+        hooks=frozenset({"transfer", "transmittance", "charge", "response", "illumination"}), predict=predict,
+        scale=np.ones(edges.value.size), conditions="orientation", conditions_words="edges at",
+        # what is wrong with contrast says nothing of asymmetry
+        along=np.tile(np.where(np.arange(len(x)) < len(REAL_AT), x, x + APART_CY_PER_PX), len(edges.edges)),
+    )  # fmt: skip
+
+
+# --- what was measured ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """One edge in one channel, of the repeats that choice may see or of those held out."""
+
+    part: tuple[SlantedEdge, ...]
+    channel: str
+    measured: EdgeMtf
+    held_out: bool
+    region: Region
+    direction_deg: float  # of the normal towards the light, from x (columns) to y (rows)
+    fixed_share: float  # of the noise's variance, that repeats have in common
+
+    @property
+    def orientation(self) -> str:
+        nominal = self.part[0].angle_deg
+        return f"{self.measured.angle_deg if nominal is None else nominal:.3g} deg"
+
+    @property
+    def setting(self) -> tuple[Region, float, str]:
+        """Alike for edges that see the same pixels in the same way."""
+        return self.region, round(self.direction_deg), self.channel
+
+
+def _measured(study: Study) -> list[_Edge]:
+    if not study.diffraction_is_known:
+        raise NotDetermined(
+            "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
+        )
+    groups = study.groups(
+        SlantedEdge, lambda c: (c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm)
+    )
+    if not groups:
+        raise NotDetermined("slanted_edge", "no slanted-edge captures")
+    edges: list[_Edge] = []
+    reasons = []
+    for i, group in enumerate(groups):
+        out = held_out_of(group, i, len(groups))
+        try:
+            regions = [group[0].region] if group[0].region else _found(study, group[0])
+        except NotDetermined as refused:
+            reasons.append(refused.reason)
+            continue
+        for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
+            for channel in study.channels if part else ():
+                for region in regions:
+                    try:
+                        measured = measure_edge(study.recordings, part, channel, None, PLAIN, region)
+                    except NotDetermined as refused:
+                        reasons.append(refused.reason)
+                        continue
+                    direction = _direction_deg(study, part[0], region, measured.angle_deg)
+                    share = _fixed_share(study, group, len(part), channel, region, measured)
+                    edges.append(
+                        _Edge(tuple(part), channel, measured, part[0].id in out, region, direction, share)
+                    )  # fmt: skip
+    if not edges:
+        raise NotDetermined("slanted_edge", reasons[0])
+    return edges
+
+
+def _found(study: Study, capture: SlantedEdge) -> list[Region]:
+    return [f.region for f in find_edges(study.recordings.frame(capture), study.stated.cfa, study.saturation_dn)]
+
+
+def _direction_deg(study: Study, capture: SlantedEdge, region: Region, angle_deg: float) -> float:
+    """Of the edge's normal that points to the light."""
+    row0, col0, row1, col1 = region
+    frame = np.asarray(study.recordings.frame(capture)[row0:row1, col0:col1], float)
+    angle = np.deg2rad(angle_deg)
+    row, col = np.arange(row1 - row0) - 0.5 * (row1 - row0 - 1), np.arange(col1 - col0) - 0.5 * (col1 - col0 - 1)
+    side = np.cos(angle) * col[None, :] + np.sin(angle) * row[:, None]
+    return angle_deg if float(np.sum(side * (frame - frame.mean()))) > 0 else angle_deg + 180.0
+
+
+def _fixed_share(
+    study: Study, group: Sequence[SlantedEdge], frames: int, channel: str, region: Region, measured: EdgeMtf
+) -> float:
+    """Share of the variance of a mean of `frames` frames that doesn't differ from repeat to repeat (pixels' response)."""
+    total = measured.noise_std_light**2
+    if len(group) > 1:
+        row0, col0, row1, col1 = region
+        mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))[row0:row1, col0:col1]
+        first, second = (
+            np.asarray(study.recordings.frame(c)[row0:row1, col0:col1], float)[mask] for c in (group[0], group[1])
+        )
+        black = study.stated.black_level_dn or 0.0
+        middle = black + 0.5 * (measured.dark_level + measured.light_level)
+        light = 0.5 * (first + second) > middle + 0.35 * (measured.light_level - measured.dark_level)
+        apart = (first - second)[light]
+        if apart.size < 64:
+            return 0.0
+        temporal = 0.5 * float(np.var(apart))
+    elif study.stated.conversion_gain_dn_per_e is not None:
+        temporal = study.noise.gain * measured.light_level + study.noise.read_dn**2
+    else:
+        return 0.0
+    return float(np.clip(1.0 - temporal / frames / max(total, 1e-300), 0.0, 0.95))
+
+
+# --- the estimator as an operator ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Quadrature:
+    """ESF(d) = 1/2 + sum over nodes of Re H(f_k) odd[k](d) + (Im H(f_k) / f_k) even[k](d), H a polynomial in pieces.
+
+    ESF(d) = 1/2 + integral of [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df. Tables are at d = 0, `GRID_PX`, ...
+    """
+
+    frequency: FloatArray
+    odd: FloatArray  # (nodes, d)
+    even: FloatArray
+
+    @staticmethod
+    def of(highest: float, reach_px: float) -> _Quadrature:
+        """Up to `highest` cy/px. Pieces of 1/4, 1/2, 1 cy/px with 8, 6, 6 of Gauss's points: a copy of the image 3 px aside is
+        still followed to 1e-4."""
+        cuts = np.concatenate([np.arange(0.0, 1.0, 0.25), np.arange(1.0, 2.0, 0.5), np.arange(2.0, 64.0)])
+        cuts = np.append(cuts[cuts < highest], highest)
+        distance = np.arange(int(np.ceil(reach_px / GRID_PX)) + 2) * GRID_PX
+        nodes, odd, even = [], [], []
+        for low, high in pairwise(cuts):
+            unit = np.polynomial.legendre.leggauss(8 if high <= 1.0 else 6)[0]
+            fine, weight = np.polynomial.legendre.leggauss(int(16 + 4.0 * (high - low) * reach_px))
+            f, width = 0.5 * (low + high) + 0.5 * (high - low) * fine, 0.5 * (high - low) * weight
+            hats = _lagrange(unit, fine)
+            phase = 2.0 * np.pi * np.outer(f, distance)
+            nodes.append(0.5 * (low + high) + 0.5 * (high - low) * unit)
+            odd.append((hats * (width / (np.pi * f))) @ np.sin(phase))
+            even.append((hats * (width / np.pi)) @ np.cos(phase))
+        return _Quadrature(np.concatenate(nodes), np.concatenate(odd), np.concatenate(even))
+
+
+def _lagrange(nodes: FloatArray, at: FloatArray) -> FloatArray:
+    """(nodes, at): the polynomials that are 1 at one node and 0 at all others."""
+    basis = np.ones((len(nodes), len(at)))
+    for k, node in enumerate(nodes):
+        for other in np.delete(nodes, k):
+            basis[k] *= (at - other) / (node - other)
+    return basis
+
+
+@dataclass(frozen=True)
+class _Estimator:
+    """How an edge's profile departs from the baseline's: weighted least squares of few shapes, linear in the samples' values.
+
+    profile = level + contrast x (baseline + shift x slope + sum of departures x shapes) + the illumination's gradient; a shape is
+    what the profile gains where the transfer function does at one frequency. So what is told of neighbouring frequencies is
+    told by all samples that see it; with next to no prior, and none of what a camera is expected to do.
+    """
+
+    rows: FloatArray  # (contrast, shift, departures..., distances): of values at distances
+    value: FloatArray  # (rows,): of the recording
+    scatter: FloatArray  # (rows, rows): its covariance over repeats
+
+    @staticmethod
+    def of(geometry: EdgeGeometry, spread: FloatArray, shapes: FloatArray) -> _Estimator:
+        """`spread` (k + g, distances): from values at distances to the normal equations' right side; `shapes` (j, distances):
+        level, contrast, slope, and the departures."""
+        size = geometry.spline.size
+        matrix, right = geometry.gram[:-1, :-1], geometry.gram[:-1, -1]
+        bridged = matrix[:size, :size] + geometry.spline.roughness(SMOOTHING * np.trace(matrix[:size, :size]) / size)
+        count = len(shapes)
+        columns = np.zeros((len(matrix), count + len(matrix) - size))
+        columns[:size, :count] = np.linalg.solve(bridged, spread[:size] @ shapes.T)
+        columns[size:, count:] = np.eye(len(matrix) - size)
+        normal = columns.T @ matrix @ columns
+        normal[np.arange(3, count), np.arange(3, count)] += DEPARTURE_STD**-2
+        solve = (np.linalg.inv(normal) @ columns.T)[1:count]
+        return _Estimator(solve @ spread, solve @ right, solve @ matrix @ solve.T)
+
+
+@dataclass(frozen=True)
+class _Operators:
+    """The estimators of all edges, each at its own geometry; rows are contrast, shift and departures."""
+
+    constant: FloatArray  # (edges, rows): of the profile's mean, 1/2
+    odd: FloatArray  # (edges, rows, nodes)
+    even: FloatArray
+    profile: FloatArray  # (edges, rows, distances): of any change of the profile at `distance`
+    distance: FloatArray
+    offset: FloatArray  # (edges,): the dark side's light, of the contrast
+    shade: FloatArray  # (edges, distances): the illumination, which is in the operators
+
+    def report(self, otf: ComplexArray, frequency: FloatArray, change: FloatArray | None = None) -> FloatArray:
+        """What is reported, (edges, rows), of the model's transfer functions (edges, nodes); `change` of the profile (edges, distances)
+        beside them."""
+        rows = self.constant + (self.odd @ np.real(otf)[..., None])[..., 0]
+        if np.any(np.imag(otf)):
+            rows = rows + (self.even @ (np.imag(otf) / frequency)[..., None])[..., 0]
+        if change is not None:
+            rows = rows + (self.profile @ change[..., None])[..., 0]
+        return np.asarray(rows)
+
+
+@lru_cache(maxsize=4)
+def _interpolation(reach_px: float) -> tuple[FloatArray, FloatArray, sparse.csr_array]:
+    """Distances of the fine and of the coarse grid, and the cubic interpolation (fine, coarse) between them."""
+    count = int(np.ceil(reach_px / GRID_PX)) + 1
+    coarse = GRID_PX * np.arange(-count, count + 1, dtype=float)
+    ratio = round(GRID_PX / FINE_PX)
+    fine = FINE_PX * np.arange(-(count - 2) * ratio, (count - 2) * ratio + 1, dtype=float)
+    place = (fine - coarse[0]) / GRID_PX
+    left = np.floor(place + 1e-9).astype(int)
+    t = place - left
+    weights = np.stack(
+        [0.5 * t * (-1 + t * (2 - t)), 1 + 0.5 * t * t * (-5 + 3 * t), 0.5 * t * (1 + t * (4 - 3 * t)), 0.5 * t * t * (t - 1)], axis=1
+    )  # fmt: skip
+    index = left[:, None] + np.array([-1, 0, 1, 2])
+    rows = np.repeat(np.arange(len(fine)), 4)
+    return fine, coarse, sparse.csr_array((weights.ravel(), (rows, index.ravel())), shape=(len(fine), len(coarse)))
+
+
+def _spread(geometry: EdgeGeometry, reach_px: float) -> FloatArray:
+    """(k + g, coarse distances): from a profile to the right side of an edge's normal equations."""
+    fine, _, between = _interpolation(reach_px)
+    distance = np.asarray(geometry.distance_px, float)
+    weight = _shared_out(distance, np.asarray(geometry.weight, float), fine)
+    used = np.flatnonzero(weight)
+    table = np.zeros((geometry.spline.size + len(geometry.gradients), len(fine)))
+    table[: geometry.spline.size, used] = (geometry.spline.design(fine[used]).T * weight[used]).toarray()
+    for k, row in enumerate(geometry.gradients):
+        table[geometry.spline.size + k] = _shared_out(distance, np.asarray(row * geometry.weight, float), fine)
+    return np.asarray(table @ between)
+
+
+def _shapes(quadrature: _Quadrature, top: float) -> tuple[FloatArray, FloatArray]:
+    """(nodes of the quadrature, numbers): transfer functions that are 1 at one of the frequencies measured and 0 at the others,
+    real and imaginary, cubic between; nil at no frequency and well beyond the highest."""
+    f = quadrature.frequency
+    tables = []
+    for at, still in ((REAL_AT, np.zeros(1)), (IMAGINARY_AT, np.array([0.0, 0.5 * STILL, STILL]))):
+        knots = np.concatenate([still, at, [1.25, 1.6]]) * top
+        cardinal = CubicSpline(knots, np.eye(len(knots))[:, len(still) : -2], bc_type="natural")
+        tables.append(np.where((f < knots[-1])[:, None], cardinal(np.minimum(f, knots[-1])), 0.0))
+    return tables[0], tables[1]
+
+
+def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> FloatArray:
+    """Amounts at any distances laid on an even grid, each on its two neighbours: sums over them are linear between grid points."""
+    place = (distance - grid[0]) / FINE_PX
+    left = place.astype(int)
+    right_part = amount * (place - left)
+    return np.asarray(np.bincount(left, amount - right_part, len(grid)) + np.bincount(left + 1, right_part, len(grid)))
+
+
+# --- all edges of one side ------------------------------------------------------------------------------------------------------
+
+
+class _Edges:
+    """The edges of one side, their numbers and the model's."""
+
+    def __init__(self, study: Study) -> None:
+        self._study, self._camera = study, study.camera
+        self.edges = _measured(study)
+        lights = list(dict.fromkeys(e.part[0].light_radiance for e in self.edges))
+        #: All channels in every light: neighbours of other colours may matter.
+        self._sights = [(c, light) for light in lights for c in study.channels]
+        self._sight = np.array([self._sights.index((e.channel, e.part[0].light_radiance)) for e in self.edges])
+        self._turns, self._turn = _clusters(np.array([e.direction_deg for e in self.edges]), ALIKE_DEG)
+        places = [_place_um(study, e) for e in self.edges]
+        if len(set(places)) == 1:  # what differs from place to place can't be told from what doesn't
+            places = [(0.0, 0.0)] * len(places)
+        self._places = list(dict.fromkeys(places))
+        self._place = np.array([self._places.index(p) for p in places])
+        spectra = [self._light(light) for _, light in self._sights]
+        self._lit = list(zip((c for c, _ in self._sights), spectra, strict=True))
+        shortest = float(common_wavelengths(self._camera, self._lit)[0][0])
+        lens = self._camera.lens
+        cutoff = self._camera.pixel_pitch_um * lens.imaging.cutoff_cy_per_um(shortest, lens.f_number)
+        reach = max(e.measured.geometry.reach_px for e in self.edges) + 3 * GRID_PX
+        self._quadrature = _Quadrature.of(min(cutoff, HIGHEST_CY_PER_PX), reach)
+        top = min(HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE * self._mean_cutoff())
+        #: cy/px of the numbers, real parts and then imaginary ones.
+        self.frequencies = np.concatenate([REAL_AT, IMAGINARY_AT]) * top
+        self._at = _shapes(self._quadrature, top)
+        self._spectral: dict[_Key, tuple[FloatArray, FloatArray, ComplexArray]] = {}
+        self._blurred: dict[tuple[_Key, _Key], ComplexArray] = {}
+        self._changes: dict[_Key, FloatArray | None] = {}
+        self._numbers_of: dict[_Key, FloatArray] = {}
+        self._baseline = self._otf(())
+        estimators, self._operators = self._estimated(reach)
+        self._recorded = np.array([e.value for e in estimators])
+        split = len(REAL_AT)
+        f = self._quadrature.frequency
+        self._level = np.array(
+            [[*np.interp(self.frequencies[:split], f, np.real(row)), *np.interp(self.frequencies[split:], f, np.imag(row))]
+             for row in self._baseline]
+        )  # fmt: skip
+        self.value = self._numbers(self._recorded)
+        self._noise = [_relative(e.scatter, row) for e, row in zip(estimators, self._recorded, strict=True)]
+
+    def _light(self, path: str | None) -> Spectrum | None:
+        return self._study.spectrum(path) if path else None
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Noise of all edges' numbers. What repeats have in common (the pixels' unequal response), edges in the same place and of the
+        same direction have, too."""
+        factors = [np.linalg.cholesky(c + 1e-16 * np.eye(len(c))) for c in self._noise]
+        size = self.value.shape[1]
+        out = np.zeros((self.value.size,) * 2)
+        for i, a in enumerate(self.edges):
+            for j, b in enumerate(self.edges[: i + 1]):
+                if a.setting == b.setting:
+                    share = 1.0 if i == j else np.sqrt(a.fixed_share * b.fixed_share)
+                    out[i * size : (i + 1) * size, j * size : (j + 1) * size] = share * factors[i] @ factors[j].T
+                    out[j * size : (j + 1) * size, i * size : (i + 1) * size] = share * factors[j] @ factors[i].T
+        for i, rounded in enumerate(self._rounded.transpose(1, 2, 0)):
+            out[i * size : (i + 1) * size, i * size : (i + 1) * size] += rounded @ rounded.T
+        return np.asarray(out + EDGE_FLOOR**2 * np.eye(len(out)))
+
+    @property
+    def _rounded(self) -> FloatArray:
+        """What rounding may do to numbers, (changes, edges, frequencies), one standard deviation each: over a profile whose dark side
+        spreads by less than a code, a saw-tooth of the level, its harmonics of any phase, as no level is known to a fraction of a code."""
+        contrast = np.array([e.measured.light_level - e.measured.dark_level for e in self.edges])[:, None]
+        level_dn = np.maximum(self._light_profile * contrast, 0.0)
+        waves = rounding_waves_dn(level_dn, self._study.noise.spread_dn2(level_dn))
+        base = self.predict(())
+        return np.array([self._numbers(self._reported((), wave / contrast)) - base for wave in waves]).reshape(
+            -1, *base.shape
+        )
+
+    # --- the model ---
+
+    def predict(self, effects: Effects) -> FloatArray:
+        """Numbers of all edges, (edges, frequencies)."""
+        key = tuple(effects)
+        return _kept(self._numbers_of, key, lambda: self._numbers(self._reported(key)))
+
+    def _numbers(self, rows: FloatArray) -> FloatArray:
+        """Transfer functions at `frequencies`, (edges, frequencies), of what the estimators report."""
+        return np.asarray(rows[:, 2:] / rows[:, :1] + self._level)
+
+    def _reported(
+        self, effects: tuple[Effect, ...], more: FloatArray | None = None, otf: ComplexArray | None = None
+    ) -> FloatArray:
+        """Of the model, (edges, rows), its profiles where the recorded ones lie: noise and lopsided blurs move them. `more` and `otf`:
+        of the profiles on top, and the transfer functions in place of the effects'."""
+        otf, change = self._otf(effects) if otf is None else otf, self._change(effects)
+        if more is not None:
+            change = more if change is None else change + more
+        f = self._quadrature.frequency
+        moved = np.zeros(len(otf))
+        wanted = self._recorded[:, 1] / self._recorded[:, 0]
+        rows = self._operators.report(otf, f, change)
+        for _ in range(2 if not np.any(np.imag(otf)) and change is None else 4):
+            short = wanted - rows[:, 1] / rows[:, 0]
+            if np.all(np.abs(short) < 1e-5):
+                break
+            moved += np.clip(short, -0.5, 0.5)
+            rows = self._operators.report(otf * np.exp(2j * np.pi * moved[:, None] * f), f, change)
+        return rows
+
+    def _estimated(self, reach_px: float) -> tuple[list[_Estimator], _Operators]:
+        """The estimator of every edge, about its baseline, and all of them as operators on transfer functions."""
+        distance = _interpolation(reach_px)[1]
+        quadrature = self._quadrature
+        half, count = len(distance) // 2, quadrature.odd.shape[1]
+        odd, even = np.zeros((2, len(quadrature.frequency), len(distance)))
+        odd[:, half : half + count], even[:, half : half + count] = quadrature.odd, quadrature.even
+        odd[:, half - count + 1 : half + 1] = -quadrature.odd[:, ::-1]
+        even[:, half - count + 1 : half + 1] = quadrature.even[:, ::-1]
+        real, imaginary = self._at[0].T @ odd, (self._at[1] / quadrature.frequency[:, None]).T @ even
+        estimators, found = [], []
+        for k, (edge, otf) in enumerate(zip(self.edges, self._baseline, strict=True)):
+            contrast = max(edge.measured.light_level - edge.measured.dark_level, 1e-9)
+            offset = max(edge.measured.dark_level, 0.0) / contrast
+            shade = self._shade(k, distance, ())
+            rising = np.real(otf) @ odd + (np.imag(otf) / quadrature.frequency) @ even
+            profile = (0.5 + offset + rising) * shade - offset
+            slope = np.gradient(profile, distance)
+            shapes = np.concatenate(
+                [np.ones((1, len(distance))), profile[None], slope[None], real * shade, imaginary * shade]
+            )
+            estimator = _Estimator.of(edge.measured.geometry, _spread(edge.measured.geometry, reach_px), shapes)
+            estimators.append(estimator)
+            shaded = estimator.rows * shade
+            constant = shaded.sum(axis=1) * (0.5 + offset) - estimator.rows.sum(axis=1) * offset
+            found.append((constant, shaded @ odd.T, shaded @ even.T, estimator.rows, offset, shade))
+        constant, by_odd, by_even, rows, offsets, shades = (np.array(part) for part in zip(*found, strict=True))
+        return estimators, _Operators(constant, by_odd, by_even, rows, distance, offsets, shades)
+
+    def _mean_cutoff(self) -> float:
+        """The lens's cutoff at the mean wavelength of all sights, cy/px."""
+        nodes, shares = common_wavelengths(self._camera, self._lit)
+        lens = self._camera.lens
+        mean = float((shares @ nodes).mean())
+        return self._camera.pixel_pitch_um * lens.imaging.cutoff_cy_per_um(mean, lens.f_number)
+
+    def _otf(self, effects: tuple[Effect, ...]) -> ComplexArray:
+        """(edges, nodes): transfer functions along the edges' normals."""
+        local = [tuple(e.at_place(*p, self._camera) for e in effects) for p in self._places]
+        found = {here: self._sights_otf(here) for here in dict.fromkeys(local)}
+        table = np.array([found[here] for here in local])
+        # what is spread widely is of the profile (`_change`): its transfer falls within the first of the quadrature's nodes
+        veiled = wide_contrast(effects, self._camera, self._quadrature.frequency)
+        return np.asarray(table[self._place, self._sight, self._turn] / veiled)
+
+    def _sights_otf(self, effects: tuple[Effect, ...]) -> ComplexArray:
+        """(sights, directions, nodes)."""
+        spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
+        nodes, shares, kink = self._wavelengths(spectral)
+        fx, fy = self._frequencies
+        moving = tuple(e for e in effects if type(e).charge is not Effect.charge and self._camera.cfa != "MONO")
+        optical = tuple(e for e in effects if e not in moving and overrides(e, BLURRING_HOOKS))
+
+        def blurred() -> ComplexArray:
+            whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical) for w in nodes])
+            return np.asarray(np.tensordot(shares, whole, 1) + kink, complex)
+
+        otf = _kept(self._blurred, (spectral, optical), blurred)
+        return self._mixed(otf, moving) if moving else otf
+
+    @cached_property
+    def _frequencies(self) -> tuple[FloatArray, FloatArray]:
+        turn = np.deg2rad(self._turns)
+        return np.outer(np.cos(turn), self._quadrature.frequency), np.outer(np.sin(turn), self._quadrature.frequency)
+
+    def _wavelengths(self, spectral: tuple[Effect, ...]) -> tuple[FloatArray, FloatArray, ComplexArray]:
+        """A few wavelengths (w,), their shares (sights, w), and what these few miss of the perfect lens's transfer."""
+
+        def worked_out() -> tuple[FloatArray, FloatArray, ComplexArray]:
+            grid, perfect = self._perfect
+            fine = wavelength_shares(self._camera, self._lit, grid, spectral)
+            few, _ = gauss_rule(grid, fine.mean(axis=0), WAVELENGTHS)
+            share = lagrange_shares(grid, fine, few)
+            missed = fine - np.array([linear_shares(few, own, grid) for own in share])
+            return few, share, np.tensordot(missed, perfect, 1)
+
+        return _kept(self._spectral, spectral, worked_out)
+
+    @cached_property
+    def _perfect(self) -> tuple[FloatArray, ComplexArray]:
+        """Wavelengths (w,), nm, and the lens's and the pixel's transfer at each without effects, (w, directions, nodes)."""
+        curves = self._camera.quantum_efficiency.values()
+        low, high = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
+        grid = np.linspace(low, high, 2 + int((high - low) / FINE_NM))
+        return grid, np.array([transfer_at(self._camera, float(w), *self._frequencies) for w in grid])
+
+    def _mixed(self, otf: ComplexArray, moving: tuple[Effect, ...]) -> ComplexArray:
+        """Charge that moves between pixels of different colours: neighbours' edges, weighted by their light."""
+        camera, step = self._camera, mosaic.step(self._camera.cfa)
+        fx, fy = self._frequencies
+        middle = 4 * step
+        out = np.zeros(otf.shape, complex)
+        single = np.zeros((2 * middle + step,) * 2)
+        single[middle, middle] = 1.0
+        for effect in moving:
+            single = effect.charge(single, 0.0, camera)
+        rows, cols = np.nonzero(np.abs(single) > 1e-9)
+        phases = mosaic.phases(camera.cfa)
+        channel_at = {(r % step, c % step): ch for ch, places in phases.items() for r, c in places}
+        for k, (channel, _light) in enumerate(self._sights):
+            first = k - camera.channels.index(channel)
+            rates = [max(self._rate(first + i), 0.0) for i in range(len(camera.channels))]
+            total = 0.0
+            for row, col in phases[channel]:
+                for r, c in zip(rows, cols, strict=True):
+                    # charge from a pixel at (-dr, -dc) arrives here: an edge seen there lies further on here
+                    dr, dc = int(r) - middle, int(c) - middle
+                    source = camera.channels.index(channel_at[(row - dr) % step, (col - dc) % step])
+                    share = float(single[r, c]) * rates[source]
+                    out[k] += share * otf[first + source] * np.exp(-2j * np.pi * (fx * dc + fy * dr))
+                    total += share
+            out[k] /= max(total, 1e-300)
+        return out
+
+    def _rate(self, sight: int) -> float:
+        channel, light = self._lit[sight]
+        if light is None:
+            return 1.0
+        return electron_rate(self._camera, channel, light)
+
+    # --- what changes a profile beside its transfer ---
+
+    def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
+        """Change of the profiles (edges, distances) by the effects' shading, by responses that bend and by halos."""
+        changing = tuple(e for e in effects if overrides(e, CHANGING_HOOKS))
+        return _kept(self._changes, changing, lambda: self._changed(changing))
+
+    def _changed(self, effects: tuple[Effect, ...]) -> FloatArray | None:
+        shading = tuple(e for e in effects if type(e).illumination is not Effect.illumination)
+        bending = tuple(e for e in effects if type(e).response is not Effect.response)
+        spread = halos(effects, self._camera)
+        if not shading and not bending and not spread:
+            return None
+        light, operators = self._light_profile, self._operators
+        change = np.zeros_like(light)
+        if bending:
+            for i, edge in enumerate(self.edges):
+                scale = max(edge.measured.light_level - edge.measured.dark_level, 1e-9) / self._study.noise.gain
+                level = np.linspace(0.0, 1.1, 45) * float(light[i].max())
+                bent = level * scale
+                for e in bending:
+                    bent = e.response(bent, self._camera)
+                change[i] += np.interp(light[i], level, bent / scale) - light[i]
+        if shading:
+            for i in range(len(self.edges)):
+                ratio = self._shade(i, operators.distance, shading) / operators.shade[i]
+                change[i] += (light[i] + change[i]) * (ratio - 1.0)
+        for share, std_px in spread:
+            change += share / wide_contrast(effects, self._camera) * (ndtr(operators.distance / std_px) - 0.5)
+        return change
+
+    @cached_property
+    def _light_profile(self) -> FloatArray:
+        """(edges, distances): the profiles under the baseline, above no light, of the contrast."""
+        half = len(self._operators.distance) // 2
+        count = self._quadrature.odd.shape[1]
+        rising = np.real(self._baseline) @ self._quadrature.odd
+        profile = np.zeros((len(self.edges), 2 * half + 1))
+        profile[:, half : half + count] = rising
+        profile[:, half - count + 1 : half + 1] = -rising[:, ::-1]
+        return np.asarray((0.5 + profile + self._operators.offset[:, None]) * self._operators.shade)
+
+    def _shade(self, edge: int, distance: FloatArray, effects: Effects) -> FloatArray:
+        """Light over the distance from an edge, averaged along it, of that at the edge."""
+        x_um, y_um, light, fit = self._lighting[edge]
+        for e in effects:
+            light = light * e.illumination(x_um, y_um, self._camera)
+        terms = fit @ light
+        reach = self.edges[edge].measured.geometry.reach_px
+        return np.asarray(polynomial.polyval(np.clip(distance, -reach, reach) / UNEVEN_PX, terms / terms[0]))
+
+    @cached_property
+    def _lighting(self) -> list[tuple[FloatArray, ...]]:
+        """Of every edge: places around it, (points,) um from the optical axis; the baseline's light there; and (terms, points), which take
+        light to a polynomial in the distance: a mean over all that lies at the same distance, however long the edge is there."""
+        camera = self._camera
+        axis, pitch = optical_axis_px(camera), camera.pixel_pitch_um
+        found: list[tuple[FloatArray, ...]] = []
+        for edge in self.edges:
+            row0, col0, row1, col1 = edge.region
+            every = max(1, (row1 - row0) // 40), max(1, (col1 - col0) // 40)
+            row, col = (a.astype(float) for a in np.mgrid[row0 : row1 : every[0], col0 : col1 : every[1]])
+            turn = np.deg2rad(edge.direction_deg)
+            middle = 0.5 * (row0 + row1 - 1), 0.5 * (col0 + col1 - 1)
+            away = np.cos(turn) * (col - middle[1]) + np.sin(turn) * (row - middle[0])
+            near = np.abs(away) < edge.measured.geometry.reach_px
+            row, col = row[near], col[near]
+            light = np.asarray(relative_illumination(camera, row, col), float)
+            fit = np.linalg.pinv(polynomial.polyvander(away[near] / UNEVEN_PX, UNEVEN_ORDER))
+            found.append(((col - axis[1]) * pitch, (row - axis[0]) * pitch, light, fit))
+        return found
+
+    @cached_property
+    def slopes(self) -> dict[str, FloatArray]:
+        """By what is free: the bend of the light on the target, one for each region, direction and light; and the colour of light of which
+        nothing is said."""
+        base = self.predict(())
+        bend = self._light_profile * np.square(self._operators.distance / UNEVEN_PX) * UNEVEN_STD
+        moved = self._numbers(self._reported((), bend))
+        settings = [(e.region, round(e.direction_deg), e.part[0].light_radiance) for e in self.edges]
+        found = {}
+        for k, setting in enumerate(dict.fromkeys(settings)):
+            mine = np.array([s == setting for s in settings])[:, None]
+            found[f"edge light:{k}"] = np.where(mine, moved - base, 0.0).ravel()
+        for k, change in enumerate(self._other_colours()):
+            moved = self._numbers(self._reported((), otf=self._baseline + change[self._sight, self._turn]))
+            found[f"edge colour:{k}"] = (moved - base).ravel()
+        return found
+
+    def _other_colours(self) -> FloatArray:
+        """By how much the sights' transfers, (ways, sights, directions, nodes), may differ where nothing is said of their light and that of
+        equal energy stands for it: by its tilt, and in parts of the spectrum by themselves. A standard deviation each."""
+        blind = np.array([light is None for _, light in self._lit])
+        shape = len(blind), *self._frequencies[0].shape
+        if not blind.any():
+            return np.zeros((0, *shape))
+        wavelength_nm = np.arange(300.0, 1101.0, 5.0)
+        middle = np.arange(wavelength_nm[0], wavelength_nm[-1] + 1.0, PART_NM)[:, None]
+        parts = 1.0 + PART_STD * np.maximum(1.0 - np.abs(wavelength_nm - middle) / PART_NM, 0.0)
+        tilted = 1.0 + TILT_STD * np.clip((wavelength_nm - 550.0) / 150.0, -1.5, 1.5)
+        ways = [Spectrum.of(wavelength_nm, value) for value in (tilted, *parts)]
+        sights = [(channel, way if light is None else light) for way in [None, *ways] for channel, light in self._lit]
+        nodes, shares = common_wavelengths(self._camera, sights, count=FINE_WAVELENGTHS)
+        apart = shares.reshape(len(ways) + 1, len(self._lit), -1)
+        whole = np.array([np.real(transfer_at(self._camera, float(w), *self._frequencies)) for w in nodes])
+        return np.tensordot(apart[1:] - apart[:1], whole, 1)
+
+
+def _relative(scatter: FloatArray, rows: FloatArray) -> FloatArray:
+    """Covariance of departures relative to the contrast, of what was reported."""
+    departure = rows[2:] / rows[0]
+    slopes = (
+        np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1) / rows[0]
+    )
+    return np.asarray(slopes @ scatter @ slopes.T)
+
+
+def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Means of angles that lie closer together than `width`, and which of them each belongs to."""
+    order = np.argsort(angle_deg)
+    start = np.concatenate([[True], np.diff(angle_deg[order]) > width])
+    label = np.cumsum(start) - 1
+    which = np.empty(len(order), np.intp)
+    which[order] = label
+    count = np.bincount(which)
+    return np.bincount(which, angle_deg) / count, which
+
+
+def _place_um(study: Study, edge: _Edge) -> tuple[float, float]:
+    """(x, y) of the edge's middle from the sensor's centre."""
+    field_mm = edge.part[0].field_mm
+    if field_mm is not None and edge.part[0].region is not None:
+        return 1000.0 * field_mm[1], 1000.0 * field_mm[0]
+    pitch = study.camera.pixel_pitch_um
+    row0, col0, row1, col1 = edge.region
+    return 0.5 * pitch * (col0 + col1 - study.camera.cols), 0.5 * pitch * (row0 + row1 - study.camera.rows)

@@ -1,0 +1,215 @@
+"""Light that changes while a frame is read: what single flat frames' rows differ from those of all others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.diagnose.measurements.neighbours import held_out_flats
+from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
+from lab.errors import NotDetermined
+from sim.effects.base import Effect
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+MOST_FRAMES, MOST_LEVELS = 6, 8  # of a level; of a session
+WIDEN = 1.6  # from one band of frequencies to the next
+HIGHEST = 0.45  # cy/row
+#: Of the power in a band, alike at all levels: noise that neighbouring rows share.
+COLOUR_STD = 0.1  # and five times as much where a few rows are a period
+#: Relative amplitude of a change of the rows' pattern from one level to another, a share of whatever falls off towards the rims.
+PATTERN_STD = 3e-5
+#: Of the read noise: offsets of rows, where no dark frames tell.
+ROW_SHARE = 0.15
+#: Instants at which a light's phase is looked at: golden sections of a second, no period's multiples.
+INSTANTS = 0.6180339887 * np.arange(24) % 1.0
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Frames of one level: DN over the dark level, variance of a row's mean, power by band of their rows (relative, times rows)."""
+
+    captures: tuple[Any, ...]
+    signal: float
+    variance: float  # of a row's mean relative to the signal, by pixels' noise
+    power: FloatArray  # (bands,) over that of the noise
+    freedom: FloatArray  # (bands,)
+
+
+def flicker_block(study: Study) -> Block:
+    """Power of single flat frames' rows by spatial frequency, against the rows of all flat frames, in parts of what noise leaves.
+
+    q = row means of a frame / those of all frames - 1; power |sum q exp(-2 pi i k r)|^2 / rows, over the pixels' variance. Its cube root
+    is nearly normal (Wilson and Hilferty 1931): mean 1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. What the rows of
+    dark frames show beside noise (their offsets, in DN) is expected in light as well, and the noise's colour is free.
+    """
+    groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
+    groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1]
+    if len(groups) < 1:
+        raise NotDetermined(
+            "flicker", "no unclipped flat captures that are repeated: rows of single frames aren't comparable"
+        )
+    groups = [groups[i] for i in np.unique(np.linspace(0, len(groups) - 1, min(MOST_LEVELS, len(groups))).astype(int))]
+    step = mosaic.step(study.camera.cfa)
+    rows = study.camera.rows // step
+    if rows < 24:
+        raise NotDetermined("flicker", f"frames of {study.camera.rows} rows: too few to see bands in")
+    bands = _bands(rows, HIGHEST * step)
+    levels = _measured(study, groups, bands)
+    dark, dark_std = _dark_power(study, bands)
+    out = study.once(held_out_flats)
+    frequency = np.array([np.sqrt(b[0] * b[-1]) for b in bands]) / (rows * step)
+    freedom = np.concatenate([level.freedom for level in levels])
+    value = np.cbrt(np.concatenate([level.power for level in levels]))
+    # the fixed offsets of rows in light, DN^2 -> parts of the noise's power
+    share = np.repeat([1.0 / (level.signal**2 * level.variance) for level in levels], len(bands))
+    offsets, offsets_std = np.tile(dark, len(levels)) * share, np.tile(dark_std, len(levels)) * share
+    pattern = np.repeat([PATTERN_STD**2 * rows / level.variance for level in levels], len(bands))
+    band = np.tile(np.arange(len(bands)), len(levels))
+
+    def predict(effects: Effects) -> Prediction:
+        moving = [e for e in effects if type(e).lit is not Effect.lit]
+        power, spread = 1.0 + offsets, np.zeros(len(value))
+        if moving:
+            found = [_modulation(study, level, moving, bands, step) for level in levels]
+            power = power + np.concatenate([mean for mean, _ in found])
+            spread = np.concatenate(
+                [std / np.sqrt(len(level.captures)) for (_, std), level in zip(found, levels, strict=True)]
+            )
+        mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
+        slope = mean / (3.0 * power)
+        slopes = {}
+        for k in range(len(bands)):
+            slopes[f"rows:offset:{k}"] = np.where(band == k, slope * offsets_std, 0.0)
+            slopes[f"rows:colour:{k}"] = np.where(
+                band == k, slope * COLOUR_STD * (1.0 + 4.0 * (frequency[k] > 0.15)), 0.0
+            )
+            slopes[f"rows:pattern:{k}"] = np.where(band == k, slope * pattern, 0.0)
+        # a level's few frames catch the light at phases of their own: that much its power may lie off the mean over all phases
+        for i in np.flatnonzero(spread):
+            slopes[f"rows:phase:{i}"] = np.where(np.arange(len(value)) == i, slope[i] * spread[i], 0.0)
+        return Prediction(mean, slopes)
+
+    return Block(
+        measurement="flat_rows", axis="row_frequency", unit="cy/row", reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),
+        value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
+        labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.captures[0].id in out)
+                     for level in levels for f in frequency),
+        hooks=frozenset({"lit"}), predict=predict, scale=np.ones(len(value)), conditions="exposure", conditions_words="flats of",
+    )  # fmt: skip
+
+
+LOG_REACH = 1.0  # over a factor of e in frequency
+
+
+def _bands(rows: int, highest_cy_per_row: float) -> list[range]:
+    """Whole periods a frame in each band, from 1 to `highest_cy_per_row`, each band WIDEN times as high as the last."""
+    top = int(min(highest_cy_per_row, HIGHEST) * rows)
+    bands, low = [], 1
+    while low <= top:
+        high = max(low + 1, int(np.ceil(low * WIDEN)))
+        bands.append(range(low, min(high, top + 1)))
+        low = high
+    return bands
+
+
+def _profile(frame: NDArray[np.floating], step: int) -> FloatArray:
+    """Means of the rows, of as many together as the mosaic repeats after."""
+    rows = frame.shape[0] // step
+    return np.asarray(frame.mean(1)[: rows * step].reshape(rows, step).mean(1))
+
+
+def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[range]) -> list[_Level]:
+    noise, step = study.noise, mosaic.step(study.camera.cfa)
+    rows = study.camera.rows // step
+    profiles, variances, signals = [], [], []
+    for group in groups:
+        frames = [np.asarray(study.recordings.frame(c), np.float32) for c in group]
+        dark = noise.black + noise.dark_dn_per_s * group[0].exposure_s
+        mean = sum(frames[1:], frames[0]) / len(frames)
+        # pixels' noise beside what whole rows have in common
+        left = [f - mean for f in frames]
+        left = [d - d.mean(1, keepdims=True) for d in left]
+        pixel = float(np.mean([np.mean(np.square(d, dtype=float)) for d in left])) * len(frames) / (len(frames) - 1)
+        own = np.array([_profile(f, step) for f in frames]) - dark
+        profiles.append(own / own.mean(1, keepdims=True))
+        signals.append(float(own.mean()))
+        variances.append(pixel / (step * study.camera.cols) / signals[-1] ** 2)
+    # the reference: every frame counts by its light and its exposure, in which flicker averages out
+    weight = np.concatenate([np.full(len(g), s * g[0].exposure_s) for g, s in zip(groups, signals, strict=True)])
+    weight /= weight.sum()
+    every = np.concatenate(profiles)
+    reference = weight @ every
+    variance = np.concatenate([np.full(len(g), v) for g, v in zip(groups, variances, strict=True)])
+    found, first = [], 0
+    for group, signal, level in zip(groups, signals, variances, strict=True):
+        at = slice(first, first + len(group))
+        first += len(group)
+        # of q: a frame's own noise, less its part in the reference, and the others' there
+        own = level * (1.0 - 2.0 * weight[at].mean()) + float(weight**2 @ variance)
+        lines = np.abs(np.fft.rfft(every[at] / reference - 1.0, axis=1)) ** 2 / rows / own
+        found.append(
+            _Level(
+                tuple(group),
+                signal,
+                own,
+                np.array([lines[:, list(band)].mean() for band in bands]),
+                np.array([2.0 * len(group) * len(band) for band in bands]),
+            )
+        )
+    return found
+
+
+def _dark_power(study: Study, bands: Sequence[range]) -> tuple[FloatArray, FloatArray]:
+    """Power that dark frames' rows have beside their pixels' noise, by band, DN^2 x rows, and its standard uncertainty."""
+    noise, step = study.noise, mosaic.step(study.camera.cfa)
+    rows = study.camera.rows // step
+    total, expected, freedom = np.zeros(len(bands)), 0.0, np.zeros(len(bands))
+    for group in study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)):
+        part = group[:MOST_FRAMES]
+        if len(part) < 2:
+            continue
+        frames = [np.asarray(study.recordings.frame(c), np.float32) for c in part]
+        mean = sum(frames[1:], frames[0]) / len(frames)
+        count = len(frames) - 1
+        left = [f - mean for f in frames]
+        lines = (
+            np.mean([np.abs(np.fft.rfft(_profile(d, step))) ** 2 for d in left], axis=0) * len(frames) / count / rows
+        )
+        total += count * np.array([lines[list(band)].mean() for band in bands])
+        inner = np.mean([np.mean(np.square(d - d.mean(1, keepdims=True), dtype=float)) for d in left])
+        expected += count * float(inner) * len(frames) / count / (step * study.camera.cols)
+        freedom += count
+    if not freedom.any():
+        return np.zeros(len(bands)), np.full(len(bands), (ROW_SHARE * noise.read_dn) ** 2 / step)
+    frames_seen = freedom[0]
+    mean_power = total / frames_seen
+    uncertain = mean_power * np.sqrt(2.0 / (2.0 * frames_seen * np.array([len(b) for b in bands])))
+    excess = mean_power - expected / frames_seen
+    # what is within its own uncertainty is none
+    return np.where(excess > 2.0 * uncertain, excess, 0.0), uncertain
+
+
+def _modulation(
+    study: Study, level: _Level, effects: Sequence[Effect], bands: Sequence[range], step: int
+) -> tuple[FloatArray, FloatArray]:
+    """What effects on the light add to a level's power by band: mean over the instants, and one frame's spread about it."""
+    rows = study.camera.rows // step
+    electrons = np.full((study.camera.rows, 1), level.signal / study.noise.gain)
+    exposure = level.captures[0].exposure_s
+    profiles = []
+    for instant in INSTANTS:
+        lit = electrons
+        for effect in effects:
+            lit = effect.lit(lit, exposure, float(instant), study.camera)
+        own = _profile(lit, step)
+        profiles.append(own / own.mean())
+    relative = np.array(profiles)
+    relative = relative / relative.mean(0) - 1.0
+    lines = np.abs(np.fft.rfft(relative, axis=1)) ** 2 / rows / level.variance
+    power = np.array([lines[:, list(band)].mean(1) for band in bands])
+    return power.mean(1), power.std(1)

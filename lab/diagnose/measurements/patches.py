@@ -1,0 +1,394 @@
+"""Patches: reflectance charts, and the dark squares of patterns on a screen. Both show light that is spread widely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lab.diagnose.measurements.curves import CurveSlopes
+from lab.diagnose.measurements.summaries import (
+    CLIPPED_SHARE,
+    LEVEL_REACH,
+    SPECTRAL_HOOKS,
+    UNIFORM_HOOKS,
+    Block,
+    Effects,
+    Label,
+    Prediction,
+    Study,
+    held_out_of,
+)
+from lab.diagnose.measurements.veils import Surroundings, even_share, halo_light, harmonics, wide_contrast
+from lab.errors import NotDetermined
+from lab.fit.levels import rounding_std_dn
+from lab.formats.recording_set import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
+from lab.predict.camera_model import Field, mixed_charge
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.forward import optical_transfer
+from sim.scene.colorchecker import reflectances
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+PATCH_STD = 0.01  # of a patch's reflectance, common to the channels
+PATCH_COLOUR_STD = 0.004  # of a patch's reflectance, each channel by itself
+PATCH_LEVEL_STD = 4.0e-4  # of a perfect diffuser: gloss and the dark patches' own errors
+CHART_SCALE_STD, CHART_GRADIENT_STD = 0.05, 0.005
+SCREEN_FLOOR = (
+    6e-4  # of the lit screen: what reaches dark squares from the farthest lit ones and from around the screen
+)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """One patch in one channel, averaged over a capture's repeats; DN."""
+
+    captures: tuple[Chart, ...]
+    name: str
+    channel: str
+    level: float
+    pixels: int
+    row: float
+    col: float
+    frame: float  # mean of the whole frame in this channel
+    around: Surroundings  # of the patch in one of its planes, less what no light makes
+    tail: float  # what the point spread adds from the surroundings
+    held_out: bool
+
+
+def chart_block(study: Study) -> Block:
+    """Every patch of a chart by channel; level and evenness of its light are free, and the patches' own tolerance."""
+    if not study.stated.quantum_efficiency:
+        raise NotDetermined(
+            "chart", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"
+        )
+    points = patch_levels(study)
+    if len(points) < 12:
+        raise NotDetermined("chart", "fewer than twelve unclipped patches of a ColorChecker24")
+    noise, camera = study.noise, study.camera
+    value = np.array([p.level for p in points])
+    exposures = np.array([p.captures[0].exposure_s for p in points])
+    row, col = np.array([p.row for p in points]), np.array([p.col for p in points])
+    tail = np.array([p.tail for p in points])
+    offset = noise.black + noise.dark_dn_per_s * exposures
+    signal = np.maximum(value - offset, 0.1)
+    surround = np.array([p.frame for p in points]) - offset  # what a veil carries
+    place = Field.at(camera, row, col)
+    known = reflectances(points[0].captures[0].chart)
+    curves = CurveSlopes(
+        study,
+        [(p.captures[0].radiance, p.channel, p.captures[0].exposure_s, "chart", known[p.name]) for p in points],
+        signal / noise.gain / exposures,
+    )
+    names = {n: i for i, n in enumerate(known)}
+
+    def predict(effects: Effects) -> Prediction:
+        rates = curves.rates(effects)
+        local, time, ambient = place.under(camera, effects).light, exposures, np.zeros(len(points))
+        for effect in effects:
+            time = np.array([effect.exposure(float(t)) for t in time])
+            ambient = ambient + np.array([effect.ambient_e_per_s(p.channel, camera) for p in points]) * exposures
+        electrons = rates * local * time
+        if any(type(e).charge is not Effect.charge for e in effects):
+            electrons = electrons * _mixing(study, points, electrons, effects)
+        veil = even_share(effects) * surround + halo_light([p.around for p in points], effects, camera)
+        electrons = wide_contrast(effects, camera) * electrons + (veil + tail) / noise.gain + ambient
+        out = electrons + noise.dark_dn_per_s / noise.gain * exposures
+        for effect in effects:
+            out = effect.response(out, camera)
+        lit = out * noise.gain - noise.dark_dn_per_s * exposures
+        shift = np.array([study.offset(p.captures[0], effects) for p in points])
+        slopes = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
+        slopes |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.slopes(effects).items()}
+        slopes["chart:scale"] = CHART_SCALE_STD * lit
+        slopes["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
+        slopes["chart:y"] = CHART_GRADIENT_STD * lit * (row / camera.rows - 0.5) * 2
+        return Prediction(noise.black + out * noise.gain + shift, slopes)
+
+    return Block(
+        measurement="chart",
+        axis="level",
+        unit="DN",
+        reach=LEVEL_REACH,
+        along=np.log(np.maximum(signal, 1.0)),
+        value=value,
+        covariance=patch_covariance(study, points, signal),
+        labels=tuple(
+            Label(float(names[p.name]), p.channel, p.name, tuple(c.id for c in p.captures), p.held_out) for p in points
+        ),
+        hooks=(UNIFORM_HOOKS - {"drift"}) | SPECTRAL_HOOKS | {"veil"},
+        predict=predict,
+        scale=signal,
+        places="patches",
+    )
+
+
+def patch_levels(study: Study) -> list[Patch]:
+    groups = study.groups(Chart, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
+    groups = [g for g in groups if g[0].chart == "ColorChecker24"]
+    step = mosaic.step(study.camera.cfa)
+    points = []
+    for i, group in enumerate(groups):
+        out = held_out_of(group, i, len(groups))
+        for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
+            if not part:
+                continue
+            frame = steady(study.recordings, part)
+            clipped = study.recordings.frame(part[0]) >= study.saturation_dn
+            for channel in study.channels:
+                first_row, first_col = mosaic.phases(study.camera.cfa)[channel][0]
+                plane = frame[first_row::step, first_col::step]
+                spread = _spread(study, plane, channel, part[0].radiance)
+                mean = float(study.pixels_of(frame, channel).mean())
+                low = harmonics(plane - study.noise.black - study.noise.dark_dn_per_s * part[0].exposure_s)
+                mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))
+                for name, rows, cols, row, col in _patches(part[0]):
+                    box = (slice(*rows), slice(*cols))
+                    values = frame[box][mask[box]]
+                    if values.size < 16 or np.mean(clipped[box][mask[box]]) >= CLIPPED_SHARE:
+                        continue
+                    inside = slice(rows[0] // step, rows[1] // step), slice(cols[0] // step, cols[1] // step)
+                    points.append(
+                        Patch(tuple(part), name, channel, float(values.mean()), values.size, row, col, mean, Surroundings.of_box(low, plane.shape, *inside),
+                              float(spread[inside].mean()), part[0].id in out)
+                    )  # fmt: skip
+    return points
+
+
+def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> FloatArray:
+    """Noise, the patches' tolerance (one for all repeats and channels, and one a channel), and the point spread's."""
+    noise = study.noise
+    pixels = np.array([p.pixels for p in points])
+    repeats = np.array([len(p.captures) for p in points])
+    tail = np.array([p.tail for p in points])
+    names = np.array([p.name for p in points])
+    channel = np.array([p.channel for p in points])
+    perfect = np.array([signal[channel == c].max() / 0.9 for c in channel])  # DN of a perfect diffuser
+    temporal = (noise.gain * signal + noise.read_dn**2) / pixels / repeats
+    digits = rounding_std_dn(noise.spread_dn2(signal))
+    fixed = np.sqrt((noise.prnu * signal) ** 2 / pixels + (PATCH_COLOUR_STD * signal) ** 2 + digits**2)
+    same = names[:, None] == names
+    covariance = np.diag(temporal + noise.jitter_dn**2) + same * (channel[:, None] == channel) * np.outer(fixed, fixed)
+    covariance += same * (
+        np.outer(tail, tail) * study.tail_std**2
+        + np.outer(signal, signal) * PATCH_STD**2
+        + np.outer(perfect, perfect) * PATCH_LEVEL_STD**2
+    )
+    return np.asarray(covariance)
+
+
+def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatArray:
+    """What the baseline's own point spread adds to each place of a plane from its surroundings (DN, on the plane's grid).
+
+    The recording stands for the scene: well inside a patch both differ only by what is sought, a fraction of a per cent.
+    """
+    step = mosaic.step(study.camera.cfa)
+    picture = np.pad(plane, [(0, n) for n in plane.shape], mode="symmetric")
+    fy = np.fft.fftfreq(picture.shape[0], step)[:, None]
+    fx = np.fft.rfftfreq(picture.shape[1], step)[None, :]
+    otf = np.real(optical_transfer(study.camera, channel, study.spectrum(light), fx, fy))
+    blurred = np.fft.irfft2(np.fft.rfft2(picture) * otf, picture.shape)
+    return np.asarray(blurred[: plane.shape[0], : plane.shape[1]] - plane)
+
+
+def _mixing(study: Study, points: list[Patch], electrons: FloatArray, effects: Effects) -> FloatArray:
+    """Factors on the patches by effects that move charge between the channels of a uniform patch."""
+    factor = np.ones(len(points))
+    by_patch: dict[tuple[str, str], dict[str, int]] = {}
+    for i, p in enumerate(points):
+        by_patch.setdefault((p.captures[0].id, p.name), {})[p.channel] = i
+    for members in by_patch.values():
+        if len(members) == len(study.channels):
+            mixed = mixed_charge({c: float(electrons[i]) for c, i in members.items()}, 1.0, effects, study.camera)
+            for c, i in members.items():
+                factor[i] = mixed.get(c, 1.0)
+    return factor
+
+
+def _patches(capture: Chart) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
+    """Patches' inner halves: name, rows, cols, centre."""
+    corners = np.array(capture.corners, float)
+    found = []
+    names = list(reflectances(capture.chart))
+    for k, name in enumerate(names):
+        i, j = divmod(k, 6)
+        u, v = (j + 0.5) / 6.0, (i + 0.5) / 4.0
+        centre = (1 - v) * ((1 - u) * corners[0] + u * corners[1]) + v * ((1 - u) * corners[3] + u * corners[2])
+        right, down = (corners[1] - corners[0]) / 6.0, (corners[3] - corners[0]) / 4.0
+        half = 0.22 * min(np.linalg.norm(right), np.linalg.norm(down))
+        rows = (int(np.ceil(centre[0] - half)), int(np.floor(centre[0] + half)) + 1)
+        cols = (int(np.ceil(centre[1] - half)), int(np.floor(centre[1] + half)) + 1)
+        found.append((name, rows, cols, float(centre[0]), float(centre[1])))
+    return found
+
+
+def screen_block(study: Study) -> Block:
+    """Light in the dark squares of a pattern on the screen, beyond what the all-dark screen leaves, by channel.
+
+    Only pixels well away from any lit one count. The baseline's own point spread reaches there too and is predicted from the
+    lit pixels; a veil adds a share of the frame's mean.
+    """
+    recordings, side, camera, noise = study.recordings, study.side, study.camera, study.noise
+    by_pose: dict[str, dict[str, list[Any]]] = {}
+    shown: list[White | Black | Checkerboard | Bernoulli] = [
+        *recordings.captures(White, side), *recordings.captures(Black, side),
+        *recordings.captures(Checkerboard, side), *recordings.captures(Bernoulli, side),
+    ]  # fmt: skip
+    for capture in shown:
+        by_pose.setdefault(capture.screen.pose, {}).setdefault(capture.kind, []).append(capture)
+    points = []
+    for kinds in by_pose.values():
+        if "white" not in kinds or "black" not in kinds:
+            continue
+        levels = {k: steady(recordings, kinds[k]) for k in ("white", "black")}
+        exposure = kinds["white"][0].exposure_s
+        if kinds["black"][0].exposure_s != exposure:
+            continue
+        for kind in ("checkerboard", "bernoulli"):
+            patterned = kinds.get(kind, [])
+            if not patterned or patterned[0].exposure_s != exposure:
+                continue
+            out = held_out_of(patterned, 0, 0) if len(patterned) > 1 else set()
+            for part in ([c for c in patterned if c.id not in out], [c for c in patterned if c.id in out]):
+                if part:
+                    points += _dark_squares(
+                        study,
+                        part,
+                        steady(recordings, part),
+                        levels["white"],
+                        levels["black"],
+                        part[0].id in out,
+                        len(kinds["black"]),
+                    )
+    if not points:
+        raise NotDetermined(
+            "screen", "no white, black and patterned captures of one screen with dark squares wide enough"
+        )
+    value = np.array([p.value for p in points])
+    tail, beyond = np.array([p.tail for p in points]), np.array([p.beyond for p in points])
+    lift = np.array([p.lift for p in points])
+    covariance = np.diag(np.array([p.std for p in points]) ** 2 + 2 * noise.jitter_dn**2)
+    ids = [p.kind for p in points]
+    same = np.array([[a == b for b in ids] for a in ids])
+    white = np.array([p.white for p in points])
+    channel, digits = np.array([p.channel for p in points]), np.array([p.digits for p in points])
+    covariance += (
+        same * np.outer(tail, tail) * study.tail_std**2
+        + np.outer(beyond, beyond)
+        + np.outer(white, white) * SCREEN_FLOOR**2
+        + np.diag(np.square(1e-4 * white))
+        + same * (channel[:, None] == channel) * np.outer(digits, digits)
+    )
+
+    def predict(effects: Effects) -> Prediction:
+        shift = halo_light([p.around for p in points], effects, camera)
+        if any(type(e).response is not Effect.response for e in effects):
+            low = np.maximum(tail, 0.0) / noise.gain
+            base = np.array([p.black for p in points]) / noise.gain
+            high = base + low
+            for effect in effects:
+                base, high = effect.response(base, camera), effect.response(high, camera)
+            shift = (high - base) * noise.gain - tail
+        copied = [e for e in effects if type(e).image is not Effect.image]
+        if copied:
+            shift = shift + np.array([_copied(p, copied, camera) for p in points])
+        return Prediction(wide_contrast(effects, camera) * tail + even_share(effects) * lift + shift, {})
+
+    return Block(
+        measurement="screen", axis="level", unit="DN", reach=1e9, value=value, covariance=covariance,
+        labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
+        hooks=frozenset({"veil", "response", "image"}), predict=predict, scale=np.array([p.white for p in points]),
+        conditions="pattern", places="dark squares",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _DarkSquares:
+    kind: str
+    channel: str
+    captures: tuple[str, ...]
+    held_out: bool
+    value: float
+    std: float
+    tail: float
+    picture: FloatArray  # what the pattern adds to the dark screen, DN, over the channel's plane
+    use: NDArray[np.bool_]  # the dark squares' insides in it
+    around: Surroundings  # of these
+    beyond: float  # what the tail is uncertain by: light beyond the frame
+    lift: float
+    white: float
+    black: float
+    digits: float  # what rounding leaves in the value
+
+
+def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> float:
+    """What effects on the whole image bring into the dark squares, DN."""
+    shown = squares.picture
+    for effect in effects:
+        shown = effect.image(shown, camera)
+    return float(shown[squares.use].mean() - squares.picture[squares.use].mean())
+
+
+def steady(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatArray:
+    return np.asarray(np.mean([recordings.frame(c).astype(float) for c in captures], axis=0))
+
+
+def _dark_squares(
+    study: Study,
+    part: Sequence[Any],
+    shown: FloatArray,
+    white: FloatArray,
+    black: FloatArray,
+    held_out: bool,
+    blacks: int,
+) -> list[_DarkSquares]:
+    camera, noise = study.camera, study.noise
+    found = []
+    step = mosaic.step(camera.cfa)
+    lit_by_channel: dict[str, Any] = {}
+    for channel in study.channels:
+        row, col = mosaic.phases(camera.cfa)[channel][0]
+        plane = (slice(row, None, step), slice(col, None, step))
+        full = (white - black)[plane]
+        share = (shown - black)[plane] / np.maximum(full, 1e-6)
+        bright = full > 0.3 * np.quantile(full, 0.95)
+        lit_by_channel[channel] = plane, full, np.where(bright, np.clip(share, 0.0, 1.0), 0.0), bright
+    for channel, (plane, full, share, bright) in lit_by_channel.items():
+        lit = share > 0.25
+        away = ndimage.distance_transform_edt(~lit) * step
+        inside = ndimage.distance_transform_edt(bright) * step
+        for reach in (12.0, 9.0, 7.0):
+            use = (away >= reach) & (inside >= reach)
+            if use.sum() >= 60:
+                break
+        else:
+            continue
+        pad = [(0, n) for n in share.shape]
+        picture = np.where((share > 0.5) & bright, full, 0.0)
+        fy = np.fft.fftfreq(2 * share.shape[0], step)[:, None]
+        fx = np.fft.rfftfreq(2 * share.shape[1], step)[None, :]
+        radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
+        otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
+        # halves of the contrast mark the edges: as much light is drawn as there is, and far away its outline doesn't matter;
+        # a screen that reaches the frame's border goes on beyond it, nobody says how far: not at all, or without an end
+        ends, endless = (
+            np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
+            for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))
+        )
+        added = (shown - black)[plane]
+        difference = added[use]
+        lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
+        variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
+        means = [float(study.pixels_of(f, channel).mean()) for f in (shown, black)]
+        found.append(
+            _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
+                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
+                         added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
+                         float(black[plane][use].mean()) - noise.black, float(np.linalg.norm(rounding_std_dn(noise.spread_dn2(lights)))))
+        )  # fmt: skip
+    return found

@@ -1,0 +1,160 @@
+"""The diagnosis of all sides in one: verdict, named effects, held-out captures, sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from lab.diagnose.inference.decide import FALSE_ALARM_RATE
+from lab.diagnose.outcome.next_capture import SMALLEST_RIVAL, next_sentence
+from lab.diagnose.side import Named, SideFindings
+from lab.formats.results import (
+    DiagnosisResult,
+    HeldOut,
+    Mismatch,
+    NamedEffect,
+    ParameterValue,
+    Rival,
+    Unexplained,
+)
+from sim.camera import Side
+from sim.effects.library import effects as library
+
+Word = Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+
+
+def merged(source: str, found: Sequence[SideFindings]) -> DiagnosisResult:
+    """One result of what all sides show. An effect that several sides show is one entry, with its mean parameters."""
+    mismatches = tuple(m for f in found for m in f.mismatches)
+    effects = tuple(_named(found))
+    unexplained = tuple(u for f in found for u in f.unexplained)
+    verdict: Word = "unexplained"
+    if not effects and not unexplained and not mismatches:
+        verdict = "no_mismatch"
+    elif effects:
+        verdict = "partly_explained" if unexplained else "explained"
+    held_out = _held_out(found)
+    offered = tuple(proposal.capture for f in found for proposal in f.proposals)
+    return DiagnosisResult(
+        source=source,
+        verdict=verdict,
+        mismatches=mismatches,
+        effects=effects,
+        unexplained=unexplained,
+        held_out=held_out,
+        next_capture=next_sentence(offered, bool(unexplained)),
+        next_captures=offered,
+        places=tuple(p for f in found for p in f.places),
+        measurements=tuple(m for f in found for m in f.measurements),
+        visibility=tuple(v for f in found for v in f.visibility),
+        pictures=tuple(p for f in found for p in f.pictures),
+        threshold=max((f.threshold for f in found if f.threshold is not None), default=None),
+        false_alarm_rate=FALSE_ALARM_RATE if any(f.is_judged for f in found) else None,
+        curves=tuple(c for f in found for c in f.curves),
+        skipped=tuple(
+            dict.fromkeys(s for f in found for s in f.skipped)
+        ),  # parts of one measurement give the same reason
+        summary=tuple(_summary(verdict, mismatches, effects, unexplained, held_out)),
+    )
+
+
+def _named(found: Sequence[SideFindings]) -> list[NamedEffect]:
+    by_name: dict[str, list[tuple[Side, Named]]] = {}
+    for findings in found:
+        for one in findings.named:
+            by_name.setdefault(one.candidate.effect.name, []).append((findings.side, one))
+    named = []
+    for name, members in by_name.items():
+        kind = library()[name]
+        candidates = [one.candidate for _, one in members]
+        rivals: dict[str, float] = {}
+        for c in candidates:
+            for rival, probability in c.rivals:
+                if probability >= SMALLEST_RIVAL:
+                    rivals[rival] = max(rivals.get(rival, 0.0), probability)
+        parameters = {}
+        for field, quantity in kind.quantities().items():
+            if quantity.dispensable and all(c.std.get(field) is None for c in candidates):
+                continue
+            value, std = _mean([(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates])
+            parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit)
+        shown = sorted({measurement.replace("_", " ") for _, one in members for measurement in one.shown_in})
+        values = ", ".join(
+            f"{f.removesuffix('_' + p.unit).replace('_', ' ')} {_number(p)}" for f, p in parameters.items()
+        )
+        sides = tuple(side for side, _ in members)
+        statement = f"{kind.sentence} Seen in {' and '.join(shown)} of the {' and '.join(sides)} camera: {values}."
+        named.append(
+            NamedEffect(
+                name=name,
+                probability=min(c.probability for c in candidates),
+                sides=sides,
+                parameters=parameters,
+                rivals=tuple(Rival(name=n, probability=p) for n, p in sorted(rivals.items(), key=lambda r: -r[1])),
+                statement=statement,
+                reference=kind.reference,
+            )
+        )
+    return named
+
+
+def _number(parameter: ParameterValue) -> str:
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    if parameter.std is None:
+        return f"{parameter.value:.4g}{unit}"
+    digits = max(0, min(6, 1 - int(np.floor(np.log10(max(parameter.std, 1e-6))))))
+    return f"{parameter.value:.{digits}f} ± {parameter.std:.{digits}f}{unit}"
+
+
+def _mean(values: list[tuple[float, float | None]]) -> tuple[float, float | None]:
+    """Weighted by the variances where all are known."""
+    known = [(v, s) for v, s in values if s]
+    if len(known) != len(values) or len(values) == 1:
+        return values[0]
+    weight = np.array([1.0 / s**2 for _, s in known])
+    return float(np.sum(weight * np.array([v for v, _ in known])) / weight.sum()), float(1.0 / np.sqrt(weight.sum()))
+
+
+def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
+    """Of the sides to whose model something was added; of all where nothing was."""
+    anything = any(f.named or f.unexplained for f in found)
+    parts = [f.held_out for f in found if f.held_out is not None and (f.named or f.unexplained or not anything)]
+    if not parts:
+        return None
+    return HeldOut(
+        captures=tuple(capture for part in parts for capture in part.captures),
+        chi2_before=sum(part.chi2_before for part in parts),
+        chi2_after=sum(part.chi2_after for part in parts),
+        n=sum(part.n for part in parts),
+    )
+
+
+def _summary(
+    verdict: Word,
+    mismatches: Sequence[Mismatch],
+    effects: Sequence[NamedEffect],
+    unexplained: Sequence[Unexplained],
+    held_out: HeldOut | None,
+) -> list[str]:
+    lines = []
+    if verdict == "no_mismatch":
+        lines.append(
+            f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * FALSE_ALARM_RATE:.0f} %."
+        )
+    lines += [
+        f"{m.measurement.replace('_', ' ')} of the {m.side} camera departs from the baseline: {m.where} ({m.significance_sigma:.1f} sigma)."
+        for m in mismatches
+    ]
+    lines += [e.statement for e in effects]
+    lines += [
+        f"Not explained: {u.measurement.replace('_', ' ')} of the {u.side} camera, {u.where}: {u.shape}."
+        for u in unexplained
+    ]
+    lines += dict.fromkeys(u.check for u in unexplained if u.check)
+    if held_out is not None and held_out.chi2_after < held_out.chi2_before:
+        lines.append(
+            f"On captures that neither choice nor fit has seen, chi2 falls from {held_out.chi2_before:.0f} to {held_out.chi2_after:.0f} for {held_out.n} numbers."
+        )
+    return lines

@@ -1,0 +1,177 @@
+"""The improved model: the camera with what the diagnosis found, as a camera file that simulates and predicts like any other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.unknown import Discrepancy
+from lab.diagnose.measurements.curves import freed_curve
+from lab.diagnose.measurements.summaries import Block
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import FitResult
+from lab.predict.camera_model import camera_model
+from sim.camera import CameraModel, Side
+from sim.effects.base import Effect
+from sim.effects.nameless_correction import NamelessCorrection
+from sim.spectrum import FloatArray, Spectrum
+
+Applied = Literal["transfer", "sensitivity", "illumination", "response", "noise"]
+#: Stages that a smooth factor can act on: of a measurement of which axis, that which hook can change.
+PLACES: tuple[tuple[Applied, str, str], ...] = (
+    ("transfer", "spatial_frequency", "transfer"),
+    ("sensitivity", "wavelength", "transmittance"),
+    ("illumination", "field", "illumination"),
+    ("noise", "level", "noise_e2"),
+    ("response", "level", "response"),
+)
+#: Of a transfer function: below it there is too little contrast to say by what share it is off.
+LEAST_CONTRAST = 0.05
+#: Corrections stay within these factors: a process knows nothing of a quantity that mustn't fall to nothing.
+LOWEST, HIGHEST = 0.05, 3.0
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What stands in the improved model for one unexplained mismatch, in words; `kind` None: nothing does."""
+
+    measurement: str
+    kind: Applied | None
+    said: str
+
+
+def improved_model(
+    recordings: RecordingSet,
+    side: Side,
+    fit: FitResult | None,
+    baseline: CameraFile | None,
+    evidence: Evidence,
+    effects: Sequence[Effect],
+    unknown: Sequence[Discrepancy],
+) -> tuple[CameraFile, tuple[Correction, ...]]:
+    """The baseline with the named effects, the maker's curves within their freedom where the recordings put them, and, for what has no
+    name, corrections where the model has a place for them. Noise and levels are the fit's where there is one."""
+    always = baseline.effects if baseline is not None else ()
+    taken = baseline.camera if baseline is not None else None
+    camera = taken or camera_model(recordings, side, fit.cameras.get(side) if fit else None, maker_curves=True)
+    if fit is None and baseline is None:
+        camera = evidence.camera
+    # what is measured is electrons times gain: of another gain, the curves take up the difference
+    applied, processes = _applied(evidence, unknown)
+    quantities = evidence.quantities(effects, processes)
+    discrepant = evidence.discrepant(effects, processes)
+    share = evidence.camera.conversion_gain_dn_per_e / camera.conversion_gain_dn_per_e
+    curves = {
+        channel: _scaled(freed, share if freed is not curve else 1.0)
+        for channel, curve in camera.quantum_efficiency.items()
+        for freed in (freed_curve(curve, channel, quantities),)
+    }
+    corrections: list[Correction] = []
+    acting: list[Effect] = [*always, *effects]
+    for gap, (kind, why) in zip(unknown, applied, strict=True):
+        block = evidence.blocks[gap.index]
+        name = block.measurement.replace("_", " ")
+        if kind is None:
+            said = f"{name}: no correction in the improved model; {why}"
+            corrections.append(Correction(block.measurement, None, said))
+            continue
+        at = evidence.slices[gap.index]
+        x, factor, each = _factor(block, discrepant[at], evidence.levelled(effects)[at])
+        if kind == "sensitivity":
+            for channel, (wavelength_nm, by) in each.items():
+                if channel in curves:
+                    curves[channel] = _multiplied(curves[channel], wavelength_nm, by)
+            said = f"{name}: in the sensitivity curves, by wavelength and channel"
+        else:
+            acting.append(_correction(kind, block, x, factor, camera))
+            alike = gap.kinship == "shared"
+            said = f"{name}: a factor on the {kind}" + ("" if alike else f"; the mean of what goes {gap.kinship}")
+        corrections.append(Correction(block.measurement, kind, said))
+    improved = camera.model_copy(update={"quantum_efficiency": curves})
+    return CameraFile(f"{recordings.manifest.name} {side}".strip(), improved, tuple(acting)), tuple(corrections)
+
+
+def _applied(
+    evidence: Evidence, unknown: Sequence[Discrepancy]
+) -> tuple[list[tuple[Applied | None, str]], dict[int, FloatArray]]:
+    """What each discrepancy is applied as, or why it isn't, and the covariances of those that are, by their block."""
+    processes: dict[int, FloatArray] = {}
+    found: list[tuple[Applied | None, str]] = []
+    for gap in unknown:
+        kind = _place_for(evidence.blocks[gap.index])
+        if gap.gain <= 0:
+            found.append((None, "no smooth process describes it"))
+        elif kind is None:
+            found.append((None, "the model has no place for one there"))
+        elif any(kind == other for other, _ in found):
+            found.append((None, "another correction acts there already"))
+        else:
+            found.append((kind, ""))
+            processes[gap.index] = gap.kernel
+    return found, processes
+
+
+def _place_for(block: Block) -> Applied | None:
+    """The stage that a smooth factor along the measurement's axis can act on."""
+    if block.places:
+        return None
+    return next((kind for kind, axis, hook in PLACES if block.axis == axis and hook in block.hooks), None)
+
+
+def _factor(
+    block: Block, mean: FloatArray, predicted: FloatArray
+) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, FloatArray]]]:
+    """x and the factor on the prediction there, the mean over channels and conditions; and the same channel by channel. `mean`: of
+    the process, given the seen numbers."""
+    # of the signal that the factor acts on: its scale where that is one, else the prediction
+    whole = block.scale if np.ptp(block.scale) > 0 else predicted
+    usable = whole > LEAST_CONTRAST * float(np.max(whole))
+    x = np.array([label.x for label in block.labels])
+    channel = np.array([label.channel for label in block.labels])
+
+    def along(members: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        places, which = np.unique(np.round(x[members], 6), return_inverse=True)
+        weight = np.square(whole[members])
+        ratio = np.bincount(which, weight * (1.0 + mean[members] / whole[members])) / np.bincount(which, weight)
+        return places, np.clip(ratio, LOWEST, HIGHEST)
+
+    places, factor = along(usable)
+    return places, factor, {str(c): along(usable & (channel == c)) for c in np.unique(channel[usable])}
+
+
+def _correction(
+    kind: Applied, block: Block, x: FloatArray, factor: FloatArray, camera: CameraModel
+) -> NamelessCorrection:
+    """The factor on its stage, its places in the unit that the stage has."""
+    gain = camera.conversion_gain_dn_per_e
+    if kind == "transfer":
+        from_zero = x > 0.0  # where a transfer function is 1
+        at = np.append(0.0, x[from_zero] / camera.pixel_pitch_um)
+        return _of("frequency_cy_per_um", at, np.append(1.0, factor[from_zero]))
+    if kind == "illumination":
+        return _of("radius_um", x * 1e3, factor)
+    if kind == "noise":
+        return _of("variance_signal_e", x / gain, factor)
+    return _of("signal_e", (x - camera.black_level_dn) / gain, factor)
+
+
+def _of(along: Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"], x: FloatArray, factor: FloatArray) -> NamelessCorrection:  # fmt: skip
+    return NamelessCorrection(along=along, at=tuple(x.tolist()), factor=tuple(factor.tolist()), strength=1.0)
+
+
+def _scaled(curve: Spectrum, factor: float) -> Spectrum:
+    return (
+        curve if factor == 1.0 else Spectrum.of(curve.wavelength_nm, np.clip(factor * np.array(curve.value), 0.0, 1.0))
+    )
+
+
+def _multiplied(curve: Spectrum, at: FloatArray, factor: FloatArray) -> Spectrum:
+    """A curve times a factor that is held beyond its ends."""
+    grid = np.union1d(np.array(curve.wavelength_nm), at)
+    grid = grid[(grid >= curve.wavelength_nm[0]) & (grid <= curve.wavelength_nm[-1])]
+    return Spectrum.of(grid, np.clip(curve.at(grid) * np.interp(grid, at, factor), 0.0, 1.0))

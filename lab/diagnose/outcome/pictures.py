@@ -1,0 +1,125 @@
+"""Residual pictures: a held-out frame of each kind, measured less predicted, before and after the named effects.
+
+The frame is drawn by the one forward model (`lab.predict.replay`). What a model leaves free, the light's level, is put where the frame has
+it, channel by channel. A cell of the picture is the mean of its pixels' residuals over its scatter: the frame's noise and, as that
+doesn't average out over frames, PRNU; so that noise alone is of size 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.measurements.patches import PATCH_COLOUR_STD, PATCH_STD, _patches
+from lab.errors import NotDetermined
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import Capture, Chart, RecordingSet, SlantedEdge
+from lab.formats.results import ResidualPicture
+from lab.predict.replay import Replay
+from sim.camera import CameraModel, Side
+from sim.effects.base import Effect
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+KINDS = ("flat", "slanted_edge", "chart")
+#: Cells of a picture, at most.
+ROWS, COLS = 48, 64
+
+
+def residual_pictures(
+    recordings: RecordingSet, side: Side, evidence: Evidence, improved: CameraFile
+) -> Iterator[ResidualPicture]:
+    """One of each kind that there is and that tells what stood before the camera; the baseline has the effects that it always had."""
+    replay = Replay(recordings, side, improved.camera)
+    held_out = set(evidence.captures(True))
+    stages = evidence.always, tuple(improved.effects)  # the same where nothing was found
+    for kind in KINDS:
+        captures = [c for c in replay.captures if c.kind == kind]
+        if not captures:
+            continue
+        capture = max(captures, key=lambda c: (c.id in held_out, _usable(recordings, c, improved.camera)))
+        try:
+            drawn = {effects: _residual(recordings, replay, capture, effects) for effects in {*stages}}
+        except (NotDetermined, ValueError):
+            continue
+        before, after = (drawn[effects] for effects in stages)
+        yield ResidualPicture(
+            side=side, kind=kind, capture=capture.id, held_out=capture.id in held_out, before=_rows(before), after=_rows(after)
+        )  # fmt: skip
+
+
+def _usable(recordings: RecordingSet, capture: Capture, camera: CameraModel) -> float:
+    """How bright a frame is, unless it is clipped."""
+    high = float(np.quantile(recordings.frame(capture), 0.999))
+    return -1.0 if high >= 0.97 * camera.white_level_dn else high
+
+
+def _residual(recordings: RecordingSet, replay: Replay, capture: Capture, effects: Sequence[Effect]) -> FloatArray:
+    camera = replay.camera
+    frame = recordings.frame(capture).astype(float)
+    offset = camera.black_level_dn + camera.conversion_gain_dn_per_e * camera.dark_current_e_per_s * capture.exposure_s
+    predicted = replay.expected(capture, effects) - offset
+    judged = _judged(capture, frame.shape)
+    step = mosaic.step(camera.cfa)
+    for phases in mosaic.phases(camera.cfa).values():
+        parts = [(slice(r, None, step), slice(c, None, step)) for r, c in phases]
+        lit = sum(float(predicted[part][judged[part]].sum()) for part in parts)
+        seen = sum(float((frame[part] - offset)[judged[part]].sum()) for part in parts)
+        for part in parts:
+            predicted[part] *= seen / lit if lit > 0 else 1.0
+    gain = camera.conversion_gain_dn_per_e
+    signal = np.maximum(predicted, 0.0)
+    variance = (
+        gain * signal + (gain * camera.read_noise_e) ** 2 + (camera.prnu_percent / 100.0 * signal) ** 2 + 1.0 / 12.0
+    )
+    region = _region(capture, frame.shape)
+    known = np.hypot(PATCH_STD, PATCH_COLOUR_STD) if isinstance(capture, Chart) else 0.0
+    return _cells(
+        np.where(judged, frame - offset - predicted, 0.0)[region],
+        np.where(judged, variance, 0.0)[region],
+        np.where(judged, known * signal, 0.0)[region],
+    )
+
+
+def _judged(capture: Capture, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels of which the model says anything: of an edge its region, of a chart the patches' inner halves."""
+    inside = np.zeros(shape, bool)
+    if isinstance(capture, Chart):
+        for _, rows, cols, *_ in _patches(capture):
+            inside[slice(*rows), slice(*cols)] = True
+    else:
+        row0, col0, row1, col1 = (isinstance(capture, SlantedEdge) and capture.region) or (0, 0, *shape)
+        inside[row0:row1, col0:col1] = True
+    return inside
+
+
+def _region(capture: Capture, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Of an edge its middle, pixel by pixel; else the frame."""
+    if not isinstance(capture, SlantedEdge):
+        return slice(None), slice(None)
+    row0, col0, row1, col1 = capture.region or (0, 0, *shape)
+    row, col = (row0 + row1) // 2, (col0 + col1) // 2
+    high, wide = min(ROWS, row1 - row0) // 2, min(COLS, col1 - col0) // 2
+    return slice(row - high, row + high), slice(col - wide, col + wide)
+
+
+def _cells(residual: FloatArray, variance: FloatArray, alike: FloatArray) -> FloatArray:
+    """Sums over cells of whole mosaics, over the root of the summed variances and of what is `alike` in a cell; 0 of empty cells."""
+    high = max(-(-residual.shape[0] // ROWS), 1)
+    wide = max(-(-residual.shape[1] // COLS), 1)
+    high, wide = (size + size % 2 if size > 1 else size for size in (high, wide))
+    rows, cols = residual.shape[0] // high, residual.shape[1] // wide
+
+    def total(table: FloatArray) -> FloatArray:
+        cut = table[: rows * high, : cols * wide]
+        return np.asarray(cut.reshape(rows, high, cols, wide).sum(axis=(1, 3)))
+
+    scatter = np.sqrt(total(variance) + np.square(total(alike)))
+    return np.asarray(total(residual) / np.where(scatter > 0, scatter, np.inf))
+
+
+def _rows(table: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(round(float(v), 2) for v in row) for row in table)

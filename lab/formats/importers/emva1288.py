@@ -1,0 +1,261 @@
+"""Recordings for EMVA 1288: a folder with images and a descriptor, a text file that says what each image is.
+
+The descriptor's lines, in the form that the reference sets of the EMVA 1288 working group share: `v` release of the standard;
+`n` bits, width, height; `b` exposure (ns), photons a pixel: a bright level; `d` exposure (ns): a dark level; `i` path: one
+image of the level above it; `#` a comment. Whatever the file is called; paths with either slash, in any case of letters. The
+spatial stacks are levels like the others, with more images.
+
+What it doesn't say: the wavelength of the light, the pixel's pitch, the lens. A `camera.toml` beside it may (the keys of a
+recording set's camera, and `wavelength_nm`); else they stay unknown, and the warnings say what follows from that.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lab.errors import InputError
+from lab.formats.importers.images import IMAGES, ImageStore, read_camera_file, read_image
+from lab.formats.recording_set import Manifest, RecordingSet
+
+NS = 1e-9
+LARGEST_DESCRIPTOR_BYTES = 8 << 20
+
+
+@dataclass
+class Level:
+    """One exposure: bright with its photons (None where not stated), or dark; and the images taken of it."""
+
+    bright: bool
+    exposure_s: float
+    photons_per_pixel: float | None
+    line: int
+    images: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Descriptor:
+    """What a descriptor file says."""
+
+    release: str | None = None
+    bits: int | None = None
+    width: int | None = None
+    height: int | None = None
+    levels: list[Level] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+
+def parse_descriptor(text: str) -> Descriptor:
+    """The descriptor in `text`; InputError with `line N: ...` where a line can't be understood."""
+    found = Descriptor()
+    other: Counter[str] = Counter()
+    for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), start=1):
+        words = line.split("#")[0].split() if line.lstrip()[:1] != "i" else line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        key, rest = words[0].lower(), words[1:]
+        if key == "v":
+            found.release = " ".join(rest) or None
+        elif key == "n":
+            bits, found.width, found.height = (
+                int(value) for value in _numbers(rest, 3, number, "bits, width and height")[:3]
+            )
+            found.bits = bits
+            if not 1 <= bits <= 16:
+                raise InputError(f"line {number}: {bits} bits; frames have 1 to 16: correct it")
+        elif key == "b":
+            exposure_ns, *photons = _numbers(rest, 1, number, "exposure (ns) and photons a pixel")
+            found.levels.append(Level(True, exposure_ns * NS, photons[0] if photons else None, number))
+            if len(photons) > 1:
+                other["further numbers in a line 'b'"] += 1
+        elif key == "d":
+            exposure_ns, *_ = _numbers(rest, 1, number, "exposure (ns)")
+            found.levels.append(Level(False, exposure_ns * NS, None, number))
+        elif key == "i":
+            if not found.levels:
+                raise InputError(f"line {number}: an image before the first level; put a line 'b' or 'd' before it")
+            found.levels[-1].images.append(line.strip()[1:].strip().strip('"'))
+        else:
+            other[f"'{key}'"] += 1
+    found.remarks += [f"{count} lines with {name} are not used" for name, count in other.items()]
+    return found
+
+
+def _numbers(words: list[str], least: int, line: int, what: str) -> list[float]:
+    values: list[float] = []
+    for word in words:
+        try:
+            values.append(float(word.strip(",;") or "nan"))
+        except ValueError:
+            break  # a word after the numbers (a pixel format) does no harm
+    if len(values) < least or not all(np.isfinite(values)) or any(value < 0 for value in values):
+        raise InputError(f"line {line}: '{' '.join(words)}' isn't {what}; write these numbers")
+    return values
+
+
+def _text(file: Path) -> str:
+    data = file.read_bytes()
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")  # as Windows tools of that time wrote
+
+
+def find_descriptor(path: Path) -> Path:
+    """The descriptor: `path` itself, or the one text file in the folder (else one folder deeper) that is one."""
+    if path.is_file():
+        return path
+
+    def is_descriptor(file: Path) -> bool:
+        if not file.is_file() or file.suffix.lower() in (*IMAGES, ".npy", ".dng", ".json", ".toml"):
+            return False
+        if not 0 < file.stat().st_size <= LARGEST_DESCRIPTOR_BYTES:
+            return False
+        text = _text(file)
+        return "\0" not in text and bool(
+            re.search(r"^\s*[bd]\s+[\d.]", text, re.M | re.I) and re.search(r"^\s*i\s+\S", text, re.M | re.I)
+        )
+
+    for pattern in ("*", "*/*"):
+        found = sorted(file for file in path.glob(pattern) if is_descriptor(file))
+        if len(found) == 1:
+            return found[0]
+        if found:
+            names = ", ".join(file.name for file in found)
+            raise InputError(f"{path}: {len(found)} descriptor files ({names}); give the one that counts")
+    raise InputError(f"{path}: no EMVA 1288 descriptor (a text file with lines 'n', 'b', 'd', 'i'); give its folder")
+
+
+class _Images:
+    """Finds the images that a descriptor lists, as the machines it was written on would have."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        self.by_name: dict[str, Path] = {}
+        self.by_stem: dict[str, Path] = {}
+        for file in sorted(root.rglob("*")):
+            if file.suffix.lower() in (*IMAGES, ".npy") and file.resolve().is_relative_to(self.root):
+                relative = file.relative_to(root).as_posix().lower()
+                self.by_name[relative] = file
+                self.by_stem.setdefault(relative.rsplit(".", 1)[0], file)
+
+    def find(self, listed: str) -> Path | None:
+        """The file behind a listed path; another image format of the same name will do. None: not there."""
+        path = re.sub(r"/+", "/", listed.replace("\\", "/")).lower().removeprefix("./")
+        return self.by_name.get(path) or self.by_stem.get(path.rsplit(".", 1)[0])
+
+
+def read_emva1288(path: Path) -> RecordingSet:
+    """The recordings of an EMVA 1288 measurement as a recording set of one (left) camera.
+
+    Images that are listed but missing are left out and counted. Raises InputError where no image is there, an image is
+    damaged or of another size than the others, or the descriptor can't be understood.
+    """
+    file = find_descriptor(path)
+    try:
+        descriptor = parse_descriptor(_text(file))
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    images = _Images(file.parent)
+    warnings = [f"{file}: {remark}" for remark in descriptor.remarks]
+    listed = [(level, name, images.find(name)) for level in descriptor.levels for name in level.images]
+    there = [(level, name, found) for level, name, found in listed if found is not None]
+    missing = [name for _, name, found in listed if found is None]
+    if not there:
+        raise InputError(f"{file}: none of its {len(listed)} images is there; put them where it says, beside it")
+    if missing:
+        warnings.append(
+            f"{file}: {len(missing)} of {len(listed)} listed images are missing and left out ({missing[0]} .. "
+            f"{missing[-1]}); copy them for the full set"
+        )
+    shape, shift = _shape_and_shift(there[0][2], descriptor, file, warnings)
+    cameras = read_camera_file(
+        file.parent / "camera.toml",
+        {"left": {"rows": shape[0], "cols": shape[1], "cfa": "MONO", "bit_depth": descriptor.bits or 16}},
+    )
+    if "left" not in cameras:
+        raise InputError(f"{file.parent / 'camera.toml'}: describes no left camera; write the keys without a table")
+    camera = cameras["left"]
+    keys = camera.model_dump(exclude_unset=True)
+    wavelength_nm = keys.pop("wavelength_nm", None)  # of the light, not of the camera
+    if descriptor.bits is None and "bit_depth" not in camera.model_fields_set:
+        warnings.append(f"{file}: no line 'n', so 16 bits are assumed; write 'n BITS WIDTH HEIGHT'")
+    unknown = [key for key in ("pixel_pitch_um", "black_level_dn") if getattr(camera, key) is None]
+    if wavelength_nm is None:
+        unknown.insert(0, "wavelength_nm")
+    if unknown:
+        warnings.append(
+            f"{file}: says nothing of {', '.join(unknown)}; they stay unknown (the quantum efficiency is that at the "
+            "light's own wavelength): write them to camera.toml beside it where you know them"
+        )
+    captures, frames = _captures(there, wavelength_nm)
+    manifest = Manifest.model_validate(
+        {
+            "format": "calibench-recording",
+            "version": 1,
+            "name": path.resolve().name if path.is_dir() else file.stem,
+            "notes": f"imported from the EMVA 1288 descriptor {file.name}, release {descriptor.release or 'not stated'}",
+            "cameras": {"left": keys},
+            "captures": captures,
+        }
+    )
+    store = ImageStore(file.parent, frames, shift)
+    return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), store=store)
+
+
+def _shape_and_shift(
+    first: Path, descriptor: Descriptor, file: Path, warnings: list[str]
+) -> tuple[tuple[int, int], int]:
+    """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container."""
+    try:
+        frame = read_image(first)
+    except InputError as error:
+        raise InputError(f"{first}: {error}") from error
+    rows, cols = frame.shape
+    if (descriptor.height, descriptor.width) not in ((rows, cols), (None, None)):
+        warnings.append(
+            f"{file}: line 'n' says {descriptor.height} x {descriptor.width}, the images are {rows} x {cols} (rows x cols): "
+            "the images are believed; correct the line"
+        )
+    shift = 0
+    if descriptor.bits is not None and int(frame.max()) >= 2**descriptor.bits:
+        padding = 16 - descriptor.bits
+        if np.any(frame & ((1 << padding) - 1)):
+            raise InputError(
+                f"{first}: {int(frame.max())} DN is above the {descriptor.bits} bits of line 'n' in {file.name}; correct it"
+            )
+        shift = padding
+        warnings.append(
+            f"{file}: the images hold {descriptor.bits} bits shifted up by {shift}; they are shifted down: check that"
+        )
+    return (rows, cols), shift
+
+
+def _captures(
+    there: list[tuple[Level, str, Path]], wavelength_nm: float | None
+) -> tuple[list[dict[str, Any]], dict[str, Path]]:
+    captures: list[dict[str, Any]] = []
+    frames: dict[str, Path] = {}
+    used: Counter[str] = Counter()
+    for level, _, found in there:
+        stem = re.sub(r"[^\w.-]+", "_", found.stem)
+        used[stem] += 1
+        id = stem if used[stem] == 1 else f"{stem}-{used[stem]}"
+        path = f"frames/{id}.npy"
+        capture: dict[str, Any] = {
+            "id": id,
+            "kind": "flat" if level.bright else "dark",
+            "side": "left",
+            "frame": path,
+            "exposure_s": level.exposure_s,
+        }
+        if level.bright:
+            capture |= {"photons_per_pixel": level.photons_per_pixel, "wavelength_nm": wavelength_nm}
+        captures.append(capture)
+        frames[path] = found
+    return captures, frames

@@ -1,0 +1,120 @@
+"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, camera raws, .npy; decoded when asked for."""
+
+from __future__ import annotations
+
+import struct
+import tomllib
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from lab.errors import InputError
+from lab.formats.recording_set import RAWS, Camera, FolderStore, Frame, load_frame
+from sim.camera import Side
+
+IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
+
+
+def read_image(file: Path) -> Frame:
+    """Grey values of an image file as uint16 (rows, cols), as stored. InputError without the path."""
+    suffix = file.suffix.lower()
+    if suffix == ".npy" or suffix in RAWS:
+        return load_frame(file)
+    if suffix not in IMAGES:
+        raise InputError(f"can't be read; give one of {' '.join((*IMAGES, *RAWS, '.npy'))}")
+    return _grey(decoded(file))
+
+
+def decoded(file: Path) -> NDArray[Any]:
+    """An image file's samples as they're stored, channels in OpenCV's order. InputError without the path."""
+    data = file.read_bytes()
+    if why := _damage(data):
+        raise InputError(f"damaged image ({why}); copy it again or recapture")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError(f"damaged image ({str(error).split('error:')[-1].strip()}); copy it again") from error
+    if image is None:
+        raise InputError("damaged image (it can't be decoded); copy it again or recapture")
+    return np.asarray(image)
+
+
+def _damage(data: bytes) -> str | None:
+    """Why PNG or JPEG data aren't whole: the decoder would fill what is missing with zeros and say nothing."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        at = 8
+        while at + 12 <= len(data):
+            (length,) = struct.unpack(">I", data[at : at + 4])
+            body, sum_ = data[at + 4 : at + 8 + length], data[at + 8 + length : at + 12 + length]
+            if len(sum_) < 4:
+                break
+            if zlib.crc32(body) != struct.unpack(">I", sum_)[0]:
+                return f"the checksum of chunk {body[:4]!r} is wrong"
+            if body[:4] == b"IEND":
+                return None
+            at += 12 + length
+        return "it ends too early"
+    if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-1024:]:
+        return "it ends too early"
+    return None
+
+
+def _grey(image: NDArray[Any]) -> Frame:
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"its values are {image.dtype}; save grey values of 8 or 16 bit")
+    if image.ndim == 3:
+        colours = image[..., :3]
+        if image.shape[2] >= 3 and not np.array_equal(colours.min(axis=2), colours.max(axis=2)):
+            raise InputError("is a colour picture; give the raw mosaic, or grey values")
+        image = image[..., 0]
+    return np.ascontiguousarray(image, dtype=np.uint16)
+
+
+class ImageStore(FolderStore):
+    """A folder whose frames are images: `images` has the file behind each frame's path in the recording set. Values are
+    shifted down by `shift` bits. The files are decoded when asked for, and never copied as they are."""
+
+    def __init__(self, root: Path, images: Mapping[str, Path], shift: int = 0) -> None:
+        super().__init__(root)
+        self.images, self.shift = dict(images), shift
+
+    def file(self, path: str) -> Path | None:
+        return None if path in self.images else super().file(path)
+
+    def frame(self, path: str, camera: Camera) -> Frame:
+        return np.right_shift(read_image(self.images[path]), self.shift, dtype=np.uint16)
+
+    def where(self, path: str) -> str:
+        return str(self.images[path]) if path in self.images else super().where(path)
+
+
+def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> dict[Side, Camera]:
+    """The cameras that `camera.toml` describes: the keys of a recording set's camera, at the top for a single (left) camera,
+    or in the tables `[left]` and `[right]`. Keys that it leaves out come from that side's `defaults`; a missing file is an empty one."""
+    written: dict[str, Any] = {}
+    if file.is_file():
+        try:
+            written = tomllib.loads(file.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{file}: isn't TOML ({error}); correct it") from error
+    sides: dict[Side, dict[str, Any]] = {}
+    for side in ("left", "right"):
+        if isinstance(written.get(side), dict):
+            sides[side] = written.pop(side)
+    if not sides:
+        sides, written = {"left": written}, {}
+    cameras = {}
+    for side, keys in sides.items():
+        try:
+            cameras[side] = Camera.model_validate({**defaults.get(side, {}), **written, **keys})
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"])
+            raise InputError(f"{file}: {side} camera: {key}: {first['msg']}; write it in camera.toml") from error
+    return cameras

@@ -1,0 +1,275 @@
+"""Scenes and lights from files and by name: measured lights (CSV), pictures, spectral cubes (ENVI, .npz).
+
+Every function reads one file and returns a model; all errors are an `InputError` of one line that begins with the file.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.errors import InputError
+from lab.formats.importers.images import decoded
+from lab.formats.recording_set import parse_curve
+from sim.camera import CameraModel
+from sim.scene import Scene, SpectralImage
+from sim.scene.catalogue import SCENES, Cube, PictureOnScreen, View, scene_by_name
+from sim.scene.light import at_luminance, illuminant
+from sim.spectrum import FloatArray, Spectrum, energy_from_photons
+
+#: Luminance of a perfect white diffuser where none is asked for.
+LUMINANCE_CD_M2 = 100.0
+
+PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+CUBES = (".npz", ".hdr")
+
+#: Names of the quantity that a light's CSV or an .npz cube holds, in the column's or the array's name.
+RADIANCE, PHOTONS, RELATIVE, REFLECTANCE = "radiance_w_sr_m2_nm", "photons_s_sr_m2_nm", "relative", "reflectance"
+
+#: ENVI's `data units`, without spaces and in small letters -> (quantity, factor).
+ENVI_UNITS = {
+    "w/m^2/sr/nm": (RADIANCE, 1.0),
+    "w/(m^2*sr*nm)": (RADIANCE, 1.0),
+    "wsr^-1m^-2nm^-1": (RADIANCE, 1.0),
+    "w/m^2/sr/um": (RADIANCE, 1e-3),
+    "uw/cm^2/sr/nm": (RADIANCE, 1e-2),
+    "uw/(cm^2*sr*nm)": (RADIANCE, 1e-2),
+    "photons/s/m^2/sr/nm": (PHOTONS, 1.0),
+    "reflectance": (REFLECTANCE, 1.0),
+}
+
+#: Samples of a cube, or of a picture, above which a file is taken for a mistake: 4 GiB as float64.
+MOST_SAMPLES = 2**29
+
+
+def read_light(file: Path, luminance_cd_m2: float | None = None) -> Spectrum:
+    """Radiance (W sr^-1 m^-2 nm^-1) of a measured light.
+
+    The CSV's header is `wavelength_nm,` and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm` (s^-1 sr^-1 m^-2 nm^-1), which
+    are taken as they are unless a luminance is asked for, and `relative`, which needs one.
+    """
+    with _about(file):
+        try:
+            text = file.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"can't be read as text ({_reason(error)}); give a CSV in UTF-8") from None
+        column, curve = parse_curve(text, (RADIANCE, PHOTONS, RELATIVE))
+    lowest = int(np.argmin(curve.value))
+    if curve.value[lowest] < 0:
+        raise InputError(
+            f"{file}: {column} is {curve.value[lowest]:g} at {curve.wavelength_nm[lowest]:g} nm, below the limit of 0; subtract the dark reading, and set what stays below 0 to 0"
+        )
+    if len(curve.value) < 2:
+        raise InputError(f"{file}: one sample is a light of no width; give two or more")
+    if column == PHOTONS:
+        curve = Spectrum.of(curve.wavelength_nm, energy_from_photons(curve.wavelength_nm, curve.value))
+    if luminance_cd_m2 is None:
+        if column == RELATIVE:
+            raise InputError(f"{file}: holds a relative spectrum; say its luminance in cd/m^2, or give {RADIANCE}")
+        return curve
+    with _about(file):
+        return at_luminance(curve, luminance_cd_m2)
+
+
+def light(name: str, luminance_cd_m2: float | None = None) -> Spectrum:
+    """Radiance of a perfect white diffuser under an illuminant: a name (D65, A, FL2, ...), at 100 cd/m^2 unless told, or a CSV."""
+    if name.lower().endswith(".csv") or Path(name).is_file():
+        return read_light(Path(name), luminance_cd_m2)
+    try:
+        return illuminant(name, LUMINANCE_CD_M2 if luminance_cd_m2 is None else luminance_cd_m2)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def read_picture(file: Path) -> NDArray[np.uint8]:
+    """8-bit codes (rows, cols, 3), red green blue, of a PNG, TIFF, JPEG or BMP. Grey becomes three equal codes, 16 bit is
+    rounded to 8; transparency is refused, as what lies behind isn't known."""
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; give one of {' '.join(PICTURES)}")
+    with _about(file):
+        image = decoded(file)
+    if image.ndim == 2:
+        image = np.repeat(image[:, :, None], 3, axis=2)
+    if image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise InputError(f"{file}: has the shape {image.shape}, not (rows, cols, 3); save it as RGB")
+    full: int | None = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(image.dtype)
+    if full is None:
+        raise InputError(f"{file}: its samples are {image.dtype}, not 8 or 16 bit; save it as 8-bit RGB")
+    if image.shape[2] == 4 and np.any(image[:, :, 3] != full):
+        raise InputError(f"{file}: is transparent in places; put it on a background and save it as RGB")
+    codes = image[:, :, 2::-1]  # OpenCV's order is blue, green, red
+    if full != 255:
+        codes = np.rint(codes / 257.0)
+    return np.ascontiguousarray(codes, dtype=np.uint8)
+
+
+def read_cube(file: Path, white: Spectrum | None = None) -> SpectralImage:
+    """A spectral image from an .npz or an ENVI header (.hdr) with its data file beside it.
+
+    .npz: `wavelength_nm` (bands,) and one of `radiance_w_sr_m2_nm`, `photons_s_sr_m2_nm`, `reflectance`, (rows, cols, bands).
+    ENVI: `wavelength` in `wavelength units` nanometers or micrometers, and `data units` as in `ENVI_UNITS`. A reflectance is
+    taken under `white`, the radiance of a perfect diffuser.
+    """
+    suffix = file.suffix.lower()
+    if suffix not in CUBES:
+        raise InputError(f"{file}: a spectral cube can't be {suffix or 'without an ending'}; give .npz or ENVI's .hdr")
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; give a cube as .npz or ENVI's .hdr")
+    with _about(file):
+        quantity, wavelength_nm, values = _npz(file) if suffix == ".npz" else _envi(file)
+        wavelengths = tuple(wavelength_nm.tolist())
+        if values.dtype not in (np.float32, np.float64):
+            values = values.astype(np.float64)
+        if quantity == PHOTONS:
+            return SpectralImage.from_photons(wavelengths, values)
+        if quantity == REFLECTANCE:
+            if white is None:
+                raise InputError("holds reflectances; say the illuminant that falls on them")
+            if values.ndim != 3 or values.shape[2] != len(wavelengths):
+                raise InputError(
+                    f"reflectance of shape {values.shape} has to be (rows, cols, {len(wavelengths)} bands); move the bands to the last axis"
+                )
+            values = values * white.at(wavelengths).astype(values.dtype)
+        return SpectralImage(wavelengths, values)
+
+
+def scene(
+    name: str,
+    camera: CameraModel,
+    white: Spectrum,
+    *,
+    distance_mm: float = 1000.0,
+    parameters: Mapping[str, object] | None = None,
+) -> Scene:
+    """A scene before a camera: one of `sim.scene.catalogue.SCENES` by its name, or a picture or a cube by its file.
+
+    `white`: radiance of a perfect white diffuser there. A picture's screen takes its luminance for its own white; a cube of
+    radiance has its own light. InputError for what is neither.
+    """
+    try:
+        if name in SCENES:
+            return scene_by_name(name, camera, white, distance_mm=distance_mm, parameters=parameters)
+        view = View.of(camera, distance_mm)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    file = Path(name)
+    suffix = file.suffix.lower()
+    if suffix in PICTURES:
+        codes = read_picture(file)
+        with _about(file):
+            return PictureOnScreen.chosen(parameters).show(codes, view, white)
+    if suffix in CUBES:
+        image = read_cube(file, white)
+        with _about(file):
+            return Cube.chosen(parameters).show(image, view)
+    raise InputError(
+        f"scene {name!r} is not known: name one of {', '.join(SCENES)}, a picture ({' '.join(PICTURES)}) or a cube ({' '.join(CUBES)})"
+    )
+
+
+@contextmanager
+def _about(file: Path) -> Iterator[None]:
+    """Errors within become an InputError that begins with the file."""
+    try:
+        yield
+    except (InputError, ValueError) as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _npz(file: Path) -> tuple[str, FloatArray, NDArray[Any]]:
+    """Quantity, wavelengths and samples of an .npz, as they're stored. InputError without the path."""
+    damaged = "damaged .npz ({}); write it again with numpy.savez"
+    try:
+        with zipfile.ZipFile(file) as archive:
+            sizes = {item.filename.removesuffix(".npy"): item.file_size for item in archive.infolist()}
+    except Exception as error:
+        raise InputError(damaged.format(_reason(error))) from None
+    held = [name for name in (RADIANCE, PHOTONS, REFLECTANCE) if name in sizes]
+    if "wavelength_nm" not in sizes or len(held) != 1:
+        raise InputError(
+            f"holds {', '.join(sizes) or 'nothing'}; give wavelength_nm and one of {RADIANCE}, {PHOTONS}, {REFLECTANCE}"
+        )
+    if max(sizes.values()) > 8 * MOST_SAMPLES:
+        raise InputError(f"holds {max(sizes.values()) / 2**30:.1f} GiB, above the limit of 4 GiB; cut the cube")
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            wavelength_nm, values = np.asarray(arrays["wavelength_nm"]), np.asarray(arrays[held[0]])
+    except Exception as error:
+        raise InputError(damaged.format(_reason(error))) from None
+    for name, array in (("wavelength_nm", wavelength_nm), (held[0], values)):
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"{name} is {array.dtype}, not real numbers; save it as float32 or float64")
+    if wavelength_nm.ndim != 1:
+        raise InputError(f"wavelength_nm has the shape {wavelength_nm.shape}, not (bands,); give one a band")
+    return held[0], np.asarray(wavelength_nm, float), values
+
+
+def _envi(file: Path) -> tuple[str, FloatArray, NDArray[Any]]:
+    """As `_npz`, of an ENVI image; its samples scaled to the unit that the quantity's name says."""
+    header, values = _envi_samples(file)
+    unit, length = (str(header.get(key, "")) for key in ("data units", "wavelength units"))  # a list, where in braces
+    quantity, factor = ENVI_UNITS.get(unit.lower().replace(" ", ""), ("", 1.0))
+    if not quantity:
+        raise InputError(f"data units is '{unit[:60]}'; write one of {', '.join(ENVI_UNITS)} into the header")
+    lengths = {"nanometers": 1.0, "nm": 1.0, "micrometers": 1e3, "um": 1e3}
+    if length.lower() not in lengths:
+        raise InputError(f"wavelength units is '{length[:60]}'; write nanometers or micrometers into the header")
+    wavelength_nm = _numbers(header, "wavelength") * lengths[length.lower()]
+    if quantity == REFLECTANCE and "reflectance scale factor" in header:
+        (scale,) = _numbers(header, "reflectance scale factor")
+        if not 0 < scale < np.inf:
+            raise InputError(f"reflectance scale factor is {scale}, not a number above 0; correct the header")
+        factor /= scale
+    return quantity, wavelength_nm, values if factor == 1.0 else values * factor
+
+
+def _envi_samples(file: Path) -> tuple[dict[str, Any], NDArray[Any]]:
+    """Header and samples (rows, cols, bands), as they're stored."""
+    from spectral.io import envi  # here, as few need it
+
+    try:
+        opened = envi.open(str(file.resolve()))
+        header, shape = dict(opened.metadata), tuple(int(n) for n in getattr(opened, "shape", ()))
+    except Exception as error:
+        raise InputError(f"can't be read as ENVI ({_reason(error)}); correct the header") from None
+    # The library takes anything else for a guess of its own.
+    for key, known in (("byte order", ("0", "1")), ("interleave", ("bsq", "bil", "bip"))):
+        if str(header.get(key)).lower() not in known:
+            raise InputError(f"{key} is '{header.get(key)}', not one of {', '.join(known)}; correct the header")
+    if len(shape) != 3 or min(shape) < 1 or np.prod(shape, dtype=float) > MOST_SAMPLES:
+        raise InputError(
+            f"says {shape} rows, columns, bands, not an image of 1 to {MOST_SAMPLES} samples; correct the header"
+        )
+    data = Path(opened.filename)
+    wanted = opened.offset + int(np.prod(shape)) * np.dtype(opened.dtype).itemsize
+    if data.stat().st_size < wanted:
+        raise InputError(
+            f"{data.name} has {data.stat().st_size} bytes where the header asks for {wanted}; copy it again, or correct the header"
+        )
+    try:
+        values = np.array(opened.open_memmap(interleave="bip", writable=False))
+    except Exception as error:
+        raise InputError(f"can't be read as ENVI ({_reason(error)}); correct the header") from None
+    if values.ndim != 3:
+        raise InputError(f"{data.name} can't be mapped into memory; correct the header's offset and sizes")
+    if values.dtype.kind not in "fiu":
+        raise InputError(f"its samples are {values.dtype}, not real numbers; save 4-byte or 8-byte reals")
+    return header, values
+
+
+def _numbers(header: dict[str, Any], key: str) -> FloatArray:
+    written = header.get(key, [])
+    try:
+        return np.array([float(item) for item in (written if isinstance(written, list) else [written])])
+    except ValueError:
+        raise InputError(f"{key} is '{str(written)[:60]}', not numbers; correct the header") from None

@@ -1,0 +1,143 @@
+"""The captures of a recording set again, as a model makes them: mean frames, and recordings drawn from the model.
+
+The one forward model of `sim` draws every frame; this module only says what stood before the camera, as the manifest and the
+recordings tell it. What a model leaves free is put where the recordings have it: an edge's place, and the level of its sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from lab.errors import NotDetermined
+from lab.fit.mtf import EdgeMtf, measure_edge
+from lab.formats.recording_set import Capture, Chart, Dark, Flat, Narrowband, RecordingSet, SlantedEdge
+from sim.camera import CameraModel, Side
+from sim.effects.base import Effect
+from sim.forward import Exposure, dark_electrons, expected_electrons, read_out
+from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, ReflectanceChart, Scene, UniformField
+from sim.sensor import electrons as sensor
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray, Spectrum
+
+#: The kinds of capture whose scene a manifest tells; screens and boards also need where they stood.
+REPLAYED = (Dark, Flat, Narrowband, Chart, SlantedEdge)
+#: Light of equal energy, for edges in light that nobody measured: (nm), W sr^-1 m^-2 nm^-1.
+_EQUAL = Spectrum.of((380.0, 780.0), (0.01, 0.01))
+
+
+class Replay:
+    """One side's captures by one camera model."""
+
+    def __init__(self, recordings: RecordingSet, side: Side, camera: CameraModel) -> None:
+        self.recordings, self.side, self.camera = recordings, side, camera
+
+    @cached_property
+    def captures(self) -> tuple[Capture, ...]:
+        """Those that can be replayed, in the manifest's order."""
+        return tuple(c for c in self.recordings.captures(side=self.side) if self._tells_its_light(c))
+
+    def _tells_its_light(self, capture: Capture) -> bool:
+        if isinstance(capture, Flat):
+            return capture.radiance is not None
+        return isinstance(capture, REPLAYED)
+
+    @cached_property
+    def _start(self) -> float | None:
+        times = [c.time.timestamp() for c in self.recordings.captures(side=self.side) if c.time is not None]
+        return min(times, default=None)
+
+    def expected(self, capture: Capture, effects: Sequence[Effect] = ()) -> FloatArray:
+        """Mean frame (rows, cols) in DN. Raises NotDetermined where the capture doesn't tell what stood before the camera."""
+        exposure, electrons = self._electrons(capture, effects)
+        return sensor.dn_moments(electrons, self.camera, exposure.gain_db, read_out(self.camera, exposure, effects))[0]
+
+    def drawn(self, rng: np.random.Generator, effects: Sequence[Effect] = ()) -> RecordingSet:
+        """The recordings again, every frame of `captures` drawn anew by one camera whose pixels have patterns of their own."""
+        pattern = sensor.FixedPattern.draw(self.camera, rng)
+        frames = {}
+        mean: dict[object, tuple[Exposure, FloatArray]] = {}
+        for capture in self.captures:
+            key = self._scene_key(capture, effects)
+            if key not in mean:
+                mean = {key: self._electrons(capture, effects)}  # repeats follow one another
+            exposure, electrons = mean[key]
+            frames[capture.frame] = sensor.sample_from(
+                electrons, self.camera, rng, pattern, dark_electrons=dark_electrons(self.camera, exposure, effects),
+                gain_db=exposure.gain_db, read_out=read_out(self.camera, exposure, effects),
+            )  # fmt: skip
+        return self.recordings.with_frames(frames)
+
+    def _scene_key(self, capture: Capture, effects: Sequence[Effect]) -> object:
+        told = capture.model_dump(exclude={"id", "frame", "time"})
+        steady = not any(type(e).drift is not Effect.drift or type(e).lit is not Effect.lit for e in effects)
+        return repr(told) if steady else capture.id
+
+    def _electrons(self, capture: Capture, effects: Sequence[Effect]) -> tuple[Exposure, FloatArray]:
+        edge = self._edge(capture) if isinstance(capture, SlantedEdge) else None
+        exposure = Exposure(
+            self._scene(capture, edge), capture.exposure_s, capture.gain_db or 0.0, capture.temperature_c,
+            0.0 if capture.time is None or self._start is None else capture.time.timestamp() - self._start, placed="image",
+        )  # fmt: skip
+        electrons = expected_electrons(self.camera, exposure, effects)
+        if isinstance(capture, SlantedEdge):
+            electrons = self._levelled(capture, exposure, electrons, effects)
+        return exposure, electrons
+
+    def _scene(self, capture: Capture, edge: EdgeMtf | None) -> Scene:
+        match capture:
+            case Dark():
+                return Darkness()
+            case Flat() | Narrowband() if capture.radiance is not None:
+                return UniformField(self.recordings.spectrum(capture.radiance), capture.kind)
+            case Chart():
+                return ReflectanceChart(capture.corners, self.recordings.spectrum(capture.radiance), capture.chart)
+            case SlantedEdge() if edge is not None:
+                light = self.recordings.spectrum(capture.light_radiance) if capture.light_radiance else _EQUAL
+                dark = Spectrum.of(*(light.arrays[0], 0.0 * light.arrays[1]))
+                return KnifeEdge((_placed(self._region(capture), edge),), dark, light)
+        raise NotDetermined("replay", f"{capture.id} ({capture.kind}) doesn't tell what stood before the camera")
+
+    def _edge(self, capture: SlantedEdge) -> EdgeMtf:
+        """In the channel with most pixels."""
+        channel = "G" if "G" in self.camera.channels else self.camera.channels[0]
+        return measure_edge(self.recordings, [capture], channel)
+
+    def _region(self, capture: SlantedEdge) -> tuple[int, int, int, int]:
+        return capture.region or (0, 0, self.camera.rows, self.camera.cols)
+
+    def _levelled(
+        self, capture: SlantedEdge, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
+    ) -> FloatArray:
+        """Edges' two levels by channel as the recording has them: a straight line from the model's electrons to it, by least squares."""
+        dark = np.broadcast_to(np.asarray(dark_electrons(self.camera, exposure, effects), float), electrons.shape)
+        gain = sensor.gain_dn_per_e(self.camera, exposure.gain_db)
+        recorded = (self.recordings.frame(capture).astype(float) - self.camera.black_level_dn) / gain
+        row0, col0, row1, col1 = self._region(capture)
+        inside = np.zeros(electrons.shape, bool)
+        inside[row0:row1, col0:col1] = True
+        out = electrons.copy()
+        step = mosaic.step(self.camera.cfa)
+        for phases in mosaic.phases(self.camera.cfa).values():
+            plane = np.zeros(electrons.shape, bool)
+            for row, col in phases:
+                plane[row::step, col::step] = True
+            lit, seen = (electrons - dark)[plane & inside], (recorded - dark)[plane & inside]
+            slope, level = np.polyfit(lit, seen, 1)
+            out[plane] = np.maximum(slope * (electrons - dark)[plane] + level, 0.0) + dark[plane]
+        return out
+
+
+def _placed(region: tuple[int, int, int, int], edge: EdgeMtf) -> EdgeRegion:
+    """A straight edge where the estimator found it: through its middle, at its angle there."""
+    geometry = edge.geometry
+    row, col = geometry.centre_px
+    if geometry.transposed:
+        row += geometry.edge_px[0]
+    else:
+        col += geometry.edge_px[0]
+    placed = EdgeRegion(region, edge.angle_deg)
+    return replace(placed, offset_px=float(placed.distance_px(np.asarray(row), np.asarray(col))))

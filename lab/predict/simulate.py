@@ -1,0 +1,424 @@
+"""One raw frame of a named scene: from scene, light and camera to a file, a preview and a record of how it was made."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from lab.errors import InputError
+from lab.formats.camera_file import CameraFile, default_camera, read_camera, traced_table
+from lab.formats.raw_file import (
+    Frame,
+    RawMetadata,
+    colour_matrix,
+    daylight,
+    electrons_of,
+    replacing,
+    write_raw,
+    writer_of,
+)
+from lab.formats.scene_file import light, scene
+from lab.report.provenance import installed_versions
+from sim import forward
+from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect
+from sim.effects.distortion import Distortion
+from sim.forward import Exposure
+from sim.optics.imaging import TracedLens
+from sim.parameters import Frozen, Quantity
+from sim.scene.catalogue import View
+from sim.sensor import electrons as sensor
+from sim.sensor.electrons import FixedPattern
+from sim.spectrum import FloatArray, Spectrum
+
+Progress = Callable[[str, float], None]
+
+#: The exposure that is taken where none is asked for: the brightest 1 % of the pixels at 70 % of what they hold.
+BRIGHTEST_PERCENT, AUTO_SHARE = 1.0, 0.7
+#: Beyond these an automatic exposure makes no sense: something is wrong with the light.
+SHORTEST_S, LONGEST_S = 1e-6, 3600.0
+
+#: Hooks of an effect that may make electrons grow with the exposure in another way than in proportion.
+BENDING_HOOKS = ("exposure", "charge", "lit", "overflow")
+
+
+class SimulateOptions(Frozen):
+    """What a frame is asked for; all that, with the camera, makes the frame again."""
+
+    scene: str
+    parameters: dict[str, float] = {}
+    illuminant: str = "D65"
+    luminance_cd_m2: Annotated[
+        float | None, Quantity("cd/m^2", "luminance of a perfect white diffuser in the scene's place", lower=0.0)
+    ] = None
+    distance_mm: Annotated[float, Quantity("mm", "distance of the scene from the lens", lower=0.0)] = 1000.0
+    exposure_s: Annotated[float | None, Quantity("s", "exposure; none: automatic", lower=0.0)] = None
+    gain_db: Annotated[float, Quantity("dB", "analogue gain", lower=-60.0, upper=60.0)] = 0.0
+    temperature_c: Annotated[float | None, Quantity("C", "temperature of the sensor", lower=-273.0, upper=200.0)] = None
+    seed: Annotated[int, Quantity("1", "seed of the frame's noise", lower=0)] = 0
+    pattern_seed: Annotated[
+        int, Quantity("1", "seed of the camera's fixed patterns: which camera of its kind", lower=0)
+    ] = 0
+    expected: bool = False
+
+
+class Summary(Frozen):
+    """The frame in figures. Electrons are means before noise; the signal-to-noise ratio is that of a pixel of the mean level."""
+
+    exposure_s: float
+    automatic_exposure: bool
+    mean_electrons: float
+    brightest_percent_electrons: float
+    mean_dn: float
+    highest_dn: int
+    saturated_percent: float
+    snr: float
+
+
+class SimulationRecord(Frozen):
+    """What stands beside the frame as JSON. `camera` is the model as it was, `camera_sha256` the hash of that and the effects."""
+
+    format: str = "calibench-simulation"
+    version: int = 1
+    file: str
+    frame_sha256: str
+    options: SimulateOptions
+    camera_name: str
+    camera_sha256: str
+    camera: dict[str, Any]
+    effects: list[dict[str, Any]]
+    prescription: str | None
+    lens_warnings: tuple[str, ...]
+    magnification: float
+    summary: Summary
+    versions: dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated frame (rows, cols) in DN, with the camera it is of, the scene's white and the record."""
+
+    frame: Frame
+    camera: CameraModel
+    white: Spectrum
+    record: SimulationRecord
+
+
+def camera_for(
+    camera: Path | None, lens: Path | None, cache: Path | None = None, progress: Progress | None = None
+) -> CameraFile:
+    """The camera of a file (None: the default one), behind the lens of a prescription where one is given: then f-number and
+    focal length are that lens's. InputError for files that can't be used."""
+    content = default_camera() if camera is None else read_camera(camera, cache, progress)
+    if lens is None:
+        return content
+    table = traced_table(lens, cache, progress)
+    model = content.camera
+    try:
+        traced = Lens(
+            f_number=table.f_number,
+            focal_length_mm=table.focal_length_mm,
+            transmittance=model.lens.transmittance,
+            imaging=TracedLens(table=table),
+        )
+    except ValidationError as error:
+        raise InputError(f"{lens}: {_line(error)}") from error
+    return CameraFile(content.name, model.model_copy(update={"lens": traced}), content.effects, lens)
+
+
+def simulate(options: SimulateOptions, content: CameraFile, progress: Progress | None = None) -> Simulation:
+    """One frame: scene -> electrons -> codes. The same options and camera give the same frame.
+
+    Raises InputError for a scene, a light or an exposure that can't be used: no light where the sensor sees, every pixel full.
+    """
+    tell = progress or (lambda text, share: None)
+    content = _distorting(content)
+    camera = content.camera
+    tell("scene", 0.05)
+    white = light(options.illuminant, options.luminance_cd_m2)
+    try:
+        shown = scene(
+            options.scene, camera, white, distance_mm=options.distance_mm, parameters=options.parameters or None
+        )
+        magnification = View.of(camera, options.distance_mm).magnification
+
+        def exposed(seconds: float) -> Exposure:
+            return Exposure(
+                shown,
+                seconds,
+                gain_db=options.gain_db,
+                temperature_c=options.temperature_c,
+                magnification=magnification,
+            )
+
+        tell("optics", 0.1)
+        each_second = forward.expected_electrons(camera, exposed(1.0), content.effects)
+        dark = forward.dark_electrons(camera, exposed(1.0), content.effects)
+        _check_light(each_second, dark, options, white, camera)
+        seconds = options.exposure_s
+        if seconds is None:
+            seconds = automatic_exposure_s(each_second, camera, options.gain_db)
+        exposure = exposed(seconds)
+        proportional = all(
+            getattr(type(one), hook) is getattr(Effect, hook) for one in content.effects for hook in BENDING_HOOKS
+        )
+        electrons = (
+            each_second * seconds if proportional else forward.expected_electrons(camera, exposure, content.effects)
+        )
+        forward.check_not_saturated(camera, exposure, electrons)
+        tell("sensor", 0.8)
+        frame = _read(electrons, camera, content, exposure, options)
+    except ValueError as error:
+        raise InputError(_line(error)) from error
+    return Simulation(
+        frame, camera, white, _record(frame, electrons, exposure, options, content, camera, magnification)
+    )
+
+
+def _distorting(content: CameraFile) -> CameraFile:
+    """With the distortion of the camera's geometry as an effect: named scenes are placed by a pinhole. A traced lens has its own."""
+    camera = content.camera
+    straight = camera.geometry is None or not any(camera.geometry.distortion)
+    if straight or isinstance(camera.lens.imaging, TracedLens):
+        return content
+    return replace(content, effects=(*content.effects, Distortion(geometry=camera.geometry)))
+
+
+def automatic_exposure_s(electrons_per_s: FloatArray, camera: CameraModel, gain_db: float = 0.0) -> float:
+    """The exposure that brings the brightest 1 % of the pixels to 70 % of what they hold, to three digits."""
+    bright = float(np.percentile(electrons_per_s, 100.0 - BRIGHTEST_PERCENT))
+    bright = bright if bright > 0 else float(electrons_per_s.max())
+    seconds = AUTO_SHARE * sensor.capacity_e(camera, gain_db) / bright
+    if not SHORTEST_S <= seconds <= LONGEST_S:
+        raise InputError(
+            f"the brightest pixels collect {bright:.3g} e/s: an exposure of {seconds:.3g} s would be needed, beyond the limits of {SHORTEST_S:g} and {LONGEST_S:g} s; give --exposure-s, or another light"
+        )
+    return float(f"{seconds:.3g}")
+
+
+def _read(
+    electrons: FloatArray, camera: CameraModel, content: CameraFile, exposure: Exposure, options: SimulateOptions
+) -> Frame:
+    read_out = forward.read_out(camera, exposure, content.effects)
+    if options.expected:
+        mean, _ = sensor.dn_moments(electrons, camera, exposure.gain_db, read_out)
+        return np.clip(np.rint(mean), 0.0, camera.white_level_dn).astype(np.uint16)
+    return sensor.sample_from(
+        electrons,
+        camera,
+        np.random.default_rng(options.seed),
+        FixedPattern.draw(camera, np.random.default_rng([options.pattern_seed, 1])),
+        dark_electrons=forward.dark_electrons(camera, exposure, content.effects),
+        gain_db=exposure.gain_db,
+        read_out=read_out,
+    )
+
+
+def _check_light(
+    electrons: FloatArray, dark: FloatArray | float, options: SimulateOptions, white: Spectrum, camera: CameraModel
+) -> None:
+    asked_for = options.luminance_cd_m2 == 0.0 and options.exposure_s is not None  # a dark frame
+    if asked_for or np.any(electrons > dark):
+        return
+    curves = camera.quantum_efficiency.values()
+    seen = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
+    raise InputError(
+        f"scene {options.scene!r} under {options.illuminant!r} makes no electrons: its light runs from {white.wavelength_nm[0]:g} to {white.wavelength_nm[-1]:g} nm, the sensor sees {seen[0]:g} to {seen[1]:g} nm; give a light with power there"
+    )
+
+
+def _record(
+    frame: Frame,
+    electrons: FloatArray,
+    exposure: Exposure,
+    options: SimulateOptions,
+    content: CameraFile,
+    camera: CameraModel,
+    magnification: float,
+) -> SimulationRecord:
+    full = sensor.capacity_e(camera, exposure.gain_db)
+    level = np.array([[float(np.mean(electrons))]])
+    mean, variance = sensor.dn_moments(level, camera, exposure.gain_db)
+    imaging = camera.lens.imaging
+    described = camera.model_dump(mode="json")
+    effects = [{"name": one.name, **one.model_dump(mode="json")} for one in content.effects]
+    return SimulationRecord(
+        file="",
+        frame_sha256=hashlib.sha256(frame.astype("<u2").tobytes()).hexdigest(),
+        options=options.model_copy(update={"exposure_s": exposure.exposure_s}),
+        camera_name=content.name,
+        camera_sha256=camera_sha256(content),
+        camera=described,
+        effects=effects,
+        prescription=None if content.prescription is None else str(content.prescription),
+        lens_warnings=imaging.table.warnings if isinstance(imaging, TracedLens) else (),
+        magnification=magnification,
+        summary=Summary(
+            exposure_s=exposure.exposure_s,
+            automatic_exposure=options.exposure_s is None,
+            mean_electrons=float(level.item()),
+            brightest_percent_electrons=float(np.percentile(electrons, 100.0 - BRIGHTEST_PERCENT)),
+            mean_dn=float(frame.mean()),
+            highest_dn=int(frame.max()),
+            saturated_percent=100.0 * float(np.mean((electrons >= full) | (frame >= camera.white_level_dn))),
+            snr=float((mean - camera.black_level_dn).item() / np.sqrt(max(variance.item(), 1e-12))),
+        ),
+        versions=installed_versions(),
+    )
+
+
+def camera_sha256(content: CameraFile) -> str:
+    """Hash of all that a camera's frames depend on: the model, with a traced lens's content hash, and the effects."""
+    parts = [content.camera.model_dump_json(), *(f"{one.name} {one.model_dump_json()}" for one in content.effects)]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+# --- files -------------------------------------------------------------------------------------------------------------
+
+
+def check_out(file: Path) -> None:
+    """Refuse a file that can't be written before the work, not after it."""
+    writer_of(file)
+    if file.is_dir():
+        raise InputError(f"{file}: is a folder; name a file in it")
+    with replacing(file.with_name(f"{file.name}.probe")) as partial:
+        partial.touch()
+    file.with_name(f"{file.name}.probe").unlink()
+
+
+def write(simulation: Simulation, file: Path) -> SimulationRecord:
+    """The frame in `file`, the preview in NAME.preview.png and the record in NAME.json beside it; returns the record."""
+    record = simulation.record.model_copy(update={"file": file.name})
+    metadata = RawMetadata(
+        exposure_s=record.summary.exposure_s,
+        gain_db=record.options.gain_db,
+        camera_name=record.camera_name,
+        software=f"calibench {record.versions.get('calibench', '')}".strip(),
+        neutral=neutral(simulation.camera, simulation.white),
+    )
+    write_raw(file, simulation.frame, simulation.camera, metadata)
+    _, data = cv2.imencode(".png", preview(simulation.frame, simulation.camera, simulation.white)[..., ::-1])
+    with replacing(preview_file(file)) as partial:
+        partial.write_bytes(data.tobytes())
+    with replacing(record_file(file)) as partial:
+        partial.write_text(record.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    return record
+
+
+def preview_file(file: Path) -> Path:
+    return file.with_name(f"{file.stem}.preview.png")
+
+
+def record_file(file: Path) -> Path:
+    return file.with_name(f"{file.stem}.json")
+
+
+# --- preview -----------------------------------------------------------------------------------------------------------
+
+
+def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:
+    """Codes of a white surface in the scene's light by channel, to a common factor; None of a MONO camera, or where a channel
+    sees nothing of the light."""
+    if camera.cfa == "MONO":
+        return None
+    codes = {channel: electrons_of(white, camera.quantum_efficiency[channel]) for channel in "RGB"}
+    return codes if min(codes.values()) > 0 else None
+
+
+def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.uint8]:
+    """A picture to look at (rows, cols, 3: R, G, B): demosaicked, balanced on the scene's white, in sRGB's colours and gamma. White
+    is a full pixel."""
+    gain = camera.conversion_gain_dn_per_e
+    span = min(camera.full_well_e * gain, camera.white_level_dn - camera.black_level_dn)
+    if camera.cfa == "MONO":
+        linear = np.repeat(((frame - camera.black_level_dn) / span)[..., None], 3, axis=2)
+    else:
+        linear = (_demosaicked(frame, camera) - camera.black_level_dn) / span
+        balance = neutral(camera, white)
+        if balance is not None:
+            top = max(balance.values())
+            linear = np.minimum(linear, 1.0) * np.array([top / balance[channel] for channel in "RGB"])
+        linear = np.minimum(linear, 1.0) @ _to_srgb(camera).T
+    linear = np.clip(linear, 0.0, 1.0)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    return np.asarray(np.rint(255.0 * shown), np.uint8)
+
+
+def _demosaicked(frame: Frame, camera: CameraModel) -> FloatArray:
+    if min(frame.shape) < 4:
+        return np.repeat(frame[..., None].astype(float), 3, axis=2)
+    # OpenCV names a mosaic by the second row's second and third pixel.
+    code = {
+        "RGGB": cv2.COLOR_BayerBG2RGB,
+        "BGGR": cv2.COLOR_BayerRG2RGB,
+        "GRBG": cv2.COLOR_BayerGB2RGB,
+        "GBRG": cv2.COLOR_BayerGR2RGB,
+    }[camera.cfa]
+    return cv2.cvtColor(frame, code).astype(float)
+
+
+def _to_srgb(camera: CameraModel) -> FloatArray:
+    """From balanced camera colours to linear sRGB; white stays white."""
+    from_srgb = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    daylight_codes = np.array([electrons_of(daylight(), camera.quantum_efficiency[channel]) for channel in "RGB"])
+    balanced = np.diag(1.0 / daylight_codes) @ colour_matrix(camera) @ from_srgb
+    balanced = balanced / balanced.sum(axis=1, keepdims=True)
+    return np.asarray(np.linalg.inv(balanced))
+
+
+def _line(error: Exception) -> str:
+    """An error of `sim` in one line."""
+    if isinstance(error, ValidationError):
+        problem = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in problem["loc"])
+        return f"{where}: {problem['msg'].removeprefix('Value error, ')}".removeprefix(": ")
+    return " ".join(str(error).split())
+
+
+def options_of(values: Mapping[str, Any]) -> SimulateOptions:
+    """Options checked against their declarations; InputError in one line."""
+    try:
+        return SimulateOptions.model_validate(values)
+    except ValidationError as error:
+        raise InputError(_line(error)) from error
+
+
+def parameters_of(given: Sequence[str]) -> dict[str, float]:
+    """KEY=VALUE pairs of a command line; InputError for what isn't one."""
+    found = {}
+    for pair in given:
+        key, equals, value = pair.partition("=")
+        try:
+            found[key.strip()] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise InputError(f"--set {pair}: isn't KEY=VALUE with a number; write it as in --set contrast=0.4")
+    return found
+
+
+def summary_lines(record: SimulationRecord, file: Path) -> list[str]:
+    """What is printed of a frame."""
+    s, camera = record.summary, record.camera
+    how = (
+        f"brightest {BRIGHTEST_PERCENT:g} % at {100 * AUTO_SHARE:g} % of a full pixel"
+        if s.automatic_exposure
+        else "as asked"
+    )
+    noise = "expected, without noise" if record.options.expected else f"seed {record.options.seed}"
+    return [
+        f"{file}: {camera['cols']} x {camera['rows']} {camera['cfa']}, {record.options.scene} under {record.options.illuminant}, {noise}",
+        (
+            f"exposure {s.exposure_s:.4g} s ({how}); mean {s.mean_electrons:.4g} e, brightest {BRIGHTEST_PERCENT:g} % {s.brightest_percent_electrons:.4g} e; "
+            f"mean {s.mean_dn:.4g} DN, highest {s.highest_dn} DN; saturated {s.saturated_percent:.2g} %; SNR {s.snr:.3g} at the mean"
+        ),
+        f"preview {preview_file(file).name}, record {record_file(file).name}",
+    ]

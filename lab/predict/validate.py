@@ -1,0 +1,290 @@
+"""Predicted against measured, for what the fits did not use: the chart's patches, edges' transfer functions, kernels.
+
+The model is the fitted camera with its fitted sensitivities and, if wanted, effects. Nothing of it is adjusted here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from lab.diagnose.inference.evidence import chi2
+from lab.diagnose.measurements.patches import Patch as PatchLevel
+from lab.diagnose.measurements.patches import patch_covariance, patch_levels
+from lab.diagnose.measurements.summaries import Study
+from lab.errors import NotDetermined
+from lab.fit.mtf import EdgeMtf, measure_edge
+from lab.fit.psf import expected_kernel
+from lab.formats.camera_file import CameraFile
+from lab.formats.recording_set import Bernoulli, RecordingSet, SlantedEdge
+from lab.formats.results import CameraFit, Check, Curve, FitResult, KernelPair, Patch, Skipped, ValidationResult
+from lab.predict.camera_model import camera_model
+from sim.camera import CameraModel, Side
+from sim.effects.base import Effect
+from sim.forward import edge_profile, electron_rate, optical_transfer
+from sim.optics.illumination import relative_illumination
+from sim.scene.colorchecker import reflectances
+from sim.spectrum import FloatArray
+
+PASSED_QUANTILE = 0.999
+#: Systematic parts of the comparison that the fits' uncertainties don't hold.
+LIGHT_STD = 0.01  # of the chart's light: radiometer at the chart against radiometer at the sphere, and geometry
+MTF_FREQUENCIES = np.arange(1, 26) * 0.02
+MTF_FLOOR = 0.002
+CELL_PX = 4.0  # of a random pattern on a screen, where the recordings don't say
+KERNEL_FLOOR = 0.002  # of the kernel's maximum
+
+
+def validate(
+    recordings: RecordingSet, fit: FitResult, models: Mapping[Side, CameraFile] | None = None
+) -> ValidationResult:
+    """Checks of every side: `colorchecker`, `mtf`, `psf`. `models`: cameras with their effects, in place of the fitted ones.
+
+    A check passes where chi2 lies within its 99.9 % quantile. What the recordings don't allow stands in `skipped`.
+    """
+    checks: list[Check] = []
+    skipped: list[Skipped] = []
+    for side in recordings.sides:
+        camera_fit = fit.cameras.get(side, CameraFit())
+        improved = (models or {}).get(side)
+        model = improved.camera if improved else camera_model(recordings, side, camera_fit)
+        with_effects = improved.effects if improved else ()
+        for name, check in (("colorchecker", _charts), ("mtf", _edges), ("psf", _kernels)):
+            try:
+                checks += check(recordings, side, camera_fit, model, with_effects)
+            except NotDetermined as refused:
+                skipped.append(Skipped(step=f"validate {name}", reason=refused.reason, side=side))
+    return ValidationResult(source=recordings.source, checks=tuple(checks), skipped=tuple(skipped))
+
+
+def _check(
+    name: str, side: Side, capture: str, residual: FloatArray, covariance: FloatArray, reference: FloatArray
+) -> Check:
+    value = chi2(residual, covariance)
+    relative = residual / np.maximum(np.abs(reference), 1e-12)
+    return Check.model_validate(
+        {
+            "name": name,
+            "side": side,
+            "capture": capture,
+            "n": len(residual),
+            "chi2": value,
+            "rms_relative_percent": 100.0 * float(np.sqrt(np.mean(relative**2))),
+            "passed": bool(value <= special.chdtri(len(residual), 1.0 - PASSED_QUANTILE)),
+        }
+    )
+
+
+# --- the chart -------------------------------------------------------------------------------------------------------------
+
+
+def _charts(
+    recordings: RecordingSet, side: Side, fit: CameraFit, model: CameraModel, effects: Sequence[Effect]
+) -> list[Check]:
+    if fit.spectral is None:
+        raise NotDetermined("colorchecker", "the sensitivities weren't fitted: capture narrowband light")
+    if fit.noise is None or fit.noise.conversion_gain_dn_per_e is None:
+        raise NotDetermined("colorchecker", "the conversion gain wasn't fitted: capture flats in repeats")
+    study = Study(recordings, side, model)
+    points = patch_levels(study)
+    if not points:
+        raise NotDetermined("colorchecker", "no unclipped patches of a ColorChecker24")
+    by_capture: dict[tuple[str, ...], list[PatchLevel]] = {}
+    for point in points:
+        by_capture.setdefault(tuple(c.id for c in point.captures), []).append(point)
+    return [_chart(study, side, model, effects, captures, members) for captures, members in by_capture.items()]
+
+
+def _chart(
+    study: Study,
+    side: Side,
+    model: CameraModel,
+    effects: Sequence[Effect],
+    captures: tuple[str, ...],
+    points: list[PatchLevel],
+) -> Check:
+    known = reflectances(points[0].captures[0].chart)
+    exposure = points[0].captures[0].exposure_s
+    light = study.spectrum(points[0].captures[0].radiance)
+    gain, black = model.conversion_gain_dn_per_e, model.black_level_dn
+    dark = model.dark_current_e_per_s * exposure
+    predicted, spread = np.empty(len(points)), np.empty(len(points))
+    for i, p in enumerate(points):
+        fall_off = float(relative_illumination(model, p.row, p.col))
+        rate = electron_rate(model, p.channel, light, effects, "chart", reflectance=known[p.name])
+        electrons = rate * exposure * fall_off + p.tail / gain + dark
+        for effect in effects:
+            electrons = float(effect.response(np.asarray(electrons), model))
+        predicted[i] = electrons * gain
+        spread[i] = _curve_std(model, p.channel, light.arrays[0]) * rate * exposure * fall_off * gain
+    measured = np.array([p.level for p in points]) - black
+    covariance = patch_covariance(study, points, np.maximum(measured - dark * gain, 0.1))
+    channel = np.array([p.channel for p in points])
+    # a fitted curve's error is much the same for all patches of a channel, the light's for all of them
+    covariance += (channel[:, None] == channel) * np.outer(spread, spread) + LIGHT_STD**2 * np.outer(
+        predicted, predicted
+    )
+    std = np.sqrt(np.diag(covariance))
+    noise = np.sqrt(
+        np.array(
+            [
+                (gain * max(m, 0.0) + study.noise.read_dn**2) / p.pixels / len(p.captures)
+                for m, p in zip(measured, points, strict=True)
+            ]
+        )
+    )
+    check = _check("colorchecker", side, captures[0], measured - predicted, covariance, measured)
+    patches = tuple(
+        Patch(
+            patch=p.name, channel=p.channel, predicted_dn=float(predicted[i]), predicted_dn_std=float(std[i]),
+            measured_dn=float(measured[i]), measured_dn_std=float(noise[i]),
+        )
+        for i, p in enumerate(points)
+    )  # fmt: skip
+    return check.model_copy(update={"patches": patches})
+
+
+def _curve_std(model: CameraModel, channel: str, wavelength_nm: FloatArray) -> float:
+    """Relative standard uncertainty of a channel's response to broad light, as if neighbouring errors were alike over 30 nm."""
+    std, curve = model.quantum_efficiency_std.get(channel), model.quantum_efficiency[channel]
+    if std is None:
+        return 0.01
+    grid = np.arange(380.0, 781.0, 30.0)
+    total = float(np.sum(curve.at(grid)))
+    return float(np.sqrt(np.sum(np.square(std.at(grid)))) / total) if total > 0 else 1.0
+
+
+# --- edges -----------------------------------------------------------------------------------------------------------------
+
+
+def _edges(
+    recordings: RecordingSet, side: Side, fit: CameraFit, model: CameraModel, effects: Sequence[Effect]
+) -> list[Check]:
+    stated = recordings.camera(side)
+    if stated.f_number is None or stated.pixel_pitch_um is None:
+        raise NotDetermined("mtf", "f-number or pixel pitch isn't stated: no diffraction to predict the edges from")
+    captures = recordings.captures(SlantedEdge, side)
+    if not captures:
+        raise NotDetermined("mtf", "no slanted-edge captures")
+    settings: dict[object, list[SlantedEdge]] = {}
+    for found in captures:
+        key = (found.region, found.angle_deg, found.exposure_s, found.gain_db, found.light_radiance)
+        settings.setdefault(key, []).append(found)
+    checks, reason = [], ""
+    for repeats in settings.values():
+        capture = repeats[0]
+        curves, residuals, blocks, reference = [], [], [], []
+        for channel in model.channels:
+            try:
+                measured = measure_edge(recordings, repeats, channel, fit.noise, MTF_FREQUENCIES)
+            except NotDetermined as refused:
+                reason = refused.reason
+                continue
+            predicted = _predicted_mtf(recordings, capture, channel, measured, model, effects)
+            residuals.append(measured.mtf - predicted)
+            blocks.append(measured.covariance + np.diag(np.full(len(predicted), MTF_FLOOR**2)))
+            reference.append(np.maximum(predicted, 0.1))
+            curves.append(
+                Curve(
+                    label=f"{capture.id}, {measured.angle_deg:.1f} deg", channel=channel, axis="spatial frequency, cy/px",
+                    x=tuple(MTF_FREQUENCIES.tolist()), predicted=tuple(predicted.tolist()), measured=tuple(measured.mtf.tolist()),
+                    measured_std=tuple(measured.mtf_std.tolist()),
+                )
+            )  # fmt: skip
+        if curves:
+            check = _check(
+                "mtf", side, capture.id, np.concatenate(residuals), _diagonal(blocks), np.concatenate(reference)
+            )
+            checks.append(check.model_copy(update={"curves": tuple(curves)}))
+    if not checks:
+        raise NotDetermined("mtf", reason)
+    return checks
+
+
+def _predicted_mtf(
+    recordings: RecordingSet,
+    capture: SlantedEdge,
+    channel: str,
+    measured: EdgeMtf,
+    model: CameraModel,
+    effects: Sequence[Effect],
+) -> FloatArray:
+    light = recordings.spectrum(capture.light_radiance) if capture.light_radiance else None
+    return np.asarray(
+        measured.predict(lambda distance: edge_profile(model, channel, light, measured.angle_deg, distance, effects))
+    )
+
+
+def _diagonal(blocks: Sequence[NDArray[Any]]) -> FloatArray:
+    size = sum(len(b) for b in blocks)
+    out = np.zeros((size, size))
+    at = 0
+    for block in blocks:
+        out[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return out
+
+
+# --- kernels ---------------------------------------------------------------------------------------------------------------
+
+
+def _kernels(
+    recordings: RecordingSet, side: Side, fit: CameraFit, model: CameraModel, effects: Sequence[Effect]
+) -> list[Check]:
+    if not fit.psf:
+        raise NotDetermined("psf", "no kernel was fitted")
+    screens = {c.id: c.screen for c in recordings.captures(Bernoulli, side)}
+    by_capture: dict[str, list[KernelPair]] = {}
+    numbers: dict[str, list[tuple[FloatArray, FloatArray, FloatArray]]] = {}
+    for found in fit.psf:
+        if found.sample_pitch_px != 1.0:
+            continue
+        screen = screens.get(found.capture)
+        light = recordings.spectrum(screen.radiance) if screen and screen.radiance else None
+        cell_px = screen.cell_camera_px if screen else None
+        measured, std = np.array(found.psf), np.array(found.psf_std)
+        predicted: FloatArray = np.asarray(
+            expected_kernel(
+                lambda fx, fy, channel=found.channel, light=light: optical_transfer(  # type: ignore[misc]
+                    model, channel, light, fx, fy, effects, "bernoulli"
+                ),
+                len(measured),
+                cell_px or CELL_PX,
+            ),
+            np.float64,
+        )
+        error = float(np.mean(np.square(measured - predicted)))
+        peak = float(predicted.max())
+        by_capture.setdefault(found.capture, []).append(
+            KernelPair(
+                label=found.capture, channel=found.channel, predicted=_rows(predicted), measured=_rows(measured),
+                psnr_peak_db=_psnr(peak, error), psnr_unit_db=_psnr(1.0, error),
+            )
+        )  # fmt: skip
+        numbers.setdefault(found.capture, []).append(
+            (
+                (measured - predicted).ravel(),
+                std.ravel() ** 2 + (KERNEL_FLOOR * peak) ** 2,
+                np.full(measured.size, peak),
+            )
+        )
+    if not by_capture:
+        raise NotDetermined("psf", "the kernels found aren't sampled at the sensor's pixels")
+    checks = []
+    for capture, pairs in by_capture.items():
+        residual, variance, peaks = (np.concatenate(part) for part in zip(*numbers[capture], strict=True))
+        check = _check("psf", side, capture, residual, np.diag(variance), peaks)
+        checks.append(check.model_copy(update={"kernels": tuple(pairs)}))
+    return checks
+
+
+def _psnr(peak: float, mean_square_error: float) -> float:
+    return float(10.0 * np.log10(peak**2 / max(mean_square_error, 1e-30)))
+
+
+def _rows(table: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(v) for v in row) for row in table)

@@ -1,0 +1,138 @@
+"""Sequences as data: counts, orders, ids, and what a capture says before it is taken."""
+
+from collections import Counter, defaultdict
+
+import numpy as np
+import pytest
+
+from lab.capture.sequences.calibration import Calibration, full_calibration
+from lab.capture.sequences.dark import DarkSequence
+from lab.capture.sequences.flat import FlatSequence
+from lab.capture.sequences.narrowband import NarrowbandSequence
+from lab.capture.sequences.steps import FindExposure, RelativeExposure, Setting, Step
+from lab.capture.sequences.targets import ScreenSequence
+from lab.errors import InputError
+from lab.formats.recording_set import Narrowband, SlantedEdge
+from tests.lab import fake_bench
+
+STATION = fake_bench.station()
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_full_calibration_takes_what_the_fits_need(quick: bool) -> None:
+    steps = full_calibration(STATION, quick).steps(STATION)
+    captures = [capture for step in steps for capture in step.captures if capture.side == "left"]
+    kinds = Counter(capture.kind for capture in captures)
+    assert kinds["dark"] >= 4 * 4
+    assert kinds["flat"] >= 8 * 4
+    assert {c.wavelength_nm for c in captures if isinstance(c, Narrowband)} == set(range(400, 721, 10))
+    assert min(kinds[kind] for kind in ("chart", "white", "black", "checkerboard", "bernoulli")) >= 2
+    edges = Counter(capture.frame for capture in captures if isinstance(capture, SlantedEdge))
+    assert len(edges) >= 4 * 2  # orientations x repeats
+    assert set(edges.values()) == {3}  # regions
+    assert kinds["charuco"] == 3
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_ids_and_files_are_unique_and_the_same_every_time(quick: bool) -> None:
+    steps = full_calibration(STATION, quick).steps(STATION)
+    assert steps == full_calibration(STATION, quick).steps(STATION)
+    ids = [step.id for step in steps]
+    assert len(set(ids)) == len(ids)
+    captures = [capture.id for step in steps for capture in step.captures]
+    assert len(set(captures)) == len(captures)
+    owners = defaultdict(set)
+    for step in steps:
+        for capture in step.captures:
+            owners[capture.frame].add((step.id, capture.side))
+    assert all(len(owner) == 1 for owner in owners.values())
+
+
+def test_both_sides_are_in_every_trigger() -> None:
+    for step in full_calibration(STATION).steps(STATION):
+        assert {capture.side for capture in step.captures} in (set(), {"left", "right"})
+
+
+def test_what_a_step_relies_on_comes_before_it() -> None:
+    found, measured = set(), set()
+    for step in full_calibration(STATION).steps(STATION):
+        if isinstance(step.exposure, RelativeExposure):
+            assert step.exposure.of in found
+        if isinstance(step.exposure, FindExposure):
+            found.add(step.id)
+        if step.radiance:
+            measured.add(step.radiance)
+        for capture in step.captures:
+            for key in ("radiance", "light_radiance"):
+                assert getattr(capture, key, None) is None or getattr(capture, key) in measured
+
+
+def test_ladders_cancel_a_linear_drift() -> None:
+    # On a ladder gone up and down by turns, the mean time of every rung is the same: a drift linear in time cancels.
+    steps = FlatSequence(levels=(0.1, 0.4, 0.7, 1.0), frames=4).steps(STATION)
+    times = defaultdict(list)
+    for at, step in enumerate(step for step in steps if step.captures):
+        times[step.id.split("/")[1]].append(at)
+    assert len({np.mean(when) for when in times.values()}) == 1
+    steps = DarkSequence(exposures_s=(0.01, 1.0, 2.0), frames=2).steps(STATION)
+    assert [step.id for step in steps] == [
+        "dark/0.01s/1", "dark/1s/1", "dark/2s/1", "dark/2s/2", "dark/1s/2", "dark/0.01s/2",
+    ]  # fmt: skip
+
+
+def test_flats_go_from_near_dark_to_beyond_saturation() -> None:
+    levels = full_calibration(STATION).flat
+    assert levels is not None
+    assert min(levels.levels) <= 0.05
+    assert max(levels.levels) > 1.0
+    factors = {s.exposure.factor for s in levels.steps(STATION) if isinstance(s.exposure, RelativeExposure)}
+    assert max(factors) == pytest.approx(max(levels.levels) / levels.level_found)
+
+
+def test_wavelengths_include_both_ends() -> None:
+    assert NarrowbandSequence(from_nm=400, to_nm=720, step_nm=10).wavelengths_nm == tuple(range(400, 721, 10))
+    assert NarrowbandSequence(from_nm=400, to_nm=401, step_nm=0.1).wavelengths_nm[-1] == pytest.approx(401.0)
+
+
+def test_the_screens_patterns_fit_what_the_cameras_see() -> None:
+    sequence = ScreenSequence()
+    patterns = sequence.patterns(STATION)
+    board, coins = patterns["targets/checkerboard.npy"], patterns["targets/bernoulli.npy"]
+    assert board.shape == coins.shape
+    grid = sequence.grid(STATION)
+    assert grid.cell_px == 8  # 4 camera px at half a camera px a screen px
+    assert grid.rows * grid.cell_px <= 880
+    assert grid.cols * grid.cell_px <= 1720
+    assert np.array_equal(board, np.kron(board[::8, ::8], np.ones((8, 8))))
+    assert board[0, 0] == 0
+    assert board[0, 8] == board[8, 0] == 1
+    # A fair coin: the share of ones lies within 5 sigma of 1/2, sigma = 1/(2 sqrt(n)).
+    assert abs(coins.mean() - 0.5) < 5 / (2 * np.sqrt(coins.size))
+    assert np.array_equal(coins, sequence.patterns(STATION)["targets/bernoulli.npy"])
+    assert patterns["targets/white.npy"].all()
+
+
+def test_a_screen_too_small_to_align_is_refused() -> None:
+    with pytest.raises(InputError, match="larger visible rectangle or smaller cells"):
+        ScreenSequence(cell_camera_px=80.0).steps(STATION)
+
+
+@pytest.mark.parametrize("family", ["monochromator", "spectroradiometer", "display"])
+def test_without_an_instrument_the_sequences_that_need_it_are_left_out(family: str) -> None:
+    station = fake_bench.station(**{family: None})
+    chosen = full_calibration(station)
+    assert chosen.dark is not None
+    assert (chosen.flat is None) == (family != "display")
+    assert (chosen.screen is None) == (family != "monochromator")
+    assert chosen.steps(station)
+    wanted = full_calibration(STATION)
+    with pytest.raises(InputError, match=rf"needs a {family}"):
+        wanted.steps(station)
+
+
+def test_specs_refuse_unknown_axes() -> None:
+    with pytest.raises(ValueError, match="wavelength"):
+        Calibration.model_validate({"dark": {"exposures_s": [1], "frames": 1, "wavelength": 3}})
+    with pytest.raises(ValueError, match="need an exposure"):
+        captures = DarkSequence(exposures_s=(1.0,), frames=1).steps(STATION)[0].captures
+        Step(id="x", what="x", setting=Setting(target="cap"), captures=captures)

@@ -1,0 +1,64 @@
+"""What the devices add to the drivers: a time-out that always holds, and how bright a frame is."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from drivers.errors import InstrumentError, NoAnswer
+from lab.capture.devices import Status, in_thread, level_of
+from lab.formats.recording_set import Camera
+
+
+def test_a_level_is_that_of_the_brightest_channel() -> None:
+    sheet = Camera(rows=40, cols=40, cfa="RGGB", bit_depth=12, black_level_dn=95, white_level_dn=4095)
+    frame = np.full((40, 40), 95, np.uint16)
+    frame[1::2, 1::2] = 2095
+    assert level_of(frame, sheet) == pytest.approx(0.5)
+    frame[0, 0] = 4095  # a hot pixel: 1 of 400 of its channel, above the 99.5th percentile
+    assert level_of(frame, sheet) == pytest.approx(0.5)
+    small = sheet.model_copy(update={"full_well_e": 5000, "conversion_gain_dn_per_e": 0.5})
+    assert level_of(frame, small) == pytest.approx(2000 / 2500)
+
+
+def test_a_driver_that_never_comes_back_is_given_up() -> None:
+    free, done = threading.Event(), threading.Event()
+    status = Status("camera left", free.wait, 0.05)
+    status.add_callback(lambda _: done.set())
+    assert done.wait(30)
+    assert isinstance(status.exception(), NoAnswer)
+    assert "camera left: not back after 0.05 s" in str(status.exception())
+    free.set()  # and its late return changes nothing
+    time.sleep(0.02)
+    assert not status.success
+
+
+def test_a_status_tells_what_the_call_raised() -> None:
+    def fails() -> None:
+        raise InstrumentError("stage: stuck; free it")
+
+    done = threading.Event()
+    status = Status("stage", fails, 5.0)
+    status.add_callback(lambda _: done.set())
+    assert done.wait(30)
+    assert (status.done, status.success) == (True, False)
+    assert str(status.exception()) == "stage: stuck; free it"
+
+
+def test_a_callback_added_late_is_called_at_once() -> None:
+    status = Status("stage", lambda: None, 5.0)
+    assert status.exception(5.0) is None
+    called: list[Status] = []
+    status.add_callback(called.append)
+    assert called == [status]
+    assert status.success
+
+
+def test_a_call_that_nobody_waits_for_any_more_ends_quietly() -> None:
+    """A session that is aborted cancels what it waits for; the thread goes on, and has to find a future that takes its result."""
+    go = threading.Event()
+    future = in_thread(lambda: go.wait(10.0))
+    assert not future.cancel()
+    go.set()
+    assert future.result(10.0)

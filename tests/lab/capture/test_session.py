@@ -1,0 +1,425 @@
+"""Running sessions: every step once, through pauses, aborts, failures and kills; and nothing left open."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.errors import NoAnswer
+from drivers.instrument import Identity
+from lab.capture.sequences.calibration import Calibration, full_calibration
+from lab.capture.sequences.dark import DarkSequence
+from lab.capture.sequences.flat import FlatSequence
+from lab.capture.sequences.narrowband import NarrowbandSequence
+from lab.capture.session import CaptureSession, Progress
+from lab.capture.store import Store
+from lab.errors import DeviceError, InputError
+from lab.formats.recording_set import inspect
+from tests.lab import fake_bench
+from tests.lab.fake_bench import BLACK, SLOPE, Bench
+
+STATION = fake_bench.station()
+DARKS = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.002, 0.003, 0.004, 0.005), frames=4))
+LIT = Calibration(
+    dark=DarkSequence(exposures_s=(0.001,), frames=1), flat=FlatSequence(levels=(0.2, 0.5, 0.8), frames=2)
+)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = Store(tmp_path / "data")
+    yield opened
+    opened.close()
+
+
+def begin(
+    store: Store, bench: Bench, calibration: Calibration, on_progress: Callable[[Progress], None] | None = None
+) -> CaptureSession:
+    return CaptureSession.start(store, STATION, calibration, connect=bench.drivers, on_progress=on_progress)
+
+
+def assert_safe(bench: Bench) -> None:
+    assert not bench.opened
+    assert not bench.lit
+    assert {"close monochromator", "close display", "close camera left", "close camera right"} <= set(bench.log)
+
+
+def assert_whole(store: Store, session: str) -> None:
+    """Every step done; every capture there once, with an intact frame of its own."""
+    journal = store.journal(session)
+    assert all(entry.finished for entry in journal)
+    expected = Counter(capture.id for entry in journal for capture in entry.step.captures)
+    assert Counter(capture.name for capture in store.captures(session)) == expected
+    assert set(expected.values()) == {1}
+    problems, _ = inspect(store.recording_set(session))
+    assert problems == []
+
+
+# --- a whole run ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_whole_calibration(store: Store) -> None:
+    bench, told = Bench(), []
+    session = CaptureSession.start(
+        store, STATION, full_calibration(STATION, quick=True), connect=bench.drivers, on_progress=told.append
+    )
+    info = session.run()
+    assert (info.state, info.packed, info.steps_done) == ("finished", True, info.steps)
+    assert_whole(store, session.id)
+    assert_safe(bench)
+    assert told[0].state == "connecting"
+    assert told[-1].state == "finished"
+    assert [p.done for p in told if p.state == "running"] == list(range(info.steps))
+    assert all(p.left_s is not None for p in told if p.state == "running" and p.done > 0)
+    (run,) = store.runs(session.id)
+    assert run.instruments["camera left"]["serial_number"] == "SN-1"
+    assert {"python", "bluesky", "numpy"} <= set(run.versions)
+    recordings = store.recording_set(session.id)
+    assert {c.bandwidth_nm for c in recordings.captures("narrowband")} == {9.48}
+    assert all(c.temperature_c == 25.0 and c.time is not None for c in recordings.captures())
+
+
+def test_blueskys_documents_are_kept(store: Store) -> None:
+    session = begin(store, Bench(), LIT)
+    session.run()
+    lines = (store.folder(session.id) / "documents.jsonl").read_text().splitlines()
+    documents = [json.loads(line) for line in lines]
+    names = Counter(name for name, _ in documents)
+    assert (names["start"], names["stop"], names["event"]) == (1, 1, store.session(session.id).steps)
+    assert documents[0][1]["session"] == session.id
+    assert documents[-1][1]["exit_status"] == "success"
+
+
+def test_exposures_are_found_for_each_camera(store: Store) -> None:
+    session = begin(store, Bench(), LIT)
+    session.run()
+    results = {entry.step.id: entry.result for entry in store.journal(session.id)}
+    for side, slope in SLOPE.items():
+        exposure_s = results["flat/exposure"]["exposure_s"][side]
+        level = slope * exposure_s / (4095 - BLACK)
+        assert level == pytest.approx(0.75, abs=0.05)
+        # Flats are shares of saturation: the mean of the frame at 0.5 is half of the range, to 5 % (the search's tolerance).
+        recordings = store.recording_set(session.id)
+        flat = next(c for c in recordings.captures("flat", side) if "level-02" in c.id)  # type: ignore[arg-type]
+        assert recordings.frame(flat).mean() == pytest.approx(BLACK + 0.5 * (4095 - BLACK), rel=0.08)
+
+
+@pytest.mark.parametrize("slope", [1.0, 500.0, 1e7])
+def test_exposures_are_found_from_far_off_or_at_a_limit(
+    store: Store, slope: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SLOPE, "left", slope)
+    session = begin(store, Bench(), Calibration(flat=FlatSequence(levels=(0.5,), frames=1)))
+    session.run()
+    exposure_s = store.journal(session.id)[0].result["exposure_s"]["left"]
+    wanted = 0.75 * (4095 - BLACK) / slope
+    if wanted <= STATION.limits.exposure_max_s:
+        assert exposure_s == pytest.approx(wanted, rel=0.08)
+    else:
+        assert exposure_s == STATION.limits.exposure_max_s
+
+
+def test_a_sensor_that_saturates_below_its_data_sheet_is_not_taken_for_well_exposed(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SLOPE, "left", 1e5)
+    monkeypatch.setattr(fake_bench, "WHITE", 3490)  # 85 % of the range: neither clearly saturated nor what is wanted
+    session = begin(store, Bench(), Calibration(flat=FlatSequence(levels=(0.5,), frames=1)))
+    session.run()
+    found = store.journal(session.id)[0].result
+    assert found["level"]["left"] == pytest.approx(0.75, abs=0.05)
+    assert found["exposure_s"]["left"] == pytest.approx(0.75 * (4095 - BLACK) / 1e5, rel=0.08)
+
+
+def test_a_wavelength_that_the_radiometer_refuses_is_left_out_with_the_reason(store: Store) -> None:
+    bench, told = Bench(), []
+    bench.refused_nm = 410.0
+    session = begin(store, bench, Calibration(narrowband=NarrowbandSequence(to_nm=420)), told.append)
+    assert session.run().state == "finished"
+    assert {c.wavelength_nm for c in store.recording_set(session.id).captures("narrowband")} == {400.0, 420.0}
+    assert {entry.result.get("skipped") is not None for entry in store.journal(session.id)} == {False, True}
+    assert sum("under-exposed" in (p.remark or "") for p in told) == 2
+    bench.refused_nm = 0.0  # but a flat's spectrum is what others rely on
+    with pytest.raises(DeviceError, match="under-exposed"):
+        begin(store, bench, LIT).run()
+
+
+# --- interruptions -------------------------------------------------------------------------------------------------------
+
+
+def test_an_unplugged_camera_is_one_clear_line_and_the_rest_is_kept(store: Store) -> None:
+    bench = Bench()
+
+    def unplug(progress: Progress) -> None:
+        if progress.done == 5:
+            bench.unplugged.add("camera right")
+
+    session = begin(store, bench, LIT, unplug)
+    with pytest.raises(DeviceError) as caught:
+        session.run()
+    line = str(caught.value)
+    assert "camera right at here: the line is gone; plug it in again" in line
+    assert "\n" not in line
+    assert not bench.opened
+    assert "close monochromator" in bench.log
+    info = store.session(session.id)
+    assert (info.state, info.steps_done) == ("failed", 5)
+    assert info.error == line
+    bench.unplugged.clear()
+    assert CaptureSession(store, session.id, connect=bench.drivers).run().state == "finished"
+    assert_whole(store, session.id)
+
+
+def test_a_shutter_that_cannot_be_closed_is_said(store: Store) -> None:
+    bench = Bench()
+
+    def unplug(progress: Progress) -> None:
+        if progress.done == 3:
+            bench.unplugged |= {"monochromator", "camera left"}
+
+    session = begin(store, bench, LIT, unplug)
+    with pytest.raises(DeviceError, match=r"not brought into a safe state: .*monochromator"):
+        session.run()
+
+
+def test_an_instrument_that_is_not_there_fails_before_anything_is_taken(store: Store) -> None:
+    bench = Bench()
+    bench.unplugged.add("spectroradiometer")
+    session = begin(store, bench, LIT)
+    with pytest.raises(DeviceError, match="spectroradiometer at here"):
+        session.run()
+    assert bench.shots == 0
+    assert store.session(session.id).steps_done == 0
+
+
+def test_a_lost_frame_is_taken_once_more(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    collect, lost = fake_bench.FakeCamera.collect, []
+
+    def flaky(camera: Any) -> Any:
+        if camera.bench.shots == 3 and not lost:
+            lost.append(1)
+            raise NoAnswer("camera left: no frame came")
+        return collect(camera)
+
+    monkeypatch.setattr(fake_bench.FakeCamera, "collect", flaky)
+    session = begin(store, Bench(), DARKS)
+    assert session.run().state == "finished"
+    assert lost
+    assert_whole(store, session.id)
+
+
+def test_pause_closes_the_shutter_and_resume_goes_on(store: Store) -> None:
+    bench, states, shutter = Bench(), [], []
+
+    def follow(progress: Progress) -> None:
+        states.append(progress.state)
+        if progress.done == 6 and "paused" not in states:
+            session.pause()  # takes hold after this step
+        if progress.state == "paused":
+            shutter.append((bench.opened, bench.lit, store.session(session.id).state))
+            threading.Timer(0.2, session.resume).start()
+
+    session = begin(store, bench, LIT, lambda progress: _elsewhere(follow, progress))
+    worker = threading.Thread(target=session.run)
+    worker.start()
+    worker.join(60)
+    assert not worker.is_alive()
+    assert shutter == [(False, False, "paused")]
+    assert store.session(session.id).state == "finished"
+    assert_whole(store, session.id)
+    assert_safe(bench)
+
+
+def _elsewhere(call: Callable[[Progress], None], progress: Progress) -> None:
+    """Call from a thread of its own: `pause` waits for the run's loop, which is what calls back."""
+    thread = threading.Thread(target=call, args=(progress,))
+    thread.start()
+    if progress.state == "paused":
+        thread.join()
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_abort_drops_the_step_under_way_and_keeps_the_rest(store: Store, paused: bool) -> None:
+    bench = Bench(delay_s=0.05)
+    session = begin(store, bench, DARKS)
+    worker = threading.Thread(target=session.run)
+    worker.start()
+    _until(lambda: store.session(session.id).steps_done >= 3)
+    if paused:
+        session.pause()
+        _until(lambda: store.session(session.id).state == "paused")
+    session.abort("enough")
+    worker.join(30)
+    assert not worker.is_alive()
+    info = store.session(session.id)
+    assert (info.state, info.error) == ("interrupted", "enough")
+    assert 3 <= info.steps_done < 20
+    assert_safe(bench)
+    assert CaptureSession(store, session.id, connect=bench.drivers).run().state == "finished"
+    assert_whole(store, session.id)
+
+
+def test_a_camera_that_comes_back_after_an_abort_touches_nothing(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, waits, go_on = Bench(), threading.Event(), threading.Event()
+    fire = fake_bench.FakeCamera.fire
+
+    def slow(camera: fake_bench.FakeCamera) -> None:
+        fire(camera)
+        if camera.bench is bench and bench.shots == 4:
+            waits.set()
+            assert go_on.wait(30)
+
+    monkeypatch.setattr(fake_bench.FakeCamera, "fire", slow)
+    session = begin(store, bench, DARKS)
+    worker = threading.Thread(target=session.run)
+    worker.start()
+    assert waits.wait(20)
+    session.abort("enough")
+    worker.join(30)
+    assert CaptureSession(store, session.id, connect=Bench().drivers).run().state == "finished"
+    late = [thread for thread in threading.enumerate() if thread.name == "instrument"]
+    assert late
+    go_on.set()
+    for thread in late:
+        thread.join(10)
+    assert_whole(store, session.id)
+    assert not list((store.folder(session.id) / "frames").glob("*"))
+
+
+def _until(reached: Callable[[], bool], patience_s: float = 20.0) -> None:
+    until = time.monotonic() + patience_s
+    while not reached():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def test_an_error_of_the_callback_ends_the_run_safely(store: Store) -> None:
+    bench = Bench()
+
+    def broken(progress: Progress) -> None:
+        if progress.done == 4:
+            raise ValueError("no screen")
+
+    session = begin(store, bench, LIT, broken)
+    with pytest.raises(ValueError, match="no screen"):
+        session.run()
+    assert_safe(bench)
+    assert store.session(session.id).state == "failed"
+
+
+def test_two_processes_do_not_run_one_session(store: Store) -> None:
+    session = begin(store, Bench(), DARKS)
+    lock = store.lock(session.id)
+    assert lock.acquire()
+    with pytest.raises(InputError, match="another process runs it"):
+        session.run()
+    lock.release()
+
+
+def test_an_exchanged_instrument_is_refused(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+
+    def unplug(progress: Progress) -> None:
+        if progress.done == 2:
+            bench.unplugged.add("camera left")
+
+    session = begin(store, bench, DARKS, unplug)
+    with pytest.raises(DeviceError):
+        session.run()
+    bench.unplugged.clear()
+    monkeypatch.setattr(fake_bench.FakeCamera, "identity", lambda camera: Identity("fake", camera.who, "SN-2"))
+    with pytest.raises(InputError, match=r"camera left has the serial number SN-2, the session began with\s+SN-1"):
+        CaptureSession(store, session.id, connect=bench.drivers).run()
+
+
+def test_a_camera_of_another_size_is_refused(store: Store) -> None:
+    sheet = STATION.cameras["left"].datasheet.model_copy(update={"rows": 48})
+    cameras = dict(STATION.cameras) | {"left": STATION.cameras["left"].model_copy(update={"datasheet": sheet})}
+    station = STATION.model_copy(update={"cameras": cameras})
+    session = CaptureSession.start(store, station, DARKS, connect=Bench().drivers)
+    with pytest.raises(DeviceError, match=r"camera left: has 24 x 32 pixels, its data sheet .* 48 x 32"):
+        session.run()
+
+
+def test_a_full_disk_is_said_and_the_session_resumes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    session = begin(store, bench, DARKS)
+    with monkeypatch.context() as broken:
+
+        def full(*_: object) -> None:
+            if bench.shots == 5:
+                raise OSError(28, "No space left on device")
+
+        broken.setattr("os.fsync", full)
+        with pytest.raises(InputError, match="No space left on device"):
+            session.run()
+    assert_safe(bench)
+    assert CaptureSession(store, session.id, connect=bench.drivers).run().state == "finished"
+    assert_whole(store, session.id)
+
+
+# --- kills ---------------------------------------------------------------------------------------------------------------
+
+
+def _spawn(store: Store, session: str, delay_s: float) -> subprocess.Popen[str]:
+    root = Path(__file__).parents[2]
+    script = [sys.executable, "-m", "tests.lab.fake_bench", str(store.root), session, str(delay_s)]
+    return subprocess.Popen(
+        script, cwd=root, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
+
+
+def test_kill_9_loses_nothing_and_repeats_nothing(store: Store) -> None:
+    calibration = Calibration(dark=DarkSequence(exposures_s=tuple(0.001 * n for n in range(1, 26)), frames=4))
+    session = store.create_session(STATION, calibration.steps(STATION))
+    assert store.session(session).steps == 100
+    hashes: dict[str, str] = {}
+    for at in (12, 45, 80):
+        process = _spawn(store, session, 0.004)
+        assert process.stdout is not None
+        for line in process.stdout:
+            if int(line) >= at:
+                process.kill()
+        process.wait(30)
+        process.stdout.close()
+        info = store.session(session)
+        assert info.state == "interrupted"
+        assert at <= info.steps_done < 100
+        now = {file.path: file.sha256 for file in store.files(session)}
+        assert hashes.items() <= now.items()  # what was finished stays as it was
+        hashes = now
+    process = _spawn(store, session, 0.0)
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert store.session(session).state == "finished"
+    assert len(store.captures(session)) == 200
+    assert hashes.items() <= {file.path: file.sha256 for file in store.files(session)}.items()
+    assert_whole(store, session)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_in_good_order(store: Store, number: signal.Signals) -> None:
+    session = store.create_session(STATION, DARKS.steps(STATION))
+    process = _spawn(store, session, 0.2)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if int(line) == 4:
+            process.send_signal(number)
+    process.wait(30)
+    process.stdout.close()
+    assert process.returncode != 0
+    info = store.session(session)
+    assert info.state == "interrupted"
+    assert info.error == f"ended by {number.name}"
+    assert 4 <= info.steps_done < 20

@@ -1,0 +1,412 @@
+"""The command line: exit codes, one line for each problem and no traceback, nothing half-written."""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lab import cli
+from lab.capture.sequences.calibration import Calibration
+from lab.capture.sequences.dark import DarkSequence
+from lab.diagnose import Diagnosis
+from lab.diagnose.outcome.next_capture import Proposal
+from lab.errors import DeviceError
+from lab.formats import recording_set as recording
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.results import (
+    CameraFit,
+    Check,
+    DiagnosisResult,
+    FitResult,
+    NextCapture,
+    NoiseFit,
+    Resolution,
+    Skipped,
+    ValidationResult,
+)
+from sim.effects.library import effects
+
+
+@pytest.fixture(autouse=True)
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No test touches the data folder of the working directory."""
+    folder = tmp_path / "data"
+    monkeypatch.setenv("CALIBENCH_DATA", str(folder))
+    return folder
+
+
+@pytest.fixture
+def folder(small_set: Callable[..., RecordingSet], tmp_path: Path) -> Path:
+    return recording.write(small_set(), tmp_path / "set")
+
+
+@pytest.fixture
+def flats(tmp_path: Path) -> Path:
+    """A MONO camera of 0.5 DN/e: darks and a ladder of flats, small and quick to fit."""
+    rng = np.random.default_rng(7)
+    frames, captures = {}, []
+    for number, (kind, photons) in enumerate(
+        [("dark", 0)] * 4 + [("flat", 800 * k) for k in range(1, 8) for _ in range(2)]
+    ):
+        electrons = rng.poisson(photons, (60, 80)) + rng.normal(0, 4, (60, 80))
+        frames[f"frames/{number}.npy"] = np.clip(100 + 0.5 * electrons, 0, 4095).round().astype(np.uint16)
+        light = {"photons_per_pixel": 2 * photons, "wavelength_nm": 530} if kind == "flat" else {}
+        captures.append(
+            {
+                "id": f"{kind}-{number}",
+                "kind": kind,
+                "side": "left",
+                "frame": f"frames/{number}.npy",
+                "exposure_s": 0.01,
+            }
+            | light
+        )
+    camera = {"rows": 60, "cols": 80, "cfa": "MONO", "bit_depth": 12, "black_level_dn": 100}
+    manifest = Manifest.model_validate({"name": "flats", "cameras": {"left": camera}, "captures": captures})
+    return recording.write(RecordingSet(manifest, frames), tmp_path / "flats")
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def damaged(folder: Path) -> None:
+    file = folder / "frames/dark-000.npy"
+    file.write_bytes(file.read_bytes()[:-10])
+
+
+def spectrum_missing(folder: Path) -> None:
+    (folder / "spectra/nb550.csv").unlink()
+
+
+def wrong_size(folder: Path) -> None:
+    np.save(folder / "frames/dark-000.npy", np.zeros((4, 4), np.uint16))
+
+
+def saturated(folder: Path) -> None:
+    np.save(folder / "frames/flat-001.npy", np.full((24, 32), 4095, np.uint16))
+
+
+def leaves(folder: Path) -> None:
+    edit(folder, lambda m: m["captures"][0].update(frame="../../etc/passwd"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what"),
+    [
+        (damaged, "damaged"),
+        (spectrum_missing, "no such file"),
+        (wrong_size, "4 x 4"),
+        (saturated, "saturated"),
+        (leaves, "leaves"),
+    ],
+)
+@pytest.mark.parametrize("command", ["fit", "validate", "diagnose", "report"])
+def test_a_folder_that_cannot_be_used(
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    spoil: Callable[[Path], None],
+    what: str,
+    command: str,
+) -> None:
+    spoil(folder)
+    result = tmp_path / "result"
+    assert cli.main([command, str(folder), "--out" if command == "report" else "--json", str(result)]) == 2
+    shown = capsys.readouterr()
+    lines = shown.err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("calibench: ")
+    assert what.replace("leaves", "leads out of the folder") in lines[0]
+    assert "; " in lines[0]  # the remedy
+    assert shown.out == ""
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set"]
+
+
+def test_every_problem_of_a_folder_has_its_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for spoil in (damaged, spectrum_missing, saturated):
+        spoil(folder)
+    assert cli.main(["fit", str(folder)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 3
+
+
+def test_unknown_kinds_are_a_warning_until_nothing_is_left(flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(flats, lambda m: m["captures"].append({"id": "x", "kind": "hologram"}))
+    assert cli.main(["fit", str(flats)]) == 0
+    assert "warning: " in (line := capsys.readouterr().err)
+    assert "unknown kind 'hologram'" in line
+    edit(flats, lambda m: m.update(captures=[{"id": "x", "kind": "hologram"}]))
+    assert cli.main(["fit", str(flats)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+def test_fit_prints_figures_and_writes_what_the_results_say(
+    flats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "fit.json"
+    assert cli.main(["fit", str(flats), "--json", str(file)]) == 0
+    shown = capsys.readouterr().out
+    assert "conversion gain" in shown
+    assert "skipped: spectral (left)" in shown
+    fit = FitResult.model_validate_json(file.read_text())
+    noise = fit.cameras["left"].noise
+    assert noise is not None
+    assert noise.conversion_gain_dn_per_e is not None
+    assert noise.conversion_gain_dn_per_e_std is not None
+    assert noise.conversion_gain_dn_per_e == pytest.approx(0.5, abs=4 * noise.conversion_gain_dn_per_e_std)
+    assert noise.quantum_efficiency == pytest.approx(0.5, rel=0.05)
+    assert {"spectral", "mtf", "psf", "geometry", "stereo"} == {item.step for item in fit.skipped}
+    assert file.stat().st_mode & 0o777 == 0o644
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "flats"]
+
+
+def test_json_to_stdout_is_json_alone(flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["fit", str(flats), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["format"] == "calibench-fit"
+
+
+def test_a_result_that_cannot_be_written_is_refused_before_the_work(
+    flats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "_recordings", lambda source: pytest.fail("the work began"))
+    for command in ("fit", "validate", "diagnose"):
+        assert cli.main([command, str(flats), "--json", str(tmp_path / "nowhere" / "x.json")]) == 2
+        assert "can't be written" in capsys.readouterr().err
+
+
+def test_a_failure_while_writing_leaves_the_old_file(
+    flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "fit.json"
+    file.write_text("old")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    assert cli.main(["fit", str(flats), "--json", str(file)]) == 1
+    assert file.read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "flats"]
+
+
+@pytest.mark.parametrize(("passed", "code"), [(True, 0), (False, 4)])
+def test_a_check_that_falls_short(
+    flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passed: bool, code: int
+) -> None:
+    check = Check(name="mtf", side="left", capture="edge-1", n=10, chi2=11.0, rms_relative_percent=1.0, passed=passed)
+    monkeypatch.setattr(cli, "_validated", lambda *_: ValidationResult(source="x", checks=(check,)))
+    assert cli.main(["validate", str(flats), "--json", str(tmp_path / "v.json")]) == code
+    assert ValidationResult.model_validate_json((tmp_path / "v.json").read_text()).checks == (check,)
+
+
+def test_diagnosis_with_a_stored_fit(
+    flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["fit", str(flats), "--json", str(tmp_path / "fit.json")]) == 0
+    monkeypatch.setattr(cli, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
+    result = DiagnosisResult(source="x", verdict="no_mismatch", skipped=(Skipped(step="mtf", reason="no [edges]"),))
+    monkeypatch.setattr(cli, "_examined", lambda recordings, fit, baseline, pictures, bootstrap: Diagnosis(result, {}))
+    assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 0
+    shown = capsys.readouterr().out
+    assert "verdict: no_mismatch" in shown
+    assert "no [edges]" in shown  # text isn't markup
+    (tmp_path / "fit.json").write_text('{"format": "calibench-fit"}')
+    assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 2
+    assert "not what --json wrote" in capsys.readouterr().err
+
+
+def test_the_library_tells_what_it_declares(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["effects"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in effects())
+    for name, kind in effects().items():
+        assert cli.main(["effects", name]) == 0
+        told = capsys.readouterr().out
+        assert kind.sentence in told
+        assert all(field in told and q.meaning in told for field, q in kind.quantities().items())
+    assert cli.main(["effects", "glare"]) == 2
+    assert "no effect named 'glare'; there are: adc_nonlinearity" in capsys.readouterr().err
+
+
+def test_a_threshold_needs_more_than_a_few_draws(flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["diagnose", str(flats), "--bootstrap", "3"]) == 2
+    said = capsys.readouterr().err
+    assert "--bootstrap 3" in said and "10" in said
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["nonsense"], ["fit"], ["fit", "a", "b"], ["import", "x", "--from", "exif"], ["fit", "x", "--jason", "y"]],
+)
+def test_wrong_use_is_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    code = cli.main(arguments)
+    shown = capsys.readouterr()
+    assert code == (2 if arguments else code)
+    assert "Traceback" not in shown.err
+    if arguments:
+        assert len(shown.err.splitlines()) == 1
+
+
+def test_neither_folder_nor_session_makes_no_data_folder(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for source in ("20260101-000000-abcdef", "/nowhere/at/all"):
+        assert cli.main(["fit", source]) == 2
+        assert source in capsys.readouterr().err
+    assert not data.exists()
+
+
+def test_device_failures_interruptions_and_defects(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for error, code, words in (
+        (DeviceError("camera left: no answer; plug it in"), 3, "camera left"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("two\nlines"), 1, "ZeroDivisionError: two lines: a defect"),
+    ):
+
+        def fail(*_: object, error: BaseException = error) -> str:
+            raise error
+
+        monkeypatch.setattr(cli, "_captured", fail)
+        assert cli.main(["capture"]) == code
+        shown = capsys.readouterr().err
+        assert words in shown
+        assert len(shown.splitlines()) == 1
+
+
+def test_the_main_job_says_where_the_report_is_and_what_it_says(
+    small_set: Callable[..., RecordingSet],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The order of the main job, on a session that was captured, with results that cost nothing."""
+    recordings = small_set()
+
+    class Shelf:
+        """What `run` needs of a store."""
+
+        def __init__(self) -> None:
+            self.kept: list[str] = []
+
+        def folder(self, session_id: str) -> Path:
+            return tmp_path
+
+        def recording_set(self, session_id: str) -> RecordingSet:
+            return recordings
+
+        def add_result(self, kind: str, source: str, document: dict[str, Any]) -> None:
+            self.kept.append(kind)
+
+        def runs(self, session_id: str) -> list[Any]:
+            return []
+
+    shelf = Shelf()
+    fit = FitResult(source="s", cameras={"left": CameraFit(noise=NoiseFit(conversion_gain_dn_per_e=0.4))})
+    diagnosis = DiagnosisResult(source="s", verdict="no_mismatch")
+    monkeypatch.setattr(cli, "_store", lambda folder=None: shelf)
+    monkeypatch.setattr(cli, "_captured", lambda *_: "session-1")
+    monkeypatch.setattr(cli, "_fitted", lambda *_: fit)
+    monkeypatch.setattr(cli, "_validated", lambda *_: ValidationResult(source="s", checks=()))
+    monkeypatch.setattr(cli, "_examined", lambda *_: Diagnosis(diagnosis, {}))
+    assert cli.main(["run"]) == 0
+    shown = capsys.readouterr().out
+    for words in (
+        "conversion gain",
+        "0.4 DN/e",
+        "The baseline model explains",
+        "session: session-1",
+        f"{tmp_path}/report.html",
+    ):
+        assert words in shown
+    assert shelf.kept == ["fit", "validate", "diagnose"]
+    assert DiagnosisResult.model_validate_json((tmp_path / "diagnose.json").read_text()) == diagnosis
+    assert (tmp_path / "report.html").stat().st_size > 1e6
+
+
+@pytest.mark.parametrize("settles", [True, False])
+def test_resolve_takes_the_capture_and_decides_again(
+    settles: bool,
+    small_set: Callable[..., RecordingSet],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Only where it would settle something, and what stood before is told."""
+
+    class Shelf:
+        def recording_set(self, session_id: str) -> RecordingSet:
+            return small_set()
+
+    plan = Calibration(dark=DarkSequence(exposures_s=(0.1,), frames=2))
+    capture = NextCapture(
+        side="left",
+        capture="dark frames",
+        rivals=("defocus", "coma"),
+        distance=9.0 if settles else 0.1,
+        told_apart=0.98,
+    )
+    taken: list[Calibration | None] = []
+    captured = lambda *given: taken.append(given[-1]) or "session-2"  # noqa: E731
+    after = Diagnosis(DiagnosisResult(source="s", verdict="explained"), {})
+    monkeypatch.setattr(cli, "_captured", captured)
+    monkeypatch.setattr(
+        cli, "_examined", lambda joined, fit: after if len(joined.captures()) > n else pytest.fail("not joined")
+    )
+    recordings = small_set()
+    n = len(recordings.captures())
+    before = Diagnosis(DiagnosisResult(source="s", verdict="partly_explained"), {}, (Proposal(capture, plan),))
+    found = cli._resolved(Shelf(), None, recordings, FitResult(source="s", cameras={}), before)  # type: ignore[arg-type]
+    if not settles:
+        assert found is before
+        assert not taken
+        return
+    assert taken == [plan]
+    assert found.result.verdict == "explained"
+    assert found.result.resolution == Resolution(
+        capture="dark frames", session="session-2", verdict_before="partly_explained", effects_before=()
+    )
+    assert "dark frames, to tell defocus from coma" in capsys.readouterr().out
+
+
+def test_import_writes_a_set_or_nothing(tmp_path: Path, flats: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    raws = tmp_path / "raws"
+    raws.mkdir()
+    shutil.copy(flats / "frames/0.npy", raws / "a.npy")
+    (raws / "camera.toml").write_text('cfa = "MONO"\n')
+    (raws / "index.csv").write_text("frame,kind,exposure_s\na.npy,dark,0.5\n")
+    assert cli.main(["import", "--from", "raw-folder", str(raws), "--out", str(tmp_path / "out")]) == 0
+    assert recording.read(tmp_path / "out").captures()[0].exposure_s == 0.5
+    assert cli.main(["import", "--from", "raw-folder", str(raws), "--out", str(tmp_path / "out")]) == 2
+    (raws / "a.npy").write_bytes(b"\x93NUMPY")
+    assert cli.main(["import", "--from", "raw-folder", str(raws), "--out", str(tmp_path / "other")]) == 2
+    assert (
+        cli.main(["import", "--from", "raw-folder", str(raws), "--out", str(tmp_path / "x"), "--checkerboard", "9"])
+        == 2
+    )
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flats", "out", "raws"]
+
+
+def test_the_command_itself(tmp_path: Path) -> None:
+    """The real process: its exit code, its one line, and no traceback."""
+    done = subprocess.run(
+        [sys.executable, "-m", "lab.cli", "fit", str(tmp_path / "nowhere")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.splitlines() == [
+        f"calibench: {tmp_path / 'nowhere'}: no such folder; give the folder of a recording set"
+    ]

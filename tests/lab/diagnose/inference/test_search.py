@@ -1,0 +1,169 @@
+"""The search over sets of effects, on small made-up evidence whose effects act in known ways."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, ClassVar
+
+import numpy as np
+import pytest
+
+from lab.diagnose.inference.decide import Candidate, _either_sign
+from lab.diagnose.inference.evidence import Evidence, Within
+from lab.diagnose.inference.score import signatures
+from lab.diagnose.inference.search import Search
+from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect, Stage
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray, Spectrum
+
+X = np.linspace(0.0, 1.0, 60)
+NOISE = 0.01
+THRESHOLD = 12.0
+
+
+class _Curve(Effect):
+    """Adds `size` times a shape to the line that is measured; it borrows the hook for offsets."""
+
+    stage: ClassVar[Stage] = Stage.ELECTRONICS
+    reference: ClassVar[str] = "made up"
+    sentence: ClassVar[str] = "Made up."
+    form_tolerance: ClassVar[float] = 0.01
+    size_dn: Annotated[float, Quantity("DN", "size", prior=(0.0, 0.1), absent=0.0)] = 0.0
+
+    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+        return self.size_dn * float(self.shape(np.asarray(elapsed_s)))
+
+    def shape(self, x: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+
+class _Up(_Curve):
+    name: ClassVar[str] = "up"
+
+    def shape(self, x: FloatArray) -> FloatArray:
+        return np.asarray(x)
+
+
+class _Bend(_Curve):
+    name: ClassVar[str] = "bend"
+
+    def shape(self, x: FloatArray) -> FloatArray:
+        return np.asarray(x**2)
+
+
+class _Wave(_Curve):
+    name: ClassVar[str] = "wave"
+    rivals: ClassVar[frozenset[str]] = frozenset({"ripple"})
+
+    def shape(self, x: FloatArray) -> FloatArray:
+        return np.sin(6.0 * np.pi * x)
+
+
+class _Ripple(_Curve):
+    name: ClassVar[str] = "ripple"
+    rivals: ClassVar[frozenset[str]] = frozenset({"wave"})
+
+    def shape(self, x: FloatArray) -> FloatArray:
+        return np.asarray(np.sin(6.0 * np.pi * x) + 0.4 * np.sin(14.0 * np.pi * x))
+
+
+class _Arch(_Curve):
+    """Nearly what `up` less `bend` amount to: alone the best of all, and yet not what is there."""
+
+    name: ClassVar[str] = "arch"
+
+    def shape(self, x: FloatArray) -> FloatArray:
+        return np.sin(np.pi * x) * (1.0 + 0.3 * x)
+
+
+KINDS: tuple[type[Effect], ...] = (_Up, _Bend, _Wave, _Ripple, _Arch)
+
+
+def _camera() -> CameraModel:
+    flat = Spectrum.of([400.0, 700.0], [0.5, 0.5])
+    return CameraModel(
+        rows=8, cols=8, pixel_pitch_um=3.0, fill_factor=1.0, cfa="MONO", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.5, full_well_e=8000.0, read_noise_e=2.0, dark_current_e_per_s=1.0, dsnu_e=0.0, prnu_percent=0.0,
+        quantum_efficiency={"Y": flat}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+    )  # fmt: skip
+
+
+def _evidence(truth: Sequence[Effect], rng: np.random.Generator) -> Evidence:
+    camera = _camera()
+
+    def line(acting: Sequence[Effect]) -> FloatArray:
+        return np.array([sum(e.offset_dn(float(x), None, camera) for e in acting) for x in X])
+
+    block = Block(
+        measurement="dark", axis="time", unit="s", reach=0.2, value=line(truth) + NOISE * rng.standard_normal(X.size),
+        covariance=NOISE**2 * np.eye(X.size), labels=tuple(Label(float(x), "all", "", (f"c{i}",), False) for i, x in enumerate(X)),
+        hooks=frozenset({"offset_dn"}), predict=lambda acting: Prediction(line(acting), {}), scale=np.ones(X.size),
+    )  # fmt: skip
+    return Evidence((block,), camera)
+
+
+def _best(truth: Sequence[Effect], seed: int) -> set[str]:
+    return set(Search(_evidence(truth, np.random.default_rng(seed)), KINDS, THRESHOLD).best().names)
+
+
+def test_a_pair_is_found_that_a_third_effect_hides() -> None:
+    """x - x^2 is within 3 % of an arch: the arch alone has the highest score, and only the pair is right to the noise."""
+    truth = (_Up(size_dn=1.2), _Bend(size_dn=-1.2))
+    evidence = _evidence(truth, np.random.default_rng(1))
+    found = signatures(evidence, evidence.camera, (), KINDS)
+    assert found.scores()[0].effect is _Arch
+    pair = found.pairs(1)[0]
+    assert {type(e) for e in pair.starts} == {_Up, _Bend}
+    assert pair.value > found.scores()[0].value
+    assert _best(truth, 1) == {"up", "bend"}
+
+
+def test_two_effects_of_different_shapes_are_both_found() -> None:
+    assert _best((_Up(size_dn=0.1), _Wave(size_dn=0.05)), 2) == {"up", "wave"}
+
+
+def test_nothing_is_found_in_noise() -> None:
+    """A score beyond 12 of any of five comes in 5 x 5e-4 of the draws: of 40, none with a probability of 0.9, at most 2 with 0.9998."""
+    assert sum(bool(_best((), seed)) for seed in range(100, 140)) <= 2
+
+
+def test_the_nearer_of_two_rivals_wins() -> None:
+    assert _best((_Up(size_dn=0.1), _Ripple(size_dn=0.05)), 4) == {"up", "ripple"}
+    assert _best((_Up(size_dn=0.1), _Wave(size_dn=0.05)), 5) == {"up", "wave"}
+
+
+class _Squared(_Curve):
+    name: ClassVar[str] = "squared"
+    size_dn: Annotated[
+        float, Quantity("DN", "size", lower=-5.0, upper=5.0, prior=(0.0, 1.0), absent=0.0, slope_power=2)
+    ] = 0.0
+    skew: ClassVar[float] = 0.0
+
+    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+        return (self.size_dn**2 + self.skew * self.size_dn) * elapsed_s
+
+
+class _Lopsided(_Squared):
+    name: ClassVar[str] = "lopsided"
+    skew: ClassVar[float] = 0.3
+
+
+def test_an_uncertainty_holds_both_signs_where_only_the_square_acts() -> None:
+    """Distances 0 and 2 v from the value told, as likely: sqrt(2) v. A sign that the numbers tell stays as it is known."""
+    for kind, widened in ((_Squared, True), (_Lopsided, False)):
+        truth = kind(size_dn=0.5)
+        evidence = _evidence((truth,), np.random.default_rng(6))
+        candidate = Candidate(truth, {"size_dn": 0.01}, 1.0, (), 50.0)
+        std = _either_sign(evidence, candidate, (truth,)).std["size_dn"]
+        assert std == pytest.approx(np.hypot(0.01, np.sqrt(2.0) * 0.5) if widened else 0.01)
+
+
+def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> None:
+    covariance = np.array([[1.0, 1.2], [1.2, 1.0]]) * 4.0
+    lower = Within(covariance).lower
+    assert np.linalg.eigvalsh(lower @ lower.T)[0] > 0.0
+    np.testing.assert_allclose((lower @ lower.T)[0, 1], 4.4, rtol=1e-3)  # what eigenvalues of 2.2 and 0 leave
+    positive = np.array([[1.0, 0.5], [0.5, 1.0]])
+    np.testing.assert_allclose(Within(positive).lower @ Within(positive).lower.T, positive)

@@ -1,0 +1,88 @@
+"""Boards and pairs of cameras: geometry that is fitted freely is no finding; what changed since an earlier calibration is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.diagnose.inference.decide import Verdict, decide
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.measurements.board import board_block, calibration_of
+from lab.diagnose.measurements.stereo import scene_gain_block, time_block
+from lab.diagnose.measurements.summaries import Study
+from lab.errors import NotDetermined
+from lab.fit.pinhole import distortion_of, matrix_of
+from lab.formats.recording_set import RecordingSet
+from lab.predict.camera_model import camera_model
+from sim.camera import Geometry, Side
+from tests.proof.former import Camera, Law, Plan
+from tests.proof.former import laws as concealed
+from tests.proof.former.camera import pair
+
+PLAN = Plan(kinds=("dark", "charuco"))
+
+
+def recorded(*laws: Law, noise_draw: int = 0) -> RecordingSet:
+    return Camera(41, laws, cfa="RGGB", rows=192, cols=256, noise_draw=noise_draw).record(PLAN)
+
+
+def study_of(recordings: RecordingSet, side: Side = "left") -> Study:
+    return Study(recordings, side, camera_model(recordings, side, None, maker_curves=True))
+
+
+def judged(recordings: RecordingSet, known: Geometry | None) -> Verdict:
+    study = study_of(recordings)
+    study.camera = study.camera.model_copy(update={"geometry": known})
+    return decide(Evidence((board_block(study),), study.camera), np.random.default_rng(3))
+
+
+def calibrated() -> Geometry:
+    found = calibration_of(study_of(recorded())).intrinsics
+    a, b, c = (tuple(float(v) for v in row) for row in matrix_of(found))
+    return Geometry(camera_matrix=(a, b, c), distortion=tuple(float(v) for v in distortion_of(found)))  # type: ignore[arg-type]
+
+
+def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself() -> None:
+    """2 % of the corner's distance: of 3 px there, half a pixel where boards reach, against 0.006 px of a cell's mean."""
+    bent = recorded(concealed.LensDistortion(2.0, 0, 7), noise_draw=1)
+    alone = judged(bent, None)
+    assert not alone.named
+    assert not alone.before
+    known = judged(bent, calibrated())
+    assert [c.effect.name for c in known.named] == ["distortion"]
+
+
+@pytest.mark.slow
+def test_the_same_lens_is_no_finding_and_one_that_slipped_is_decentred() -> None:
+    known = calibrated()
+    assert not judged(recorded(noise_draw=1), known).named
+    slipped = judged(recorded(concealed.LensDecentre(12.0, 0, 7), noise_draw=1), known)
+    assert [c.effect.name for c in slipped.named] == ["decentre"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gain", [0.0, 8.0])
+def test_a_gain_that_only_scenes_show_is_named(gain: float) -> None:
+    plan = Plan(kinds=("dark", "flat", "charuco"))
+    laws = [concealed.StereoGain(gain, 0, 7)] if gain else []
+    left = Camera(51, cfa="RGGB", rows=192, cols=256, pair_middle_mm=5.0)
+    right = Camera(52, laws, cfa="RGGB", rows=192, cols=256, side="right", offset_mm=10.0, pair_middle_mm=5.0)
+    study = study_of(pair(left, right, plan), "right")
+    verdict = decide(Evidence((scene_gain_block(study),), study.camera), np.random.default_rng(3))
+    assert [c.effect.name for c in verdict.named] == (["stereo_gain_mismatch"] if gain else [])
+    if gain:
+        found = verdict.named[0]
+        std = found.std["gain_percent"]
+        assert std is not None
+        assert abs(found.effect.gain_percent - laws[0].a) < 3 * std  # type: ignore[attr-defined]
+    with pytest.raises(NotDetermined, match="less than 1 s apart"):
+        time_block(study)
+
+
+def test_one_camera_has_no_pair_to_judge() -> None:
+    study = study_of(Camera(41, cfa="MONO", rows=32, cols=40).record(Plan(kinds=("dark", "flat"))))
+    for make in (scene_gain_block, time_block):
+        with pytest.raises(NotDetermined, match="pair of cameras"):
+            make(study)
+    with pytest.raises(NotDetermined, match="no charuco captures"):
+        board_block(study)

@@ -1,0 +1,81 @@
+"""Codes in even light: converters' steps, combs and gaps, on cameras of the second image former and on drawn counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from lab.diagnose.inference.decide import decide
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.locate import look
+from lab.diagnose.measurements.converter import code_block
+from lab.diagnose.measurements.neighbours import variance_block
+from lab.diagnose.measurements.summaries import Study
+from lab.diagnose.measurements.uniform import linearity_block
+from lab.predict.camera_model import camera_model, mean_dn
+from sim.effects.library import effect
+from tests.proof.former import Camera, Plan
+from tests.proof.former.laws import AdcNonlinearity, DigitalGain, Law, LossyCodes
+
+
+def _study(seed: int, laws: Sequence[Law] = (), cfa: str | None = None) -> Study:
+    recordings = Camera(seed, laws, cfa=cfa, rows=96, cols=128).record(Plan(("dark", "flat", "narrowband")))
+    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+@pytest.mark.parametrize("seed", [772011, 772012, 772013])
+def test_even_converters_show_nothing(seed: int) -> None:
+    """chi2 of n numbers over n: 1 within 3 sqrt(2 / n) above, and no place stands out."""
+    study = _study(seed)
+    block = code_block(study)
+    chi2 = float(block.value @ np.linalg.solve(block.covariance, block.value)) / len(block.value)
+    assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
+    evidence = Evidence((block,), study.camera)
+    assert not look(evidence, evidence.gaussian())[0].significant
+
+
+def test_steps_are_measured_where_they_stand() -> None:
+    """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale, and none elsewhere: within 3.5 of the standard
+    uncertainties, seen and held out."""
+    law = AdcNonlinearity(3.0, 0, 2)
+    block = code_block(_study(772302, (law,)))
+    std = np.sqrt(np.diag(block.covariance))
+    steps = [
+        (label, v, s) for label, v, s in zip(block.labels, block.value, std, strict=True) if label.channel == "step"
+    ]
+    assert any(label.x == 2048.0 for label, _, _ in steps)
+    for label, value, s in steps:
+        assert abs(value - (law.a if label.x == 2048.0 else 0.0)) < 3.5 * s
+
+
+@pytest.mark.parametrize("variant", [0, 1])
+def test_wrong_bits_are_named(variant: int) -> None:
+    law = AdcNonlinearity(4.0, variant, 2)
+    study = _study(772302, (law,))
+    blocks = (linearity_block(study), variance_block(study), code_block(study))
+    verdict = decide(Evidence(blocks, study.camera), np.random.default_rng(0))
+    assert [c.effect.name for c in verdict.named] == ["adc_nonlinearity"]
+    found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std["error_dn"]
+    assert std is not None
+    assert abs(found["error_dn"] - law.a) < 3.0 * std
+
+
+@pytest.mark.parametrize("law", [DigitalGain(10.0), LossyCodes(0.05)], ids=lambda law: law.name)
+def test_other_combs_are_located_and_not_named(law: Law) -> None:
+    study = _study(772021, (law,))
+    evidence = Evidence((code_block(study),), study.camera)
+    verdict = decide(evidence, np.random.default_rng(0))
+    assert verdict.before[0].block.measurement == "code_density"
+    assert not verdict.named
+
+
+def test_codes_are_averaged_over_noise_in_a_mean() -> None:
+    """Far from its step a converter's error is itself; on it, half; offset and gain as without."""
+    camera = _study(772011, cfa="MONO").camera
+    one = effect("adc_nonlinearity")(error_dn=4.0)
+    for level, wanted in ((1000.0, -4.0 * 1000.0 / 4096.0), (2048.0, 2.0 - 2.0), (3000.0, 4.0 - 4.0 * 3000.0 / 4096.0)):
+        electrons = np.array([(level - camera.black_level_dn) / camera.conversion_gain_dn_per_e])
+        plain, coded = (mean_dn(camera, {"Y": electrons}, acting)["Y"] for acting in ((), (one,)))
+        assert coded - plain == pytest.approx(wanted, abs=0.1)  # 48 values stand for the noise: 4 DN / 48

@@ -1,0 +1,306 @@
+"""What dark frames say: their statistics against drawn numbers, silence on healthy cameras, names of what was put in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lab.diagnose.inference.decide import Verdict, decide
+from lab.diagnose.inference.evidence import Evidence, chi2
+from lab.diagnose.measurements import darks
+from lab.diagnose.measurements.blocks import evidence_of
+from lab.diagnose.measurements.darks import DARK_BLOCKS
+from lab.diagnose.measurements.summaries import Block, Study
+from lab.errors import NotDetermined
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.predict.camera_model import camera_model
+from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect
+from sim.effects.library import effect
+from sim.effects.row_noise import RowNoise
+from sim.forward import Exposure, sample
+from sim.scene.scenes import Darkness
+from sim.sensor.defects import odd_sizes, size_nodes
+from sim.sensor.electrons import FixedPattern
+from sim.spectrum import Spectrum
+from tests.proof.former import Camera as ConcealedCamera
+from tests.proof.former import Law, Plan, laws
+
+ROWS, COLS = 96, 128
+
+
+def _sim_darks(
+    seed: int, acting: Sequence[Effect] = (), *, bits: int = 12, cfa: Any = "MONO", plan: Sequence[tuple[float, float]] = (), read_e: float = 3.0, dark: float = 8.0
+) -> RecordingSet:  # fmt: skip
+    """Dark frames of `sim`'s own camera, (exposure, temperature) each."""
+    rng = np.random.default_rng([seed, 1])
+    white = 2.0**bits - 1
+    channels = ("Y",) if cfa == "MONO" else ("R", "G", "B")
+    black, gain = 0.03 * white, 0.97 * white / 10000.0
+    camera = CameraModel(
+        rows=ROWS, cols=COLS, pixel_pitch_um=3.0, fill_factor=0.8, cfa=cfa, bit_depth=bits, black_level_dn=black, white_level_dn=white,
+        conversion_gain_dn_per_e=gain, full_well_e=10000.0, read_noise_e=read_e, dark_current_e_per_s=dark, dsnu_e=1.0, prnu_percent=0.7,
+        quantum_efficiency={c: Spectrum.of([400.0, 700.0], [0.5, 0.5]) for c in channels}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+    )  # fmt: skip
+    pattern = FixedPattern.draw(camera, rng)
+    plan = plan or [(t, 25.0) for t in (0.001, 0.5, 2.0) for _ in range(4)]
+    frames = {
+        f"frames/{k}.npy": sample(camera, Exposure(Darkness(), t, temperature_c=c), rng, tuple(acting), pattern)
+        for k, (t, c) in enumerate(plan)
+    }
+    captures = [
+        {"id": f"d{k}", "kind": "dark", "side": "left", "frame": f"frames/{k}.npy", "exposure_s": t, "temperature_c": c}
+        for k, (t, c) in enumerate(plan)
+    ]
+    stated = {
+        "rows": ROWS, "cols": COLS, "pixel_pitch_um": 3.0, "fill_factor": 0.8, "cfa": cfa, "bit_depth": bits, "black_level_dn": black,
+        "white_level_dn": white, "conversion_gain_dn_per_e": gain, "f_number": 4.0, "focal_length_mm": 8.0,
+    }  # fmt: skip
+    return RecordingSet(Manifest.model_validate({"cameras": {"left": stated}, "captures": captures}), frames, {}, {})
+
+
+def _concealed(seed: int, *built_in: Law, warm: bool = False) -> RecordingSet:
+    return ConcealedCamera(seed, built_in, rows=ROWS, cols=COLS).record(Plan(("dark",), warm=warm, repeats=4))
+
+
+def _blocks(recordings: RecordingSet) -> tuple[Study, list[Block], dict[str, str]]:
+    study = Study(recordings, "left", camera_model(recordings, "left"))
+    found, refused = [], {}
+    for make in DARK_BLOCKS:
+        try:
+            found.append(make(study))
+        except NotDetermined as reason:
+            refused[reason.step] = reason.reason
+    return study, found, refused
+
+
+def _verdict(recordings: RecordingSet) -> Verdict:
+    study, blocks, _ = _blocks(recordings)
+    return decide(Evidence(tuple(blocks), study.camera), np.random.default_rng(0))
+
+
+def _names(verdict: Verdict) -> list[str]:
+    return [c.effect.name for c in verdict.named]
+
+
+# --- statistics against drawn numbers ----------------------------------------------------------------------------------------
+
+
+def test_shares_of_odd_pixels_are_those_of_drawn_pixels() -> None:
+    """Two kinds of odd pixels in 400 000; each bin's count within 4.5 sigma of a binomial, all of the same draw."""
+    rng = np.random.default_rng(1)
+    n, frames, moving, fixed = 400_000, 4, 2.0, 1.0
+    kind = rng.choice(3, n, p=[0.98, 0.01, 0.01])
+    more, jump = np.array([0.0, 30.0, 0.0])[kind], np.array([0.0, 0.0, 40.0])[kind]
+    noise = np.sqrt(moving**2 + 0.5 * more)
+    drawn = (
+        more + fixed * rng.standard_normal(n) + noise * rng.standard_normal((frames, n))
+        + jump * (rng.integers(0, 2, (frames, n)) - 0.5)
+    )  # fmt: skip
+    median = np.sort(drawn, axis=0)[(frames - 1) // 2] - darks._order_moments(frames)[0] * moving
+    spread = 1.6
+    classes = [darks._Class(0.01, 30.0, 0.0), darks._Class(0.01, 0.0, 40.0)]
+    shares = darks._tail_shares(classes, moving, fixed, frames, spread, 0.5, 0.0)
+    edges = np.array([-np.inf, -6.0, -4.5, *darks.TAIL_EDGES, np.inf]) * spread
+    counts = np.histogram(median, edges)[0]
+    expected = n * np.concatenate([shares[: len(darks.TAIL_EDGES)], shares[len(darks.TAIL_EDGES) :]])
+    got = np.concatenate([counts[3:], counts[1::-1]])
+    np.testing.assert_array_less(np.abs(got - expected), 4.5 * np.sqrt(expected) + 4.0)
+
+
+def test_shares_of_blinking_pixels_are_those_of_drawn_pixels() -> None:
+    """Contrasts of frames that are high or low at random: the cube root is good to a few per cent of a share."""
+    rng = np.random.default_rng(2)
+    n, frames, amplitude = 200_000, 5, 6.0
+    values = rng.standard_normal((frames, n)) + amplitude * (rng.integers(0, 2, (frames, n)) - 0.5)
+    total = np.square(values - values.mean(0)).sum(0)
+    condition = darks.Condition(1.0, None, tuple([None] * frames), ())  # type: ignore[arg-type]
+    edges = darks._blink_edges(frames - 1)[:3]
+    away = amplitude**2 * darks._jump_sums(condition)[False]
+    shares = darks._chance_above(np.full(len(away), frames - 1.0), np.maximum(away, 1e-9), edges).mean(axis=0)
+    drawn = (total[:, None] > edges).mean(axis=0)
+    # 256 draws of states: a share p is known to sqrt(p (1 - p) / 256)
+    assert np.all(np.abs(shares - drawn) < 4.0 * np.sqrt(drawn * (1 - drawn) / darks.JUMPS) + 0.01)
+
+
+def test_clipped_square_is_its_integral() -> None:
+    x = np.linspace(-12.0, 12.0, 200_001)
+    density = stats.norm.pdf(x, 1.0, 1.5)
+    wanted = np.sum(np.clip(x, -2.0, 2.0) ** 2 * density) * (x[1] - x[0])
+    assert darks._cut_square(np.array([1.0]), np.array([2.25]), 2.0)[0] == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 2.0])
+def test_nodes_have_the_distribution_that_is_drawn(spread: float) -> None:
+    """Mean 1; the standard deviation of 24 parts' means falls short by 2 %; drawn sizes agree with both at 4.5 sigma."""
+    weights, sizes = size_nodes(spread)
+    assert weights.sum() == pytest.approx(1.0)
+    assert weights @ sizes == pytest.approx(1.0, rel=1e-6)
+    assert np.sqrt(weights @ np.square(sizes - 1.0)) == pytest.approx(spread, rel=0.05, abs=1e-9)
+    drawn = odd_sizes((300, 300), 0.2, 3, spread)
+    drawn = drawn[drawn > 0]
+    assert drawn.mean() == pytest.approx(1.0, abs=4.5 * spread / np.sqrt(drawn.size) + 1e-9)
+
+
+def test_correlated_rows_have_their_spectrum() -> None:
+    """Mean over all frequencies: the variance. Drawn rows: neighbours have the stated correlation, to 4.5 / sqrt(rows)."""
+    one = RowNoise(noise_e=2.0, correlation=0.6)
+    f = np.linspace(-0.5, 0.5, 4001)[:-1]
+    assert np.mean(one.line_spectrum_e2(f, "rows", False)) == pytest.approx(4.0, rel=1e-3)
+    drawn = one.added((4000, 5), np.random.default_rng(3), _model())
+    assert drawn is not None
+    r = np.asarray(drawn)[:, 0]
+    assert r.std() == pytest.approx(2.0, rel=0.1)
+    assert np.corrcoef(r[1:], r[:-1])[0, 1] == pytest.approx(0.6, abs=4.5 / np.sqrt(4000))
+
+
+def _model() -> CameraModel:
+    recordings = _sim_darks(1, plan=[(0.1, 25.0)])
+    return camera_model(recordings, "left")
+
+
+# --- healthy cameras ---------------------------------------------------------------------------------------------------------
+
+
+def test_healthy_darks_agree_with_their_covariance() -> None:
+    """24 cameras of two generators, 10 to 16 bits: of some 260 blocks none has a chi2 that chance gives one in 30 000 of."""
+    rare = 1.0
+    sets = [_concealed(40 + k, warm=k % 2 == 0) for k in range(10)]
+    sets += [
+        _sim_darks(60 + k, bits=(10, 12, 14, 16)[k % 4], cfa=("MONO", "RGGB")[k % 2], read_e=2.0 + 0.3 * k)
+        for k in range(14)
+    ]
+    for recordings in sets:
+        study, blocks, _ = _blocks(recordings)
+        for block in blocks:
+            evidence = Evidence((block,), study.camera)
+            model, seen = evidence.seen_gaussian(), evidence.seen
+            if not seen.any():
+                continue
+            value = chi2(evidence.seen_value - model.mean, model.covariance)
+            rare = min(rare, float(stats.chi2.sf(value, int(seen.sum()))))
+    assert rare > 1.0 / 30_000.0
+
+
+@pytest.mark.parametrize("seed", [81, 82])
+def test_healthy_darks_get_no_name(seed: int) -> None:
+    verdict = _verdict(_concealed(seed, warm=True))
+    assert not verdict.named
+    assert not verdict.after
+
+
+# --- what was put in ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("law", "names"),
+    [
+        (laws.HotPixels(300.0, 1, 3), "hot_pixels"),
+        (laws.RandomTelegraphNoise(40.0, 0, 3), "random_telegraph_noise"),
+        (laws.AmplifierGlow(6.0, 1, 3), "amplifier_glow"),
+        (laws.RowNoise(1.5, 1, 3), "row_noise"),
+        (laws.ColumnNoise(1.5, 1, 3), "column_noise"),
+        (laws.DarkCurrentTemperature(1.0, 1, 3), "dark_current_temperature"),
+        (laws.BlackLevelDrift(0.5, 1, 3), "black_level_drift"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_a_concealed_law_is_named(law: Law, names: str) -> None:
+    verdict = _verdict(_concealed(91, law, warm=names == "dark_current_temperature"))
+    assert _names(verdict)[:1] == [names]
+
+
+@pytest.mark.parametrize(
+    "one",
+    [
+        effect("hot_pixels")(excess_e_per_s=400.0, share_ppm=1000.0),
+        effect("random_telegraph_noise")(amplitude_e=40.0, share_percent=0.5),
+        effect("amplifier_glow")(glow_e_per_s=10.0, reach_mm=0.06, corner="bottom_left"),
+        effect("row_noise")(noise_e=1.5),
+        effect("column_noise")(offset_e=1.5),
+    ],
+    ids=lambda e: e.name,
+)
+def test_what_sim_renders_is_named_with_its_parameters(one: Effect) -> None:
+    """Parameters within 4 standard uncertainties; the corner of a glow, which isn't fitted, is the right one."""
+    verdict = _verdict(_sim_darks(95, (one,)))
+    assert _names(verdict)[:1] == [one.name]
+    named = verdict.named[0]
+    for name in type(one).quantities():
+        std = named.std[name]
+        assert std is not None
+        if name == "offset_e" and one.name == "row_noise":
+            continue  # a fixed part of the rows in a few frames' mean is bounded, not measured
+        assert abs(getattr(named.effect, name) - getattr(one, name)) < 4.0 * std + 1e-9
+    if one.name == "amplifier_glow":
+        assert named.effect.corner == "bottom_left"  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("law", "measurement"),
+    [(laws.PeriodicBanding(1.5, 0, 3), "dark_row_noise"), (laws.TapOffset(1.5, 0, 3), "dark_field")],
+    ids=["banding", "tap"],
+)
+def test_siblings_are_located_and_get_no_name(law: Law, measurement: str) -> None:
+    verdict = _verdict(_concealed(92, law))
+    assert not verdict.named
+    assert measurement in {part.block.measurement for part in verdict.after}
+
+
+# --- what the recordings don't allow, and faults ------------------------------------------------------------------------------
+
+
+def test_one_dark_frame_is_judged_by_what_it_has() -> None:
+    _, blocks, refused = _blocks(_sim_darks(7, plan=[(0.5, 25.0)]))
+    assert {"dark", "dark_field", "odd_pixels"} <= {b.measurement for b in blocks}
+    assert "no two dark frames" in refused["dark_noise"]
+
+
+def test_codes_that_are_too_coarse_say_so() -> None:
+    """8 bit: a gain of 0.025 DN/e leaves 0.3 DN of noise with what rounding adds."""
+    _, blocks, refused = _blocks(_sim_darks(8, bits=8))
+    assert "codes are too coarse" in refused["blinking_pixels"]
+    assert "dark" in {b.measurement for b in blocks}
+
+
+def test_a_black_level_off_the_stated_one_is_no_drift() -> None:
+    recordings = _concealed(93)
+    manifest = recordings.manifest.model_dump(mode="json")
+    manifest["cameras"]["left"]["black_level_dn"] *= 1.5
+    wrong = RecordingSet(
+        Manifest.model_validate(manifest),
+        {c.frame: recordings.frame(c) for c in recordings.manifest.captures},
+        {p: recordings.spectrum(p) for p in manifest["cameras"]["left"]["quantum_efficiency"].values()},
+    )
+    verdict = _verdict(wrong)
+    assert not verdict.named
+    assert {part.block.measurement for part in verdict.after} == {"black_level"}
+
+
+def test_a_frame_that_was_not_taken_anew_is_left_out_and_told() -> None:
+    recordings = _sim_darks(9)
+    captures = list(recordings.manifest.captures)
+    frames = {c.frame: np.array(recordings.frame(c)) for c in captures}
+    frames[captures[5].frame] = frames[captures[4].frame].copy()
+    stale = RecordingSet(recordings.manifest, frames, {}, {})
+    study = Study(stale, "left", camera_model(stale, "left"))
+    assert [name for name, _ in study.stale] == ["d5"]
+    assert "d5" not in {c.id for c in study.recordings.captures("dark")}
+    _, skipped = evidence_of(stale, "left")
+    lines = [s.reason for s in skipped if "bit for bit" in s.reason]
+    assert len(lines) == 1
+    assert "d4" in lines[0]
+    assert "\n" not in lines[0]
+
+
+def test_recordings_without_noise_are_not_stale() -> None:
+    """Mean frames, as a simulator leaves them without noise: every repeat is the same."""
+    recordings = _sim_darks(10)
+    captures = list(recordings.manifest.captures)
+    first = {c.exposure_s: np.array(recordings.frame(c)) for c in reversed(captures)}
+    still = RecordingSet(recordings.manifest, {c.frame: first[c.exposure_s] for c in captures}, {}, {})
+    assert Study(still, "left", camera_model(still, "left")).stale == ()

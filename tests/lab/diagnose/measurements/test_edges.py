@@ -1,0 +1,158 @@
+"""Slanted edges in the diagnosis: the operator is the estimator, the covariance is true, and blurs are told by what they do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lab.diagnose.inference.evidence import chi2
+from lab.diagnose.measurements.edges import ASIDE, REAL_AT, _Edges, _interpolation, _spread, edge_block
+from lab.diagnose.measurements.summaries import Block, Study
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.predict.camera_model import camera_model
+from sim.effects.base import Effect
+from sim.effects.library import effect
+from sim.forward import edge_profile, optical_transfer
+from tests.proof.former import Camera, Law, Plan
+from tests.proof.former import laws as concealed
+
+EDGES = Plan(("dark", "slanted_edge"))
+
+
+def _study(recordings: RecordingSet) -> Study:
+    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+def _recorded(
+    *laws: Law, seed: int = 7, plan: Plan = EDGES, pitch: float | None = None, rows: int = 112, **camera: Any
+) -> Study:
+    former = Camera(seed, laws, rows=rows, cols=rows, **camera)
+    former.pitch = pitch or former.pitch
+    return _study(former.record(plan))
+
+
+def _misfit(block: Block, *acting: Effect, aside: bool | None = None) -> float:
+    """chi2 per number, by which a tenth more than noise makes is allowed for what edges in the same place share: above 1 there is
+    more. `aside`: of asymmetries (True) or contrasts (False) alone."""
+    model = block.predict(acting)
+    covariance = block.covariance + sum(np.outer(s, s) for s in model.slopes.values())
+    where = np.array([aside is None or label.condition.endswith(ASIDE) == aside for label in block.labels])
+    n = int(where.sum())
+    value = chi2((block.value - model.mean)[where], covariance[np.ix_(where, where)])
+    return value / (1.1 * n + 3.0 * np.sqrt(2.0 * n))
+
+
+@pytest.mark.parametrize(("cfa", "f_number"), [("MONO", 2.0), ("RGGB", 2.0), ("MONO", 8.0)])
+def test_a_models_numbers_are_its_transfer_function(cfa: str, f_number: float) -> None:
+    """Through samples, splines and shapes comes what went in: transfer functions at the frequencies measured, of sharp lenses,
+    too, whose detail lies far beyond the pixels' Nyquist frequency. A cubic between 11 frequencies is good to 3e-3; the highest
+    three lean on what lies beyond."""
+    study = _recorded(cfa=cfa, f_number=f_number, pitch=4.5)
+    camera, block = study.camera, edge_block(study)
+    labels = [label for label in block.labels if label.condition == "5 deg" and label.channel == camera.channels[0]]
+    rows = [block.labels.index(label) for label in labels][: len(REAL_AT)]
+    f, turn = np.array([block.labels[i].x for i in rows]), np.deg2rad(5.0)
+    light = study.recordings.spectrum(str(study.recordings.captures("slanted_edge")[0].light_radiance))
+    blurs: tuple[tuple[Effect, ...], ...] = (
+        (), (effect("defocus")(defocus_um=0.8 * f_number**2),), (effect("pixel_aperture")(side_change_um=0.3),),
+    )  # fmt: skip
+    for acting in blurs:
+        wanted = np.real(
+            optical_transfer(camera, camera.channels[0], light, f * np.cos(turn), f * np.sin(turn), acting)
+        )
+        np.testing.assert_allclose(block.predict(acting).mean[rows[:-3]], wanted[:-3], atol=3e-3)
+
+
+def test_a_direct_sum_over_the_samples_agrees() -> None:
+    """The estimators' rows on a grid of distances against the normal equations of the samples themselves, in which the profile
+    stands at every sample's own distance: within 1e-5 of the contrast."""
+    study = _recorded(cfa="MONO", f_number=2.0)
+    edges = _Edges(study)
+    geometry = edges.edges[0].measured.geometry
+    reach = geometry.reach_px + 1.0
+    light = study.recordings.spectrum(str(edges.edges[0].part[0].light_radiance))
+    on_grid = edge_profile(study.camera, "Y", light, 5.0, _interpolation(reach)[1])
+    exact = edge_profile(study.camera, "Y", light, 5.0, geometry.distance_px)
+    weighted = exact * geometry.weight
+    right = np.concatenate([geometry.basis.T @ weighted, geometry.gradients @ weighted])
+    np.testing.assert_allclose(_spread(geometry, reach) @ on_grid, right, atol=1e-5 * np.abs(right).max())
+
+
+def test_noise_is_what_the_covariance_says() -> None:
+    """Of sharp and soft lenses, mono and colour: chi2 of n numbers is n within 3 sqrt(2 n), and a tenth."""
+    for seed, cfa, f_number in ((11, "MONO", 2.0), (12, "RGGB", 2.8), (13, "MONO", 11.0), (14, "GRBG", 5.6)):
+        block = edge_block(_recorded(seed=seed, cfa=cfa, f_number=f_number))
+        n = len(block.value)
+        assert 0.9 * n - 3.0 * np.sqrt(2.0 * n) < _misfit(block) * (1.1 * n + 3.0 * np.sqrt(2.0 * n))
+        assert _misfit(block) < 1.0
+
+
+def test_coma_shows_in_the_asymmetry_with_its_direction() -> None:
+    """W131 r^2 (x cos t + y sin t), t drawn by the law: the effect of that size and direction explains it. (The former's path errors
+    are delays, the library's are leads.)"""
+    law = concealed.Coma(0.3, 0)
+    block = edge_block(_recorded(law, cfa="MONO", f_number=2.8))
+    turn, coma = 2.0 * np.pi * law.u[0], effect("coma")
+    right = coma(w131_x_um=-0.3 * np.cos(turn), w131_y_um=-0.3 * np.sin(turn))
+    wrong = coma(w131_x_um=0.3 * np.cos(turn), w131_y_um=0.3 * np.sin(turn))
+    assert _misfit(block, aside=True) > 2.0
+    assert _misfit(block, right) < 1.0
+    assert _misfit(block, wrong, aside=True) > 2.0 * _misfit(block, aside=True)
+
+
+def test_a_blur_that_is_alike_on_both_sides_has_no_asymmetry() -> None:
+    block = edge_block(_recorded(concealed.Defocus(10.0, 1), cfa="MONO", f_number=2.8))
+    assert _misfit(block, aside=False) > 5.0
+    assert _misfit(block, aside=True) < 1.0
+    assert _misfit(block, effect("defocus")(defocus_um=10.0)) < 1.0
+
+
+def test_charge_that_crosses_colours_brings_their_edges_along() -> None:
+    """In light of 460 and 640 nm a colour's pixels hold much of their neighbours' charge: the mosaic's mix explains it, the
+    transfer of one channel by itself doesn't."""
+    block = edge_block(
+        _recorded(concealed.Crosstalk(4.0, 0), cfa="RGGB", f_number=4.0, rows=96, plan=Plan(EDGES.kinds, lights=True))
+    )
+    assert _misfit(block) > 1.0
+    assert _misfit(block, effect("crosstalk")(share_percent=4.0)) < 1.0
+
+
+def test_shading_is_no_blur() -> None:
+    """A fall-off towards the corners bends the light beside an edge; with it in the model the edges are the baseline's."""
+    block = edge_block(_recorded(concealed.Vignetting(15.0, 0), cfa="MONO", f_number=4.0, rows=96))
+    shaded = effect("vignetting")(corner_loss_percent=15.0)
+    assert _misfit(block, shaded) < 1.0
+    change = np.abs(block.predict((shaded,)).mean - block.predict(()).mean)
+    assert change.max() > 1e-3  # or the test would show nothing
+
+
+def test_directions_point_to_the_light() -> None:
+    study = _recorded(cfa="MONO", f_number=4.0)
+    found = sorted({round(e.direction_deg) for e in _Edges(study).edges})
+    assert found == [-40, 3, 5, 95]
+
+
+def test_field_curvature_needs_more_than_one_place() -> None:
+    """Edges all in one place, wherever that is, tell nothing of what differs from place to place; two places do."""
+    former = Camera(7, (), cfa="MONO", f_number=4.0, rows=112, cols=112)
+    recordings = former.record(EDGES)
+    manifest = recordings.manifest.model_dump(mode="json")
+    bowl = effect("field_curvature")(curvature_um=30.0)
+    changes = []
+    for count in (1, 2):
+        for k, capture in enumerate(c for c in manifest["captures"] if c["kind"] == "slanted_edge"):
+            capture["field_mm"] = [0.1 * (k // 2 % count), 0.05]
+        frames = {c.frame: np.array(recordings.frame(c)) for c in recordings.manifest.captures}
+        paths = [*recordings.camera("left").quantum_efficiency.values()]
+        paths += [str(c.light_radiance) for c in recordings.captures("slanted_edge")]
+        moved = RecordingSet(
+            Manifest.model_validate(manifest),
+            frames,
+            {path: recordings.spectrum(path) for path in dict.fromkeys(paths)},
+        )
+        block = edge_block(_study(moved))
+        changes.append(float(np.abs(block.predict((bowl,)).mean - block.predict(()).mean).max()))
+    assert changes[0] == 0.0
+    assert changes[1] > 1e-3

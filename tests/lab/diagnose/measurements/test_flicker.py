@@ -1,0 +1,58 @@
+"""Flickering light in the rows of flat frames: by another former's laws and by `sim`'s, and what isn't flicker."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.diagnose.measurements.flicker import flicker_block
+from lab.diagnose.measurements.shading import shading_block
+from lab.diagnose.measurements.uniform import linearity_block
+from lab.errors import NotDetermined
+from sim.effects.light_flicker import LightFlicker
+from tests.lab.diagnose.on_blocks import evidence, former, names, rendered, sigmas, study, verdict
+from tests.proof.former.laws import LightFlicker as Flicker
+from tests.proof.former.laws import PeriodicBanding, RowNoise
+
+LOOKED_AT = (flicker_block, linearity_block, shading_block)
+
+
+def test_rows_of_healthy_frames_are_noise() -> None:
+    """chi2 of about 60 numbers: its mean over 4 cameras within 3 / sqrt(4) of its standard deviation, and 0.3 for what is free."""
+    found = [sigmas(evidence(former(s, cfa=c), flicker_block)) for s in (1, 2) for c in ("MONO", "RGGB")]
+    assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.3
+    assert max(found) < 4.0
+
+
+@pytest.mark.parametrize(("variant", "cfa"), [(0, "MONO"), pytest.param(1, "GRBG", marks=pytest.mark.slow)])
+def test_flicker_of_another_former_is_named(variant: int, cfa: str) -> None:
+    """A sine and a rectified one; bands of half a period in these frames, of 0.3 % of the light at 5 ms."""
+    found = verdict(former(11, Flicker(1.0, variant, 3), cfa=cfa), *LOOKED_AT)
+    assert names(found) == ["light_flicker"]
+
+
+def test_flicker_of_sim_is_named_with_its_bands() -> None:
+    """The bands' frequency, frequency x line time, is what rows show: three periods a frame, known to the band of 2 and 3."""
+    truth = LightFlicker(modulation_percent=6.0, frequency_hz=100.0, line_time_us=310.0)
+    found = verdict(rendered(5, (truth,)), *LOOKED_AT)
+    assert names(found) == ["light_flicker"]
+    effect = found.named[0].effect
+    assert isinstance(effect, LightFlicker)
+    assert effect.frequency_hz * effect.line_time_us * 96e-6 == pytest.approx(3.0, abs=1.2)
+
+
+def test_bands_that_move_from_repeat_to_repeat_are_no_shot_noise() -> None:
+    """The first guess of the gain, from differences of repeats, beside the same camera in steady light: within 5 %."""
+    steady, flickering = (study(former(11, *laws)).noise.gain for laws in ((), (Flicker(10.0, 0, 9),)))
+    assert flickering == pytest.approx(steady, rel=0.05)
+
+
+def test_noise_of_rows_is_no_flicker() -> None:
+    """What dark frames' rows have as well: white from row to row, and a ripple of a fixed period."""
+    for law in (RowNoise(4.0), PeriodicBanding(3.0, 0, 5)):
+        assert "light_flicker" not in names(verdict(former(12, law), *LOOKED_AT))
+
+
+def test_what_says_nothing_of_rows_is_refused() -> None:
+    with pytest.raises(NotDetermined, match="repeated"):
+        evidence(former(1, kinds=("dark",)), flicker_block)

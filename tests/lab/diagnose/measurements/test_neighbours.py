@@ -1,0 +1,172 @@
+"""Temporal noise: what neighbours share is told apart from what isn't there, by white noise, by analytic kernels, and by both image formers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from lab.diagnose.inference.decide import Verdict, decide
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.measurements.neighbours import PAIRS, correlations, held_out_flats, neighbour_block, variance_block
+from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.measurements.uniform import linearity_block
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.predict.camera_model import camera_model
+from sim.camera import CameraModel, Lens
+from sim.effects.base import Effect
+from sim.effects.library import effect
+from sim.forward import Exposure, dark_electrons, expected_electrons, read_out
+from sim.scene.scenes import Darkness, UniformField
+from sim.sensor.electrons import FixedPattern, sample_from
+from sim.spectrum import Spectrum
+from tests.proof.former import Camera as ConcealedCamera
+from tests.proof.former import Plan
+from tests.proof.former.laws import BrighterFatter, InterPixelCapacitance, Law, OnChipSharpening, OnChipSmoothing
+
+LIGHT = Spectrum.of([400.0, 700.0], [2e-3, 2e-3])
+
+
+def _study(recordings: RecordingSet) -> Study:
+    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+def _concealed(seed: int, laws: Sequence[Law] = (), cfa: str | None = None, repeats: int = 3) -> Study:
+    camera = ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128)
+    return _study(camera.record(Plan(("dark", "flat"), repeats=repeats)))
+
+
+def _rendered(acting: Sequence[Effect], seed: int = 5, cfa: str = "MONO") -> Study:
+    """Darks and flats of `sim`, with PRNU and a lamp that flickers by 0.3 %."""
+    channels = ("Y",) if cfa == "MONO" else ("R", "G", "B")
+    camera = CameraModel(
+        rows=96, cols=128, pixel_pitch_um=3.45, fill_factor=1.0, cfa=cfa, bit_depth=12, black_level_dn=100.0, white_level_dn=4095.0,
+        conversion_gain_dn_per_e=0.4, full_well_e=1e4, read_noise_e=3.0, dark_current_e_per_s=5.0, dsnu_e=1.0, prnu_percent=0.8,
+        quantum_efficiency={c: Spectrum.of([400.0, 700.0], [0.5, 0.5]) for c in channels}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+    )  # fmt: skip
+    rng = np.random.default_rng(seed)
+    pattern = FixedPattern.draw(camera, rng)
+    frames, captures = {}, []
+    one = float(np.mean(expected_electrons(camera, Exposure(UniformField(LIGHT), 0.01)))) / 0.01
+    for kind, times in (
+        ("dark", (0.001, 0.5)),
+        ("flat", tuple(x * 1e4 / one for x in (0.08, 0.25, 0.4, 0.55, 0.7, 0.85))),
+    ):
+        for t in times:
+            exposure = Exposure(Darkness() if kind == "dark" else UniformField(LIGHT), t)
+            mean = expected_electrons(camera, exposure, acting)
+            dark = dark_electrons(camera, exposure, acting)
+            for _ in range(4):
+                path = f"{len(captures)}.npy"
+                lit = dark + (mean - dark) * (1.0 + 3e-3 * rng.standard_normal())
+                frames[path] = sample_from(
+                    lit, camera, rng, pattern, dark_electrons=dark, read_out=read_out(camera, exposure, acting)
+                )
+                captures.append({"id": f"c{len(captures)}", "kind": kind, "side": "left", "frame": path, "exposure_s": t}
+                                | ({"radiance": "lamp.csv"} if kind == "flat" else {}))  # fmt: skip
+    stated = {"rows": 96, "cols": 128, "pixel_pitch_um": 3.45, "cfa": cfa, "bit_depth": 12, "f_number": 4.0, "focal_length_mm": 8.0,
+              "quantum_efficiency": dict.fromkeys(channels, "qe.csv")}  # fmt: skip
+    manifest = Manifest.model_validate({"cameras": {"left": stated}, "captures": captures})
+    return _study(
+        RecordingSet(manifest, frames, {"lamp.csv": LIGHT, "qe.csv": Spectrum.of([400.0, 700.0], [0.5, 0.5])})
+    )
+
+
+def _blocks(study: Study) -> tuple[Block, ...]:
+    return linearity_block(study), variance_block(study), neighbour_block(study)
+
+
+def _verdict(study: Study) -> Verdict:
+    return decide(Evidence(_blocks(study), study.camera), np.random.default_rng(0))
+
+
+def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
+    """White noise through a kernel: by hand, at every pair; on a mosaic a colour's pixels are two apart."""
+    kernel = np.array([[0.0, 0.05, 0.0], [0.05, 0.8, 0.05], [0.0, 0.05, 0.0]])
+    size = np.sum(kernel**2)
+    own = {"1,0": 2 * 0.8 * 0.05 / size, "1,1": 2 * 0.05**2 / size, "2,0": 0.05**2 / size}
+    mono = correlations("MONO", ["Y"], np.array([100.0]), np.zeros(1), 4.0, 0.0, kernel)
+    np.testing.assert_allclose(mono[:5], [own["1,0"], own["1,0"], own["1,1"], own["2,0"], own["2,0"]], atol=1e-12)
+    bayer = correlations("RGGB", ["R", "G1", "G2", "B"], np.full(4, 100.0), np.zeros(4), 4.0, 0.0, kernel)
+    np.testing.assert_allclose(bayer, [0.0, 0.0, 0.0, own["1,0"], own["1,0"], own["1,1"]], atol=1e-12)
+    # rounding is each pixel's own: half of the variance halves all
+    rounded = correlations("MONO", ["Y"], np.array([100.0]), np.zeros(1), 4.0, 104.0 * size, kernel)
+    np.testing.assert_allclose(rounded, 0.5 * mono, atol=1e-12)
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
+def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
+    """chi2 of both formers' cameras over their numbers: 3 sigma of 2 / n is 0.4 for 100 numbers; never above by more."""
+    for study in (_concealed(770011, cfa=cfa), _concealed(770012, cfa=cfa, repeats=6), _rendered((), cfa=cfa)):
+        for block in (variance_block(study), neighbour_block(study)):
+            residual = block.value - block.predict(()).mean
+            slopes = np.array(list(block.predict(()).slopes.values())).reshape(-1, len(residual))
+            covariance = block.covariance + slopes.T @ slopes
+            chi2 = float(residual @ np.linalg.solve(covariance, residual)) / len(residual)
+            assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(residual))
+
+
+def test_a_lamp_that_flickers_and_rows_with_noise_leave_no_correlation() -> None:
+    """Rows' noise of 3 e, as large as the pixels' own: the rows' means are taken out and what that takes is put back. Of 144 numbers."""
+    blocks = [neighbour_block(_rendered((effect("row_noise")(noise_e=3.0),), seed)) for seed in (20, 21, 22)]
+    pulls = np.concatenate([b.value / np.sqrt(np.diag(b.covariance)) for b in blocks])
+    assert np.mean(np.square(pulls)) < 1.0 + 3.0 * np.sqrt(2.0 / len(pulls))
+    assert abs(np.mean(pulls)) < 3.0 / np.sqrt(len(pulls))
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "GRBG"])
+@pytest.mark.parametrize(
+    "one",
+    [
+        effect("brighter_fatter")(loss_percent=12.0, shared_percent=10.0),
+        effect("on_chip_smoothing")(strength=0.06),
+        effect("on_chip_sharpening")(strength=0.06),
+    ],
+    ids=lambda e: e.name,
+)
+def test_what_sim_renders_is_predicted_and_named(one: Effect, cfa: str) -> None:
+    """The prediction's chi2 as above; the name alone; and its size within 3.5 standard uncertainties."""
+    study = _rendered((one,), seed=8, cfa=cfa)
+    block = neighbour_block(study)
+    residual = block.value - block.predict((one,)).mean
+    assert float(np.mean(np.square(residual) / np.diag(block.covariance))) < 1.0 + 4.0 * np.sqrt(2.0 / len(residual))
+    verdict = _verdict(study)
+    assert [c.effect.name for c in verdict.named] == [one.name]
+    main = next(iter(type(one).quantities()))
+    std = verdict.named[0].std[main]
+    assert std is not None
+    assert abs(getattr(verdict.named[0].effect, main) - getattr(one, main)) < 3.5 * std
+
+
+@pytest.mark.parametrize(
+    ("law", "name"),
+    [
+        (BrighterFatter(9.0, 1), "brighter_fatter"),
+        (OnChipSmoothing(0.06, 0), "on_chip_smoothing"),
+        (OnChipSmoothing(0.06, 1), "on_chip_smoothing"),
+        (OnChipSharpening(0.06, 1), "on_chip_sharpening"),
+        (InterPixelCapacitance(1.0), "inter_pixel_capacitance"),
+    ],
+    ids=lambda v: v if isinstance(v, str) else f"{v.s:g}-{v.v}",
+)
+def test_what_another_former_conceals_is_named(law: Law, name: str) -> None:
+    """Non-centralities of 70 and more: by how what neighbours share grows with the level, darks among them."""
+    assert [c.effect.name for c in _verdict(_concealed(770021, (law,), cfa="MONO")).named] == [name]
+
+
+def test_few_repeats_hold_whole_levels_out_and_many_their_last_third() -> None:
+    few, many = _concealed(770031), _concealed(770031, repeats=6)
+    levels = [{c.id for c in g} for g in few.flat_levels()]
+    out = held_out_flats(few)
+    assert all(g <= out or not g & out for g in levels)
+    assert 0 < sum(g <= out for g in levels) < len(levels) / 2
+    assert not levels[-1] & out  # the brightest
+    for group in many.flat_levels():
+        assert {c.id for c in group} & held_out_flats(many) == {c.id for c in group[4:]}
+    seen = {c for b in _blocks(few) for label in b.labels if not label.held_out for c in label.captures}
+    assert not seen & out
+
+
+def test_pairs_are_all_within_two_pixels() -> None:
+    assert all(max(abs(d) for d in lag) <= 2 for lags in PAIRS.values() for lag in lags)

@@ -1,0 +1,179 @@
+"""Patterns on screens: healthy cameras leave nothing to find, and what second image formers conceal is found by its own measurement."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from lab.diagnose.inference.decide import Verdict, decide
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.measurements.patches import screen_block
+from lab.diagnose.measurements.screens import (
+    SCREEN_BLOCKS,
+    colour_block,
+    contrast_block,
+    grid_block,
+    rim_block,
+    turned_block,
+)
+from lab.diagnose.measurements.summaries import Block, Study
+from lab.errors import NotDetermined
+from lab.formats.recording_set import RecordingSet
+from lab.predict.camera_model import camera_model
+from sim.effects.defocus import Defocus
+from sim.effects.ghost import Ghost
+from sim.effects.screen_gamma import ScreenGamma
+from tests.proof.former import Camera, Law, Plan
+from tests.proof.former import laws as concealed
+
+PLAN = Plan(kinds=("dark", "flat", "screen"))
+
+
+def recorded(*laws: Law, seed: int = 61, cfa: str = "GRBG", plan: Plan = PLAN) -> RecordingSet:
+    return Camera(seed, laws, cfa=cfa, f_number=2.8, rows=96, cols=128).record(plan)
+
+
+def study_of(recordings: RecordingSet) -> Study:
+    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+def evidence(recordings: RecordingSet, make: Callable[[Study], Block]) -> Evidence:
+    study = study_of(recordings)
+    return Evidence((make(study),), study.camera)
+
+
+def verdict_of(recordings: RecordingSet) -> Verdict:
+    study = study_of(recordings)
+    blocks = []
+    for make in SCREEN_BLOCKS:
+        try:
+            blocks.append(make(study))
+        except NotDetermined:
+            continue
+    return decide(Evidence(tuple(blocks), study.camera), np.random.default_rng(3))
+
+
+@pytest.mark.parametrize(("seed", "cfa"), [(62, "MONO"), (63, "RGGB")])
+def test_a_healthy_camera_keeps_the_contrast_that_the_model_says(seed: int, cfa: str) -> None:
+    verdict = verdict_of(recorded(seed=seed, cfa=cfa))
+    assert not verdict.named
+    assert not verdict.abstained
+    assert not verdict.before
+    block = verdict.evidence.blocks[0]
+    model = verdict.evidence.gaussian()
+    at = verdict.evidence.slices[0]
+    residual = (verdict.evidence.value - model.mean)[at]
+    chi2 = float(residual @ np.linalg.solve(model.covariance[at, at], residual))
+    # floors make it less than n; above it the noise's covariance would be too small: 4 sigma of a chi2 of n numbers
+    assert chi2 < len(block.value) + 4 * np.sqrt(2 * len(block.value))
+
+
+FOUND: list[tuple[Law, str]] = [
+    (concealed.Ghost(0.6, 0, 5), "ghost"),
+    (concealed.Ghost(2.0, 1, 5), "ghost"),
+    (concealed.ScreenPixelStructure(8.0, 0, 5), "screen_pixel_structure"),
+    (concealed.ScreenGamma(1.5, 0, 5), "screen_gamma"),
+    (concealed.ScreenGamma(4.0, 1, 5), "screen_gamma"),
+    (concealed.LateralColour(3.0, 0, 5), "lateral_chromatic_aberration"),
+]
+
+
+@pytest.mark.parametrize(("law", "name"), FOUND, ids=[f"{type(law).__name__}-{law.v}" for law, _ in FOUND])
+def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
+    verdict = verdict_of(recorded(law))
+    assert [c.effect.name for c in verdict.named] == [name]
+
+
+def test_a_screen_that_fills_the_frame_lights_dark_squares_from_beyond() -> None:
+    """The former's screen goes on beyond the frame; what that is uncertain by is half of all that an endless screen would add."""
+    found = evidence(recorded(), screen_block)
+    model = found.gaussian()
+    away = (found.value - model.mean) / np.sqrt(np.diag(model.of(0)))
+    assert np.all(np.abs(away) < 1.5)
+
+
+def test_a_copy_of_the_image_falls_into_the_dark_squares() -> None:
+    """Of light of mean m in the plane, turned about its middle, 1 % of what lies there: between nothing and the brightest."""
+    block = evidence(recorded(), screen_block).blocks[0]
+    more = block.predict((Ghost(share_percent=1.0),)).mean - block.predict(()).mean
+    assert np.all(more > 0.0)
+    assert np.all(more < 0.011 * block.scale)
+
+
+def test_a_steep_gamma_over_wide_rims_is_predicted() -> None:
+    """v^5 on rims of a standard deviation of 0.4 px: lit cells of 4 px lose a quarter of their width. Contrast comes out within noise,
+    what rims lack to 5 %."""
+    study = study_of(recorded(concealed.ScreenGamma(4.0, 1, 5)))
+    effect = ScreenGamma(exponent=5.0, rim_px=0.4)
+    contrasts = Evidence((contrast_block(study),), study.camera)
+    n, covariance = len(contrasts.value), contrasts.gaussian().covariance
+    for effects, low, high in (((), 5.0, 1e9), ((effect,), 0.0, 1.0)):
+        residual = contrasts.value - contrasts.mean(effects)
+        chi2 = float(residual @ np.linalg.solve(covariance, residual))
+        assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
+    rims = rim_block(study)
+    np.testing.assert_allclose(rims.predict((effect,)).mean, rims.value, rtol=0.05)
+
+
+def test_defocus_changes_the_contrast_as_predicted() -> None:
+    """12 um: far out of the noise, and with the effect within it, levels and the screen's own blur free."""
+    study = study_of(recorded(concealed.Defocus(12.0, 1)))
+    evidence = Evidence((contrast_block(study),), study.camera)
+    for effects, low, high in (((), 5.0, 1e9), ((Defocus(defocus_um=12.0),), 0.0, 1.0)):
+        model = evidence.gaussian(effects)
+        residual = evidence.value - model.mean
+        n = len(residual)
+        chi2 = float(residual @ np.linalg.solve(model.covariance, residual))
+        assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
+
+
+def test_what_was_measured_dies_with_its_study() -> None:
+    """A service diagnoses one set after another: thirty megabytes a set would stay for ever."""
+    study = study_of(recorded())
+    contrast_block(study)
+    kept = weakref.ref(study)
+    del study
+    gc.collect()
+    assert kept() is None
+
+
+def test_a_colours_contrast_is_that_of_its_own_place() -> None:
+    """Red and blue land half a pixel out and more. Drawn where green is, they would lose 2 to 4 % below 0.25 cy/px."""
+    plain, moved = (contrast_block(study_of(recorded(*laws))) for laws in ((), (concealed.LateralColour(4.0, 0, 5),)))
+    kept = {(k.channel, k.condition, round(k.x, 2)): v for k, v in zip(plain.labels, plain.value, strict=True)}
+    lost = [
+        kept[key] - v
+        for k, v in zip(moved.labels, moved.value, strict=True)
+        if (key := (k.channel, k.condition, round(k.x, 2))) in kept and k.channel in "RB" and k.x < 0.25
+    ]
+    assert len(lost) > 20
+    # a band's contrast is good to 0.3 %: 4 standard errors of two dozen
+    assert abs(np.mean(lost)) < 0.0025
+
+
+def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
+    """3 um a 100 nm in the corner: what each colour's light is apart from green's, by the block's own prediction at that size."""
+    from sim.effects.lateral_chromatic_aberration import LateralChromaticAberration
+
+    law = concealed.LateralColour(3.0, 0, 5)
+    block = colour_block(study_of(recorded(law)))
+    expected = block.predict((LateralChromaticAberration(slope_um=law.a),)).mean
+    std = np.sqrt(np.diag(block.covariance))
+    assert np.abs(expected).max() > 8 * std.max()
+    assert np.all(np.abs(block.value - expected) < 4 * std + 0.05 * np.abs(expected))
+
+
+def test_the_screen_s_grid_is_seen_in_white_frames_alone() -> None:
+    """Lit screens without white captures say nothing of it, and one channel nothing of lateral colour."""
+    mono = study_of(recorded(cfa="MONO"))
+    assert abs(float(grid_block(mono).value[0])) < 4.0
+    with pytest.raises(NotDetermined, match="one channel"):
+        colour_block(mono)
+    with pytest.raises(NotDetermined, match="no white captures"):
+        grid_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))
+    with pytest.raises(NotDetermined, match="no bernoulli captures"):
+        turned_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))

@@ -1,0 +1,85 @@
+"""Uneven flat fields: which law, about which point, and what no law fits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.diagnose.measurements.shading import (
+    ALIKE,
+    _adjacent,
+    _cell_means,
+    _cell_points,
+    _pattern_variance,
+    shading_block,
+)
+from lab.diagnose.measurements.uniform import linearity_block
+from tests.lab.diagnose.on_blocks import evidence, former, names, sigmas, study, verdict
+from tests.proof.former import Law
+from tests.proof.former.laws import DustShadow, NonUniformIllumination, TapGain, Vignetting, VignettingDecentre
+
+LOOKED_AT = (shading_block, linearity_block)
+
+
+def test_healthy_cells_scatter_as_they_should() -> None:
+    """4 cameras: the mean of chi2's departures within 3 / sqrt(4) of its standard deviations, and 0.5 for the free axis and level."""
+    found = [sigmas(evidence(former(s, cfa=c), shading_block)) for s in (1, 2) for c in ("MONO", "BGGR")]
+    assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.5
+    assert max(found) < 4.0
+
+
+@pytest.mark.parametrize("variant", [0, *(pytest.param(v, marks=pytest.mark.slow) for v in (1, 2))])
+def test_vignetting_is_named_whatever_its_power(variant: int) -> None:
+    """As the square of the radius, two discs that part, as the fourth power."""
+    found = verdict(former(21, Vignetting(4.0, variant, 1), cfa="RGGB"), *LOOKED_AT)
+    assert names(found) == ["vignetting"]
+    if variant == 0:
+        one = found.named[0]
+        std = one.std["corner_loss_percent"]
+        assert std is not None
+        assert abs(one.effect.model_dump()["corner_loss_percent"] - 4.0) < 3.0 * std
+
+
+@pytest.mark.parametrize("variant", [pytest.param(0, marks=pytest.mark.slow), 1])
+def test_a_fall_off_about_another_point_is_named(variant: int) -> None:
+    found = verdict(former(22, VignettingDecentre(0.3, variant, 2)), *LOOKED_AT)
+    assert names(found) == ["vignetting_decentre"]
+
+
+@pytest.mark.parametrize("variant", [pytest.param(0, marks=pytest.mark.slow), 1])
+def test_a_slope_is_uneven_light_with_or_without_a_bow(variant: int) -> None:
+    truth = NonUniformIllumination(1.5, variant, 3)
+    found = verdict(former(23, truth, cfa="GRBG"), *LOOKED_AT)
+    assert names(found) == ["non_uniform_illumination"]
+    for name, value in truth.stated().items():
+        std = found.named[0].std[name]
+        assert std is not None
+        assert abs(found.named[0].effect.model_dump()[name] - value) < 3.0 * std
+
+
+@pytest.mark.parametrize(
+    "law", [TapGain(1.0), pytest.param(DustShadow(2.0, 0, 4), marks=pytest.mark.slow)], ids=lambda law: law.name
+)
+def test_what_no_law_fits_is_seen_and_gets_no_name(law: Law) -> None:
+    found = verdict(former(24, law), *LOOKED_AT)
+    assert not found.named
+    assert {s.block.measurement for s in found.before} == {"flat_field"}
+
+
+def test_a_pattern_that_neighbours_share_counts_more() -> None:
+    """White: its own variance, within 3 sqrt(2 / 192) of blocks' differences and as much of a median's; alike: at most ALIKE times."""
+    rng = np.random.default_rng(3)
+    white = 1.0 + 0.01 * rng.standard_normal((192, 256))
+    assert _pattern_variance(white, 0.0) == pytest.approx(1e-4, rel=0.2)
+    alike = 0.8 * (white - 1.0) + 0.02 * np.kron(rng.standard_normal((48, 64)), np.ones((4, 4)))
+    single = _pattern_variance(1.0 + 0.8 * (white - 1.0), 0.0)
+    assert single < _pattern_variance(1.0 + alike, 0.0) <= ALIKE * _adjacent(1.0 + alike, 1)
+
+
+def test_means_over_cells_are_exact_for_the_fourth_power() -> None:
+    """x^4 over a cell from a to b: (b^5 - a^5) / (5 (b - a))."""
+    camera = study(former(1, kinds=("dark", "flat"))).camera
+    place = _cell_points(camera, 0.0, 0.0)
+    edges = (np.linspace(0, camera.cols, 9) - camera.cols / 2) * camera.pixel_pitch_um
+    exact = np.diff(edges**5) / (5.0 * np.diff(edges))
+    np.testing.assert_allclose(_cell_means(place.x_um**4).reshape(6, 8)[2], exact, rtol=1e-9)

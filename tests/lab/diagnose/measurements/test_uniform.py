@@ -1,0 +1,162 @@
+"""Levels of flat fields and narrowband light: what bends, drifts or is off, told apart, and true covariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.diagnose.measurements.summaries import level_scatter, repeated_levels
+from lab.diagnose.measurements.uniform import (
+    MOST_SAMPLE_STD,
+    RADIOMETER_STD,
+    READING_SAMPLE_STD,
+    READING_STD,
+    _reading_std,
+    _sample_std,
+    linearity_block,
+    narrowband_block,
+)
+from lab.fit.levels import rounding_std_dn
+from sim.effects.second_order_light import SecondOrderLight
+from sim.spectrum import Spectrum
+from tests.lab.diagnose.on_blocks import UNIFORM, evidence, former, names, rendered, sigmas, study, verdict
+from tests.proof.former import Law
+from tests.proof.former.laws import (
+    AbsorptionBand,
+    CoverGlassFringe,
+    ExposureOffset,
+    Nonlinearity,
+    RedLeak,
+    SourceBandwidth,
+    SourceDrift,
+    StrayLight,
+    WavelengthOffset,
+)
+
+LEVELS: list[tuple[Law, bool]] = [
+    (law, shuttle)
+    for shuttle in (False, True)
+    for law in (SourceDrift(0.1, 0, 1), SourceDrift(0.2, 1, 1), Nonlinearity(0.5, 1), ExposureOffset(2.0))
+]
+
+
+@pytest.mark.parametrize(
+    ("law", "shuttle"),
+    [*LEVELS[:1], *(pytest.param(*case, marks=pytest.mark.slow) for case in LEVELS[1:])],
+    ids=lambda value: f"{value.name}-{value.v}" if isinstance(value, Law) else f"shuttle-{value}",
+)
+def test_what_changes_levels_is_told_apart(law: Law, shuttle: bool) -> None:
+    """Up only, where time and level go together but for the repeats; and up and down."""
+    found = verdict(former(31, law, shuttle=shuttle), linearity_block)
+    assert names(found) == [law.effect]
+    for name, value in law.stated().items():
+        std = found.named[0].std[name]
+        assert std is not None
+        assert abs(found.named[0].effect.model_dump()[name] - value) < 3.5 * std
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        StrayLight(0.8, 1),
+        pytest.param(SourceBandwidth(3.0, 1), marks=pytest.mark.slow),
+        pytest.param(WavelengthOffset(-0.5, 0), marks=pytest.mark.slow),
+    ],
+    ids=lambda law: law.name,
+)
+def test_what_changes_narrow_lines_is_told_apart(law: Law) -> None:
+    found = verdict(former(32, law, cfa="RGGB", kinds=UNIFORM), linearity_block, narrowband_block)
+    assert names(found) == [law.effect]
+
+
+@pytest.mark.parametrize(
+    "law",
+    [CoverGlassFringe(2.0, 0, 3)]
+    + [pytest.param(law, marks=pytest.mark.slow) for law in (RedLeak(8.0, 0, 3), AbsorptionBand(3.0, 0, 3))],
+    ids=lambda law: law.name,
+)
+def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None:
+    """The red leak of a grey sensor has no colour to be known by: a radiometer's law took some of it and left more."""
+    cfa = "MONO" if isinstance(law, RedLeak) else "RGGB"
+    found = verdict(former(33, law, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
+    assert not found.named
+    assert {s.block.measurement for s in found.before} == {"narrowband"}
+
+
+def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
+    """A sweep to 900 nm: beyond 800 a blue line comes along. Share within 3 standard uncertainties."""
+    truth = SecondOrderLight(share_percent=3.0)
+    found = verdict(rendered(6, (truth,), sweep_to_nm=900, repeats=2), linearity_block, narrowband_block)
+    assert names(found) == ["second_order_light"]
+    std = found.named[0].std["share_percent"]
+    assert std is not None
+    assert abs(found.named[0].effect.model_dump()["share_percent"] - 3.0) < 3.0 * std
+
+
+def test_healthy_levels_scatter_as_they_should() -> None:
+    """4 cameras: no more than noise; less, as a few numbers in ten are free."""
+    for seed, cfa in ((1, "MONO"), (2, "RGGB"), (3, "GBRG"), (4, "MONO")):
+        found = evidence(former(seed, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
+        assert -6.0 < sigmas(found) < 3.0
+
+
+def test_a_drifting_lamp_doesn_t_scatter() -> None:
+    """0.5 % a minute makes repeats differ by 0.17 %; a trend common to all levels leaves the scatter that there was, 0."""
+    for shuttle in (False, True):
+        looked_at = study(former(34, SourceDrift(0.5), shuttle=shuttle))
+        noise = looked_at.noise
+        found = level_scatter(repeated_levels(looked_at, noise.black, noise.gain, noise.read_dn))
+        assert found < 4e-4
+
+
+class _Reading:
+    """As much of a capture as a reading's scatter needs."""
+
+    def __init__(self, name: str, wavelength_nm: float) -> None:
+        self.id, self.wavelength_nm = name, wavelength_nm
+
+
+@pytest.mark.parametrize("scatter", [0.0, 1e-3, 0.02])
+def test_scatter_of_readings_is_measured_and_capped(scatter: float) -> None:
+    """60 second differences: the median of magnitudes is good to 20 %; what scatters more than a radiometer is no radiometer's."""
+    rng = np.random.default_rng(7)
+    points = [(_Reading(f"c{i}", 400.0 + 5.0 * i), "Y") for i in range(62)]
+    signal = 1e4 * (1.0 + scatter * rng.standard_normal(62))
+    found = _reading_std(points, signal, np.full(62, 1e-2), np.full(62, 1e4))
+    assert found == pytest.approx(min(max(scatter, READING_STD), RADIOMETER_STD), rel=0.4)
+
+
+def test_rounding_moves_means_of_quiet_pixels_only() -> None:
+    """Means of 4000 rounded normal numbers of spread 0.3 about levels over one code: root mean square within 10 %."""
+    rng = np.random.default_rng(8)
+    level = np.arange(50) / 50
+    error = np.round(level[:, None] + 0.3 * rng.standard_normal((50, 4000))).mean(1) - level
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(rounding_std_dn(np.array(0.09)), rel=0.1)
+    assert rounding_std_dn(np.array(1.0)) < 1e-8
+
+
+@pytest.mark.parametrize("scatter", [0.0, 1.5e-3, 0.02])
+def test_scatter_within_readings_is_measured_and_capped(scatter: float) -> None:
+    """24 pairs of some 16 samples: their median is good to 5 %. A level that changed between two readings is none."""
+    rng = np.random.default_rng(8)
+    wavelength = np.arange(540.0, 581.0)
+    line = np.exp(-0.5 * ((wavelength - 560.0) / 4.0) ** 2)
+    pairs = [
+        [Spectrum.of(wavelength, level * line * (1.0 + scatter * rng.standard_normal(41))) for level in (1.0, 1.1)]
+        for _ in range(24)
+    ]
+    assert _sample_std(pairs) == pytest.approx(min(scatter, MOST_SAMPLE_STD), rel=0.15, abs=1e-12)
+    assert _sample_std(readings[:1] for readings in pairs) == READING_SAMPLE_STD
+
+
+def test_a_warmer_frame_s_dark_current_is_free() -> None:
+    """A tenth of the dark current for each degree above the session's median; nothing where no temperature is stated."""
+    recordings = former(35, kinds=UNIFORM)
+    looked_at = study(recordings)
+    capture = recordings.captures("narrowband")[0]
+    assert looked_at.temperature_c is not None
+    warm = capture.model_copy(update={"temperature_c": looked_at.temperature_c + 3.0})
+    slope = looked_at.free_warmth([capture.model_copy(update={"temperature_c": None}), warm])["warmth"]
+    assert slope == pytest.approx([0.0, 0.3 * looked_at.noise.dark_dn_per_s * capture.exposure_s])
+    looked_at.temperature_c = None
+    assert looked_at.free_warmth([capture]) == {}

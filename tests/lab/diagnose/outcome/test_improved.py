@@ -1,0 +1,142 @@
+"""The improved model: written, read, taken as the baseline, and simulated with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.diagnose import Diagnosis, examine
+from lab.diagnose.inference.evidence import Evidence, chi2
+from lab.diagnose.inference.unknown import discrepancy
+from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.outcome.improved import improved_model
+from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
+from lab.formats.recording_set import Manifest, RecordingSet
+from lab.predict.simulate import SimulateOptions, simulate
+from sim.effects.base import Effect
+from sim.effects.nameless_correction import NamelessCorrection
+from tests.proof.former import Camera, Plan
+from tests.proof.former import laws as concealed_laws
+
+SET = RecordingSet(
+    Manifest.model_validate(
+        {"cameras": {"left": {"rows": 8, "cols": 8, "cfa": "MONO", "bit_depth": 12}}, "captures": []}
+    )
+)
+KINDS = ("dark", "flat", "narrowband", "slanted_edge")
+
+
+def _found(seed: int, law: concealed_laws.Law) -> tuple[RecordingSet, Diagnosis]:
+    recordings = Camera(seed, [law], cfa="MONO", f_number=4.0, rows=240, cols=240).record(Plan(KINDS))
+    return recordings, examine(recordings)
+
+
+@pytest.fixture(scope="module")
+def filtered() -> tuple[RecordingSet, Diagnosis]:
+    return _found(20731, concealed_laws.InfraredCutFilter(60.0))
+
+
+def _through_a_file(content: CameraFile, folder: Path) -> CameraFile:
+    write_camera(folder / "camera.toml", content)
+    return read_camera(folder / "camera.toml")
+
+
+def test_a_saved_model_explains_the_recordings(filtered: tuple[RecordingSet, Diagnosis], tmp_path: Path) -> None:
+    recordings, found = filtered
+    assert [e.name for e in found.result.effects] == ["infrared_cut_filter"]
+    saved = _through_a_file(found.improved["left"], tmp_path)
+    assert [e.name for e in saved.effects] == ["infrared_cut_filter"]
+    again = examine(recordings, baseline={"left": saved})
+    assert again.result.verdict == "no_mismatch"
+    assert again.improved["left"].effects == saved.effects
+
+
+def test_a_saved_model_simulates_with_what_was_found(filtered: tuple[RecordingSet, Diagnosis], tmp_path: Path) -> None:
+    """A red light through the saved camera: by as much dimmer as the filter found passes less of it."""
+    saved = _through_a_file(filtered[1].improved["left"], tmp_path)
+    light = tmp_path / "red.csv"
+    light.write_text("wavelength_nm,radiance_w_sr_m2_nm\n690,0\n695,0.05\n700,0\n", encoding="utf-8")
+    options = SimulateOptions(scene="uniform", illuminant=str(light), exposure_s=0.01, expected=True)
+    with_it, without = (
+        float(simulate(options, content).frame.mean()) - saved.camera.black_level_dn
+        for content in (saved, replace(saved, effects=()))
+    )
+    passed = float(saved.effects[0].transmittance(np.array([695.0]), 0.0)[0])
+    assert without > 50.0
+    assert with_it == pytest.approx(passed * without, rel=0.05, abs=1.0)  # codes are whole numbers; a line 5 nm wide
+
+
+# --- what has no name --------------------------------------------------------------------------------------------------------
+
+FREQUENCY = np.linspace(0.02, 0.9, 23)
+NOISE = 0.004
+
+
+def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
+    """Two channels' contrasts exp(-2 f), off by `departs`; without effects but corrections."""
+    content = default_camera()
+    pitch = content.camera.pixel_pitch_um
+    labels = tuple(Label(float(f), c, "5 deg", ("edge-1",), False) for c in "RG" for f in FREQUENCY)
+    contrast = np.tile(np.exp(-2.0 * FREQUENCY), 2)
+
+    def predict(acting: Sequence[Effect]) -> Prediction:
+        value = contrast
+        for e in acting:
+            factor = e.transfer(np.tile(FREQUENCY, 2) / pitch, np.zeros(46), 550.0, content.camera)
+            value = value if factor is None else value * np.real(factor)
+        return Prediction(value, {})
+
+    value = contrast * np.tile(1.0 + departs, 2) + NOISE * np.random.default_rng(3).standard_normal(46)
+    block = Block(
+        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=NOISE**2 * np.eye(46),
+        labels=labels, hooks=frozenset({"transfer"}), predict=predict, scale=np.ones(46), conditions="orientation",
+    )  # fmt: skip
+    return block, content
+
+
+def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
+    """A ripple of 10 % of the contrast: the saved correction follows it to what 46 points of noise 0.004 / exp(-2 f) leave open, and
+    the model with it explains the numbers."""
+    ripple = 0.1 * np.sin(9.0 * FREQUENCY)
+    block, content = _edges(ripple)
+    evidence = Evidence((block,), content.camera)
+    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
+    improved, corrections = improved_model(SET, "left", None, content, evidence, (), (gap,))
+    assert [(c.measurement, c.kind) for c in corrections] == [("slanted_edge", "transfer")]
+    (one,) = improved.effects
+    assert isinstance(one, NamelessCorrection)
+    x = FREQUENCY / content.camera.pixel_pitch_um
+    follows = np.real(one.transfer(x, 0 * x, 550.0, content.camera)) - 1.0 - ripple
+    assert np.abs(follows[FREQUENCY < 0.6]).max() < 3 * NOISE / np.sqrt(2) / np.exp(-1.2)
+    mended = Evidence((replace(block, predict=lambda acting: block.predict((one, *acting))),), content.camera)
+    assert chi2(mended.value - mended.mean(), block.covariance) < 46 + 3 * np.sqrt(92)
+
+
+def test_what_the_model_has_no_place_for_is_said() -> None:
+    block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
+    evidence = Evidence((replace(block, measurement="patches_of_light", places="patches"),), content.camera)
+    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
+    improved, corrections = improved_model(SET, "left", None, content, evidence, (), (gap,))
+    assert not improved.effects
+    assert corrections[0].kind is None
+    assert (
+        corrections[0].said
+        == "patches of light: no correction in the improved model; the model has no place for one there"
+    )
+
+
+@pytest.mark.parametrize(
+    ("axis", "unit", "hook", "along"),
+    [("field", "mm", "illumination", "radius_um"), ("level", "DN", "response", "signal_e"), ("level", "DN", "noise_e2", "variance_signal_e")],
+)  # fmt: skip
+def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str, hook: str, along: str) -> None:
+    block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
+    other = replace(block, axis=axis, unit=unit, hooks=frozenset({hook}), conditions="")
+    evidence = Evidence((other,), content.camera)
+    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
+    improved, _ = improved_model(SET, "left", None, content, evidence, (), (gap,))
+    assert [e.along for e in improved.effects if isinstance(e, NamelessCorrection)] == [along]

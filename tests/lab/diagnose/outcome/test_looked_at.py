@@ -1,0 +1,114 @@
+"""Places, measurements and what could have been seen, on small made-up evidence; residual pictures on recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lab.diagnose.inference.decide import Candidate, Verdict
+from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.outcome.looked_at import detectable, measurement_fits, places, visibility
+from lab.diagnose.outcome.pictures import residual_pictures
+from lab.formats.camera_file import CameraFile, default_camera
+from lab.predict.camera_model import camera_model
+from sim.effects.base import Effect
+from sim.effects.defocus import Defocus
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from tests.proof.former import Camera, Plan
+from tests.proof.former import laws as concealed_laws
+
+CAMERA = default_camera().camera
+FREQUENCY = np.linspace(0.05, 0.9, 18)
+NOISE = 0.004
+TRUTH = OpticalLowPassFilter(displacement_x_um=1.5, displacement_y_um=1.5)
+
+
+def _verdict(named: tuple[Effect, ...] = ()) -> Verdict:
+    angles = [0.0, 0.0, 0.8, 0.8]
+
+    def predict(acting: Sequence[Effect]) -> Prediction:
+        parts = []
+        for angle in angles:
+            value, f = np.exp(-2.0 * FREQUENCY), FREQUENCY / CAMERA.pixel_pitch_um
+            for e in acting:
+                factor = e.transfer(f * np.cos(angle), f * np.sin(angle), 550.0, CAMERA)
+                value = value if factor is None else value * np.real(factor)
+            parts.append(value)
+        return Prediction(np.concatenate(parts), {})
+
+    labels = tuple(
+        Label(float(f), "G", f"{a:g}", (f"edge-{i}",), i % 2 == 1) for i, a in enumerate(angles) for f in FREQUENCY
+    )
+    value = predict((TRUTH,)).mean + NOISE * np.random.default_rng(8).standard_normal(len(labels))
+    block = Block(
+        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value,
+        covariance=NOISE**2 * np.eye(len(labels)), labels=labels, hooks=frozenset({"transfer"}), predict=predict,
+        scale=np.ones(len(labels)), conditions="orientation",
+    )  # fmt: skip
+    candidates = tuple(Candidate(e, {}, 1.0, (), 100.0) for e in named)
+    return Verdict(Evidence((block,), CAMERA), 12.0, 60.0, (), candidates, (), (), ())
+
+
+def test_detectable_is_seen_at_its_rate() -> None:
+    """200 000 draws of a squared normal: 3 sigma of the rate are 0.002."""
+    size = np.sqrt(detectable(12.0))
+    score = np.square(np.random.default_rng(1).standard_normal(200_000) + size)
+    assert np.mean(score > 12.0) == pytest.approx(0.9, abs=0.002)
+
+
+def test_the_smallest_size_that_is_seen_has_that_non_centrality() -> None:
+    """The change by the effect at that size, whitened: lambda to 5 %, as blurs bend a little beyond the slope at zero."""
+    verdict = _verdict()
+    found = {item.effect: item for item in visibility("left", verdict)}
+    size = found["defocus"].smallest["defocus_um"]
+    evidence = verdict.evidence
+    change = (evidence.mean((Defocus(defocus_um=size),)) - evidence.mean())[evidence.seen] / NOISE
+    assert float(change @ change) == pytest.approx(detectable(12.0), rel=0.05)
+    assert 0.9 < found["defocus"].cosine <= 1.0  # all blurs are alike in so few numbers
+    assert found["defocus"].told_apart == pytest.approx(
+        stats.norm.cdf(0.5 * np.sqrt(detectable(12.0) * (1.0 - found["defocus"].cosine ** 2)))
+    )
+
+
+def test_measurements_fit_with_the_truth_and_not_without() -> None:
+    (fit,) = measurement_fits("left", _verdict((TRUTH,)))
+    evidence = _verdict().evidence
+    assert (fit.n, fit.held_out_n) == (36, 36)
+    assert fit.held_out_before == pytest.approx(evidence.held_out()[0])
+    assert fit.held_out_after == pytest.approx(evidence.held_out((TRUTH,))[0])
+    assert fit.chi2_after < stats.chi2.ppf(0.999, 36) < fit.chi2_before
+
+
+def test_every_place_is_told_before_and_after() -> None:
+    found = list(places("left", _verdict((TRUTH,))))
+    assert {p.axis for p in found} == {"spatial_frequency", "orientation"}
+    assert max(p.sigma_before for p in found) > 5.0
+    assert max(p.sigma_after for p in found) < 3.0
+    assert all(p.chi2_after < p.chi2_before for p in found)
+
+
+def test_pictures_show_what_the_model_lacks_and_noise_once_it_has_it() -> None:
+    """Cells' residuals of a right model are normal, of rms 1; the sensor's own patterns differ from their mean scatter by some per cent."""
+    law = concealed_laws.OpticalLowPassFilter(1.8)
+    camera = Camera(20771, [law], cfa="MONO", f_number=4.0, rows=160, cols=200)
+    recordings = camera.record(Plan(("flat", "slanted_edge")))
+    model = camera_model(recordings, "left").model_copy(
+        update={"black_level_dn": camera.black, "conversion_gain_dn_per_e": camera.gain, "read_noise_e": camera.read,
+                "prnu_percent": camera.prnu, "dark_current_e_per_s": camera.dark, "full_well_e": camera.full}
+    )  # fmt: skip
+    known = CameraFile("known", model, (OpticalLowPassFilter(displacement_x_um=1.8, displacement_y_um=1.8),))
+    found = {p.kind: p for p in residual_pictures(recordings, "left", _verdict().evidence, known)}
+    assert set(found) == {"flat", "slanted_edge"}
+
+    def rms(table: tuple[tuple[float, ...], ...]) -> float:
+        return float(np.sqrt(np.mean(np.square(table))))
+
+    edge = found["slanted_edge"]
+    # where the edge lies is known to some hundredths of a pixel only: it keeps a thin trace
+    assert rms(edge.after) < 1.4
+    assert rms(edge.before) > rms(edge.after) + 0.1
+    assert rms(found["flat"].after) == pytest.approx(1.0, abs=0.15)

@@ -1,0 +1,211 @@
+"""Two calibrations compared: what is the same says so, what changed is found, and a motion of the camera is no change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lab.cli import main
+from lab.fit.compare import compare
+from lab.fit.geometry import calibrate_robustly, geometry_result
+from lab.formats.results import CameraFit, ComparisonResult, FitResult, MtfCurve, NoiseFit, SpectralFit, StereoFit
+from tests.lab.fit.projected import SHAPE, poses, seen
+
+
+@pytest.fixture(scope="module")
+def geometries():
+    """The same camera calibrated twice, from different poses."""
+    return [
+        geometry_result(calibrate_robustly(seen(np.random.default_rng(seed), poses(10, seed=seed)), SHAPE))
+        for seed in (1, 2)
+    ]
+
+
+def made(seed: int, **noise: float) -> FitResult:
+    """A fit of an unchanged rig with errors of its stated size."""
+    rng = np.random.default_rng(seed)
+    wave = np.arange(400.0, 701.0, 10.0)
+    curve = np.exp(-0.5 * ((wave - 550) / 60) ** 2)
+    frequency = np.linspace(0, 0.5, 26)
+    values = {"conversion_gain_dn_per_e": 0.4, "read_noise_e": 2.3} | noise
+    turn = cv2.Rodrigues(np.array([0.01, -0.06, 0.006]) + rng.normal(0, 1e-5, 3))[0]
+    camera = CameraFit(
+        noise=NoiseFit(
+            **{name: value + rng.normal(0, 0.002) for name, value in values.items()},
+            **{f"{name}_std": 0.002 for name in values},
+        ),
+        spectral=SpectralFit(
+            wavelength_nm=tuple(wave),
+            quantum_efficiency={"G": tuple(curve + rng.normal(0, 0.003, wave.size))},
+            quantum_efficiency_std={"G": (0.003,) * wave.size},
+        ),
+        mtf=(
+            MtfCurve(
+                capture="edge-1", channel="G", angle_deg=5.0 + rng.normal(), angle_deg_std=0.01,
+                frequency_cy_per_px=tuple(frequency), mtf=tuple(np.sinc(frequency) + rng.normal(0, 0.004, 26)),
+                mtf_std=(0.004,) * 26,
+            ),
+        ),
+    )  # fmt: skip
+    stereo = StereoFit(
+        rotation=tuple(map(tuple, turn.tolist())), rotation_std_rad=(1e-5, 1e-5, 1e-5),
+        translation_mm=tuple(np.array([-60.0, 0.1, 0.2]) + rng.normal(0, 0.01, 3)), translation_mm_std=(0.01,) * 3,
+        baseline_mm=60.0, baseline_mm_std=0.01, rms_px=0.1, pairs=10,
+    )  # fmt: skip
+    return FitResult(source=f"set {seed}", cameras={"left": camera}, stereo=stereo)
+
+
+def test_an_unchanged_rig_is_unchanged():
+    result = compare(made(1), made(2))
+    assert not result.changed
+    assert {row.name for row in result.changes} >= {
+        "noise read_noise_e", "spectral quantum_efficiency G", "mtf edge-1 G mtf", "stereo translation_mm", "stereo rotation_mrad",
+    }  # fmt: skip
+    # an edge's angle belongs to the set-up, not to the camera
+    assert not any("angle" in row.name for row in result.changes)
+    assert ComparisonResult.model_validate_json(result.model_dump_json()) == result
+
+
+def test_chance_of_a_false_alarm_is_at_most_the_stated_one():
+    alarms = [compare(made(2 * k), made(2 * k + 1)).changed for k in range(100)]
+    assert np.mean(alarms) < 0.01 + 3 * np.sqrt(0.01 * 0.99 / 100)
+    assert np.mean([compare(made(2 * k), made(2 * k + 1), 0.5).changed for k in range(60)]) == pytest.approx(
+        0.5, abs=0.2
+    )
+
+
+def test_what_changed_is_found_and_nothing_else():
+    result = compare(made(1), made(2, read_noise_e=2.33))
+    (row,) = [row for row in result.changes if row.changed]
+    assert (row.name, row.side) == ("noise read_noise_e", "left")
+    assert row.difference == pytest.approx(0.03, abs=0.01)
+    assert row.difference_std == pytest.approx(0.002 * np.sqrt(2))
+
+
+def test_one_point_of_a_curve_is_found_with_its_place():
+    other = made(2)
+    curve = list(other.cameras["left"].spectral.quantum_efficiency["G"])
+    curve[20] += 0.04
+    spectral = other.cameras["left"].spectral.model_copy(update={"quantum_efficiency": {"G": tuple(curve)}})
+    camera = other.cameras["left"].model_copy(update={"spectral": spectral})
+    result = compare(made(1), other.model_copy(update={"cameras": {"left": camera}}))
+    (row,) = [row for row in result.changes if row.changed]
+    assert row.name == "spectral quantum_efficiency G"
+    assert row.where == "wavelength 600 nm"
+    assert row.n == 31
+
+
+def test_rounding_is_no_change():
+    """A normalised curve is 1 at frequency 0 but for rounding, and states an uncertainty of that size."""
+    one, two = (
+        FitResult(
+            source="m",
+            cameras={
+                "left": CameraFit(
+                    mtf=(
+                        MtfCurve(
+                            capture="edge-1", channel="G", angle_deg=5.0, frequency_cy_per_px=(0.0, 0.1),
+                            mtf=(1.0 - off, 0.9), mtf_std=(1e-17, 0.01),
+                        ),
+                    )
+                )
+            },
+        )
+        for off in (0.0, 5e-16)
+    )  # fmt: skip
+    result = compare(one, two)
+    assert not result.changed
+    assert [row.where for row in result.changes] == ["frequency 0.1 cy/px"]
+
+
+def test_a_curve_on_another_axis_is_compared_where_both_reach():
+    other = made(2)
+    spectral = SpectralFit(
+        wavelength_nm=(500.0, 550.0, 600.0),
+        quantum_efficiency={"G": (0.706, 1.0, 0.706)}, quantum_efficiency_std={"G": (0.05, 0.05, 0.05)},
+    )  # fmt: skip
+    camera = other.cameras["left"].model_copy(update={"spectral": spectral})
+    result = compare(made(1), other.model_copy(update={"cameras": {"left": camera}}))
+    row = next(row for row in result.changes if "quantum" in row.name)
+    assert row.n == 11
+
+
+def test_what_only_one_has_is_said():
+    bare = FitResult(source="bare", cameras={"left": CameraFit()})
+    result = compare(made(1), bare)
+    reasons = [item.reason for item in result.skipped]
+    assert any("only A has noise" in reason for reason in reasons)
+    assert any(item.step == "stereo" for item in result.skipped)
+    assert (
+        compare(bare, FitResult(source="x", cameras={"right": CameraFit()})).skipped[0].reason == "only A has this side"
+    )
+
+
+def with_geometry(geometry) -> FitResult:
+    return FitResult(source="g", cameras={"left": CameraFit(geometry=geometry)})
+
+
+def test_two_calibrations_of_one_camera_project_alike(geometries):
+    result = compare(*(with_geometry(geometry) for geometry in geometries))
+    (projection,) = result.projection
+    assert not result.changed
+    assert projection.significance_sigma < 3.3
+    assert 0.3 * projection.expected_px < projection.difference_px < 2 * projection.expected_px
+    # as they stand, the two differ by more: the rest is a motion that their corners can't see
+    assert projection.difference_px < projection.as_stated_px
+
+
+def test_a_principal_point_that_moved_is_mostly_a_motion(geometries):
+    """8 px of the centre: the parameters differ by 8 px, the projections by what a turn can't undo; both are found."""
+    matrix = [list(row) for row in geometries[0].camera_matrix]
+    matrix[0][2] += 8.0
+    moved = geometries[0].model_copy(update={"camera_matrix": tuple(map(tuple, matrix))})
+    result = compare(with_geometry(geometries[0]), with_geometry(moved))
+    (projection,) = result.projection
+    assert projection.as_stated_px == pytest.approx(8.0)
+    assert projection.difference_px < 0.1 * projection.as_stated_px
+    assert projection.implied_turn_mrad[1] == pytest.approx(-8e3 / 1400, rel=0.2)
+    assert projection.changed
+    assert [row.where for row in result.changes if row.changed] == ["cx"]
+
+
+def test_a_longer_lens_is_a_change_although_each_number_is_uncertain(geometries):
+    """Distances are known, so a focal length is no motion."""
+    matrix = [list(row) for row in geometries[0].camera_matrix]
+    matrix[0][0] *= 1.01
+    matrix[1][1] *= 1.01
+    longer = geometries[0].model_copy(update={"camera_matrix": tuple(map(tuple, matrix))})
+    (projection,) = compare(with_geometry(geometries[0]), with_geometry(longer)).projection
+    assert projection.changed
+    assert projection.significance_sigma > 6
+
+
+def test_geometry_without_covariance_is_skipped_with_its_reason(geometries):
+    old = geometries[0].model_copy(update={"covariance": None})
+    result = compare(with_geometry(old), with_geometry(geometries[1]))
+    assert result.projection == ()
+    assert "A states no covariance" in result.skipped[-1].reason
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    files = []
+    for name, fit in (("a", made(1)), ("b", made(2)), ("c", made(3, read_noise_e=2.5))):
+        files.append(tmp_path / f"{name}.json")
+        files[-1].write_text(fit.model_dump_json())
+    assert main(["compare", str(files[0]), str(files[1]), "--check"]) == 0
+    assert "none of" in capsys.readouterr().out
+    assert main(["compare", str(files[0]), str(files[2]), "--json", str(tmp_path / "out.json")]) == 0
+    said = capsys.readouterr().out
+    assert "noise read_noise_e" in said and "yes" in said
+    assert ComparisonResult.model_validate_json((tmp_path / "out.json").read_text()).changed
+    assert main(["compare", str(files[0]), str(files[2]), "--check"]) == 4
+    capsys.readouterr()
+    assert main(["compare", str(files[0]), str(files[2]), "--json", "-", "--report", str(tmp_path / "page")]) == 0
+    said = capsys.readouterr()
+    assert ComparisonResult.model_validate_json(said.out).changed  # the page's place goes to stderr
+    assert "compare.html" in said.err and (tmp_path / "page" / "compare.html").stat().st_size > 10_000
+    assert main(["compare", str(files[0]), str(tmp_path / "out.json")]) == 2
+    assert main(["compare", str(files[0]), str(tmp_path / "nothing")]) == 2

@@ -1,0 +1,74 @@
+"""Validation on recordings of a second image former: a healthy camera passes, a concealed filter is caught, and the filter's
+model mends it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from lab.fit import fit_recording_set
+from lab.fit.psf import expected_kernel
+from lab.formats.camera_file import fitted_camera
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import FitResult, ValidationResult
+from lab.predict.camera_model import camera_model
+from lab.predict.validate import validate
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from sim.forward import kernel, optical_transfer
+from tests.proof.former import Camera, Law, Plan
+from tests.proof.former import laws as concealed_laws
+
+DISPLACEMENT_UM = 1.6
+
+
+def _fitted(*concealed: Law) -> tuple[RecordingSet, FitResult]:
+    # f/2: the lens leaves much beyond the pixels' Nyquist frequency
+    recordings = Camera(931, concealed, cfa="MONO", f_number=2.0).record()
+    return recordings, fit_recording_set(recordings)
+
+
+def _passed(result: ValidationResult) -> dict[str, bool]:
+    return {name: all(c.passed for c in result.checks if c.name == name) for name in {c.name for c in result.checks}}
+
+
+def test_a_healthy_camera_is_predicted_within_its_uncertainty() -> None:
+    result = validate(*_fitted())
+    assert _passed(result) == {"colorchecker": True, "mtf": True, "psf": True}
+    assert not result.skipped
+    assert all(check.n > 0 and check.chi2 > 0 for check in result.checks)
+
+
+def test_a_concealed_filter_shows_in_edges_and_kernels_and_its_model_mends_it() -> None:
+    recordings, fit = _fitted(concealed_laws.OpticalLowPassFilter(DISPLACEMENT_UM))
+    plain = validate(recordings, fit)
+    assert _passed(plain) == {"colorchecker": True, "mtf": False, "psf": False}
+    known = OpticalLowPassFilter(displacement_x_um=DISPLACEMENT_UM, displacement_y_um=DISPLACEMENT_UM)
+    camera = fitted_camera(recordings, "left", fit.cameras["left"])
+    mended = validate(recordings, fit, {"left": replace(camera, effects=(known,))})
+    before = {c.capture: c.chi2 for c in plain.checks if c.name == "mtf"}
+    for check in mended.checks:
+        if check.name == "mtf":
+            assert check.chi2 < 0.1 * before[check.capture]
+
+
+def test_what_isn_t_there_is_skipped_with_its_reason() -> None:
+    result = validate(Camera(931, cfa="MONO").record(Plan(("dark",))), FitResult(source="", cameras={}))
+    assert not result.checks
+    assert {s.step for s in result.skipped} == {"validate colorchecker", "validate mtf", "validate psf"}
+    assert all(s.reason for s in result.skipped)
+
+
+def test_the_expected_kernel_of_a_soft_lens_is_the_forward_models() -> None:
+    """Without detail that half a pixel's samples can't hold, least squares on any pattern find the transfer's own kernel: five taps
+    leave some 1e-3 of the maximum in the core. Of a sharp one the rims of the cells make it another."""
+    for f_number, apart in ((8.0, (0.0, 6e-3)), (1.8, (2e-2, 0.2))):
+        model = camera_model(
+            Camera(931, cfa="MONO", f_number=f_number, rows=32, cols=32).record(Plan(("dark",))), "left"
+        )
+        expected = expected_kernel(partial(optical_transfer, model, "Y", None), 9, 4.0)
+        plain = kernel(model, "Y", None, 9)
+        assert expected.sum() == pytest.approx(1.0)
+        assert apart[0] <= np.abs(expected - plain)[2:-2, 2:-2].max() / plain.max() <= apart[1]
