@@ -14,6 +14,7 @@ import pytest
 from lab import cli
 from lab.capture.sequences.calibration import Calibration
 from lab.capture.sequences.dark import DarkSequence
+from lab.cli import capturing, diagnosis, fitting, sources
 from lab.diagnose import Diagnosis
 from lab.diagnose.outcome.next_capture import Proposal
 from lab.errors import DeviceError
@@ -176,7 +177,8 @@ def test_json_to_stdout_is_json_alone(flats: Path, capsys: pytest.CaptureFixture
 def test_a_result_that_cannot_be_written_is_refused_before_the_work(
     flats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "_recordings", lambda source: pytest.fail("the work began"))
+    for module in (fitting, diagnosis):
+        monkeypatch.setattr(module, "recordings_of", lambda source: pytest.fail("the work began"))
     for command in ("fit", "validate", "diagnose"):
         assert cli.main([command, str(flats), "--json", str(tmp_path / "nowhere" / "x.json")]) == 2
         assert "can't be written" in capsys.readouterr().err
@@ -202,7 +204,7 @@ def test_a_check_that_falls_short(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passed: bool, code: int
 ) -> None:
     check = Check(name="mtf", side="left", capture="edge-1", n=10, chi2=11.0, rms_relative_percent=1.0, passed=passed)
-    monkeypatch.setattr(cli, "_validated", lambda *_: ValidationResult(source="x", checks=(check,)))
+    monkeypatch.setattr(diagnosis, "validated", lambda *_: ValidationResult(source="x", checks=(check,)))
     assert cli.main(["validate", str(flats), "--json", str(tmp_path / "v.json")]) == code
     assert ValidationResult.model_validate_json((tmp_path / "v.json").read_text()).checks == (check,)
 
@@ -211,9 +213,11 @@ def test_diagnosis_with_a_stored_fit(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["fit", str(flats), "--json", str(tmp_path / "fit.json")]) == 0
-    monkeypatch.setattr(cli, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
+    monkeypatch.setattr(sources, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
     result = DiagnosisResult(source="x", verdict="no_mismatch", skipped=(Skipped(step="mtf", reason="no [edges]"),))
-    monkeypatch.setattr(cli, "_examined", lambda recordings, fit, baseline, pictures, bootstrap: Diagnosis(result, {}))
+    monkeypatch.setattr(
+        diagnosis, "examined", lambda recordings, fit, baseline, pictures, bootstrap: Diagnosis(result, {})
+    )
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 0
     shown = capsys.readouterr().out
     assert "verdict: no_mismatch" in shown
@@ -274,7 +278,7 @@ def test_device_failures_interruptions_and_defects(
         def fail(*_: object, error: BaseException = error) -> str:
             raise error
 
-        monkeypatch.setattr(cli, "_captured", fail)
+        monkeypatch.setattr(capturing, "_captured", fail)
         assert cli.main(["capture"]) == code
         shown = capsys.readouterr().err
         assert words in shown
@@ -310,12 +314,12 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
 
     shelf = Shelf()
     fit = FitResult(source="s", cameras={"left": CameraFit(noise=NoiseFit(conversion_gain_dn_per_e=0.4))})
-    diagnosis = DiagnosisResult(source="s", verdict="no_mismatch")
-    monkeypatch.setattr(cli, "_store", lambda folder=None: shelf)
-    monkeypatch.setattr(cli, "_captured", lambda *_: "session-1")
-    monkeypatch.setattr(cli, "_fitted", lambda *_: fit)
-    monkeypatch.setattr(cli, "_validated", lambda *_: ValidationResult(source="s", checks=()))
-    monkeypatch.setattr(cli, "_examined", lambda *_: Diagnosis(diagnosis, {}))
+    found = DiagnosisResult(source="s", verdict="no_mismatch")
+    monkeypatch.setattr(capturing, "open_store", lambda folder=None: shelf)
+    monkeypatch.setattr(capturing, "_captured", lambda *_: "session-1")
+    monkeypatch.setattr(capturing, "fit_or_read", lambda *_: fit)
+    monkeypatch.setattr(capturing, "validated", lambda *_: ValidationResult(source="s", checks=()))
+    monkeypatch.setattr(capturing, "examined", lambda *_: Diagnosis(found, {}))
     assert cli.main(["run"]) == 0
     shown = capsys.readouterr().out
     for words in (
@@ -327,7 +331,7 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
     ):
         assert words in shown
     assert shelf.kept == ["fit", "validate", "diagnose"]
-    assert DiagnosisResult.model_validate_json((tmp_path / "diagnose.json").read_text()) == diagnosis
+    assert DiagnosisResult.model_validate_json((tmp_path / "diagnose.json").read_text()) == found
     assert (tmp_path / "report.html").stat().st_size > 1e6
 
 
@@ -356,14 +360,14 @@ def test_resolve_takes_the_capture_and_decides_again(
     taken: list[Calibration | None] = []
     captured = lambda *given: taken.append(given[-1]) or "session-2"  # noqa: E731
     after = Diagnosis(DiagnosisResult(source="s", verdict="explained"), {})
-    monkeypatch.setattr(cli, "_captured", captured)
+    monkeypatch.setattr(capturing, "_captured", captured)
     monkeypatch.setattr(
-        cli, "_examined", lambda joined, fit: after if len(joined.captures()) > n else pytest.fail("not joined")
+        capturing, "examined", lambda joined, fit: after if len(joined.captures()) > n else pytest.fail("not joined")
     )
     recordings = small_set()
     n = len(recordings.captures())
     before = Diagnosis(DiagnosisResult(source="s", verdict="partly_explained"), {}, (Proposal(capture, plan),))
-    found = cli._resolved(Shelf(), None, recordings, FitResult(source="s", cameras={}), before)  # type: ignore[arg-type]
+    found = capturing._resolved(Shelf(), None, recordings, FitResult(source="s", cameras={}), before)  # type: ignore[arg-type]
     if not settles:
         assert found is before
         assert not taken

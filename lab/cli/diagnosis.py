@@ -1,0 +1,138 @@
+"""`calibench validate`, `diagnose`, `report` and `effects`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from lab.cli.console import check_writable, out, write_json
+from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.sources import (
+    FitFile,
+    Json,
+    Model,
+    Source,
+    camera_path,
+    examined,
+    fit_or_read,
+    instruments_of,
+    read_models,
+    recordings_of,
+    save_models,
+    validated,
+)
+from lab.cli.tables import print_diagnosis, print_validation
+from lab.errors import InputError
+
+#: Drawn cameras from which a threshold is taken: a standard deviation of fewer is known to a quarter and worse.
+FEWEST_DRAWS = 10
+
+commands = typer.Typer()
+
+
+@commands.command()
+def validate(source: Source, json: Json = None, fit_file: FitFile = None, model: Model = None) -> None:
+    """Predicted against measured, for what the fit didn't use. Exit code 4 where a check falls short."""
+    check_writable(json)
+    recordings = recordings_of(source)
+    result = validated(recordings, fit_or_read(recordings, fit_file), read_models(recordings, model))
+    if str(json) != "-":
+        print_validation(result)
+    write_json(result, json)
+    if not all(check.passed for check in result.checks):
+        raise typer.Exit(EXIT_CHECK)
+
+
+@commands.command()
+def diagnose(
+    source: Source,
+    json: Json = None,
+    fit_file: FitFile = None,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", metavar="DIR", help="write each camera with what was found as DIR/SIDE.toml"),
+    ] = None,
+    model: Model = None,
+    bootstrap: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help=f"draw N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
+        ),
+    ] = 0,
+) -> None:
+    """Name the physics that the model left out, where the recordings show any."""
+    if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
+        raise InputError(
+            f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
+        )
+    check_writable(json)
+    recordings = recordings_of(source)
+    if save is not None:
+        camera_path(recordings, recordings.sides[0], save)
+    baseline = read_models(recordings, model)
+    found = examined(recordings, fit_or_read(recordings, fit_file), baseline, pictures=False, bootstrap=bootstrap)
+    if str(json) != "-":
+        print_diagnosis(found.result)
+    write_json(found.result, json)
+    if save is not None:
+        save_models(recordings, found, save)
+
+
+@commands.command()
+def report(
+    source: Source,
+    out_file: Annotated[Path, typer.Option("--out", metavar="FILE", help="the page to write")] = Path("report.html"),
+    fit_file: FitFile = None,
+) -> None:
+    """Fit, validate, diagnose, and write one page with pictures."""
+    from lab.report import provenance_of, write_report
+
+    check_writable(out_file)
+    recordings = recordings_of(source)
+    fitted = fit_or_read(recordings, fit_file)
+    validation, diagnosis = validated(recordings, fitted), examined(recordings, fitted).result
+    provenance = provenance_of(recordings, instruments_of(source))
+    out.print(f"report: {write_report(out_file, recordings, fitted, validation, diagnosis, provenance)}")
+
+
+@commands.command()
+def effects(
+    name: Annotated[str, typer.Argument(metavar="[NAME]", help="one effect, with all that it declares")] = "",
+) -> None:
+    """The library of effects: what a diagnosis can name, and what a camera file can have."""
+    from sim.effects import library
+
+    if not name:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("effect", "acts in", "parameters"):
+            table.add_column(heading)
+        for kind in library.effects().values():
+            table.add_row(kind.name, str(kind.stage), escape(" ".join(kind.quantities())))
+        out.print(table)
+        return
+    try:
+        kind = library.effect(name)
+    except KeyError as unknown:
+        raise InputError(str(unknown.args[0])) from None
+    out.print(escape(f"{kind.name} ({kind.stage}): {kind.sentence}"))
+    table = Table(box=None, pad_edge=False)
+    for heading in ("parameter", "unit", "from", "to", "usual", "absent", "what it is"):
+        table.add_column(heading)
+    for field, quantity in kind.quantities().items():
+        usual = "any" if quantity.prior is None else "{:g} ± {:g}".format(*quantity.prior)
+        limits = ("-" if v is None else f"{v:g}" for v in (quantity.lower, quantity.upper))
+        absent = "-" if quantity.absent is None else f"{quantity.absent:g}"
+        table.add_row(field, quantity.unit, *limits, usual, absent, escape(quantity.meaning))
+    out.print(table)
+    for heading, told in (
+        ("shown by", sorted(kind.shown_by)),
+        ("can look like", sorted(kind.rivals)),
+        ("doesn't depend on", sorted(kind.invariances)),
+        ("after", [kind.reference]),
+    ):
+        out.print(escape(f"{heading}: {', '.join(told) or 'nothing'}"))

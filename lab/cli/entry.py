@@ -1,0 +1,73 @@
+"""The application of all commands, and the entry point `main` that turns errors into exit codes."""
+
+from __future__ import annotations
+
+import os
+import traceback
+
+import typer
+from rich.markup import escape
+
+from lab.challenge.command import commands as challenge
+from lab.cli import capturing, diagnosis, fitting, recordings, simulation
+from lab.cli.console import err
+from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
+from lab.errors import DeviceError, InputError
+
+app = typer.Typer(
+    name="calibench",
+    help="Captures with, calibrates and explains cameras.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+for _group in (capturing, fitting, diagnosis, recordings, simulation):
+    app.registered_commands += _group.commands.registered_commands
+app.add_typer(challenge)
+
+
+def _attach_service_and_mocks() -> None:
+    """Add the commands of `api` and `mocks`. Only this function imports them, and only when a command line is parsed."""
+    from api.command import commands as service
+    from mocks.command import commands as mocks
+
+    names = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
+    if "bench" in names:  # `main` was called before in this process
+        return
+    for others in (service, mocks):
+        app.registered_commands += others.registered_commands
+        app.registered_groups += others.registered_groups
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    try:
+        _attach_service_and_mocks()
+        code = app(arguments, standalone_mode=False)
+    except (InputError, DeviceError) as error:
+        if os.environ.get("CALIBENCH_DEBUG"):
+            traceback.print_exc()
+        for line in str(error).splitlines():
+            err.print(f"[red]calibench:[/] {escape(line)}")
+        return error.exit_code
+    except KeyboardInterrupt:
+        code = EXIT_INTERRUPTED
+    except Exception as error:
+        usage = getattr(error, "format_message", None)
+        if usage is not None:
+            err.print(f"[red]calibench:[/] {escape(usage())} See `calibench --help`.")
+            return EXIT_INPUT
+        if os.environ.get("CALIBENCH_DEBUG"):
+            traceback.print_exc()
+        text = " ".join(str(error).split())
+        err.print(
+            f"[red]calibench:[/] {type(error).__name__}: {escape(text)}: a defect of calibench; "
+            "report it with what CALIBENCH_DEBUG=1 shows"
+        )
+        return EXIT_INTERNAL
+    if code == EXIT_INTERRUPTED:
+        err.print("[red]calibench:[/] interrupted")
+    return int(code or 0)

@@ -1,0 +1,115 @@
+"""`calibench fit` and `calibench compare`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from lab.cli.console import check_writable, err, make_folder, write_json
+from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.sources import Json, Source, fit_or_read, open_store, read_result, recordings_of
+from lab.cli.tables import print_comparison, print_fit
+from lab.errors import NotDetermined
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import FitResult
+
+commands = typer.Typer()
+
+
+@commands.command()
+def fit(
+    source: Source,
+    json: Json = None,
+    cameras: Annotated[
+        Path | None, typer.Option("--write-cameras", metavar="DIR", help="write each fitted camera as DIR/SIDE.toml")
+    ] = None,
+    maps: Annotated[
+        Path | None,
+        typer.Option(
+            "--maps",
+            metavar="DIR",
+            help="write every pixel's offset, dark current and gain, and which are defective, into DIR/SIDE (.npy and .png)",
+        ),
+    ] = None,
+) -> None:
+    """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
+    check_writable(json)
+    recordings = recordings_of(source)
+    result = fit_or_read(recordings, None)
+    if str(json) != "-":
+        print_fit(recordings, result)
+    write_json(result, json)
+    if cameras is not None:
+        _write_cameras(recordings, result, cameras)
+    if maps is not None:
+        _write_maps(recordings, maps)
+
+
+def _write_maps(recordings: RecordingSet, folder: Path) -> None:
+    """Maps of every side's pixels; a side without darks is said."""
+    from lab.fit.pixels import pixel_maps
+    from lab.report.maps import write_maps
+
+    for side in recordings.sides:
+        try:
+            names = write_maps(folder / side, pixel_maps(recordings, side))
+        except NotDetermined as refused:
+            err.print(escape(f"maps ({side}): none: {refused.reason}"))
+        else:
+            err.print(escape(f"maps: {folder / side}: {', '.join(n for n in names if n.endswith('.npy'))}"))
+
+
+def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) -> None:
+    """Camera files of a fit, and what they hold that was neither fitted nor stated."""
+    from lab.formats.camera_file import fitted_camera, write_camera
+    from lab.predict.camera_model import assumptions
+
+    make_folder(folder)
+    for side, fitted in result.cameras.items():
+        write_camera(folder / f"{side}.toml", fitted_camera(recordings, side, fitted))
+        taken = "; ".join(f"{one.quantity} taken as {one.value}" for one in assumptions(recordings.camera(side)))
+        note = f" (neither fitted nor stated: {taken})" if taken else ""
+        err.print(escape(f"camera: {folder / f'{side}.toml'}{note}"))
+
+
+@commands.command()
+def compare(
+    a: Annotated[str, typer.Argument(metavar="A", help="a fit's JSON, a recording set's folder, or a session's id")],
+    b: Annotated[str, typer.Argument(metavar="B", help="the calibration to compare with it")],
+    json: Json = None,
+    check: Annotated[bool, typer.Option("--check", help="exit code 4 where anything changed")] = False,
+    every: Annotated[bool, typer.Option("--all", help="list what didn't change, too")] = False,
+    report_folder: Annotated[
+        Path | None, typer.Option("--report", metavar="DIR", help="write DIR/compare.html, one page with pictures")
+    ] = None,
+) -> None:
+    """Two calibrations: what changed beyond its uncertainty."""
+    from lab.fit.compare import compare as compared
+
+    check_writable(json)
+    result = compared(_calibration(a), _calibration(b))
+    if str(json) != "-":
+        print_comparison(result, every)
+    write_json(result, json)
+    if report_folder is not None:
+        from lab.report.compare import write_comparison
+
+        err.print(f"report: {escape(str(write_comparison(report_folder, result)))}")
+    if check and result.changed:
+        raise typer.Exit(EXIT_CHECK)
+
+
+def _calibration(source: str) -> FitResult:
+    """A fit: of a file that `--json` wrote, as a session keeps it, or of recordings that are fitted now."""
+    from lab.capture.store import Settings
+
+    if Path(source).is_file():
+        return read_result(FitResult, Path(source))
+    if not Path(source).exists() and Settings().data.is_dir():
+        kept = open_store().results(source, "fit")
+        if kept:
+            return FitResult.model_validate(kept[0].document)
+    return fit_or_read(recordings_of(source), None)

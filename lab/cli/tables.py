@@ -1,0 +1,100 @@
+"""Results as tables and sentences on stdout."""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from lab.cli.console import out
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
+
+
+def print_skipped(skipped: tuple[Skipped, ...]) -> None:
+    for item in skipped:
+        of = f" ({item.side})" if item.side else ""
+        out.print(f"skipped: {escape(item.step)}{of}: {escape(item.reason)}")
+
+
+def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
+    from lab.report.figures import by_side, stereo_figures
+
+    sides = list(fit.cameras)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("quantity")
+    for side in sides:
+        table.add_column(f"{side} (± one standard uncertainty)")
+    for name, figures in by_side(fit, recordings.manifest.cameras):
+        table.add_row(name, *(figures[side].text if side in figures else "-" for side in sides))
+    if table.row_count:
+        out.print(table)
+    if fit.stereo is not None:
+        for figure in stereo_figures(fit.stereo):
+            out.print(f"{figure.name}: {figure.text}")
+    for side, camera in fit.cameras.items():
+        for part in (camera.noise, camera.spectral):
+            for remark in part.remarks if part else ():
+                out.print(f"{side}: {escape(remark)}")
+    print_skipped(fit.skipped)
+
+
+def print_validation(validation: ValidationResult) -> None:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("check", "side", "capture", "n", "chi2/n", "rms, %", "within noise"):
+        table.add_column(heading)
+    for check in validation.checks:
+        table.add_row(
+            check.name,
+            check.side,
+            check.capture,
+            str(check.n),
+            f"{check.chi2 / max(check.n, 1):.2f}",
+            f"{check.rms_relative_percent:.2f}",
+            "yes" if check.passed else "[red]no[/]",
+        )
+    if table.row_count:
+        out.print(table)
+    print_skipped(validation.skipped)
+
+
+def print_diagnosis(diagnosis: DiagnosisResult) -> None:
+    out.print(f"verdict: [bold]{diagnosis.verdict}[/]")
+    for sentence in diagnosis.summary:
+        out.print(escape(sentence))
+    if diagnosis.held_out is not None:
+        held = diagnosis.held_out
+        captures = f"{len(held.captures)} held-out captures"
+        out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after, n = {held.n}")
+    if diagnosis.next_capture:
+        out.print(f"next: {escape(diagnosis.next_capture)}")
+    print_skipped(diagnosis.skipped)
+
+
+def print_comparison(comparison: ComparisonResult, every: bool) -> None:
+    from lab.report.figures import measured
+
+    shown = [row for row in comparison.changes if every or row.changed]
+    table = Table(box=None, pad_edge=False)
+    for heading in ("quantity", "side", "where", "A", "B", "B - A", "sigma", "changed"):
+        table.add_column(heading)
+    for row in sorted(shown, key=lambda row: -row.significance_sigma):
+        values = (measured(row.a, row.a_std), measured(row.b, row.b_std), measured(row.difference, row.difference_std))
+        of = f"{row.where} (worst of {row.n})" if row.n > 1 else row.where
+        marks = (f"{row.significance_sigma:.1f}", "yes" if row.changed else "no")
+        table.add_row(escape(row.name), row.side or "", escape(of), *values, *marks)
+    if table.row_count:
+        out.print(table)
+    for item in comparison.projection:
+        turn = ", ".join(f"{value:.3f}" for value in item.implied_turn_mrad)
+        out.print(
+            f"projection ({item.side}): {item.difference_px:.4f} px rms apart once the implied motion is taken out, {item.expected_px:.4f} "
+            f"px by the uncertainties, {item.significance_sigma:.1f} sigma: {'changed' if item.changed else 'unchanged'} (as stated "
+            f"{item.as_stated_px:.4f} px; implied turn {turn} mrad)"
+        )
+    number = sum(row.changed for row in comparison.changes) + sum(item.changed for item in comparison.projection)
+    total = len(comparison.changes) + len(comparison.projection)
+    out.print(
+        f"{number or 'none'} of {total} numbers and curves changed beyond {comparison.threshold_sigma:.1f} sigma, which an unchanged rig "
+        f"passes in {100 * comparison.false_alarm_rate:g} % of all comparisons"
+    )
+    print_skipped(comparison.skipped)
