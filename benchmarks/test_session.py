@@ -22,7 +22,7 @@ import pytest
 
 from benchmarks.table import Row, show
 from lab.fit.geometry import fit_geometry
-from lab.fit.mtf import fit_mtf
+from lab.fit.mtf.recordings import fit_mtf
 from lab.fit.noise import fit_noise
 from lab.fit.psf import fit_psf_field
 from lab.fit.spectral import fit_spectral

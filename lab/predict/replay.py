@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from lab.errors import NotDetermined
-from lab.fit.mtf import EdgeMtf, measure_edge
+from lab.fit.mtf.recordings import measure_edge
+from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.formats.recording_set import Capture, Chart, Dark, Flat, Narrowband, RecordingSet, SlantedEdge
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect

@@ -17,7 +17,8 @@ from lab.diagnose.measurements.patches import Patch as PatchLevel
 from lab.diagnose.measurements.patches import patch_covariance, patch_levels
 from lab.diagnose.measurements.summaries import Study
 from lab.errors import NotDetermined
-from lab.fit.mtf import EdgeMtf, measure_edge
+from lab.fit.mtf.recordings import measure_edge
+from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.fit.psf import expected_kernel
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import Bernoulli, RecordingSet, SlantedEdge

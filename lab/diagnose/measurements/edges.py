@@ -37,7 +37,11 @@ from lab.diagnose.measurements.summaries import (
 from lab.diagnose.measurements.veils import halos, wide_contrast
 from lab.errors import NotDetermined
 from lab.fit.levels import rounding_waves_dn
-from lab.fit.mtf import SMOOTHING, EdgeGeometry, EdgeMtf, Region, find_edges, measure_edge
+from lab.fit.mtf.edge_profile import ROUGHNESS_SHARE
+from lab.fit.mtf.edges_in_frame import find_edges
+from lab.fit.mtf.recordings import measure_edge
+from lab.fit.mtf.samples import Region
+from lab.fit.mtf.transfer_function import EdgeGeometry, EdgeMtf
 from lab.formats.recording_set import SlantedEdge
 from sim.effects.base import Effect
 from sim.forward import common_wavelengths, electron_rate, transfer_at, wavelength_shares
@@ -279,7 +283,9 @@ class _Estimator:
         level, contrast, slope, and the departures."""
         size = geometry.spline.size
         matrix, right = geometry.gram[:-1, :-1], geometry.gram[:-1, -1]
-        bridged = matrix[:size, :size] + geometry.spline.roughness(SMOOTHING * np.trace(matrix[:size, :size]) / size)
+        bridged = matrix[:size, :size] + geometry.spline.roughness(
+            ROUGHNESS_SHARE * np.trace(matrix[:size, :size]) / size
+        )
         count = len(shapes)
         columns = np.zeros((len(matrix), count + len(matrix) - size))
         columns[:size, :count] = np.linalg.solve(bridged, spread[:size] @ shapes.T)

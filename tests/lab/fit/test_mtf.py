@@ -9,7 +9,11 @@ import pytest
 from scipy.special import erf, ndtr
 
 from lab.errors import NotDetermined
-from lab.fit.mtf import Plane, edge_mtf, find_edges, fit_mtf, planes_mtf
+from lab.fit.mtf import edge_mtf
+from lab.fit.mtf.edges_in_frame import find_edges
+from lab.fit.mtf.estimate_mtf import planes_mtf
+from lab.fit.mtf.recordings import fit_mtf
+from lab.fit.mtf.samples import Plane
 
 FULL_E = 9000.0
 

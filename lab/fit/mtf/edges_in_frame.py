@@ -1,0 +1,99 @@
+"""Edges of a frame from which an MTF can be taken, found without a stated region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from lab.errors import NotDetermined
+from lab.fit.mtf.estimate_mtf import planes_mtf
+from lab.fit.mtf.samples import Region, region_planes
+from sim.camera import Cfa
+from sim.sensor.mosaic import step as period
+
+LEAST_EDGE_PX, LEAST_ROOM_PX, MOST_EDGES = 40.0, 20.0, 24
+
+
+@dataclass(frozen=True)
+class FoundEdge:
+    """An edge: a region (row0, col0, row1, col1) about its middle, its angle from the vertical, and the length that is
+    used.
+    """
+
+    region: Region
+    angle_deg: float
+    length_px: float
+
+
+def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None = None) -> tuple[FoundEdge, ...]:
+    """Edges of a raw frame (rows, cols) from which an MTF can be taken, the longest first, none twice.
+
+    Line segments (LSD, von Gioi et al. 2010) of the frame binned to the pitch of a channel. About the middle of each
+    segment a region is laid that holds no other edge. It is kept where both sides are uniform and unsaturated, and the
+    MTF of the green (or only) channel can be determined. Raises `NotDetermined` where none is left, with the reason of
+    the last one refused.
+    """
+    values = np.asarray(frame, dtype=float)
+    if values.ndim != 2 or not np.isfinite(values).all():
+        raise NotDetermined("mtf", "the frame has to be two-dimensional and finite to find edges in it")
+    step = period(cfa)
+    rows, cols = (n // step * step for n in values.shape)
+    binned = values[:rows, :cols].reshape(rows // step, step, cols // step, step).mean(axis=(1, 3))
+    low, high = np.quantile(binned, [0.002, 0.998])
+    if not high > low:
+        raise NotDetermined("mtf", "no edge found in the frame: it is uniform")
+    picture = ndimage.gaussian_filter(np.clip((binned - low) / (high - low), 0.0, 1.0), 1.0)
+    lines = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(np.rint(255.0 * picture).astype(np.uint8))[0]
+    found: list[FoundEdge] = []
+    reason = "no straight line of 40 px or more stands out"
+    segments = np.empty((0, 4)) if lines is None else lines.reshape(-1, 4) * step
+    lengths = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
+    for index in np.argsort(-lengths):
+        if lengths[index] < LEAST_EDGE_PX or len(found) == MOST_EDGES:
+            break
+        x0, y0, x1, y1 = segments[index]
+        middle, along = (
+            (0.5 * (y0 + y1), 0.5 * (x0 + x1)),
+            (np.array([y1 - y0, x1 - x0]) / lengths[index]),
+        )
+        if any(
+            abs((middle[0] - 0.5 * (r0 + r1)) * along[1] - (middle[1] - 0.5 * (c0 + c1)) * along[0]) < LEAST_ROOM_PX
+            and max(abs(middle[0] - 0.5 * (r0 + r1)), abs(middle[1] - 0.5 * (c0 + c1))) < 0.75 * max(r1 - r0, c1 - c0)
+            for r0, c0, r1, c1 in (f.region for f in found)
+        ):
+            continue
+        for share in (0.9, 0.7, 0.5):
+            half = 0.5 * share * lengths[index] * np.abs(along)
+            if min(2.0 * half.max(), 2.0 * half.max()) < 0.6 * LEAST_EDGE_PX:
+                break
+            # Across the edge, not so much that the next side of a square is within the region
+            room = np.maximum(half, np.minimum(LEAST_ROOM_PX + half.min(), 0.47 * lengths[index] * np.abs(along).max()))
+            start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
+            stop = np.minimum(np.floor(np.array(middle) + room) + 1, values.shape).astype(int)
+            region = (int(start[0]), int(start[1]), int(stop[0]), int(stop[1]))
+            part = values[start[0] : stop[0], start[1] : stop[1]]
+            if saturation_dn is not None and np.mean(part >= saturation_dn) > 0.002:
+                reason = f"the edge at row {middle[0]:.0f}, column {middle[1]:.0f} is saturated; expose it shorter"
+                continue
+            try:
+                planes = region_planes(values, region, cfa, "Y" if cfa == "MONO" else "G", 0.0)
+                edge = planes_mtf(planes, np.array([0.1, 0.25]))
+            except NotDetermined as refused:
+                reason = f"at row {middle[0]:.0f}, column {middle[1]:.0f}: {refused.reason}"
+                continue
+            noise = max(edge.noise_std_dark, edge.noise_std_light)
+            contrast = edge.light_level - edge.dark_level
+            if edge.residual_chi2_per_sample > 2.0 or noise > 0.1 * contrast or contrast < 0.05 * (high - low):
+                reason = (
+                    f"what lies at row {middle[0]:.0f}, column {middle[1]:.0f} isn't one edge between two even fields"
+                )
+                continue
+            found.append(FoundEdge(region, edge.angle_deg, float(share * lengths[index])))
+            break
+    if not found:
+        raise NotDetermined("mtf", f"no edge found in the frame: {reason}")
+    return tuple(found)

@@ -1,0 +1,234 @@
+"""The prior of the line-spread function, and the posterior of the edge profile under it.
+
+The masses m of the line-spread function between the knots of the spline have a Gaussian prior with covariance
+
+    C = G G^T + strength^2 E K E + amplitude^2 T.
+
+G: a Gaussian line spread with free height, place and width, a little skewness and excess kurtosis. E K E: a Gaussian
+process; E is an envelope from the estimate itself, K a Matern correlation of distances in blur widths, longer far from
+the edge. T: a tail amplitude / distance^2, as any aperture diffracts, nearly equal on both sides; it carries what is
+seen of the tail to beyond the samples. Smoothness and length of K, `strength` and `amplitude` are hyperparameters on a
+grid. The posterior is an average over them, weighted by the marginal likelihood: its mean lies between theirs, and its
+covariance holds how far they differ. Levels and gradients have flat priors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, special
+
+from lab.fit.mtf.spline import Spline
+
+Array = NDArray[np.floating[Any]]
+PriorIndex = tuple[
+    int, int, int, int
+]  # into the grid of hyperparameters: smoothness, length, strength, amplitude of the tail
+
+KNOT_SPACING_PX = 0.25  # near the edge; a cubic spline of this spacing passes 1 cy/px with an error of 1e-4
+PRIOR_LENGTHS = (0.5, 1.2, 3.0)  # blur widths
+PRIOR_STRENGTHS = (0.12, 0.25, 0.5, 1.0, 2.0, 4.0)  # of the envelope
+TAIL_AMPLITUDES_PX = (0.001, 0.1, 0.3)  # 4 / (pi^3 cutoff) for a diffracting lens
+GAUSSIAN_SHAPE_STD = (1.0, 1.0, 1.0, 0.1, 0.1)  # height, place, width, skewness, excess kurtosis
+WARP_WIDTHS = 2.0  # blur widths from the edge beyond which the correlation length grows with the distance
+LEAST_PRIOR_WEIGHT = 0.01  # hyperparameters of less weight are dropped
+LOG_LIKELIHOOD_RANGE = 4.0  # below the maximum, within which hyperparameters are searched
+ENVELOPE_WIDTHS, ENVELOPE_FLOOR = 0.8, 1e-3  # blur widths of the smoothing; least value, of the maximum
+TAIL_LENGTH, TAIL_SYMMETRY = 4.0, 0.98  # correlation length of the tail in ln(distance); correlation of both sides
+
+
+@dataclass(frozen=True)
+class LineSpreadPriors:
+    """Covariances of the masses (k,) of the line-spread function between knots.
+
+    `envelope` (k,): E. `warped` (k,): distance from the edge in blur widths, compressed far from it. `gaussian`,
+    `tails` (k, k): G G^T and T.
+    """
+
+    envelope: Array
+    warped: Array
+    gaussian: Array
+    tails: Array
+
+    @staticmethod
+    def of(spline: Spline, coefficients: Array, width: float, reach: float) -> LineSpreadPriors:
+        """The priors for a spline whose `coefficients` are the current estimate.
+
+        `width`: blur width, px, the standard deviation of a Gaussian with the same 10 % to 90 % distance; `reach`: of
+        the samples, px.
+        """
+        knots = np.concatenate([[spline.knot_px[0]] * 2, spline.knot_px, [spline.knot_px[-1]] * 2])
+        place = (knots[:-2] + knots[1:-1] + knots[2:]) / 3.0
+        at, pitch = 0.5 * (place[1:] + place[:-1]), np.diff(place)
+        scale = max(width, KNOT_SPACING_PX)
+        density = np.where(np.abs(at) < reach, np.diff(coefficients) / pitch, 0.0)
+        share = pitch * np.exp(-0.5 * ((at[:, None] - at) / (ENVELOPE_WIDTHS * scale)) ** 2)
+        local = np.abs(share @ density) / share.sum(axis=1)
+        decay = 1.0 / (1.0 + (at / (4.0 * scale)) ** 2)
+        envelope = pitch * np.maximum(local * (np.abs(at) < 0.5 * reach), ENVELOPE_FLOOR * local.max() * decay)
+
+        x = place / scale
+        bell = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
+        shapes = np.stack([special.ndtr(x), bell, x * bell, (x * x - 1.0) * bell, (x**3 - 3.0 * x) * bell])
+        columns = np.diff(np.linalg.solve(spline.design(place).toarray(), shapes.T), axis=0) * np.array(
+            GAUSSIAN_SHAPE_STD
+        )
+
+        side = np.where(np.sign(at)[:, None] == np.sign(at), 1.0, TAIL_SYMMETRY)
+        order = np.log(np.maximum(np.abs(at), 1.0))
+        far = pitch * at**2 / (at**2 + (3.0 * scale) ** 2) / np.maximum(at**2, 1e-6)
+        return LineSpreadPriors(
+            envelope=envelope,
+            warped=WARP_WIDTHS * np.arcsinh(at / (WARP_WIDTHS * scale)),
+            gaussian=columns @ columns.T,
+            tails=np.outer(far, far) * side * _matern_3_2(np.abs(order[:, None] - order) / TAIL_LENGTH),
+        )
+
+    def near(self, smoothness: int, length: int) -> Array:
+        """E K E of unit strength, by the indices of smoothness and length."""
+        apart = np.abs(self.warped[:, None] - self.warped) / PRIOR_LENGTHS[length]
+        return np.outer(self.envelope, self.envelope) * CORRELATIONS[smoothness](apart)
+
+    def at(self, point: PriorIndex) -> Array:
+        """The whole covariance C at a point of the grid of hyperparameters."""
+        smoothness, length, strength, amplitude = point
+        near = PRIOR_STRENGTHS[strength] ** 2 * self.near(smoothness, length)
+        return near + TAIL_AMPLITUDES_PX[amplitude] ** 2 * self.tails + self.gaussian
+
+
+def _matern_3_2(apart: Array) -> Array:
+    """Matern correlation of order 3/2 at distances in units of its length: once differentiable."""
+    return np.asarray((1.0 + np.sqrt(3.0) * apart) * np.exp(-np.sqrt(3.0) * apart))
+
+
+def _matern_5_2(apart: Array) -> Array:
+    """Matern correlation of order 5/2: twice differentiable."""
+    return np.asarray((1.0 + np.sqrt(5.0) * apart + 5.0 / 3.0 * apart * apart) * np.exp(-np.sqrt(5.0) * apart))
+
+
+CORRELATIONS = (_matern_3_2, _matern_5_2)
+PRIOR_GRID = (len(CORRELATIONS), len(PRIOR_LENGTHS), len(PRIOR_STRENGTHS), len(TAIL_AMPLITUDES_PX))
+
+
+def posterior(
+    priors: LineSpreadPriors, matrix: Array, right: Array, start: PriorIndex, log_likelihood_range: float
+) -> tuple[Array, Array, PriorIndex]:
+    """Solve the edge profile under the priors of its line-spread function.
+
+    `matrix` (k + g, k + g) and `right` (k + g,): normal equations of the spline coefficients and the gradients.
+    `start`: where the search for hyperparameters begins; `log_likelihood_range`: see `_prior_weights`. Returns the
+    inverse of the normal matrix with its prior, the covariance of the solution about the truth (both (k + g, k + g)),
+    and the best hyperparameters.
+    """
+    masses = len(priors.envelope)
+    size = masses + 1
+    flat = 1 + len(matrix) - size
+    # New unknowns: the dark level, the gradients, the masses
+    to_coefficients = np.zeros((len(matrix), len(matrix)))
+    to_coefficients[:size, 0] = 1.0
+    to_coefficients[size:, 1:flat] = np.eye(flat - 1)
+    to_coefficients[:size, flat:] = np.tril(np.ones((size, masses)), -1)
+    normal, normal_right = to_coefficients.T @ matrix @ to_coefficients, to_coefficients.T @ right
+    free_covariance = np.linalg.inv(normal[:flat, :flat])
+    elimination = free_covariance @ normal[:flat, flat:]
+    power, waves = np.linalg.eigh(normal[flat:, flat:] - normal[flat:, :flat] @ elimination)
+    seen = power > 1e-14 * power[-1]
+    reduced_right = normal_right[flat:] - elimination.T @ normal_right[:flat]
+    # The whitened problem: data = design @ masses + noise of unit variance
+    design = np.sqrt(power[seen])[:, None] * waves[:, seen].T
+    data = waves[:, seen].T @ reduced_right / np.sqrt(power[seen])
+
+    weights, best = _prior_weights(priors, design, data, start, log_likelihood_range)
+    information = design.T @ design
+    mixture = np.zeros((masses, masses))
+    means = []
+    for at, weight in weights.items():
+        root = _covariance_root(priors.at(at))
+        inner = root.T @ information @ root
+        inner[np.diag_indices_from(inner)] += 1.0
+        factor, _ = linalg.lapack.dpotrf(inner, lower=1)
+        half, _ = linalg.lapack.dtrtrs(factor, root.T, lower=1)
+        covariance = half.T @ half
+        mixture += weight * covariance
+        means.append(covariance @ reduced_right)
+    shares = np.array(list(weights.values()))
+    apart = (np.array(means) - shares @ np.array(means)) * np.sqrt(shares)[:, None]
+    from_masses = to_coefficients @ np.concatenate([-elimination, np.eye(masses)])
+    inverse = (
+        from_masses @ mixture @ from_masses.T
+        + to_coefficients[:, :flat] @ free_covariance @ to_coefficients[:, :flat].T
+    )
+    apart = apart @ from_masses.T
+    return inverse, inverse + apart.T @ apart, best
+
+
+def _prior_weights(
+    priors: LineSpreadPriors, design: Array, data: Array, start: PriorIndex, log_likelihood_range: float
+) -> tuple[dict[PriorIndex, float], PriorIndex]:
+    """Weights of the hyperparameters by marginal likelihood, sum 1, and the best ones; data = design @ masses + noise
+    of unit variance.
+
+    Coordinate ascent on the grid from `start`, then all connected points whose log marginal likelihood is within
+    `log_likelihood_range` of the maximum.
+    """
+    fixed, far = (design @ part @ design.T for part in (priors.gaussian, priors.tails))
+    near: dict[tuple[int, int], Array] = {}
+    tried: dict[PriorIndex, float] = {}
+
+    def log_likelihood(at: PriorIndex) -> float:
+        """Log marginal likelihood, up to a constant; minus infinity beside the grid."""
+        if not all(0 <= i < count for i, count in zip(at, PRIOR_GRID, strict=True)):
+            return -np.inf
+        if at not in tried:
+            smoothness, length, strength, amplitude = at
+            if (smoothness, length) not in near:
+                near[smoothness, length] = design @ priors.near(smoothness, length) @ design.T
+            covariance = (
+                PRIOR_STRENGTHS[strength] ** 2 * near[smoothness, length]
+                + TAIL_AMPLITUDES_PX[amplitude] ** 2 * far
+                + fixed
+            )
+            covariance[np.diag_indices_from(covariance)] += 1.0
+            factor, _ = linalg.lapack.dpotrf(covariance, lower=1)
+            white, _ = linalg.lapack.dtrtrs(factor, data, lower=1)
+            tried[at] = float(-0.5 * white @ white - np.log(np.diag(factor)).sum())
+        return tried[at]
+
+    best = start
+    while True:
+        higher = max(_neighbours(best), key=log_likelihood)
+        if log_likelihood(higher) <= log_likelihood(best):
+            break
+        best = higher
+    candidates, waiting = {best}, [best]
+    while waiting:
+        for at in _neighbours(waiting.pop()):
+            if at not in candidates and log_likelihood(at) > log_likelihood(best) - log_likelihood_range:
+                candidates.add(at)
+                waiting.append(at)
+    top = max(log_likelihood(at) for at in candidates)
+    weights = {at: float(np.exp(log_likelihood(at) - top)) for at in candidates}
+    least = LEAST_PRIOR_WEIGHT * sum(weights.values())
+    total = sum(weight for weight in weights.values() if weight > least)
+    return {at: weight / total for at, weight in weights.items() if weight > least}, best
+
+
+def _neighbours(at: PriorIndex) -> list[PriorIndex]:
+    """The eight neighbours on the grid of hyperparameters."""
+    smoothness, length, strength, amplitude = at
+    return [
+        (smoothness + i, length + j, strength + k, amplitude + m)
+        for i, j, k, m in (*np.eye(4, dtype=int).tolist(), *(-np.eye(4, dtype=int)).tolist())
+    ]
+
+
+def _covariance_root(covariance: Array) -> Array:
+    """R with covariance = R R^T."""
+    scale = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(scale, scale)
+    correlation[np.diag_indices_from(correlation)] += 1e-12
+    factor, _ = linalg.lapack.dpotrf(correlation, lower=1, clean=1)
+    return np.asarray(scale[:, None] * factor)
