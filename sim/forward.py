@@ -10,10 +10,11 @@ result is the baseline bit for bit. Frequencies are cy/px, fx along columns (to 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, reduce
-from typing import Literal
+from functools import lru_cache, partial, reduce
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,7 +32,7 @@ from sim.optics.imaging import DiffractionLimited, TracedLens
 from sim.optics.pupil import Wavefront
 from sim.optics.table import LensTable
 from sim.scene.render import Drawing, Grid, Layer, Light, cell_means, draw
-from sim.scene.scenes import Darkness, KnifeEdge, Scene, ScreenPattern, SpectralImage, UniformField
+from sim.scene.scenes import Darkness, KnifeEdge, PosedEdges, Scene, ScreenPattern, SpectralImage, UniformField
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
 from sim.sensor.electrons import FixedPattern, ReadOut
@@ -287,24 +288,10 @@ def expected_electrons(
     0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4.
     """
     check_overlap(camera, exposure.scene)
-    collected_s, source = exposure.exposure_s, 1.0
-    for effect in effects:
-        collected_s = effect.exposure(collected_s)
-        source *= effect.drift(exposure.elapsed_s)
-    if exposure.magnification != 0.0:
-        source *= irradiance_factor(camera.lens.f_number, exposure.magnification) / irradiance_factor(
-            camera.lens.f_number
-        )
-    rate = _light_electron_rate(camera, exposure.scene, effects, source, oversample, margin_px, exposure.placed)
-    light = rate * collected_s
-    for effect in effects:
-        light = effect.lit(light, exposure.exposure_s, exposure.elapsed_s, camera)
-    electrons = light + dark_electrons(camera, exposure, effects)
-    for effect in effects:
-        electrons = effect.charge(electrons, exposure.exposure_s, camera)
-    for effect in effects:
-        electrons = effect.overflow(electrons, camera)
-    return electrons
+    light = scene_light(
+        camera, exposure.scene, effects, oversample=oversample, margin_px=margin_px, placed=exposure.placed
+    )
+    return collected_electrons(light, camera, exposure, effects)
 
 
 def check_overlap(camera: CameraModel, scene: Scene) -> None:
@@ -427,11 +414,8 @@ def expected_sequence(
         if exposure is not before:
             new = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
             before = exposure
-        collected = new + left
-        left = 0.0
-        for effect in effects:
-            left = left + effect.left_behind(np.minimum(collected, camera.full_well_e), camera)
-        yield collected - left
+        read, left = read_electrons(new + left, camera, effects)
+        yield read
 
 
 def sample_sequence(
@@ -637,38 +621,6 @@ def _transfer_at(
     return value
 
 
-def _light_electron_rate(
-    camera: CameraModel,
-    scene: Scene,
-    effects: Sequence[Effect],
-    source: float,
-    oversample: int,
-    margin_px: int,
-    placed: str,
-) -> FloatArray:
-    """Electrons a second of every pixel that light makes, (rows, cols). `source`: factor on the scene's radiance."""
-    shape = camera.rows, camera.cols
-    if isinstance(scene, Darkness):
-        return np.zeros(shape)
-    row, col = np.arange(camera.rows, dtype=np.float64)[:, None], np.arange(camera.cols, dtype=np.float64)[None, :]
-    if isinstance(camera.lens.imaging, TracedLens):
-        traced = _traced_image(camera, camera.lens.imaging.table, scene, effects, oversample, margin_px, placed)
-        images = dict.fromkeys(camera.channels, traced)
-        shade: FloatArray = np.full(shape, source)
-    else:
-        images = _plain_images(camera, scene, effects, oversample, margin_px)
-        shade = relative_illumination(camera, row, col) * source
-    x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
-    y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
-    for effect in effects:
-        shade = shade * effect.illumination(x_um, y_um, camera)
-    images = {channel: _reflected(image, camera, effects) for channel, image in images.items()}
-    for channel in camera.channels:
-        ambient = sum(effect.ambient_e_per_s(channel, camera) for effect in effects)
-        images[channel] = images[channel] * shade + ambient
-    return mosaic.assemble(images, camera.cfa)
-
-
 def _reflected(image: FloatArray, camera: CameraModel, effects: Sequence[Effect]) -> FloatArray:
     """A channel's image with what effects make of it as a whole. A traced lens's image is a mosaic already: colour by colour."""
     acting = [effect for effect in effects if type(effect).image is not Effect.image]
@@ -683,7 +635,12 @@ def _reflected(image: FloatArray, camera: CameraModel, effects: Sequence[Effect]
 
 
 def _plain_images(
-    camera: CameraModel, scene: Scene, effects: Sequence[Effect], oversample: int, margin_px: int
+    camera: CameraModel,
+    scene: Scene,
+    effects: Sequence[Effect],
+    oversample: int,
+    margin_px: int,
+    transfers: KeptTransfers | None = None,
 ) -> dict[str, FloatArray]:
     """Electrons a second of every channel behind a lens that blurs alike everywhere, (rows, cols) each, before cos^4."""
     shape = camera.rows, camera.cols
@@ -691,11 +648,13 @@ def _plain_images(
         images = {c: _uniform_image(camera, c, scene, effects) for c in camera.channels}
     elif isinstance(scene, KnifeEdge):
         images = {c: _edge_image(camera, c, scene, effects) for c in camera.channels}
+    elif isinstance(scene, PosedEdges):
+        images = _posed_edge_images(camera, scene, effects)
     elif isinstance(scene, SpectralImage):
         images = _cube_images(camera, scene, effects, oversample, _margin_for(camera, effects, margin_px))
     else:
         grid = Grid(*shape, oversample, _margin_for(camera, effects, margin_px))
-        images = _blurred_images(camera, scene, effects, grid)
+        images = _blurred_images(camera, scene, effects, grid, transfers)
     return images
 
 
@@ -909,12 +868,70 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
     return image
 
 
-def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect], grid: Grid) -> dict[str, FloatArray]:
+def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence[Effect]) -> dict[str, FloatArray]:
+    """Electrons a second of every channel, before cos^4: a pixel sees the profile of its edge at its own distance, and lens and
+    perspective bend distance and slope along the edge. The transfer is that of the place where the edge's middle is seen."""
+    moves = _light_moves(camera, effects)
+    margin = _margin_for(camera, effects, 1)
+    axes = [np.arange(-margin, n + margin, dtype=float) for n in (camera.rows, camera.cols)]
+    owner, away_mm = scene.distances(*axes)
+    slopes = [np.gradient(distance) for distance in away_mm]
+    pixels = np.meshgrid(np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float), indexing="ij")
+    square = sin_theta_at(camera, *pixels) ** 2
+    inner = slice(margin, margin + camera.rows), slice(margin, margin + camera.cols)
+    spectra = scene.dark_radiance, scene.light_radiance
+    images: dict[str, FloatArray] = {}
+    for channel in camera.channels:
+        place = None
+        if moves:
+            mean_nm = _mean_wavelength(camera, channel, scene.light_radiance, effects, scene.kind)
+            place = np.stack(_unmoved_px(camera, pixels[0], pixels[1], mean_nm, effects)) + margin
+        mine = owner[inner] if place is None else map_coordinates(owner, place, order=0, mode="nearest")
+        rates = [electron_rate(camera, channel, radiance, effects, scene.kind) for radiance in spectra]
+        field = _field_of_rates(camera, channel, [(radiance, None) for radiance in spectra], effects, scene.kind)
+        image = np.empty((camera.rows, camera.cols))
+        for index, (edge, distance, (down, across)) in enumerate(zip(scene.edges, away_mm, slopes, strict=True)):
+            use = mine == index
+            if not np.any(use):
+                continue
+            px = distance / np.hypot(down, across)
+            seen = px[inner][use] if place is None else map_coordinates(px, place[:, use], order=3, mode="nearest")
+            at = np.array([np.clip(float(v), 0.0, n - 1.0) for v, n in zip(scene.warp().to_camera(*edge.centre_mm), (camera.rows, camera.cols), strict=True)])  # fmt: skip
+            near = tuple(np.rint(at).astype(int) + margin)
+            angle_deg = float(np.rad2deg(np.arctan2(down[near], across[near])))
+            from_centre_um = (at - 0.5 * (np.array([camera.rows, camera.cols]) - 1.0)) * camera.pixel_pitch_um
+            acting = tuple(
+                e.at_place(float(from_centre_um[1]), float(from_centre_um[0]), camera) for e in _blurring(effects)
+            )
+            if moves:
+                acting = (*acting, _ShiftAt(acting=acting, row=float(at[0]), col=float(at[1]), less_at_nm=mean_nm))
+            profiles = [edge_profile(camera, channel, scene.light_radiance, angle_deg, seen, acting, scene.kind)]
+            if not _alike(*spectra):
+                profiles.append(edge_profile(camera, channel, scene.dark_radiance, angle_deg, seen, acting, scene.kind))
+            dark, light = rates[0] * np.ones(1), rates[1] * np.ones(1)
+            if field is not None:
+                dark, light = dark * field[0](square[use]), light * field[1](square[use])
+            image[use] = light * profiles[0] + dark * (1.0 - profiles[-1])
+        images[channel] = np.maximum(image, 0.0)
+    return images
+
+
+def _alike(one: Spectrum, other: Spectrum) -> bool:
+    """Whether two lights have the same colour."""
+    (w, a), (x, b) = one.arrays, other.arrays
+    return (
+        w.shape == x.shape and bool(np.all(w == x)) and np.allclose(a * np.sum(b), b * np.sum(a), rtol=1e-9, atol=0.0)
+    )
+
+
+def _blurred_images(
+    camera: CameraModel, scene: Scene, effects: Sequence[Effect], grid: Grid, kept: KeptTransfers | None = None
+) -> dict[str, FloatArray]:
     """Electrons a second (rows, cols) of every channel, of a scene drawn by area and convolved, before cos^4.
 
     With OTF_k at a few wavelengths, w_lk the share of light l's electrons that goes with each, and F the Fourier transform,
     the image is sum_k OTF_k F[sum_l w_lk picture_l]. The ground's picture is 1 minus all others', so that only the
-    differences to the ground are transformed.
+    differences to the ground are transformed. `kept`: transfers of scenes before in the same lights, and those of this one.
     """
     drawing = draw(scene, grid)
     if isinstance(scene, ScreenPattern):
@@ -933,7 +950,9 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
         shares = lagrange_shares(wavelength_nm, weight, nodes)
         field = _field_of_rates(camera, channel, lights, effects, scene.kind)
         pictures = [layer.coverage for layer in drawing.layers]
-        if field is not None:
+        # lights of one colour change alike over the field
+        apart = field is not None and any(not np.allclose(f.c, field[0].c, rtol=0.0, atol=1e-12) for f in field)
+        if field is not None and apart:
             pictures = [
                 picture * _relative_to_ground(camera, grid, layer.window, field[index], field[0])
                 for index, (layer, picture) in enumerate(zip(drawing.layers, pictures, strict=True), 1)
@@ -941,34 +960,60 @@ def _blurred_images(camera: CameraModel, scene: Scene, effects: Sequence[Effect]
         windows = [layer.window for layer in drawing.layers]
         # Few pictures are transformed one by one, once for all channels; of many, one sum a wavelength.
         few = len(pictures) <= nodes.size
-        if few and (field is not None or not transformed):
+        if few and (apart or not transformed):
             transformed = [_transform(grid, [w], [p], [1.0]) for w, p in zip(windows, pictures, strict=True)]
-        spectrum = np.zeros((ny, nx // 2 + 1), complex)
-        moved: list[tuple[float, ComplexArray]] = []
-        for k, node in enumerate(nodes):
-            if moves:
-                spectrum = np.zeros((ny, nx // 2 + 1), complex)
-                moved.append((float(node), spectrum))
-            over = (shares[1:, k] - shares[0, k]).tolist()
-            transfer = _transfer_at(camera, float(node), fx, fy, _blurring(effects))
-            for factor, picture in (
-                zip(over, transformed, strict=True) if few else [(1.0, _transform(grid, windows, pictures, over))]
-            ):
-                spectrum += (factor * transfer) * picture
-        if moved:
-            image = sum(
-                _at_moved_pixels(camera, part * (pixel_x * pixel_y), grid, node, effects) for node, part in moved
-            )
-        else:
-            spectrum *= pixel_x
-            spectrum *= pixel_y
+        over = shares[1:] - shares[0]
+
+        if few and not moves:
+            key = (channel, *lights, scene.kind, grid)
+            make = partial(_layer_transfers, camera, nodes, over, grid, effects)
+            spectrum = np.zeros((ny, nx // 2 + 1), complex)
+            acting: Sequence[NDArray[np.complexfloating[Any]]] = make() if kept is None else kept.get(key, make)
+            for transfer, picture in zip(acting, transformed, strict=True):
+                spectrum += transfer * picture
             image = _at_pixels(spectrum, grid.oversample, nx)[m : m + grid.rows, m : m + grid.cols]
+        else:
+            spectrum = np.zeros((ny, nx // 2 + 1), complex)
+            image = np.zeros((grid.rows, grid.cols))
+            for node, factors in zip(nodes, over.T.tolist(), strict=True):
+                part = _transfer_at(camera, float(node), fx, fy, _blurring(effects)) * (pixel_x * pixel_y)
+                part = part * (
+                    _mixed(transformed, factors)
+                    if few and transformed
+                    else _transform(grid, windows, pictures, factors)
+                )
+                if moves:
+                    image = image + _at_moved_pixels(camera, part, grid, float(node), effects)
+                else:
+                    spectrum += part
+            if not moves:
+                image = _at_pixels(spectrum, grid.oversample, nx)[m : m + grid.rows, m : m + grid.cols]
         image = np.maximum(image + np.sum(weight[0]), 0.0)
         if field is not None:
             row, col = np.arange(camera.rows)[:, None], np.arange(camera.cols)[None, :]
             image *= field[0](sin_theta_at(camera, row, col) ** 2)
         images[channel] = image
     return images
+
+
+def _layer_transfers(
+    camera: CameraModel, nodes: FloatArray, over: FloatArray, grid: Grid, effects: Sequence[Effect]
+) -> list[ComplexArray]:
+    """What the transform of each layer's picture is multiplied with: sum_k over_lk OTF_k at the nodes (nm), with the pixel."""
+    fy, fx, pixel_y, pixel_x = _pixel_on_grid(camera, grid)
+    total = np.zeros((len(over), fy.size, fx.size), complex)
+    for node, factors in zip(nodes, over.T, strict=True):
+        transfer = _transfer_at(camera, float(node), fx, fy, _blurring(effects))
+        for index, factor in enumerate(factors):
+            total[index] += factor * transfer
+    return [part * pixel_x * pixel_y for part in total]
+
+
+def _mixed(transformed: Sequence[ComplexArray], factors: Sequence[float]) -> ComplexArray:
+    total = np.zeros_like(transformed[0])
+    for factor, picture in zip(factors, transformed, strict=True):
+        total += factor * picture
+    return total
 
 
 def _shown(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
@@ -1205,3 +1250,112 @@ def _transform(
     for window, picture, factor in zip(windows, pictures, factors, strict=True):
         total[window] += factor * picture
     return np.asarray(fft.rfft2(total), complex)
+
+
+# --- the steps of an exposure one by one, for who keeps a scene's light over many exposures -----------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SceneLight:
+    """Electrons a second that light makes in every pixel, (rows, cols): of the scene, and of the room beside it."""
+
+    scene: FloatArray
+    room: FloatArray | float = 0.0
+
+
+class KeptTransfers:
+    """The transfers that whole frames were blurred with, for the next scene in the same lights; of one camera with one set of
+    effects. The latest `most` are kept, one a channel and light, of 12 MB at 480 x 640 px and 3 samples a pixel."""
+
+    def __init__(self, most: int = 3) -> None:
+        self._kept: OrderedDict[Hashable, list[NDArray[np.complex64]]] = OrderedDict()
+        self._most = most
+
+    def get(self, key: Hashable, make: Callable[[], list[ComplexArray]]) -> list[NDArray[np.complex64]]:
+        """What is kept for `key`, else what `make` makes."""
+        if key not in self._kept:
+            self._kept[key] = [part.astype(np.complex64) for part in make()]
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+
+def scene_light(
+    camera: CameraModel,
+    scene: Scene,
+    effects: Sequence[Effect] = (),
+    *,
+    oversample: int = 3,
+    margin_px: int = 32,
+    placed: Literal["ideal", "image"] = "ideal",
+    transfers: KeptTransfers | None = None,
+) -> SceneLight:
+    """The part of `expected_electrons` that no exposure changes, and that takes nearly all its time."""
+    shape = camera.rows, camera.cols
+    if isinstance(scene, Darkness):
+        return SceneLight(np.zeros(shape))
+    row, col = np.arange(camera.rows, dtype=np.float64)[:, None], np.arange(camera.cols, dtype=np.float64)[None, :]
+    if isinstance(camera.lens.imaging, TracedLens):
+        traced = _traced_image(camera, camera.lens.imaging.table, scene, effects, oversample, margin_px, placed)
+        images = dict.fromkeys(camera.channels, traced)
+        shade: FloatArray = np.ones(shape)
+    else:
+        images = _plain_images(camera, scene, effects, oversample, margin_px, transfers)
+        shade = relative_illumination(camera, row, col)
+    x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
+    y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
+    for effect in effects:
+        shade = shade * effect.illumination(x_um, y_um, camera)
+    images = {channel: _reflected(image, camera, effects) * shade for channel, image in images.items()}
+    ambient = {c: sum(effect.ambient_e_per_s(c, camera) for effect in effects) for c in camera.channels}
+    if not any(ambient.values()):
+        return SceneLight(mosaic.assemble(images, camera.cfa))
+    room = {channel: np.full(shape, float(value)) for channel, value in ambient.items()}
+    return SceneLight(mosaic.assemble(images, camera.cfa), mosaic.assemble(room, camera.cfa))
+
+
+def collected_electrons(
+    light: SceneLight, camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, source: float = 1.0
+) -> FloatArray:
+    """`expected_electrons` of a scene whose light is known. `source`: factor on the scene's light at this time, beside the effects'."""
+    collected_s = exposure.exposure_s
+    for effect in effects:
+        collected_s = effect.exposure(collected_s)
+        source *= effect.drift(exposure.elapsed_s)
+    if exposure.magnification != 0.0:
+        source *= irradiance_factor(camera.lens.f_number, exposure.magnification) / irradiance_factor(
+            camera.lens.f_number
+        )
+    lit = (light.scene * source + light.room) * collected_s
+    for effect in effects:
+        lit = effect.lit(lit, exposure.exposure_s, exposure.elapsed_s, camera)
+    electrons = lit + dark_electrons(camera, exposure, effects)
+    for effect in effects:
+        electrons = effect.charge(electrons, exposure.exposure_s, camera)
+    for effect in effects:
+        electrons = effect.overflow(electrons, camera)
+    return electrons
+
+
+def read_electrons(
+    collected: FloatArray, camera: CameraModel, effects: Sequence[Effect] = ()
+) -> tuple[FloatArray, FloatArray | float]:
+    """Of the mean electrons that a frame holds, those that are read, and those that stay in the pixels for the next frame."""
+    left: FloatArray | float = 0.0
+    for effect in effects:
+        left = left + effect.left_behind(np.minimum(collected, camera.full_well_e), camera)
+    return collected - left, left
+
+
+def radiance_at_lens(radiance: Spectrum, effects: Sequence[Effect], kind: str) -> Spectrum:
+    """The radiance in front of the lens where the radiometer says `radiance`, in a capture of `kind`."""
+    wavelength_nm, value = radiance.arrays
+    for effect in effects:
+        value = effect.radiance(wavelength_nm, value, kind)
+    return Spectrum.of(wavelength_nm, value)
+
+
+def scene_gain(effects: Sequence[Effect]) -> float:
+    """Factor on the right camera's light over the left one's in a scene that both see, against uniform light."""
+    return float(np.prod([effect.scene_gain() for effect in effects]))

@@ -16,6 +16,7 @@ from sim.scene.scenes import (
     KnifeEdge,
     PlanarTarget,
     PointArray,
+    PosedEdges,
     Ramp,
     ReflectanceChart,
     Scene,
@@ -90,8 +91,8 @@ def draw(scene: Scene, grid: Grid) -> Drawing:
         lit = cells(np.asarray(scene.pattern, float), scene.to_camera, grid, 0.0)
     elif isinstance(scene, PlanarTarget):
         lit = cells(np.asarray(scene.texture, float), scene.warp(), grid, scene.surround)
-    elif isinstance(scene, KnifeEdge):
-        lit = _edges(scene, grid)
+    elif isinstance(scene, KnifeEdge | PosedEdges):
+        lit = _edges(scene, grid) if isinstance(scene, KnifeEdge) else _posed_edges(scene, grid)
     elif isinstance(scene, ZonePlate):
         lit = _zone_plate(scene, grid)
     elif isinstance(scene, SiemensStar):
@@ -281,6 +282,17 @@ def _edges(scene: KnifeEdge, grid: Grid) -> FloatArray:
     return lit
 
 
+def _posed_edges(scene: PosedEdges, grid: Grid) -> FloatArray:
+    """Every sample is cut by the line that its edge is there, by exact area."""
+    owner, away = scene.distances(*grid.axes_px())
+    lit = np.empty(grid.shape)
+    for index, distance in enumerate(away):
+        mine = owner == index
+        down, across = np.gradient(distance)
+        lit[mine] = half_plane(distance[mine], across[mine], down[mine])
+    return lit
+
+
 def _light_side(edge: EdgeRegion, grid: Grid) -> FloatArray:
     """Share of every sample on an edge's light side: that part of the grid is a polygon."""
     row, col = grid.axes_px()
@@ -383,7 +395,7 @@ def _chart(scene: ReflectanceChart, grid: Grid) -> Drawing:
         )
     # The corners are the outer corners of the corner patches: the grid is (n - gap) distances wide.
     size = 1.0 - scene.gap
-    warp = Warp.from_corners(cols - scene.gap, rows - scene.gap, scene.corners)
+    warp = Warp.from_corners(cols - scene.gap, rows - scene.gap, scene.corners, scene.geometry)
     row, col = grid.axes_px()
     drawn = []
     for index, reflectance in enumerate(patches.values()):

@@ -49,7 +49,8 @@ class ReflectanceChart:
 
     `corners`: outer corners [row, col] of the patch grid, in the order dark skin, bluish green, black, white (SG: A1, N1, N10,
     A10; for an upright chart: top left, top right, bottom right, bottom left). `illuminant_radiance`: of a perfect white diffuser in the chart's
-    place. `gap`: share of the distance of neighbouring patches that the frame between them takes.
+    place. `gap`: share of the distance of neighbouring patches that the frame between them takes. `geometry`: of a lens that distorts; the
+    corners are then where a pinhole would have them, and every patch's corners are distorted.
     """
 
     corners: Corners
@@ -57,6 +58,7 @@ class ReflectanceChart:
     name: str = "ColorChecker24"
     gap: float = 0.13
     kind: str = "chart"
+    geometry: Geometry | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,48 @@ class PlanarTarget(Posed):
     def warp(self) -> Warp:
         """From texels to camera px: camera_matrix [r1 r2 t] texel_mm, then the lens's distortion."""
         return self.plane_warp(self.texel_mm)
+
+
+@dataclass(frozen=True)
+class PlaneEdge:
+    """One straight edge in a target's plane: through the point `through_mm` [x, y], `angle_deg` from the y axis (positive turns its
+    top to the right), light on the side of larger x. It rules the points that lie nearest to `centre_mm` [x, y]."""
+
+    centre_mm: tuple[float, float]
+    through_mm: tuple[float, float]
+    angle_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class PosedEdges(Posed):
+    """Knife edges in one plane at a pose, seen in perspective and through the lens's distortion, which bends them."""
+
+    edges: tuple[PlaneEdge, ...]
+    rotation: Matrix
+    translation_mm: tuple[float, float, float]
+    geometry: Geometry
+    dark_radiance: Spectrum
+    light_radiance: Spectrum
+    kind: str = "slanted_edge"
+
+    def __post_init__(self) -> None:
+        if not self.edges:
+            raise ValueError("a knife edge with no edge shows nothing: give at least one")
+
+    def warp(self) -> Warp:
+        """From the plane (mm) to camera px."""
+        return self.plane_warp(1.0)
+
+    def distances(self, row: FloatArray, col: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """On the grid of ascending `row` x `col` (px): the index of the edge that rules each point, and the signed distance of each
+        point from each edge in mm, positive on the light side; (rows, cols) and (edges, rows, cols)."""
+        x, y = self.warp().grid_to_pattern(row, col)
+        owner = np.argmin([np.hypot(x - e.centre_mm[0], y - e.centre_mm[1]) for e in self.edges], axis=0)
+        away = []
+        for edge in self.edges:
+            angle = np.deg2rad(edge.angle_deg)
+            away.append((x - edge.through_mm[0]) * np.cos(angle) + (y - edge.through_mm[1]) * np.sin(angle))
+        return owner, np.stack(away)
 
 
 @dataclass(frozen=True)
