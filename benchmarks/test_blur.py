@@ -1,6 +1,6 @@
 """Edges and kernels with known truth: bias, scatter and CPU time beside the peers', the original report's table, a photograph.
 
-Peers: the slanted edge as ISO 12233:2005 has it (`peers/iso12233.py`), the objective of Mosleh et al. (`lab.fit.mosleh`); the
+Peers: the slanted edge as ISO 12233:2005 has it (`peers/iso12233.py`), the objective of Mosleh et al. (`peers/mosleh.py`); the
 Cramer-Rao bound of a free line spread of +-4 px, and of a free kernel. Prints the tables of docs/accuracy.md, "MTF" and "PSF".
 """
 
@@ -18,16 +18,14 @@ from scipy.optimize import brentq
 from scipy.signal import fftconvolve
 
 from benchmarks.peers.iso12233 import iso12233_mtf
-from lab.fit.mosleh import mosleh_kernel
+from benchmarks.peers.mosleh import mosleh_kernel
 from lab.fit.mtf import edge_mtf
-from lab.fit.psf import (
-    ScreenPictures,
-    displaced,
-    estimate_kernel,
-    measure_kernels,
-    normal_equations,
-    photographed_kernel,
-)
+from lab.fit.psf import estimate_kernel
+from lab.fit.psf.levelled_captures import ScreenPictures
+from lab.fit.psf.normal_equations import normal_equations
+from lab.fit.psf.photograph import photographed_kernel
+from lab.fit.psf.screen_kernel import measure_kernels
+from lab.fit.psf.target_displacement import displaced
 from lab.formats.recording_set import Bernoulli, Screen
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, expected_electrons, kernel
@@ -314,8 +312,9 @@ def test_sub_pixel_kernels() -> None:
 
 
 def sub_pixel(cells: np.ndarray, seen: np.ndarray, support: int) -> np.ndarray:
-    """`lab.fit.psf.solve_kernel` on the normal equations of every 4th sample."""
-    from lab.fit.psf import Normal, solve_kernel
+    """`lab.fit.psf.regularised_kernel.solve_kernel` on the normal equations of every 4th sample."""
+    from lab.fit.psf.normal_equations import NormalEquations
+    from lab.fit.psf.regularised_kernel import solve_kernel
 
     half, size = support // 2, support * support
     windows = np.lib.stride_tricks.sliding_window_view(cells, (support, support))
@@ -327,7 +326,7 @@ def sub_pixel(cells: np.ndarray, seen: np.ndarray, support: int) -> np.ndarray:
         gram += design.T @ design
         right += value @ design
         power, count = power + float(value @ value), count + len(value)
-    return solve_kernel(Normal(gram, right, power, count), support).kernel
+    return solve_kernel(NormalEquations(gram, right, power, count), support).kernel
 
 
 def test_a_real_photograph() -> None:

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from benchmarks.table import Row, show
-from lab.fit.board import find_board, luminance
-from lab.fit.geometry import calibrate, calibrate_robustly, fit_geometry, geometry_result
-from lab.fit.pinhole import intrinsics_of
-from lab.fit.projection import difference, grid, grid_points, points_at
+from lab.fit.geometry.board_detection import find_board, luminance
+from lab.fit.geometry.calibration import calibrate, calibrate_robustly
+from lab.fit.geometry.pinhole import intrinsics_of
+from lab.fit.geometry.projection_errors import difference, grid, grid_points, points_at
+from lab.fit.geometry.recordings import fit_geometry, geometry_result
 from lab.fit.stereo import fit_stereo
 from lab.formats.importers import read_checkerboard_pairs
 from tests.lab.fit import conftest as drawn

@@ -48,10 +48,10 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
 
     Both sides, and each side's geometry beside its radiometry, run at the same time.
     """
-    from lab.fit.geometry import fit_geometry
+    from lab.fit.geometry.recordings import fit_geometry
     from lab.fit.mtf.recordings import fit_mtf
     from lab.fit.noise import fit_noise
-    from lab.fit.psf import fit_psf_field
+    from lab.fit.psf.recordings import fit_psf_field
     from lab.fit.spectral import fit_spectral
     from lab.fit.stereo import fit_stereo
 

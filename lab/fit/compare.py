@@ -3,7 +3,7 @@
 Every number that a fit states with a standard uncertainty is compared, found by its name: `x` beside `x_std`. Numbers of curves and
 kernels share one row, of the point at which they differ most, with the number of points allowed for (Sidak). Cameras' geometry
 is also compared by what it does: both project the same points, the rigid motion that the two calibrations imply between each other
-taken out first (`lab.fit.projection`), since parameters that differ by much may project alike, and the other way round.
+taken out first (`lab.fit.geometry.projection_errors`), since parameters that differ by much may project alike, and the other way round.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from lab.fit.pinhole import COUNT, NAMES, intrinsics_of_fit, project, unproject
-from lab.fit.projection import difference, grid, grid_points, implied_motion, seen_points
+from lab.fit.geometry.pinhole import COUNT, NAMES, intrinsics_of_fit, project, unproject
+from lab.fit.geometry.projection_errors import difference, grid, grid_points, implied_motion, seen_points
+from lab.fit.tuples import triple
 from lab.formats.results import (
     Change,
     ComparisonResult,
@@ -275,8 +276,8 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
     return ProjectionChange(
         side=side,
         as_stated_px=float(np.sqrt(np.mean(np.sum(stated**2, axis=1)))),
-        implied_turn_mrad=_three(1e3 * Rotation.from_matrix(rotation).as_rotvec()),
-        implied_shift_mm=_three(shift),
+        implied_turn_mrad=triple(1e3 * Rotation.from_matrix(rotation).as_rotvec()),
+        implied_shift_mm=triple(shift),
         difference_px=found.rms_px,
         expected_px=found.expected_px,
         significance_sigma=found.significance_sigma,
@@ -319,7 +320,3 @@ def _turned(a: StereoFit, b: StereoFit) -> Iterator[Change]:
             significance_sigma=_sigma(2.0 * float(special.ndtr(-abs(turn[k]) / std))),
             changed=False,
         )
-
-
-def _three(values: Array) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])

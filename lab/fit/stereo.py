@@ -1,7 +1,7 @@
 """Extrinsics of a stereo pair: x_right = rotation x_left + translation_mm, from poses of a board that both cameras saw.
 
 One least-squares problem over everything that both cameras saw: the rig's rotation and translation, both cameras' intrinsics, the
-boards' warp and the pose of the board in every capture (`lab.fit.bundle`). Solving for the rig alone, with the intrinsics held
+boards' warp and the pose of the board in every capture (`lab.fit.geometry.bundle_adjustment`). Solving for the rig alone, with the intrinsics held
 where each camera's own views put them, would push their errors into the rig and leave them out of its uncertainty.
 
 From the joint covariance follows what a depth is worth. A point P in the left camera's frame is seen at q(theta, P), (4,) px in
@@ -20,19 +20,29 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lab.errors import NotDetermined
-from lab.fit.board import BoardView, board_points
-from lab.fit.bundle import RIG, Bundle, Sight, Solution, State, board_key, board_pose, rms_px
-from lab.fit.pinhole import (
+from lab.fit.geometry.board_detection import BoardView, board_points
+from lab.fit.geometry.bundle_adjustment import (
+    RIG,
+    BundleAdjustment,
+    Observation,
+    Solution,
+    State,
+    board_key,
+    board_pose,
+    rms_px,
+)
+from lab.fit.geometry.pinhole import (
     NAMES,
     cross_matrices,
     distortion_of,
     intrinsics_of,
     intrinsics_of_fit,
     matrix_of,
-    project_slopes,
+    project_with_jacobian,
     unproject,
 )
-from lab.fit.projection import grid, grid_points
+from lab.fit.geometry.projection_errors import grid, grid_points
+from lab.fit.tuples import numbers, rows, triple, triples
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
 from sim.camera import Side
@@ -89,7 +99,7 @@ def fit_pairs(
         solution = solve_rig(pairs, left, right, shapes[0])
         of_pairs = [
             rms_px(np.concatenate(solution.residuals[2 * k : 2 * k + 2])) for k in range(len(pairs))
-        ]  # two sights a pair, left then right
+        ]  # two observations a pair, left then right
         worst = int(np.argmax(of_pairs))
         limit = max(OUTLYING_PAIR * float(np.median(of_pairs)), OUTLYING_PAIR_PX)
         if len(pairs) == MIN_PAIRS or of_pairs[worst] <= limit:
@@ -141,10 +151,10 @@ def solve_rig(pairs: Sequence[Pair], left: GeometryFit, right: GeometryFit, shap
     fits ended. Sights stand pair by pair, left then right."""
     cameras = np.array([intrinsics_of_fit(left), intrinsics_of_fit(right)])
     keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
-    sights, poses, turns, shifts = [], [], [], []
+    observations, poses, turns, shifts = [], [], [], []
     for k, pair in enumerate(pairs):
         board = keys.index(board_key(pair.left))
-        sights += [Sight(pair.left, k, board, 0), Sight(pair.right, k, board, 1)]
+        observations += [Observation(pair.left, k, board, 0), Observation(pair.right, k, board, 1)]
         (turn_one, shift_one), (turn_two, shift_two) = (
             board_pose(view, camera) for view, camera in zip((pair.left, pair.right), cameras, strict=True)
         )
@@ -157,10 +167,10 @@ def solve_rig(pairs: Sequence[Pair], left: GeometryFit, right: GeometryFit, shap
         rotation=Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(),
         translation_mm=np.median(shifts, axis=0),
         warps_mm=np.zeros((len(keys), 3)),
-        turns=np.array([turn for turn, _ in poses]),
-        shifts_mm=np.array([shift for _, shift in poses]),
+        rotations=np.array([turn for turn, _ in poses]),
+        translations_mm=np.array([shift for _, shift in poses]),
     )
-    return Bundle(sights, np.array([free_of(left), free_of(right)]), shape).solve(start)
+    return BundleAdjustment(observations, np.array([free_of(left), free_of(right)]), shape).solve(start)
 
 
 def _result(
@@ -178,20 +188,20 @@ def _result(
     along = translation / baseline
     of_shift = solution.covariance[at + 3 : at + 6, at + 3 : at + 6]
     return StereoFit(
-        rotation=_rows3(state.rotation),
-        rotation_std_rad=_three(std[:3]),
-        translation_mm=_three(translation),
-        translation_mm_std=_three(std[3:]),
+        rotation=triples(state.rotation),
+        rotation_std_rad=triple(std[:3]),
+        translation_mm=triple(translation),
+        translation_mm_std=triple(std[3:]),
         baseline_mm=baseline,
         baseline_mm_std=float(np.sqrt(along @ of_shift @ along)),
         rms_px=solution.rms_px,
         pairs=len(pairs),
-        camera_matrix_left=_rows3(matrix_of(state.intrinsics[0])),
-        distortion_left=_numbers(distortion_of(state.intrinsics[0])),
-        camera_matrix_right=_rows3(matrix_of(state.intrinsics[1])),
-        distortion_right=_numbers(distortion_of(state.intrinsics[1])),
+        camera_matrix_left=triples(matrix_of(state.intrinsics[0])),
+        distortion_left=numbers(distortion_of(state.intrinsics[0])),
+        camera_matrix_right=triples(matrix_of(state.intrinsics[1])),
+        distortion_right=numbers(distortion_of(state.intrinsics[1])),
         parameters=solution.names,
-        covariance=_rows(solution.covariance),
+        covariance=rows(solution.covariance),
         corner_px_std=solution.noise_px,
         rejected=rejected,
         rectification=rectification(state, pairs, shapes[0]) if shapes[0] == shapes[1] else None,
@@ -202,29 +212,29 @@ def _result(
 # --- depth -------------------------------------------------------------------------------------------------------------------
 
 
-def triangulation_slopes(solution: Solution, points: Array) -> tuple[Array, Array]:
+def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Array]:
     """Slopes of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by the shared parameters
     (n, 4, parameters)."""
     state, free = solution.state, solution.free
     shared = np.zeros((len(points), 4, len(solution.names)))
     by_point = np.empty((len(points), 4, 3))
-    _, by_point[:, :2], by_camera = project_slopes(points, state.intrinsics[0])
+    _, by_point[:, :2], by_camera = project_with_jacobian(points, state.intrinsics[0])
     first = int(free[0].sum())
     shared[:, :2, :first] = by_camera[:, :, free[0]]
     turned = points @ state.rotation.T
-    _, slope, by_camera = project_slopes(turned + state.translation_mm, state.intrinsics[1])
-    by_point[:, 2:] = slope @ state.rotation
+    _, point_jacobian, by_camera = project_with_jacobian(turned + state.translation_mm, state.intrinsics[1])
+    by_point[:, 2:] = point_jacobian @ state.rotation
     at = solution.names.index(RIG[0])
     shared[:, 2:, first:at] = by_camera[:, :, free[1]]
-    shared[:, 2:, at : at + 3] = -slope @ cross_matrices(turned)
-    shared[:, 2:, at + 3 : at + 6] = slope
+    shared[:, 2:, at : at + 3] = -point_jacobian @ cross_matrices(turned)
+    shared[:, 2:, at + 3 : at + 6] = point_jacobian
     return by_point, shared
 
 
 def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[Array, Array]:
     """Standard uncertainty (n,) of the triangulated depth of `points`, mm: by the calibration, and with corners in both pictures
     that scatter by `corner_px_std` a coordinate, too."""
-    by_point, shared = triangulation_slopes(solution, points)
+    by_point, shared = triangulation_jacobian(solution, points)
     inverse = np.linalg.pinv(by_point)[:, 2, :]  # (n, 4): the row of the depth
     by_parameter = -np.einsum("nk,nkp->np", inverse, shared)
     calibration = np.einsum("np,pq,nq->n", by_parameter, solution.covariance, by_parameter)
@@ -242,7 +252,7 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
     on_right = points[there] @ state.rotation.T + state.translation_mm
     front = on_right[:, 2] > 0
     there[there] = front
-    seen[there] = project_slopes(on_right[front], state.intrinsics[1])[0]
+    seen[there] = project_with_jacobian(on_right[front], state.intrinsics[1])[0]
     rows, cols = shapes[1]
     there &= (seen[:, 0] >= 0) & (seen[:, 0] <= cols - 1) & (seen[:, 1] >= 0) & (seen[:, 1] <= rows - 1)
     maps = np.full((2, len(points)), np.nan)
@@ -251,8 +261,8 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
     calibration, total = maps.reshape(2, len(y), len(x))
     return DepthUncertainty(
         depth_mm=float(depth_mm),
-        x_px=_numbers(x),
-        y_px=_numbers(y),
+        x_px=numbers(x),
+        y_px=numbers(y),
         calibration_mm_std=_open_rows(calibration),
         total_mm_std=_open_rows(total),
     )
@@ -272,7 +282,7 @@ def rectification(state: State, pairs: Sequence[Pair], shape: tuple[int, int]) -
     gaps = []
     for pair in pairs:
         _, at_left, at_right = np.intersect1d(pair.left.index, pair.right.index, return_indices=True)
-        rows = [
+        row_px = [
             cv2.undistortPoints(view.image_px[at][:, None, :], matrix, distortion, R=turn, P=new)[:, 0, 1]
             for view, at, matrix, distortion, turn, new in (
                 (pair.left, at_left, one, of_one, turn_one, new_one),
@@ -280,13 +290,13 @@ def rectification(state: State, pairs: Sequence[Pair], shape: tuple[int, int]) -
             )
             if len(at)
         ]
-        gaps += [rows[1] - rows[0]] if rows else []
+        gaps += [row_px[1] - row_px[0]] if row_px else []
     return Rectification(
-        rotation_left=_rows3(turn_one),
-        rotation_right=_rows3(turn_two),
-        projection_left=_rows(new_one),
-        projection_right=_rows(new_two),
-        disparity_to_depth=_rows(to_depth),
+        rotation_left=triples(turn_one),
+        rotation_right=triples(turn_two),
+        projection_left=rows(new_one),
+        projection_right=rows(new_two),
+        disparity_to_depth=rows(to_depth),
         row_rms_px=float(np.sqrt(np.mean(np.concatenate(gaps) ** 2))),
     )
 
@@ -310,22 +320,6 @@ def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, 
         )
         found[side] = (x, y)
     return found
-
-
-def _three(values: Array) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
-
-
-def _rows3(values: Array) -> tuple[tuple[float, float, float], ...]:
-    return tuple(_three(row) for row in values)
-
-
-def _numbers(values: Array) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
-
-
-def _rows(values: Array) -> tuple[tuple[float, ...], ...]:
-    return tuple(_numbers(row) for row in values)
 
 
 def _open_rows(values: Array) -> tuple[tuple[float | None, ...], ...]:

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from lab.fit.board import CornerFits
 from lab.fit.compare import compare
-from lab.fit.geometry import calibrate_robustly, channel_geometry, cross_validation, geometry_result
-from lab.fit.pinhole import intrinsics_of
-from lab.fit.projection import difference, grid, grid_points, points_at
+from lab.fit.geometry.calibration import calibrate_robustly
+from lab.fit.geometry.corners import CornerFits
+from lab.fit.geometry.cross_validation import cross_validation
+from lab.fit.geometry.lateral_colour import channel_geometry
+from lab.fit.geometry.pinhole import intrinsics_of
+from lab.fit.geometry.projection_errors import difference, grid, grid_points, points_at
+from lab.fit.geometry.recordings import geometry_result
 from lab.fit.stereo import Pair, depth_std, solve_rig
 from lab.formats.results import CameraFit, FitResult
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen

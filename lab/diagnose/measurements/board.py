@@ -21,10 +21,11 @@ from scipy import linalg
 from lab.diagnose.measurements.screens import COLOUR_FLOOR_PX, colour_shift_px
 from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
 from lab.errors import NotDetermined
-from lab.fit.board import BoardView, channel_corners, find_boards
-from lab.fit.bundle import Bundle, Solution
-from lab.fit.geometry import MODELS, Calibration, calibrate_robustly, free_intrinsics, sights_of
-from lab.fit.pinhole import NAMES, intrinsics_of
+from lab.fit.geometry.board_detection import BoardView, channel_corners, find_boards
+from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Solution
+from lab.fit.geometry.calibration import Calibration, calibrate_robustly, observations_of
+from lab.fit.geometry.distortion_model import MODELS, free_intrinsics
+from lab.fit.geometry.pinhole import NAMES, intrinsics_of
 from lab.formats.results import Skipped
 from sim.camera import Side
 from sim.spectrum import FloatArray
@@ -74,8 +75,8 @@ class _Corners:
     view: FloatArray  # (n,) number of its view
 
     @staticmethod
-    def of(views: Sequence[BoardView], solution: Solution, bundle: Bundle) -> _Corners:
-        shared, by_pose = bundle.slopes(solution.state)
+    def of(views: Sequence[BoardView], solution: Solution, bundle: BundleAdjustment) -> _Corners:
+        shared, by_pose = bundle.jacobian(solution.state)
         n = len(shared)
         free = shared.reshape(2 * n, -1)
         poses = np.zeros((2 * n, 6 * len(views)))
@@ -106,7 +107,7 @@ def board_block(study: Study) -> Block:
         fixed = intrinsics_of(known.camera_matrix, known.distortion)
         start = np.array([np.concatenate([state.intrinsics[0, :4], fixed[4:]])])
         state = replace(state, intrinsics=start)
-    bundle = Bundle(sights_of(views), free[None, :], shape)
+    bundle = BundleAdjustment(observations_of(views), free[None, :], shape)
     solution = bundle.solve(state)
     corners = _Corners.of(views, solution, bundle)
     noise_px = min(corners.noise_px, found.solution.noise_px)

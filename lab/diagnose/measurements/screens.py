@@ -1,7 +1,7 @@
 """Patterns on a screen: how much contrast a random pattern keeps at every frequency, what its rims lack, what lies over it
 turned about the axis, where each colour's copy of it lands, and the grid of the screen's own pixels.
 
-The Bernoulli pattern is drawn where the checkerboard says that it is (`lab.fit.screen`) and passed through the baseline's
+The Bernoulli pattern is drawn where the checkerboard says that it is (`lab.fit.psf.screen_registration`) and passed through the baseline's
 transfer function. Band by band of frequency and orientation its picture is split, and what is seen is a sum of these parts:
 
     seen = sum over bands of c_b P_b + rim P (1 - P) + turned T + even + shifts . gradient P + P beyond the bands
@@ -26,8 +26,8 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, held_out_of
 from lab.errors import NotDetermined
-from lab.fit.psf import area_drawn
-from lab.fit.screen import ScreenWarp, register
+from lab.fit.psf.drawn_pattern import area_drawn
+from lab.fit.psf.screen_registration import ScreenWarp, register
 from lab.formats.recording_set import Bernoulli, Black, Capture, Checkerboard, White
 from sim.camera import CameraModel
 from sim.effects.base import Effect

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from lab.diagnose.measurements.board import views_of
 from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
 from lab.errors import NotDetermined
-from lab.fit.board import BoardView
-from lab.fit.bundle import board_pose
-from lab.fit.geometry import Calibration, calibrate_robustly
-from lab.fit.pinhole import project
+from lab.fit.geometry.board_detection import BoardView
+from lab.fit.geometry.bundle_adjustment import board_pose
+from lab.fit.geometry.calibration import Calibration, calibrate_robustly
+from lab.fit.geometry.pinhole import project
 from lab.formats.recording_set import Capture, Flat, White
 from sim.camera import Side
 from sim.optics.illumination import relative_illumination

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lab.fit.geometry import fit_geometry
+from lab.fit.geometry.recordings import fit_geometry
 from lab.formats.recording_set import Camera, Charuco, Manifest, RecordingSet
 from lab.formats.results import GeometryFit
 

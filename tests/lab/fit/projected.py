@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.fit.board import BoardView, board_points
+from lab.fit.geometry.board_detection import BoardView, board_points
 from lab.formats.recording_set import Charuco
 
 SHAPE = (960, 1280)

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.fit.bundle import Bundle, Sight, State, first_intrinsics, first_state
-from lab.fit.geometry import MODELS, calibrate, free_intrinsics
+from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Observation, State, first_intrinsics, first_state
+from lab.fit.geometry.calibration import calibrate
+from lab.fit.geometry.distortion_model import MODELS, free_intrinsics
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 AT = poses(10)
@@ -34,18 +35,18 @@ def test_a_flat_model_of_a_bent_board_is_worse():
     assert flat_rms > 1.2 * 0.1 * np.sqrt(2)
 
 
-def test_slopes_are_those_of_the_residuals():
+def test_jacobian_is_that_of_the_residuals():
     """Central differences in every shared parameter and the first pose, of a pair."""
     views = [*seen(np.random.default_rng(1), AT[:2]), *seen(np.random.default_rng(2), AT[:2], side="right")]
-    sights = [Sight(view, pose=k % 2, camera=k // 2) for k, view in enumerate(views)]
+    sights = [Observation(view, pose=k % 2, camera=k // 2) for k, view in enumerate(views)]
     free = np.array([free_intrinsics(MODELS[-1])] * 2)
-    problem = Bundle(sights, free, SHAPE)
+    problem = BundleAdjustment(sights, free, SHAPE)
     start = first_state(views[:2], first_intrinsics(views[:2], SHAPE))
     state = State(
         intrinsics=np.repeat(start.intrinsics, 2, axis=0), rotation=TRUTH.rotation, translation_mm=TRUTH.translation_mm,
-        warps_mm=np.array([[0.1, 0.2, 0.3]]), turns=start.turns, shifts_mm=start.shifts_mm,
+        warps_mm=np.array([[0.1, 0.2, 0.3]]), rotations=start.rotations, translations_mm=start.translations_mm,
     )  # fmt: skip
-    shared, by_pose = problem.slopes(state)
+    shared, by_pose = problem.jacobian(state)
     nothing, none = np.zeros(problem.size), np.zeros((2, 6))
 
     def at(k: int, step: float) -> np.ndarray:
@@ -76,13 +77,15 @@ def test_covariance_of_a_pair_is_the_scatter_of_repeated_solves():
         rng = np.random.default_rng([3, draw])
         sides = [seen(rng, AT, truth, side=side) for side in ("left", "right")]
         sights = [
-            Sight(view, pose=k, camera=camera) for camera, views in enumerate(sides) for k, view in enumerate(views)
+            Observation(view, pose=k, camera=camera)
+            for camera, views in enumerate(sides)
+            for k, view in enumerate(views)
         ]
         start = State(
             np.array(matrices), truth.rotation, truth.translation_mm, np.array([truth.warp_mm]),
             np.array([turn for turn, _ in AT]), np.array([shift for _, shift in AT]),
         )  # fmt: skip
-        found = Bundle(sights, free, SHAPE).solve(start)
+        found = BundleAdjustment(sights, free, SHAPE).solve(start)
         turn = cv2.Rodrigues(found.state.rotation @ truth.rotation.T)[0].ravel()
         runs.append(
             [

@@ -10,7 +10,8 @@ import pytest
 
 from lab.cli import main
 from lab.fit.compare import compare
-from lab.fit.geometry import calibrate_robustly, geometry_result
+from lab.fit.geometry.calibration import calibrate_robustly
+from lab.fit.geometry.recordings import geometry_result
 from lab.formats.results import CameraFit, ComparisonResult, FitResult, MtfCurve, NoiseFit, SpectralFit, StereoFit
 from tests.lab.fit.projected import SHAPE, poses, seen
 

@@ -12,7 +12,14 @@ from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, GeometryFit, NoiseFit, StereoFit
 
-STEPS = ("noise", "spectral", "mtf", "psf", "geometry", "stereo")
+STEPS = {
+    "noise": "lab.fit.noise.fit_noise",
+    "spectral": "lab.fit.spectral.fit_spectral",
+    "mtf": "lab.fit.mtf.recordings.fit_mtf",
+    "psf": "lab.fit.psf.recordings.fit_psf_field",
+    "geometry": "lab.fit.geometry.recordings.fit_geometry",
+    "stereo": "lab.fit.stereo.fit_stereo",
+}
 
 
 def refuse(step: str) -> Callable[..., Any]:
@@ -27,8 +34,8 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """`steps(noise=..., geometry=...)`: these fits, and all others refused."""
 
     def use(**fits: Callable[..., Any]) -> None:
-        for step in STEPS:
-            monkeypatch.setattr(f"lab.fit.{step}.fit_{step}", fits.get(step, refuse(step)))
+        for step, function in STEPS.items():
+            monkeypatch.setattr(function, fits.get(step, refuse(step)))
 
     return use
 

@@ -10,15 +10,12 @@ import pytest
 from scipy.special import erf
 
 from lab.errors import NotDetermined
-from lab.fit.board import CornerFits, find_board, fit_corners, luminance
-from lab.fit.geometry import (
-    board_warps,
-    calibrate_robustly,
-    channel_geometry,
-    cross_validation,
-    fit_geometry,
-    geometry_result,
-)
+from lab.fit.geometry.board_detection import find_board, luminance
+from lab.fit.geometry.calibration import calibrate_robustly
+from lab.fit.geometry.corners import CornerFits, fit_corners
+from lab.fit.geometry.cross_validation import cross_validation
+from lab.fit.geometry.lateral_colour import channel_geometry
+from lab.fit.geometry.recordings import board_warps, fit_geometry, geometry_result
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import GeometryFit
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen

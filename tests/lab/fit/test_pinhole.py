@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.fit.pinhole import cross_matrices, distortion_of, intrinsics_of, matrix_of, project, project_slopes, unproject
+from lab.fit.geometry.pinhole import (
+    cross_matrices,
+    distortion_of,
+    intrinsics_of,
+    matrix_of,
+    project,
+    project_with_jacobian,
+    unproject,
+)
 
 MATRIX = np.array([[420.0, 0, 203.0], [0, 421.0, 147.0], [0, 0, 1]])
 BROWN = np.array([-0.12, 0.06, 5e-4, -3e-4, 0.02])
@@ -22,7 +30,7 @@ def points() -> np.ndarray:
 @pytest.mark.parametrize("distortion", [np.zeros(5), BROWN, RATIONAL])
 def test_projection_and_slopes_are_opencvs(points, distortion):
     intrinsics = intrinsics_of(MATRIX, distortion)
-    seen, by_point, by_camera = project_slopes(points, intrinsics)
+    seen, by_point, by_camera = project_with_jacobian(points, intrinsics)
     all_eight = np.pad(distortion, (0, 8 - len(distortion)))
     theirs, slopes = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, all_eight)
     np.testing.assert_allclose(seen, theirs[:, 0], atol=1e-9)

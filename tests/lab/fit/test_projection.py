@@ -6,9 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.fit.geometry import calibrate_robustly
-from lab.fit.pinhole import intrinsics_of, project
-from lab.fit.projection import difference, error_operator, grid, grid_points, implied_motion, points_at, projection_std
+from lab.fit.geometry.calibration import calibrate_robustly
+from lab.fit.geometry.pinhole import intrinsics_of, project
+from lab.fit.geometry.projection_errors import (
+    difference,
+    error_operator,
+    grid,
+    grid_points,
+    implied_motion,
+    points_at,
+    projection_std,
+)
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
 INTRINSICS = intrinsics_of(TRUTH.left, TRUTH.distortion_left)

@@ -13,22 +13,18 @@ from scipy.ndimage import map_coordinates
 from scipy.signal import fftconvolve
 from scipy.special import j1, ndtr
 
+from benchmarks.peers.mosleh import mosleh_kernel
 from lab.errors import NotDetermined
-from lab.fit.mosleh import mosleh_kernel
-from lab.fit.psf import (
-    ScreenKernel,
-    displacement,
-    estimate_kernel,
-    fit_psf,
-    fit_psf_field,
-    measure_kernels,
-    normal_equations,
-    on_simplex,
-    photographed_kernel,
-    radial_symmetry,
-    screen_pictures,
-)
-from lab.fit.screen import register, target_corners
+from lab.fit.psf import estimate_kernel
+from lab.fit.psf.levelled_captures import screen_pictures
+from lab.fit.psf.normal_equations import normal_equations
+from lab.fit.psf.photograph import photographed_kernel
+from lab.fit.psf.radial_symmetry import radial_symmetry
+from lab.fit.psf.recordings import fit_psf_field
+from lab.fit.psf.screen_kernel import ScreenKernel, measure_kernels
+from lab.fit.psf.screen_registration import register, target_corners
+from lab.fit.psf.simplex import on_simplex
+from lab.fit.psf.target_displacement import displacement
 from lab.formats.recording_set import Bernoulli, Black, Camera, Checkerboard, Manifest, RecordingSet, Screen, White
 
 
@@ -254,7 +250,7 @@ def kernel_at(row_px, col_px, sigma_row, sigma_col, angle_deg, rng):
         covariance=std**2 * np.eye(size * size),
         fine=None,
         oversample=2,
-        far=0.0,
+        outside=0.0,
         corner_rms_px=0.0,
         centre_px=(row_px, col_px),
     )
@@ -429,7 +425,7 @@ def test_corners_of_a_target():
 
 
 def test_kernels_of_all_channels_are_the_gaussians(screen):
-    kernels = fit_psf(screen, "left")
+    kernels = fit_psf_field(screen, "left", patches=0).kernels
     assert [k.channel for k in kernels] == ["R", "G", "B"]
     for found in kernels:
         kernel = np.array(found.psf)
@@ -483,16 +479,16 @@ def test_a_finer_grid_gives_the_same_kernel(screen):
 
 def test_missing_captures_are_named():
     with pytest.raises(NotDetermined, match="no bernoulli"):
-        fit_psf(screen_recordings(without=("bernoulli",)), "left")
+        fit_psf_field(screen_recordings(without=("bernoulli",)), "left", patches=0)
     with pytest.raises(NotDetermined, match="white"):
-        fit_psf(screen_recordings(without=("white",)), "left")
+        fit_psf_field(screen_recordings(without=("white",)), "left", patches=0)
 
 
 def test_another_pattern_than_the_target_is_refused():
     with pytest.raises(NotDetermined, match="screen moved"):
-        fit_psf(screen_recordings(pattern_seed=1), "left")
+        fit_psf_field(screen_recordings(pattern_seed=1), "left", patches=0)
 
 
 def test_a_saturated_screen_is_refused():
     with pytest.raises(NotDetermined, match="saturated"):
-        fit_psf(screen_recordings(electrons=10100.0), "left")
+        fit_psf_field(screen_recordings(electrons=10100.0), "left", patches=0)

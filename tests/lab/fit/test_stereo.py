@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.geometry import calibrate_robustly, fit_geometry, geometry_result
+from lab.fit.geometry.calibration import calibrate_robustly
+from lab.fit.geometry.recordings import fit_geometry, geometry_result
 from lab.fit.stereo import Pair, fit_pairs, fit_stereo, rectification_maps
 from lab.formats.recording_set import Camera, Charuco, Manifest, RecordingSet
 from tests.lab.fit.projected import SHAPE, poses, seen

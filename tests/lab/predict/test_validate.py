@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lab.fit import fit_recording_set
-from lab.fit.psf import expected_kernel
+from lab.fit.psf.expected_kernel import expected_kernel
 from lab.formats.camera_file import fitted_camera
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, ValidationResult

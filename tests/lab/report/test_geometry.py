@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.fit.geometry import calibrate_robustly, geometry_result
+from lab.fit.geometry.calibration import calibrate_robustly
+from lab.fit.geometry.recordings import geometry_result
 from lab.fit.stereo import Pair, fit_pairs
 from lab.formats.recording_set import Camera, Manifest, RecordingSet
 from lab.formats.results import ChannelGeometry, GeometryFit

@@ -11,7 +11,7 @@ from lab.diagnose.measurements.board import board_block, calibration_of
 from lab.diagnose.measurements.stereo import scene_gain_block, time_block
 from lab.diagnose.measurements.summaries import Study
 from lab.errors import NotDetermined
-from lab.fit.pinhole import distortion_of, matrix_of
+from lab.fit.geometry.pinhole import distortion_of, matrix_of
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
 from sim.camera import Geometry, Side

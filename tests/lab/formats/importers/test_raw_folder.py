@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lab.errors import InputError
-from lab.fit.geometry import fit_geometry
+from lab.fit.geometry.recordings import fit_geometry
 from lab.fit.stereo import fit_stereo
 from lab.formats import recording_set as recording
 from lab.formats.importers.raw_folder import read_checkerboard_pairs, read_raw_folder

@@ -1,13 +1,14 @@
-"""Bundle adjustment: cameras, the rig between two of them, the boards' own shape and their poses, by one least-squares solve.
+"""Bundle adjustment: cameras, the rig between two of them, the warp of the boards and their poses, by one
+least-squares solve.
 
-Minimised is sum |predicted - seen|^2 over all corners, in px, with weak priors on distortion and board warp. Turns are local
-(a small rotation about the camera's axes, applied from the left), so that no rotation is singular. Poses are eliminated by
-the Schur complement: what is left is the normal matrix of the shared parameters, and its inverse times the variance of a
-corner is their full covariance. See Triggs et al., "Bundle Adjustment: A Modern Synthesis" (2000); the board's warp follows
-mrcal (D. Kogan).
+Minimised is sum |predicted - seen|^2 over all corners, in px, with weak priors on distortion and warp. Rotations are
+updated locally, by a small rotation about the axes of the camera applied from the left, so that none is singular.
+Poses are eliminated by the Schur complement: what is left is the normal matrix of the shared parameters. Its inverse
+times the variance of a corner is their full covariance. See Triggs et al., "Bundle Adjustment: A Modern Synthesis"
+(2000); the warp of the board follows mrcal (D. Kogan).
 
-A board's warp is z(x, y) = a (x^2 - 1/3) + b (y^2 - 1/3) + c x y mm, with x and y from -1 to 1 across the board: a bend along
-each axis and a twist. A shift or a tilt would be a pose.
+The warp of a board is z(x, y) = a (x^2 - 1/3) + b (y^2 - 1/3) + c x y mm, with x and y from -1 to 1 across the board:
+a bend along each axis and a twist. A shift or a tilt would be a pose.
 """
 
 from __future__ import annotations
@@ -22,41 +23,39 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lab.errors import NotDetermined
-from lab.fit.board import BoardView
-from lab.fit.pinhole import (
+from lab.fit.geometry.board_detection import BoardView
+from lab.fit.geometry.pinhole import (
     COUNT,
     NAMES,
     cross_matrices,
     distortion_of,
     matrix_of,
     project,
-    project_slopes,
+    project_with_jacobian,
 )
 
 Array = NDArray[np.floating[Any]]
-
 RIG = ("turn_x_rad", "turn_y_rad", "turn_z_rad", "translation_x_mm", "translation_y_mm", "translation_z_mm")
 WARP = ("bend_x_mm", "bend_y_mm", "twist_mm")
-#: Standard deviation of the prior of each distortion term, as a share of the radius at the frame's corner, and its power of it:
-#: tens of px, far beyond what any corner leaves open. It only keeps terms that no view shows from growing without bound.
+#: Standard deviation of the prior of each distortion term: share of the radius at the corner of the frame, and power of
+#: the radius. Tens of px: it only keeps terms that no view determines from growing without bound.
 DISTORTION_PRIOR = {
     "k1": (0.3, 2), "k2": (0.1, 4), "k3": (0.03, 6), "k4": (0.3, 2), "k5": (0.1, 4), "k6": (0.03, 6), "p1": (0.03, 1), "p2": (0.03, 1)
 }  # fmt: skip
-#: ... and of a board's warp: share of its diagonal.
-WARP_PRIOR = 0.005
-FIRST_NOISE_PX = 0.1  # what priors are weighed against until the corners' own scatter is known
+WARP_PRIOR = 0.005  # standard deviation of the prior of a warp, of the diagonal of the board
+FIRST_NOISE_PX = 0.1  # of a corner, for the weight of the priors in the first solve
 MAX_STEPS = 60
 
 
 def board_key(view: BoardView) -> tuple[object, ...]:
-    """What makes two captures views of the same board."""
+    """The properties of a board. Captures that agree in them show the same board."""
     capture = view.capture
     return capture.dictionary, capture.squares, capture.square_mm, capture.marker_mm
 
 
 @dataclass(frozen=True)
-class Sight:
-    """A view in its place: camera 0 or 1 saw pose number `pose` of board number `board`."""
+class Observation:
+    """A view: camera 0 or 1 saw pose number `pose` of board number `board`."""
 
     view: BoardView
     pose: int
@@ -66,24 +65,28 @@ class Sight:
 
 @dataclass(frozen=True)
 class State:
-    """All parameters. `intrinsics` (cameras, 12); `rotation`, `translation_mm`: camera 0 to camera 1; `warps_mm` (boards, 3);
-    `turns` (poses, 3, 3) and `shifts_mm` (poses, 3): board to camera 0."""
+    """All parameters.
+
+    `intrinsics` (cameras, 12). `rotation` (3, 3), `translation_mm` (3,): camera 0 to camera 1. `warps_mm` (boards, 3).
+    `rotations` (poses, 3, 3), `translations_mm` (poses, 3): board to camera 0.
+    """
 
     intrinsics: Array
     rotation: Array
     translation_mm: Array
     warps_mm: Array
-    turns: Array
-    shifts_mm: Array
+    rotations: Array
+    translations_mm: Array
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the solve ended.
+    """The end of a solve.
 
-    `names` and `covariance` (n, n) are of the shared parameters, poses marginalised: the free intrinsics of each camera
-    ("fx", or "left fx", "right fx" of two), the rig's turn (about the second camera's axes) and translation, the warps.
-    `residuals` are (n, 2) per sight, seen less predicted, px; `noise_px` is the standard deviation of one coordinate.
+    `names` and `covariance` (n, n) are of the shared parameters, poses marginalised: the free intrinsics of each
+    camera ("fx", or "left fx", "right fx" of two), rotation (about the axes of the second camera) and translation of
+    the rig, and the warps. `free` (cameras, 12): which intrinsics were fitted. `residuals`: (n, 2) for each
+    observation, seen less predicted, px. `noise_px`: standard deviation of one coordinate.
     """
 
     state: State
@@ -95,23 +98,23 @@ class Solution:
 
     @property
     def rms_px(self) -> float:
-        """Of the corners' distances from their predictions."""
+        """Root mean square of the distances of the corners from their predictions."""
         return rms_px(np.concatenate(self.residuals))
 
     @property
     def determined(self) -> bool:
-        """Whether the covariance is a covariance."""
+        """Whether the covariance is finite and positive."""
         diagonal = np.diag(self.covariance)
         return bool(np.isfinite(diagonal).all() and (diagonal > 0).all())
 
     def std(self, camera: int = 0) -> Array:
-        """Standard uncertainties (12,) of one camera's intrinsics; 0 of those that were held."""
+        """Standard deviations (12,) of the intrinsics of a camera; 0 where they were held."""
         found = np.zeros(COUNT)
         found[self.free[camera]] = np.sqrt(np.diag(self.covariance)[self._of_camera(camera)])
         return found
 
     def of_camera(self, camera: int = 0) -> Array:
-        """Covariance (12, 12) of one camera's intrinsics, 0 where they were held."""
+        """Covariance (12, 12) of the intrinsics of a camera, 0 where they were held."""
         found = np.zeros((COUNT, COUNT))
         part = self._of_camera(camera)
         found[np.ix_(self.free[camera], self.free[camera])] = self.covariance[part, part]
@@ -123,12 +126,12 @@ class Solution:
 
 
 def rms_px(residuals: Array) -> float:
-    """Root of the mean squared length of vectors (n, 2)."""
+    """Root mean square of the length of vectors (n, 2)."""
     return float(np.sqrt(np.mean(np.sum(np.square(residuals), axis=1))))
 
 
 def warp_shape(view: BoardView) -> Array:
-    """Height (n, 3) of a view's corners, mm for each mm of the three warp parameters."""
+    """Height (n, 3) of the corners of a view, mm per mm of each of the three warp parameters."""
     rows, cols = view.capture.squares
     x = 2.0 * view.board_mm[:, 0] / (cols * view.capture.square_mm) - 1.0
     y = 2.0 * view.board_mm[:, 1] / (rows * view.capture.square_mm) - 1.0
@@ -136,56 +139,62 @@ def warp_shape(view: BoardView) -> Array:
 
 
 def warp_prior_mm(view: BoardView) -> float:
-    """Standard deviation of the prior of a board's warp."""
+    """Standard deviation of the prior of the warp of a board, mm."""
     return WARP_PRIOR * view.capture.square_mm * float(np.hypot(*view.capture.squares))
 
 
-class Bundle:
-    """The problem: `sights` in frames of `shape` (rows, cols), with the intrinsics `free` (cameras, 12) may move.
+class BundleAdjustment:
+    """The problem: `observations` in frames of `shape` (rows, cols); `free` (cameras, 12) says which intrinsics are
+    fitted.
 
-    Poses may be fitted alone (`only_poses`): how well a camera that is held predicts views. `boards`: how many there are, where not
-    all of them are seen.
+    `only_poses`: fit the poses alone, with everything else held; this shows how well a given camera predicts views.
+    `boards`: their number, where not all of them are seen.
     """
 
     def __init__(
         self,
-        sights: Sequence[Sight],
+        observations: Sequence[Observation],
         free: NDArray[np.bool_],
         shape: tuple[int, int],
         *,
         only_poses: bool = False,
         boards: int = 0,
     ) -> None:
-        self.sights = list(sights)
+        self.observations = list(observations)
         self.free = free
         self.cameras = len(free)
-        self.boards = max(boards, 1 + max(sight.board for sight in sights))
-        self.poses = 1 + max(sight.pose for sight in sights)
+        self.boards = max(boards, 1 + max(observation.board for observation in observations))
+        self.poses = 1 + max(observation.pose for observation in observations)
         self.only_poses = only_poses
-        ends = np.cumsum([len(sight.view.index) for sight in sights])
-        self.parts = [slice(end - len(sight.view.index), end) for end, sight in zip(ends, sights, strict=True)]
-        self.flat = np.concatenate([sight.view.board_mm for sight in sights]).astype(float)
-        self.shapes = np.concatenate([warp_shape(sight.view) for sight in sights])
-        self.seen = np.concatenate([sight.view.image_px for sight in sights]).astype(float)
-        self.of_camera = np.concatenate([np.full(len(s.view.index), s.camera) for s in sights])
+        ends = np.cumsum([len(observation.view.index) for observation in observations])
+        self.parts = [
+            slice(end - len(observation.view.index), end) for end, observation in zip(ends, observations, strict=True)
+        ]
+        self.flat = np.concatenate([observation.view.board_mm for observation in observations]).astype(float)
+        self.shapes = np.concatenate([warp_shape(observation.view) for observation in observations])
+        self.seen = np.concatenate([observation.view.image_px for observation in observations]).astype(float)
+        self.of_camera = np.concatenate([np.full(len(s.view.index), s.camera) for s in observations])
         counts = [int(mask.sum()) for mask in free]
         self.at_rig = int(sum(counts))
         self.at_warp = self.at_rig + (6 if self.cameras > 1 else 0)
         self.size = 0 if only_poses else self.at_warp + 3 * self.boards
         self.prior_std = np.full(self.size, np.inf)
         if not only_poses:
-            self._set_priors(shape)
+            self._set_warp_priors(shape)
 
-    def _set_priors(self, shape: tuple[int, int]) -> None:
-        # The radius of the frame's corner follows from the focal length, which is only known in the solve: the diagonal's half
-        # over the focal length of the start is set by `solve`.
+    def _set_warp_priors(self, shape: tuple[int, int]) -> None:
         self.half_diagonal_px = 0.5 * float(np.hypot(*shape))
         for number in range(self.boards):
-            seen = [sight.view for sight in self.sights if sight.board == number] or [self.sights[0].view]
+            seen = [observation.view for observation in self.observations if observation.board == number] or [
+                self.observations[0].view
+            ]
             at = self.at_warp + 3 * number
             self.prior_std[at : at + 3] = warp_prior_mm(seen[0])
 
     def _set_distortion_prior(self, intrinsics: Array) -> None:
+        """The priors of the distortion terms need the focal length of the start: the radius of the corner of the frame
+        follows from it.
+        """
         at = 0
         for camera, mask in enumerate(self.free):
             radius = self.half_diagonal_px / float(intrinsics[camera, 0])
@@ -197,7 +206,7 @@ class Bundle:
             at += count
 
     def names(self) -> tuple[str, ...]:
-        """Of the shared parameters, in their order."""
+        """Names of the shared parameters, in their order."""
         if self.only_poses:
             return ()
         sides = [""] if self.cameras == 1 else ["left ", "right "]
@@ -212,22 +221,22 @@ class Bundle:
         return (*found, *(f"board {k + 1} {name}" if several else name for k in range(self.boards) for name in WARP))
 
     def _placed(self, state: State) -> tuple[Array, Array, Array]:
-        """Every corner in its camera's frame, in camera 0's turned only by the board's pose, and in camera 0's frame."""
-        turned, placed = np.empty_like(self.flat), np.empty_like(self.flat)
-        for sight, part in zip(self.sights, self.parts, strict=True):
+        """All corners (n, 3): in the frame of their camera; rotated into that of camera 0; and placed in it."""
+        rotated, placed = np.empty_like(self.flat), np.empty_like(self.flat)
+        for observation, part in zip(self.observations, self.parts, strict=True):
             on_board = self.flat[part].copy()
-            on_board[:, 2] += self.shapes[part] @ state.warps_mm[sight.board]
-            turned[part] = on_board @ state.turns[sight.pose].T
-            placed[part] = turned[part] + state.shifts_mm[sight.pose]
+            on_board[:, 2] += self.shapes[part] @ state.warps_mm[observation.board]
+            rotated[part] = on_board @ state.rotations[observation.pose].T
+            placed[part] = rotated[part] + state.translations_mm[observation.pose]
         own = placed
         if self.cameras > 1:
             second = self.of_camera == 1
             own = placed.copy()
             own[second] = placed[second] @ state.rotation.T + state.translation_mm
-        return own, turned, placed
+        return own, rotated, placed
 
     def residuals(self, state: State) -> Array:
-        """Seen less predicted (n, 2); infinite where a corner would be behind its camera."""
+        """Seen less predicted (n, 2), px; infinite where a corner would be behind its camera."""
         own = self._placed(state)[0]
         if np.any(own[:, 2] <= 0) or not np.isfinite(own).all():
             return np.full_like(self.seen, np.inf)
@@ -237,16 +246,16 @@ class Bundle:
             predicted[its] = project(own[its], state.intrinsics[camera])
         return self.seen - predicted
 
-    def slopes(self, state: State) -> tuple[Array, Array]:
-        """Slopes of the predictions by the shared parameters (n, 2, shared) and by the pose (n, 2, 6)."""
-        own, turned, placed = self._placed(state)
+    def jacobian(self, state: State) -> tuple[Array, Array]:
+        """Jacobian of the predictions by the shared parameters (n, 2, shared) and by the pose (n, 2, 6)."""
+        own, rotated, placed = self._placed(state)
         count = len(own)
         shared = np.zeros((count, 2, self.size))
         by_point = np.empty((count, 2, 3))
         at = 0
         for camera, mask in enumerate(self.free):
             its = self.of_camera == camera
-            _, slope, by_camera = project_slopes(own[its], state.intrinsics[camera])
+            _, slope, by_camera = project_with_jacobian(own[its], state.intrinsics[camera])
             by_point[its] = slope
             if not self.only_poses:
                 shared[its, :, at : at + int(mask.sum())] = by_camera[:, :, mask]
@@ -261,15 +270,15 @@ class Bundle:
             in_first = by_point.copy()
             in_first[second] = by_point[second] @ state.rotation
         if not self.only_poses:
-            for sight, part in zip(self.sights, self.parts, strict=True):
-                lift = in_first[part] @ state.turns[sight.pose][:, 2]
-                column = self.at_warp + 3 * sight.board
+            for observation, part in zip(self.observations, self.parts, strict=True):
+                lift = in_first[part] @ state.rotations[observation.pose][:, 2]
+                column = self.at_warp + 3 * observation.board
                 shared[part, :, column : column + 3] = lift[:, :, None] * self.shapes[part][:, None, :]
-        by_pose = np.concatenate([-in_first @ cross_matrices(turned), in_first], axis=2)
+        by_pose = np.concatenate([-in_first @ cross_matrices(rotated), in_first], axis=2)
         return shared, by_pose
 
-    def _values(self, state: State) -> Array:
-        """The shared parameters that have priors; the rig's stand as 0."""
+    def _prior_values(self, state: State) -> Array:
+        """The shared parameters that have priors; 0 for the rig."""
         if self.only_poses:
             return np.zeros(0)
         free = [state.intrinsics[camera][mask] for camera, mask in enumerate(self.free)]
@@ -290,61 +299,63 @@ class Bundle:
                 intrinsics[camera, mask] += shared[at : at + int(mask.sum())]
                 at += int(mask.sum())
             if self.cameras > 1:
-                rotation = _turned(shared[at : at + 3]) @ rotation
+                rotation = _rotation(shared[at : at + 3]) @ rotation
                 translation = translation + shared[at + 3 : at + 6]
             warps = warps + shared[self.at_warp :].reshape(-1, 3)
-        turns = np.array([_turned(step[:3]) @ turn for step, turn in zip(poses, state.turns, strict=True)])
-        return State(intrinsics, rotation, translation, warps, turns, state.shifts_mm + poses[:, 3:])
+        rotations = np.array(
+            [_rotation(step[:3]) @ before for step, before in zip(poses, state.rotations, strict=True)]
+        )
+        return State(intrinsics, rotation, translation, warps, rotations, state.translations_mm + poses[:, 3:])
 
     def _normal(self, state: State, residual: Array, noise_px: float) -> tuple[Array, ...]:
         """Normal matrices of the shared parameters, shared x pose, and pose, and the right-hand sides."""
-        shared, by_pose = self.slopes(state)
+        shared, by_pose = self.jacobian(state)
         size, prior = self.size, (noise_px / self.prior_std) ** 2
         flat = shared.reshape(2 * len(shared), size)
         matrix = flat.T @ flat + np.diag(prior)
-        right = flat.T @ residual.ravel() - prior * self._values(state)
+        right = flat.T @ residual.ravel() - prior * self._prior_values(state)
         mixed, own = np.zeros((self.poses, size, 6)), np.zeros((self.poses, 6, 6))
         own_right = np.zeros((self.poses, 6))
-        for sight, part in zip(self.sights, self.parts, strict=True):
+        for observation, part in zip(self.observations, self.parts, strict=True):
             pose = by_pose[part].reshape(-1, 6)
             one = shared[part].reshape(len(pose), size)
-            mixed[sight.pose] += one.T @ pose
-            own[sight.pose] += pose.T @ pose
-            own_right[sight.pose] += pose.T @ residual[part].ravel()
+            mixed[observation.pose] += one.T @ pose
+            own[observation.pose] += pose.T @ pose
+            own_right[observation.pose] += pose.T @ residual[part].ravel()
         return matrix, mixed, own, right, own_right
 
     def _cost(self, state: State, residual: Array, noise_px: float) -> float:
         if not np.isfinite(residual).all():
             return np.inf
-        prior = float(np.sum((self._values(state) * noise_px / self.prior_std) ** 2))
+        prior = float(np.sum((self._prior_values(state) * noise_px / self.prior_std) ** 2))
         return float(np.sum(residual**2)) + prior
 
     def solve(self, start: State, noise_px: float = FIRST_NOISE_PX) -> Solution:
-        """Levenberg and Marquardt's method from `start`."""
+        """Solve by the method of Levenberg and Marquardt, from `start`."""
         if not self.only_poses:
             self._set_distortion_prior(start.intrinsics)
         state, residual = start, self.residuals(start)
         cost, damping = self._cost(start, residual, noise_px), 1e-4
         for _ in range(MAX_STEPS):
             parts = self._normal(state, residual, noise_px)
-            settled = False
+            converged = False
             while damping < 1e10:
                 shared, poses = _step(parts, damping)
                 tried = self._moved(state, shared, poses)
                 new = self.residuals(tried)
                 new_cost = self._cost(tried, new, noise_px)
                 if new_cost <= cost:
-                    settled = cost - new_cost < 1e-9 * cost
+                    converged = cost - new_cost < 1e-9 * cost
                     state, residual, cost = tried, new, new_cost
                     damping = max(damping * 0.1, 1e-12)
                     break
                 damping *= 10.0
             else:
                 break
-            if settled:
+            if converged:
                 break
-        numbers = residual.size - self.size - 6 * self.poses
-        noise = float(np.sqrt(np.sum(residual**2) / max(numbers, 1)))
+        freedom = residual.size - self.size - 6 * self.poses
+        noise = float(np.sqrt(np.sum(residual**2) / max(freedom, 1)))
         return Solution(
             state=state,
             free=self.free,
@@ -367,19 +378,15 @@ class Bundle:
         return noise_px**2 * 0.5 * (inverse + inverse.T) / np.outer(scale, scale)
 
 
-def _turned(turn: Array) -> Array:
-    return np.asarray(Rotation.from_rotvec(turn).as_matrix())
-
-
 def _reduced(matrix: Array, mixed: Array, own: Array) -> tuple[Array, Array]:
-    """The Schur complement of the poses, and mixed own^-1."""
+    """Schur complement of the poses, and mixed own^-1."""
     ridge = 1e-12 * np.einsum("pkk->pk", own)
     gain = np.linalg.solve(own + ridge[:, :, None] * np.eye(6), np.swapaxes(mixed, 1, 2))  # (poses, 6, shared)
     return matrix - np.einsum("psk,pkt->st", mixed, gain), np.swapaxes(gain, 1, 2)
 
 
 def _step(parts: tuple[Array, ...], damping: float) -> tuple[Array, Array]:
-    """Changes of the shared parameters and of the poses."""
+    """Steps of the shared parameters and of the poses."""
     matrix, mixed, own, right, own_right = parts
     damped_own = own + damping * np.einsum("pkk->pk", own)[:, :, None] * np.eye(6)
     if not len(right):
@@ -393,28 +400,33 @@ def _step(parts: tuple[Array, ...], damping: float) -> tuple[Array, Array]:
     return shared, np.linalg.solve(damped_own, rest[:, :, None])[:, :, 0]
 
 
-# --- beginnings ------------------------------------------------------------------------------------------------------------
+def _rotation(rotation_vector: Array) -> Array:
+    return np.asarray(Rotation.from_rotvec(rotation_vector).as_matrix())
 
 
 def board_pose(view: BoardView, intrinsics: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and translation (3,) from the flat board to a camera, from one view."""
+    """Rotation (3, 3) and translation (3,), mm, from the flat board to a camera, from one view. Raises `NotDetermined`
+    where none fits.
+    """
     matrix, distortion = matrix_of(intrinsics), distortion_of(intrinsics)
     points, seen = view.board_mm.astype(float), view.image_px.astype(float)
     try:
-        found, turn, shift = cv2.solvePnP(points, seen, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
+        found, rotation_vector, translation = cv2.solvePnP(points, seen, matrix, distortion, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error:
-        found, turn, shift = False, np.zeros(3), np.zeros(3)
-    rotation = np.asarray(cv2.Rodrigues(turn)[0]) if found else np.eye(3)
-    shift = np.asarray(shift).ravel() if found else np.zeros(3)
-    if not np.all(points @ rotation[2] + shift[2] > 0):
+        found, rotation_vector, translation = False, np.zeros(3), np.zeros(3)
+    rotation = np.asarray(cv2.Rodrigues(rotation_vector)[0]) if found else np.eye(3)
+    translation = np.asarray(translation).ravel() if found else np.zeros(3)
+    if not np.all(points @ rotation[2] + translation[2] > 0):
         raise NotDetermined(
             "geometry", "no pose of the board fits its corners: check what the capture says of the board"
         )
-    return rotation, shift
+    return rotation, translation
 
 
 def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Array:
-    """A pinhole without distortion to begin with: Zhang's focal length, or, where the views give none, the frame's width."""
+    """A pinhole without distortion to begin with: the focal length of Zhang, or the width of the frame where the views
+    determine none.
+    """
     boards = [view.board_mm.astype(np.float32) for view in views]
     points = [view.image_px.astype(np.float32) for view in views]
     start = np.zeros(COUNT)
@@ -431,18 +443,18 @@ def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Arra
 
 
 def first_state(views: Sequence[BoardView], intrinsics: Array) -> State:
-    """One camera, every view a pose of its own."""
+    """State of one camera, each view with a pose of its own."""
     poses = [board_pose(view, intrinsics) for view in views]
     return State(
         intrinsics=intrinsics[None, :],
         rotation=np.eye(3),
         translation_mm=np.zeros(3),
         warps_mm=np.zeros((1, 3)),
-        turns=np.array([turn for turn, _ in poses]),
-        shifts_mm=np.array([shift for _, shift in poses]),
+        rotations=np.array([rotation for rotation, _ in poses]),
+        translations_mm=np.array([translation for _, translation in poses]),
     )
 
 
 def with_boards(state: State, boards: int) -> State:
-    """The state with flat boards, `boards` of them."""
+    """The state with `boards` flat boards."""
     return replace(state, warps_mm=np.zeros((boards, 3)))

@@ -1,12 +1,13 @@
-"""Where a pattern on a screen lies in the camera's frame, to a few thousandths of a pixel.
+"""Where a pattern on a screen lies in the frame of the camera, to a few thousandths of a pixel.
 
-The checkerboard's corners are found and fitted in the levelled mosaic (see `lab.fit.board`), numbered by growing a grid
-from one of them, and matched to the target by the Bernoulli pattern, which unlike a checkerboard fits in one place only. The
-map from camera px to target cells is a homography after a smooth displacement, cubic in the position:
+The corners of the checkerboard are found and fitted in the levelled mosaic (`lab.fit.geometry.corners`). They are
+numbered by growing a grid from one of them, and matched to the target by the Bernoulli pattern, which unlike a
+checkerboard fits in one place only. The map from camera px to target cells is a homography H after a smooth
+displacement D, cubic in the position:
 
     cell(p) = H(p + D(p))
 
-Points are (x, y), x along columns; a cell (i, j) of the target covers j..j+1 by i..i+1.
+Points are (x, y), x along columns; the cell (i, j) of the target covers j..j+1 by i..i+1.
 """
 
 from __future__ import annotations
@@ -20,51 +21,57 @@ from numpy.typing import NDArray
 from scipy import ndimage, spatial
 
 from lab.errors import NotDetermined
-from lab.fit.board import fit_corners
+from lab.fit.geometry.corners import fit_corners
 
 Array = NDArray[np.floating[Any]]
 
-ORDER = 3
+ORDER = 3  # of the displacement, in x and y together
 MIN_CORNERS = 12
-MATCH = 0.5  # correlation of the levelled picture with the pattern, below which it isn't that pattern
+LEAST_CORRELATION = 0.5  # of the levelled picture with the pattern; below it, the picture shows another one
 
 
 @dataclass(frozen=True)
 class ScreenWarp:
-    """Camera px -> target cells. `displacement` (2, terms) in px, of a polynomial in (p - centre) / scale."""
+    """Map from camera px to target cells; see the module.
+
+    `homography` (3, 3). `displacement` (2, terms), px, of a polynomial in (p - centre) / scale. `corner_rms_px`:
+    residual of the corners; `corner_std_px`: standard deviation of their mean.
+    """
 
     homography: Array
     displacement: Array
     centre: Array
     scale: float
     corner_rms_px: float
-    corner_std_px: float  # of their mean
+    corner_std_px: float
 
     @staticmethod
     def of_corners(corners: Array, shape: tuple[int, ...]) -> ScreenWarp:
-        """The homography that takes four points (x, y), clockwise from top left, to the corners of a target of `shape`."""
+        """The homography that takes four points (x, y), clockwise from top left, to the corners of a target of
+        `shape`.
+        """
         cells = np.array([[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=np.float32)
         homography = cv2.getPerspectiveTransform(np.asarray(corners, dtype=np.float32), cells)
         centre = np.asarray(corners, dtype=float).mean(axis=0)
         return ScreenWarp(homography, np.zeros((2, 10)), centre, float(np.ptp(corners, axis=0).max()) / 2.0, 0.0, 0.0)
 
     def basis(self, points: Array) -> Array:
-        """Polynomial terms at `points` (n, 2): (terms, n); the first is constant."""
+        """Polynomial terms (terms, n) at `points` (n, 2); the first is constant."""
         x, y = ((points - self.centre) / self.scale).T
         return np.array([x**i * y**j for n in range(ORDER + 1) for i, j in ((n - k, k) for k in range(n + 1))])
 
     def cells(self, points: Array) -> Array:
-        """(x, y) in cells of the points (n, 2) in px."""
+        """Cells (n, 2), (x, y), of points (n, 2) in px."""
         moved = points + (self.displacement @ self.basis(points)).T
         return np.asarray(cv2.perspectiveTransform(moved[:, None, :].astype(np.float64), self.homography)[:, 0])
 
     def moved(self, origin: Array) -> ScreenWarp:
-        """The same of a picture of which this one is the part that begins at `origin`, (x, y)."""
+        """The same map for a picture of which this one is the part that begins at `origin`, (x, y)."""
         shift = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]])
         return replace(self, homography=self.homography @ shift, centre=self.centre + origin)
 
     def displaced(self, change: Array) -> ScreenWarp:
-        """With `change` (2, terms) added to the displacement."""
+        """The map with `change` (2, terms) added to the displacement."""
         return replace(self, displacement=self.displacement + change)
 
 
@@ -75,9 +82,11 @@ def register(
     bernoulli_target: NDArray[np.uint8],
     cell_px: float | None,
 ) -> ScreenWarp:
-    """The warp from pictures (rows, cols), levelled to 0 dark .. 1 lit (NaN where the screen isn't), and their targets.
+    """The warp from pictures of a checkerboard and a Bernoulli pattern to their targets.
 
-    `cell_px`: a cell's size in camera px, nominal. Raises `NotDetermined` where corners or pattern aren't found.
+    The pictures (rows, cols) are levelled, 0 dark .. 1 lit, NaN where the screen isn't; the targets (rows, cols) hold
+    a value per cell. `cell_px`: nominal size of a cell in camera px; None where the whole target is in view. Raises
+    `NotDetermined` where corners or pattern aren't found.
     """
     rows, cols = target_corners(checkerboard_target)
     seen = np.isfinite(checkerboard)
@@ -87,7 +96,7 @@ def register(
         cell_px = float(np.sqrt(seen.sum() / checkerboard_target.size))
     square_px = cell_px * float(rows[1] - rows[0])
     picture = np.where(seen, checkerboard, 0.0)
-    points, grid, across, down = _grown_grid(picture, seen, square_px)
+    points, grid, across, down = _numbered_corners(picture, seen, square_px)
     half = np.full(len(points), float(np.clip(0.4 * square_px, 2.5, 9.0)))
     fitted, trusted, _ = fit_corners(picture, points, across, down, half)
     points, grid = fitted[trusted], grid[trusted]
@@ -95,34 +104,12 @@ def register(
         raise NotDetermined(
             "psf", f"{len(points)} corners of the checkerboard found, {MIN_CORNERS} needed: focus the screen better"
         )
-    cells = _matched(points, grid, rows, cols, bernoulli, bernoulli_target)
+    cells = _matched_cells(points, grid, rows, cols, bernoulli, bernoulli_target)
     return _fitted_warp(points, cells)
 
 
-def busiest_quadrilateral(picture: Array) -> Array:
-    """Corners (4, 2), (x, y), clockwise from the top left, of the largest part of a picture that is full of fine structure."""
-    fine = np.abs(picture - ndimage.gaussian_filter(picture, 1.0))
-    # A pattern is busy all over, a marker or an edge only along lines: the lower quartile of a neighbourhood tells
-    busy = ndimage.percentile_filter(fine, 25, size=11)
-    busy = ndimage.gaussian_filter(busy, 1.0)
-    mask = busy > 0.5 * np.quantile(busy, 0.99)
-    narrow = max(4, int(np.sqrt(mask.sum()) / 8.0))  # what clings to the pattern is narrower than it
-    part, count = ndimage.label(ndimage.binary_opening(mask, np.ones((3, 3)), iterations=narrow))
-    if not count:
-        raise NotDetermined("psf", "the photograph shows no pattern: nothing in it is full of fine structure")
-    largest = part == 1 + int(np.argmax(ndimage.sum_labels(part > 0, part, np.arange(1, count + 1))))
-    points = np.argwhere(largest)[:, ::-1].astype(np.float32)
-    box = cv2.boxPoints(cv2.minAreaRect(points))
-    box += (
-        3.5 * (box - box.mean(axis=0)) / np.linalg.norm(box - box.mean(axis=0), axis=1).mean()
-    )  # the quartile shrinks it
-    around = np.arctan2(*(box - box.mean(axis=0)).T[::-1])
-    ordered = box[np.argsort(around)]  # clockwise, for y goes down
-    return np.asarray(np.roll(ordered, -int(np.argmin(ordered.sum(axis=1))), axis=0), dtype=float)
-
-
 def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns, in cells, of a checkerboard target's inner corners."""
+    """Rows and columns, in cells, of the inner corners of a checkerboard target."""
     t = target.astype(bool)
     corner = (t[:-1, :-1] == t[1:, 1:]) & (t[:-1, 1:] == t[1:, :-1]) & (t[:-1, :-1] != t[:-1, 1:])
     rows = np.flatnonzero(corner.any(axis=1)) + 1
@@ -132,10 +119,14 @@ def target_corners(target: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArra
     return rows, cols
 
 
-def _grown_grid(
+def _numbered_corners(
     picture: Array, seen: NDArray[np.bool_], square_px: float
 ) -> tuple[Array, NDArray[np.int64], Array, Array]:
-    """Saddle points numbered by steps along two directions: points (n, 2), steps (n, 2), and the step vectors there."""
+    """Corners numbered by their steps along two directions: points (n, 2), steps (n, 2), and the two step vectors (n,
+    2) at each.
+
+    Candidates are the maxima of the saddle strength Ixy^2 - Ixx Iyy.
+    """
     sigma = float(np.clip(0.08 * square_px, 1.2, 4.0))
     xx, yy, xy = (ndimage.gaussian_filter(picture, sigma, order) for order in ((0, 2), (2, 0), (1, 1)))
     saddle = xy**2 - xx * yy
@@ -153,7 +144,7 @@ def _grown_grid(
     best: dict[tuple[int, int], int] = {}
     vectors: dict[tuple[int, int], tuple[Array, Array]] = {}
     for seed in tree.query(points.mean(axis=0), k=min(6, len(points)))[1]:
-        numbered, steps = _grow(points, tree, int(seed))
+        numbered, steps = _grown_grid(points, tree, int(seed))
         if len(numbered) > len(best):
             best, vectors = numbered, steps
         if len(best) > 0.7 * len(points):
@@ -167,9 +158,10 @@ def _grown_grid(
     )
 
 
-def _grow(
+def _grown_grid(
     points: Array, tree: spatial.cKDTree, seed: int
 ) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], tuple[Array, Array]]]:
+    """Grid numbers grown from `seed` by nearest neighbours, and the step vectors at each number."""
     near = points[tree.query(points[seed], k=min(9, len(points)))[1][1:]] - points[seed]
     first = near[0]
     turned = near @ np.array([-first[1], first[0]]) / (np.linalg.norm(near, axis=1) * np.linalg.norm(first))
@@ -179,7 +171,7 @@ def _grow(
     numbered, taken = {(0, 0): seed}, {seed}
     vectors = {(0, 0): (first, square[0])}
     queue = [(0, 0)]
-    for at in queue:  # grows while it runs
+    for at in queue:  # the list grows in the loop
         across, down = vectors[at]
         for step, vector in (((1, 0), across), ((-1, 0), -across), ((0, 1), down), ((0, -1), -down)):
             to = (at[0] + step[0], at[1] + step[1])
@@ -196,7 +188,7 @@ def _grow(
     return numbered, vectors
 
 
-def _matched(
+def _matched_cells(
     points: Array,
     grid: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -204,13 +196,15 @@ def _matched(
     bernoulli: Array,
     target: NDArray[np.uint8],
 ) -> Array:
-    """Cells (x, y) of the corners: of all turns and shifts of the grid, the one that the Bernoulli picture agrees with."""
+    """Cells (x, y) of the corners (n, 2), NaN where unknown: of all rotations and shifts of the grid, the one with the
+    highest correlation of the Bernoulli picture with its target.
+    """
     some = np.argwhere(np.isfinite(bernoulli))
     some = some[np.random.default_rng(0).integers(0, len(some), 4000)]
     value = bernoulli[some[:, 0], some[:, 1]]
     best, score = None, -1.0
-    for turn in ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0)):
-        turned = grid @ np.array(turn).reshape(2, 2).T
+    for quarter_turn in ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0)):
+        turned = grid @ np.array(quarter_turn).reshape(2, 2).T
         turned = turned - turned.min(axis=0)
         extent = turned.max(axis=0)
         for sx in range(max(1, len(cols) - int(extent[0]))):
@@ -233,7 +227,7 @@ def _matched(
                 agreement = float(np.corrcoef(lit, value[inside])[0, 1]) if lit.std() > 0 else 0.0
                 if agreement > score:
                     score, best = agreement, (known, cells)
-    if best is None or score < MATCH:
+    if best is None or score < LEAST_CORRELATION:
         raise NotDetermined(
             "psf",
             f"the Bernoulli capture doesn't show its target (correlation {max(score, 0.0):.2f}): was the screen moved?",
@@ -245,7 +239,7 @@ def _matched(
 
 
 def _fitted_warp(points: Array, cells: Array) -> ScreenWarp:
-    """Homography and cubic displacement from the corners, outliers beyond 5 sigma left out."""
+    """Homography and cubic displacement through the corners, without outliers beyond 5 standard deviations."""
     used = np.isfinite(cells[:, 0])
     points, cells = points[used], cells[used]
     homography, _ = cv2.findHomography(points, cells, 0)
@@ -254,9 +248,9 @@ def _fitted_warp(points: Array, cells: Array) -> ScreenWarp:
     )
     back = np.linalg.inv(homography)
     expected = cv2.perspectiveTransform(cells[:, None, :].astype(np.float64), back)[:, 0]
-    gap = expected - points  # where D has to take the points
+    gap = expected - points  # by which D has to move the points
     basis = warp.basis(points)
-    # The homography stays as it is, so that the terms only take up what it leaves: few corners, few terms
+    # The homography is kept; few corners determine few terms
     terms = 10 if len(points) >= 40 else 6 if len(points) >= 20 else 1
     kept = np.ones(len(points), dtype=bool)
     for _ in range(4):

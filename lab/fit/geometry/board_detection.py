@@ -1,0 +1,305 @@
+"""Which corners of a ChArUco board or a plain checkerboard are seen in a frame, and where.
+
+The boards are the `charuco` captures. A plain checkerboard is a `charuco` capture whose `dictionary` is `"none"`:
+`squares` counts its squares `[rows, cols]`, so that it has `rows - 1` x `cols - 1` inner corners. `marker_mm` is
+ignored then, and all inner corners have to be in view. Pictures of a plain checkerboard become a recording set that
+way, each picture one capture, the pictures of a pair under one `pose`.
+
+Corners are found on the raw mosaic. A board is black and white, so that each plane of the mosaic, levelled by itself,
+shows the same picture. Interleaved they are the luminance, sampled at every pixel. No demosaicing moves a corner. Each
+corner is then fitted (`fit_corners`) over the pixels that no marker touches.
+
+Points are those of OpenCV: (x, y) px, x to the right along columns, (0, 0) the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lab.errors import NotDetermined
+from lab.fit.geometry.corners import CornerFits, fit_corners
+from lab.formats.recording_set import Charuco, RecordingSet
+from lab.formats.results import Skipped
+from sim.camera import Side
+from sim.sensor.mosaic import phases, planes
+
+Array = NDArray[np.floating[Any]]
+
+MIN_CORNERS = 8  # of a view: a pose has six parameters
+WINDOW_PX = 9.0  # largest radius of the window of a corner
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """Corners of a board in one frame.
+
+    `board_mm` (n, 3), z = 0; `image_px` (n, 2), (x, y); `index` (n,) numbers the corners row by row; `std_px` (n,):
+    standard deviation of a coordinate by the noise of the picture, where it is known.
+    """
+
+    capture: Charuco
+    index: NDArray[np.int64]
+    board_mm: Array
+    image_px: Array
+    std_px: Array | None = None
+
+    def only(self, kept: NDArray[np.bool_]) -> BoardView:
+        """The corners for which `kept` (n,) is true."""
+        std = None if self.std_px is None else self.std_px[kept]
+        return BoardView(self.capture, self.index[kept], self.board_mm[kept], self.image_px[kept], std)
+
+
+def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
+    """The mosaic (rows, cols) of a black and white scene as one picture, 0 dark .. 1 light: each plane between its 2 %
+    and 98 % quantiles.
+    """
+    picture = np.array(frame, dtype=float)
+    for plane in planes(picture, cfa).values():  # views of the picture
+        low, high = np.quantile(plane, [0.02, 0.98])
+        plane[:] = (plane - low) / max(high - low, 1e-12)
+    return picture
+
+
+def find_board(picture: Array, capture: Charuco) -> BoardView:
+    """Corners of the board in a picture (rows, cols) of 0..1. Raises `NotDetermined` where it isn't found, with the
+    reason.
+    """
+    rows, cols = capture.squares
+    grey = np.clip(255.0 * ndimage.gaussian_filter(picture, 0.7), 0, 255).astype(np.uint8)
+    if capture.dictionary == "none":
+        index, points = _plain_corners(grey, rows - 1, cols - 1)
+        marker_mm = 0.0
+    else:
+        index, points = _charuco_corners(grey, capture)
+        marker_mm = float(capture.marker_mm or 0.0)
+    if len(index) < MIN_CORNERS:
+        mirrored = np.ascontiguousarray(grey[:, ::-1])
+        if capture.dictionary != "none" and len(_charuco_corners(mirrored, capture)[0]) >= MIN_CORNERS:
+            raise NotDetermined(
+                "geometry", "the picture is mirrored: its board is found in the reflection; flip the frames"
+            )
+        raise NotDetermined(
+            "geometry",
+            f"only {len(index)} corners found, {MIN_CORNERS} needed: light or place the board better, and check that it has "
+            f"{rows} x {cols} squares and its dictionary is {capture.dictionary}",
+        )
+    if len(index) < (rows - 1) * (cols - 1):
+        index, points = _with_missing_corners(index, points, rows - 1, cols - 1, picture.shape)
+    board = board_points(capture, index)
+    fitted, trusted, std_px = refined_corners(picture, points, board[:, :2], capture.square_mm, marker_mm, rows, cols)
+    if trusted.sum() < MIN_CORNERS:
+        raise NotDetermined(
+            "geometry",
+            f"only {trusted.sum()} corners are clear enough, {MIN_CORNERS} needed: focus or light the board better",
+        )
+    return BoardView(capture, index, board, fitted, std_px).only(trusted)
+
+
+def _charuco_corners(grey: NDArray[np.uint8], capture: Charuco) -> tuple[NDArray[np.int64], Array]:
+    """Numbers and places of the inner corners of a ChArUco board, by the detector of OpenCV."""
+    code = getattr(cv2.aruco, capture.dictionary, None)
+    if not isinstance(code, int) or not capture.dictionary.startswith("DICT_"):
+        raise NotDetermined(
+            "geometry", f"OpenCV knows no dictionary '{capture.dictionary}': give one of its names, DICT_..."
+        )
+    rows, cols = capture.squares
+    best: tuple[NDArray[np.int64], Array] = (np.empty(0, np.int64), np.empty((0, 2)))
+    for legacy in (False, True):  # since OpenCV 4.6 boards of an even number of rows begin differently
+        board = cv2.aruco.CharucoBoard(
+            (cols, rows), capture.square_mm, capture.marker_mm or 0.0, cv2.aruco.getPredefinedDictionary(code)
+        )
+        board.setLegacyPattern(legacy)
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        if ids is not None and len(ids) > len(best[0]):
+            best = (ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(float))
+        if len(best[0]) or rows % 2:
+            break
+    return best
+
+
+def _grid_steps(index: NDArray[np.int64], cols: int) -> Array:
+    """(x, y) of corners in squares, from the first inner corner."""
+    return np.column_stack([index % cols, index // cols]).astype(float)
+
+
+def board_points(capture: Charuco, index: NDArray[np.int64]) -> Array:
+    """(x, y, 0), mm, of the inner corners of these numbers; the first square begins at 0."""
+    return np.column_stack(
+        [(_grid_steps(index, capture.squares[1] - 1) + 1.0) * capture.square_mm, np.zeros(len(index))]
+    )
+
+
+def _with_missing_corners(
+    index: NDArray[np.int64], points: Array, rows: int, cols: int, shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], Array]:
+    """Add the corners between markers that couldn't be read, where a homography and a quadratic correction predict
+    them.
+    """
+    homography, _ = cv2.findHomography(_grid_steps(index, cols), points, cv2.RANSAC, 3.0)
+    if homography is None:
+        return index, points
+
+    def plane(of: NDArray[np.int64]) -> Array:
+        return np.asarray(cv2.perspectiveTransform(_grid_steps(of, cols)[:, None, :], homography)[:, 0])
+
+    known = plane(index)
+    centre, scale = known.mean(axis=0), known.std() + 1.0
+
+    def quadratic_terms(at: Array) -> Array:
+        x, y = ((at - centre) / scale).T
+        terms = [np.ones_like(x), x, y]
+        if len(index) >= 12:
+            terms += [x * x, x * y, y * y]
+        return np.column_stack(terms)
+
+    gap = np.linalg.lstsq(quadratic_terms(known), points - known, rcond=None)[0]
+    missing = np.setdiff1d(np.arange(rows * cols), index)
+    guess = plane(missing)
+    guess = guess + quadratic_terms(guess) @ gap
+    inside = np.all((guess > 4) & (guess < np.array([shape[1], shape[0]]) - 5), axis=1)
+    index = np.concatenate([index, missing[inside]])
+    order = np.argsort(index)
+    return index[order], np.concatenate([points, guess[inside]])[order]
+
+
+def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArray[np.int64], Array]:
+    """Numbers and places of the inner corners of a plain checkerboard; all of them have to be in view."""
+    found, corners = cv2.findChessboardCorners(
+        grey, (cols, rows), flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+    if not found:  # slower, finds more
+        found, corners = cv2.findChessboardCornersSB(grey, (cols, rows), flags=cv2.CALIB_CB_EXHAUSTIVE)
+    if not found:
+        raise NotDetermined(
+            "geometry", f"no checkerboard of {rows} x {cols} inner corners found: all of it has to be in view"
+        )
+    grid = corners.reshape(rows, cols, 2).astype(float)
+    candidates = [np.rot90(grid, k) for k in range(4)] if rows == cols else [grid, grid[::-1, ::-1]]
+    candidates += [g[:, ::-1] for g in candidates]
+    # Seen from the front, a row and a column turn clockwise. Of these, the one whose first square is dark, so that both
+    # cameras of a pair number alike. Boards that look the same rotated by 180 deg begin at the top left.
+    front = [g for g in candidates if _cross(g[0, -1] - g[0, 0], g[-1, 0] - g[0, 0]) > 0]
+    if (rows + cols) % 2:
+        front = [g for g in front if _first_square_is_dark(grey, g)] or front
+    first = min(front, key=lambda g: float(g[0, 0].sum()))
+    return np.arange(rows * cols), first.reshape(-1, 2)
+
+
+def _cross(a: Array, b: Array) -> float:
+    """z of the cross product of two vectors."""
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
+def _first_square_is_dark(grey: NDArray[np.uint8], grid: Array) -> bool:
+    """Whether the square between the first four inner corners, which has the colour of the first square, is darker
+    than its neighbours.
+    """
+    middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    level = ndimage.map_coordinates(grey.astype(float), middles[..., ::-1].reshape(-1, 2).T, order=1, mode="nearest")
+    even = np.indices(middles.shape[:2]).sum(axis=0).ravel() % 2 == 0
+    return bool(level[even].mean() < level[~even].mean())
+
+
+def refined_corners(
+    picture: Array, points: Array, board: Array, square_mm: float, marker_mm: float, rows: int, cols: int
+) -> CornerFits:
+    """Corners (n, 2) fitted in the picture, at the pixels that no marker touches."""
+    homography, _ = cv2.findHomography(board.astype(np.float64), points.astype(np.float64), cv2.RANSAC, 3.0)
+    if homography is None:
+        raise NotDetermined("geometry", "the corners found don't lie on a plane: light or place the board better")
+    inverse = np.linalg.inv(homography)
+
+    def to_image(at: Array) -> Array:
+        return np.asarray(cv2.perspectiveTransform(at[:, None, :].astype(np.float64), homography)[:, 0])
+
+    step = 0.5 * square_mm
+    along = [
+        to_image(board + np.array(d) * step) - to_image(board - np.array(d) * step) for d in ((1.0, 0.0), (0.0, 1.0))
+    ]
+    square_px = np.minimum(np.linalg.norm(along[0], axis=1), np.linalg.norm(along[1], axis=1))
+    half = np.clip(0.42 * square_px, 2.0, WINDOW_PX)
+
+    def clear(at_px: Array) -> NDArray[np.bool_]:
+        """Pixels (n, 2) that are on the board and that no marker blurs into."""
+        mm = cv2.perspectiveTransform(at_px.reshape(-1, 1, 2).astype(np.float64), inverse)[:, 0]
+        inside = np.all((mm > 0) & (mm < np.array([cols, rows]) * square_mm), axis=1)
+        if marker_mm <= 0:
+            return np.asarray(inside)
+        blur_mm = 1.5 * square_mm / float(np.median(square_px))
+        reach = 0.5 * marker_mm + blur_mm
+        # Markers are in the light squares
+        cell = np.floor(mm / square_mm)
+        centre = (cell + 0.5) * square_mm
+        near = np.all(np.abs(mm - centre) < reach, axis=1)
+        light = light_squares[
+            np.clip(cell[:, 1], 0, rows - 1).astype(int), np.clip(cell[:, 0], 0, cols - 1).astype(int)
+        ]
+        return np.asarray(inside & ~(near & light))
+
+    light_squares = _light_squares(picture, to_image, square_mm, marker_mm, rows, cols)
+    return fit_corners(picture, points, along[0], along[1], half, clear)
+
+
+def _light_squares(
+    picture: Array, to_image: Any, square_mm: float, marker_mm: float, rows: int, cols: int
+) -> NDArray[np.bool_]:
+    """Which squares are light: of the two checker patterns, the one that agrees with the picture near the borders of
+    the squares.
+    """
+    row, col = np.indices((rows, cols))
+    rim = 0.5 - 0.25 * max(1.0 - marker_mm / square_mm, 0.1)
+    level = np.zeros((rows, cols))
+    for dx, dy in ((rim, 0.0), (-rim, 0.0), (0.0, rim), (0.0, -rim)):
+        at = to_image(np.column_stack([(col.ravel() + 0.5 + dx) * square_mm, (row.ravel() + 0.5 + dy) * square_mm]))
+        level += ndimage.map_coordinates(picture, at[:, ::-1].T, order=1, mode="nearest").reshape(rows, cols)
+    even = (row + col) % 2 == 0
+    return np.asarray(even if level[even].mean() > level[~even].mean() else ~even)
+
+
+def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> dict[str, CornerFits]:
+    """Corners of `view` in each colour of its own frame, on the pixels of that colour; green is the mean of its two
+    phases.
+    """
+    capture = view.capture
+    rows, cols = capture.squares
+    found: dict[str, CornerFits] = {}
+    for channel, places in phases(cfa).items():
+        of_phases = []
+        for row, col in places:
+            plane = np.asarray(frame[row::2, col::2], dtype=float)
+            low, high = np.quantile(plane, [0.02, 0.98])
+            plane = (plane - low) / max(high - low, 1e-12)
+            fits = refined_corners(
+                plane,
+                (view.image_px - [col, row]) / 2.0,
+                view.board_mm[:, :2],
+                capture.square_mm,
+                0.0 if capture.dictionary == "none" else float(capture.marker_mm or 0.0),
+                rows,
+                cols,
+            )
+            of_phases.append(CornerFits(2.0 * fits.points + [col, row], fits.trusted, 2.0 * fits.std_px))
+        found[channel] = CornerFits(
+            np.mean([fits.points for fits in of_phases], axis=0),
+            np.all([fits.trusted for fits in of_phases], axis=0),
+            np.sqrt(np.mean([fits.std_px**2 for fits in of_phases], axis=0) / len(of_phases)),
+        )
+    return found
+
+
+def find_boards(recordings: RecordingSet, side: Side) -> tuple[list[BoardView], list[Skipped]]:
+    """Boards of all `charuco` captures of `side`, and the captures in which none was found, with the reason."""
+    cfa = recordings.camera(side).cfa
+    views, rejected = [], []
+    for capture in recordings.captures("charuco", side):
+        try:
+            views.append(find_board(luminance(recordings.frame(capture), cfa), capture))
+        except NotDetermined as refused:
+            rejected.append(Skipped(step=capture.id, reason=refused.reason, side=side))
+    return views, rejected

@@ -1,0 +1,220 @@
+"""One camera from views of a board, without the corners and views that don't fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.errors import NotDetermined
+from lab.fit.geometry.board_detection import MIN_CORNERS, BoardView
+from lab.fit.geometry.bundle_adjustment import (
+    BundleAdjustment,
+    Observation,
+    Solution,
+    board_key,
+    board_pose,
+    first_intrinsics,
+    first_state,
+    with_boards,
+)
+from lab.fit.geometry.distortion_model import MODELS, choose_model, free_intrinsics
+from lab.fit.geometry.projection_errors import points_at, projection_std
+from lab.formats.results import DistortionModel, Skipped
+from sim.camera import Side
+
+Array = NDArray[np.floating[Any]]
+
+MIN_VIEWS = 3
+OUTLYING_VIEW_RATIO = 3.0  # rms of a view over the median rms, above which it is left out
+OUTLYING_VIEW_PX = 0.1  # rms below which no view is left out
+OUTLYING_CORNER_STD = 5.0  # standard deviations of a coordinate; of 2000 good corners, one in 500 calibrations
+OUTLYING_CORNER_SHARE = 0.25  # of the corners of a view, above which the view is left out
+LARGEST_RMS_SHARE = 0.005  # rms over the diagonal of the frame, above which no camera explains the corners
+LARGEST_FOCAL_STD = 0.1  # relative; above it the focal length isn't determined
+PARALLEL_DEG = 5.0
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera with the views that it rests on, and what was left out.
+
+    `shape`: (rows, cols) of the frame. `models`: the distortion models that were compared.
+    """
+
+    views: tuple[BoardView, ...]
+    solution: Solution
+    shape: tuple[int, int]  # rows, cols of the frame
+    models: tuple[DistortionModel, ...] = ()
+    rejected: tuple[Skipped, ...] = ()
+    rejected_corners: tuple[Skipped, ...] = ()
+
+    @property
+    def intrinsics(self) -> Array:
+        """Intrinsics (12,), see `lab.fit.geometry.pinhole`."""
+        return np.asarray(self.solution.state.intrinsics[0])
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (12, 12) of the intrinsics."""
+        return self.solution.of_camera(0)
+
+    @property
+    def points(self) -> Array:
+        """Corners (n, 3), mm, in the frame of the camera; they determine the implied motion of `projection_errors`."""
+        return placed_points(self.views, self.solution)
+
+    def projection_std(self, image: Array, distance_mm: float | None) -> Array:
+        """Standard deviation (n,), px, of projecting to `image` (n, 2) from a distance; NaN where nothing projects."""
+        points = points_at(image, self.intrinsics, distance_mm)
+        return projection_std(self.intrinsics, self.covariance, self.points, points)
+
+
+def placed_points(views: Sequence[BoardView], solution: Solution, camera: int = 0) -> Array:
+    """Corners (n, 3), mm, of `views`, one pose each, in the frame of the first camera."""
+    state = solution.state
+    return np.concatenate(
+        [view.board_mm @ state.rotations[k].T + state.translations_mm[k] for k, view in enumerate(views)]
+    ).astype(float)
+
+
+def observations_of(views: Sequence[BoardView]) -> list[Observation]:
+    """Views of one camera as observations, each with its own pose; views of equal boards share the board."""
+    keys = list(dict.fromkeys(board_key(view) for view in views))
+    return [Observation(view, pose=k, board=keys.index(board_key(view))) for k, view in enumerate(views)]
+
+
+def calibrate(views: Sequence[BoardView], shape: tuple[int, int], coefficients: Sequence[str] = MODELS[-1]) -> Solution:
+    """Calibrate one camera from all views, in frames of `shape` (rows, cols), with the distortion `coefficients`.
+
+    The solve starts from a pinhole and goes by way of k1: started without distortion, a rich model may end in another
+    minimum.
+    """
+    observations = observations_of(views)
+    start = first_state(views, first_intrinsics(views, shape))
+    start = with_boards(start, 1 + max(observation.board for observation in observations))
+    rough = BundleAdjustment(observations, free_intrinsics(MODELS[0])[None, :], shape).solve(start)
+    return BundleAdjustment(observations, free_intrinsics(coefficients)[None, :], shape).solve(rough.state)
+
+
+def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side: Side | None = None) -> Calibration:
+    """`calibrate` without the corners and views that don't fit, with the distortion model that predicts unseen views
+    best.
+
+    A corner is left out beyond 5 standard deviations of the others. A view is left out where its rms is beyond 3 times
+    the median, or where a quarter of its corners would go. Raises `NotDetermined` where too few views are left, where
+    no camera explains them, or where they don't determine the focal length.
+    """
+    kept: list[BoardView] = []
+    rejected: list[Skipped] = []
+    start = first_intrinsics(views, shape)
+    for view in views:
+        try:
+            board_pose(view, start)
+            kept.append(view)
+        except NotDetermined as refused:
+            rejected.append(Skipped(step=view.capture.id, reason=refused.reason, side=side))
+    outliers: dict[str, list[tuple[int, float]]] = {}
+    while True:
+        if len(kept) < MIN_VIEWS:
+            why = f"; {rejected[0].step}: {rejected[0].reason}" if rejected else ""
+            raise NotDetermined("geometry", f"{len(kept)} views of the board can be used, {MIN_VIEWS} are needed{why}")
+        solution = calibrate(kept, shape)
+        outlying = _outlying_view(kept, solution)
+        if outlying is not None:
+            which, reason = outlying
+            rejected.append(Skipped(step=kept[which].capture.id, reason=reason, side=side))
+            outliers.pop(kept[which].capture.id, None)
+            del kept[which]
+            continue
+        if not _remove_outlying_corners(kept, solution, outliers):
+            break
+    _check_board(kept, solution, shape)
+    coefficients, models = choose_model(kept, shape, solution)
+    if coefficients != MODELS[-1]:
+        solution = calibrate(kept, shape, coefficients)
+    _check_focal_length(solution)
+    corners = tuple(
+        Skipped(step=capture, reason=_corner_reason(numbers, solution.noise_px), side=side)
+        for capture, numbers in outliers.items()
+    )
+    return Calibration(tuple(kept), solution, shape, models, tuple(rejected), corners)
+
+
+def _outlying_view(views: Sequence[BoardView], solution: Solution) -> tuple[int, str] | None:
+    """The view that fits worst and the reason to leave it out; None where all fit."""
+    squares = [np.sum(residual**2, axis=1) for residual in solution.residuals]
+    rms = np.array([np.sqrt(np.mean(one)) for one in squares])
+    # The median of a view: a single outlying corner is no reason to leave out the others
+    typical = np.array([np.sqrt(np.median(one)) for one in squares])
+    limit = max(OUTLYING_VIEW_RATIO * float(np.median(rms)), OUTLYING_VIEW_PX)
+    worst = int(np.argmax(rms))
+    if rms[worst] <= limit:
+        return None
+    outlying = squares[worst] > (OUTLYING_CORNER_STD * max(coordinate_std_px(solution), 1e-3)) ** 2
+    if outlying.mean() < OUTLYING_CORNER_SHARE and typical[worst] <= limit and (~outlying).sum() >= MIN_CORNERS:
+        return None
+    return worst, f"rms {rms[worst]:.2f} px, where the other views have {np.median(rms):.2f} px"
+
+
+def coordinate_std_px(solution: Solution) -> float:
+    """Standard deviation of one coordinate, px, by the median modulus: outliers do not widen it."""
+    return 1.4826 * float(np.median(np.abs(np.concatenate(solution.residuals))))
+
+
+def _remove_outlying_corners(
+    kept: list[BoardView], solution: Solution, outliers: dict[str, list[tuple[int, float]]]
+) -> bool:
+    """Remove the outlying corners from `kept`, record them in `outliers`; whether there were any."""
+    std = max(coordinate_std_px(solution), 1e-3)
+    found = False
+    for k, (view, residual) in enumerate(zip(kept, solution.residuals, strict=True)):
+        distance = np.linalg.norm(residual, axis=1)
+        outlying = distance > OUTLYING_CORNER_STD * std
+        # The worst ones first: they bias the others
+        outlying &= distance > 0.5 * distance.max(initial=0.0)
+        if not outlying.any() or (~outlying).sum() < MIN_CORNERS:
+            continue
+        noted = outliers.setdefault(view.capture.id, [])
+        noted += [(int(index), float(px)) for index, px in zip(view.index[outlying], distance[outlying], strict=True)]
+        kept[k] = view.only(~outlying)
+        found = True
+    return found
+
+
+def _corner_reason(numbers: list[tuple[int, float]], noise_px: float) -> str:
+    which = ", ".join(f"{index} ({px:.2f} px)" for index, px in sorted(numbers))
+    return f"corners {which} lie off, where the others std by {noise_px:.3f} px"
+
+
+def _check_board(views: Sequence[BoardView], solution: Solution, shape: tuple[int, int]) -> None:
+    """Raise `NotDetermined` where the rms is too large for any camera."""
+    diagonal = float(np.hypot(*shape))
+    if not solution.rms_px < LARGEST_RMS_SHARE * diagonal:
+        capture = views[0].capture
+        raise NotDetermined(
+            "geometry",
+            f"no camera explains the corners (rms {solution.rms_px:.1f} px): check that the board has {capture.squares[0]} x "
+            f"{capture.squares[1]} squares, that it is flat, and that it didn't move while it was exposed",
+        )
+
+
+def _check_focal_length(solution: Solution) -> None:
+    """Raise `NotDetermined` where the focal length is uncertain by more than 10 %."""
+    focal = float(solution.state.intrinsics[0, 0])
+    uncertain = float(solution.std()[0]) / focal if solution.determined and focal > 0 else np.inf
+    if uncertain <= LARGEST_FOCAL_STD:
+        return
+    normals = solution.state.rotations[:, :, 2]
+    apart = np.rad2deg(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))).max()
+    why = (
+        f"all views are parallel within {apart:.0f} deg, so that focal length and distance can't be told apart"
+        if apart < PARALLEL_DEG
+        else f"it is open by {100 * min(uncertain, 9.99):.0f} %"
+    )
+    raise NotDetermined(
+        "geometry", f"the focal length isn't determined: {why}; tilt the board by 20..40 deg in several views"
+    )

@@ -1,0 +1,167 @@
+"""The geometry of a camera from its board captures, as it stands in the results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.errors import NotDetermined
+from lab.fit.geometry.board_detection import BoardView, channel_corners, find_boards
+from lab.fit.geometry.bundle_adjustment import Solution, warp_prior_mm
+from lab.fit.geometry.calibration import MIN_VIEWS, Calibration, calibrate_robustly
+from lab.fit.geometry.cross_validation import cross_validation
+from lab.fit.geometry.distortion_model import first_view_of_boards
+from lab.fit.geometry.lateral_colour import channel_geometry
+from lab.fit.geometry.pinhole import distortion_of, matrix_of
+from lab.fit.geometry.projection_errors import grid, grid_points
+from lab.fit.tuples import numbers, rows, triples
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import (
+    BoardWarp,
+    ChannelGeometry,
+    CrossValidation,
+    GeometryFit,
+    ProjectionUncertainty,
+    Skipped,
+    ViewResiduals,
+)
+from sim.camera import Side
+
+Array = NDArray[np.floating[Any]]
+
+LARGEST_WARP_STD = 0.5  # of the standard deviation of the prior; above it, the views don't determine a warp
+
+
+def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
+    """Camera matrix and distortion of `side` from its `charuco` captures (plain checkerboards: see `board_detection`).
+
+    Raises `NotDetermined` below 3 good views, where the board isn't what the captures say, or where all views are
+    parallel to each other: without perspective, focal length and distance can't be separated.
+    """
+    if not recordings.captures("charuco", side):
+        raise NotDetermined("geometry", "no charuco captures")
+    views, missed = find_boards(recordings, side)
+    camera = recordings.camera(side)
+    shape = (camera.rows, camera.cols)
+    if len(views) < MIN_VIEWS:
+        why = f"; {missed[0].step}: {missed[0].reason}" if missed else ""
+        raise NotDetermined("geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{why}")
+    calibration = calibrate_robustly(views, shape, side)
+    channels: tuple[ChannelGeometry, ...] = ()
+    if camera.cfa != "MONO":
+        frames = (channel_corners(recordings.frame(view.capture), camera.cfa, view) for view in calibration.views)
+        channels = channel_geometry(calibration, list(frames))
+    return geometry_result(calibration, missed, channels)
+
+
+def geometry_result(
+    calibration: Calibration,
+    missed: Sequence[Skipped] = (),
+    channels: tuple[ChannelGeometry, ...] = (),
+) -> GeometryFit:
+    """A calibration with its errors as a result; `missed`: captures in which no board was found."""
+    solution = calibration.solution
+    validation = cross_validation(calibration)
+    noises = [view.std_px for view in calibration.views if view.std_px is not None]
+    of_pictures = float(np.sqrt(np.mean(np.concatenate(noises) ** 2))) if noises else None
+    std = solution.std()
+    intrinsics_count = int(solution.free.sum())
+    warps = solution.covariance[intrinsics_count:, intrinsics_count:]
+    fx, fy, cx, cy = (float(value) for value in std[:4])
+    intrinsics = calibration.intrinsics
+    return GeometryFit(
+        camera_matrix=triples(matrix_of(intrinsics)),
+        camera_matrix_std=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 0.0)),
+        distortion=numbers(distortion_of(intrinsics)),
+        distortion_std=numbers(std[4 : 4 + len(distortion_of(intrinsics))]),
+        rms_px=solution.rms_px,
+        views=len(calibration.views),
+        rejected=(*missed, *calibration.rejected),
+        rejected_corners=calibration.rejected_corners,
+        parameters=solution.names,
+        covariance=rows(solution.covariance),
+        corner_px_std=solution.noise_px,
+        corner_noise_px=of_pictures,
+        board_warp=board_warps(calibration.views, solution.state.warps_mm, warps),
+        distortion_models=calibration.models,
+        cross_validation=validation,
+        projection=projection_maps(calibration),
+        channels=channels,
+        residuals=view_residuals(calibration),
+        remarks=tuple(_remarks(solution, validation, of_pictures)),
+    )
+
+
+def projection_maps(calibration: Calibration) -> tuple[ProjectionUncertainty, ...]:
+    """Standard deviation of the projection over the frame, at the median distance of the boards and at infinity."""
+    x, y = grid(calibration.shape)
+    image = grid_points(x, y)
+    distances = (float(np.median(np.linalg.norm(calibration.points, axis=1))), None)
+    found = []
+    for distance_mm in distances:
+        std = calibration.projection_std(image, distance_mm).reshape(len(y), len(x))
+        if not np.isfinite(std).all():  # where the distortion has no inverse
+            std = np.where(np.isfinite(std), std, np.nanmax(std))
+        found.append(
+            ProjectionUncertainty(
+                distance_mm=distance_mm, x_px=numbers(x), y_px=numbers(y), projection_px_std=rows(std)
+            )
+        )
+    return tuple(found)
+
+
+def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) -> tuple[BoardWarp, ...]:
+    """The warps (boards, 3), mm, as results, with their joint `covariance`; None where the views don't determine them."""
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(-1, 3)
+    found = []
+    for number, view in enumerate(first_view_of_boards(views)):
+        capture = view.capture
+        known = std[number] < LARGEST_WARP_STD * warp_prior_mm(view)
+        fields: dict[str, float | None] = {}
+        for k, field in enumerate(("bend_x_mm", "bend_y_mm", "twist_mm")):
+            fields[field] = float(warps_mm[number, k]) if known[k] else None
+            fields[f"{field}_std"] = float(std[number, k]) if known[k] else None
+        name = f"{capture.squares[0]} x {capture.squares[1]} squares of {capture.square_mm:g} mm, {capture.dictionary}"
+        found.append(BoardWarp(board=name, **fields))
+    return tuple(found)
+
+
+def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
+    """Where the corners of each view were seen, and their distances from the predictions."""
+    state = calibration.solution.state
+    found = []
+    for k, (view, rest) in enumerate(zip(calibration.views, calibration.solution.residuals, strict=True)):
+        depth = (view.board_mm @ state.rotations[k].T + state.translations_mm[k])[:, 2]
+        found.append(
+            ViewResiduals(
+                capture=view.capture.id,
+                corner=tuple(int(index) for index in view.index),
+                x_px=numbers(np.round(view.image_px[:, 0], 5)),
+                y_px=numbers(np.round(view.image_px[:, 1], 5)),
+                dx_px=numbers(np.round(rest[:, 0], 5)),
+                dy_px=numbers(np.round(rest[:, 1], 5)),
+                depth_mm=numbers(np.round(depth, 3)),
+            )
+        )
+    return tuple(found)
+
+
+def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures: float | None) -> list[str]:
+    remarks = []
+    if of_pictures is not None and solution.noise_px > 2.0 * max(of_pictures, 1e-3):
+        remarks.append(
+            f"The corners std by {solution.noise_px:.3f} px about the model, where the pictures' noise accounts for "
+            f"{of_pictures:.3f} px: the rest is the board's print and shape, motion, or the lens model."
+        )
+    if validation is None:
+        remarks.append(f"Fewer than {2 * MIN_VIEWS} views: the model's own error can't be told from the sampling's.")
+    elif validation.model_error_px > 0:
+        remarks.append(
+            f"Two halves of the views differ by {validation.difference_px:.3f} px over the frame, where the corners' noise lets "
+            f"them differ by {validation.expected_px:.3f} px: the model is off by about {validation.model_error_px:.3f} px, which "
+            "the standard uncertainties leave out."
+        )
+    return remarks
