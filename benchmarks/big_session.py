@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import mocks.bench
+import mocks.conceal
 import mocks.truth
 from lab.capture.sequences.calibration import full_calibration
 from lab.capture.sequences.steps import FindExposure, FixedExposure, RelativeExposure, Step
@@ -49,12 +50,6 @@ def enlarged(camera: mocks.truth.HiddenCamera, rng: np.random.Generator) -> mock
 
 def bench() -> mocks.bench.Bench:
     """The mock bench with the enlarged cameras."""
-    # The bench takes its size from its module: this process builds one session and ends.
-    mocks.bench.ROWS, mocks.bench.COLS = ROWS, COLS
-    mocks.bench.MM_PER_PX /= SCALE
-    mocks.bench.EDGE_PLACES_PX = {
-        name: (SCALE * down, SCALE * across) for name, (down, across) in mocks.bench.EDGE_PLACES_PX.items()
-    }
     made = mocks.bench.Bench()
     rng = np.random.default_rng(0)
     cameras = {side: enlarged(camera, rng) for side, camera in made._truth.cameras.items()}
@@ -101,9 +96,9 @@ class Session:
         if step.radiance is not None:
             self._keep_spectrum(step.radiance, self.bench.radiance())
         if isinstance(step.exposure, FindExposure):
-            for side in mocks.truth.SIDES:
+            for side in mocks.conceal.SIDES:
                 self.found[step.id, side] = self._find(side, step.exposure.level)
-        exposure_s = {side: self._exposure_s(step, side) for side in mocks.truth.SIDES}
+        exposure_s = {side: self._exposure_s(step, side) for side in mocks.conceal.SIDES}
         taken: dict[str, float] = {}
         for capture in step.captures:
             if capture.frame not in taken:

@@ -14,10 +14,11 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
@@ -30,7 +31,14 @@ from mocks.specbos1211 import Specbos1211
 from mocks.stage import Stage, Targets
 from mocks.wire import AddressError, Endpoint, Fault, FaultSpecError, Grammar, Light, Pty, Tcp, parse_faults, serve
 
+if TYPE_CHECKING:
+    from mocks.bench import Bench
+    from mocks.conceal import Concealed
+
 commands = typer.Typer()
+
+#: Says what a bench conceals that is told nothing on its command line.
+CONCEAL_VARIABLE = "CALIBENCH_CONCEAL"
 
 
 class Place(Light, Targets, Screen, Protocol):
@@ -97,14 +105,29 @@ def bench(
     ] = False,
     display: Annotated[str, typer.Option(help="HOST:PORT at which the display driver will listen.")] = "",
     with_parent: Annotated[bool, typer.Option("--with-parent", help="End when standard input is closed.")] = False,
+    conceal: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="SIDE:EFFECT:PARAMETER=VALUE[,...], as in left:nonlinearity:quadratic_percent=2, in place of what the bench "
+            "conceals by itself; may be repeated (or CALIBENCH_CONCEAL, with a ; between)."
+        ),
+    ] = None,
+    healthy: Annotated[
+        bool, typer.Option("--healthy", help="Conceal nothing: cameras that do what their data sheet says.")
+    ] = False,
+    warm_up: Annotated[
+        float, typer.Option(help="Degrees by which the sensors get warmer during the first virtual minutes.")
+    ] = 0.0,
 ) -> None:
     """Run the whole mock bench: prints one line an instrument, then `ready`."""
     with _one_line_errors():
         faults = _bench_faults(fault or [])
+        concealed = _concealed(conceal or [], healthy)
         stop = threading.Event()
         with _ended_by_signals(stop), contextlib.ExitStack() as running:
             line = _BenchLine(host, advertise or host, serial_over_tcp, display)
-            addresses, known = _start_bench(running, stop, seed, real_time, faults, line)
+            place = _bench(seed, real_time, concealed, warm_up)
+            addresses, known = _start_bench(running, stop, place, faults, line)
             for instrument, at in addresses.items():
                 _say(f"{instrument} {at['driver']} {at['address']}")
             if station is not None:
@@ -141,21 +164,39 @@ class _BenchLine:
         return self.display, {"driver": "browser", "address": f"0.0.0.0:{port}", "allow_remote": True}
 
 
+def _concealed(specs: list[str], healthy: bool) -> Concealed | None:
+    """What the command line, or without that the environment, says is to be concealed; None: what the bench conceals by itself."""
+    from mocks.conceal import ConcealError, parse
+
+    told = specs or [part for part in os.environ.get(CONCEAL_VARIABLE, "").split(";") if part.strip()]
+    if healthy and told:
+        raise _Unusable("bench: --healthy conceals nothing; leave out --conceal, or --healthy")
+    try:
+        return parse(told) if told or healthy else None
+    except ConcealError as error:
+        raise _Unusable(str(error)) from error
+
+
+def _bench(seed: int, real_time: float, concealed: Concealed | None, warm_up_c: float) -> Bench:
+    from mocks.bench import Bench
+
+    place = Bench(seed, max(0.0, real_time), concealed, warm_up_c=warm_up_c, session_clock=time.time)
+    place.compile_loops()
+    return place
+
+
 def _start_bench(
     running: contextlib.ExitStack,
     stop: threading.Event,
-    seed: int,
-    real_time: float,
+    place: Bench,
     faults: Mapping[str, tuple[Fault, ...]],
     line: _BenchLine,
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
     """Start everything; returns the addresses by instrument, and what a lab knows of this bench."""
-    # The bench brings the whole image former along: only this command pays for it.
-    from mocks.bench import SCREEN_COLS, SCREEN_ROWS, Bench
+    # The bench brings the whole forward model along: only this command pays for it.
+    from mocks.targets import SCREEN_COLS, SCREEN_ROWS
     from mocks.usb import SERIAL_NUMBERS, serve_usbip, stereo_pair
 
-    place = Bench(seed=seed, real_time_factor=max(0.0, real_time))
-    place.compile_loops()
     running.callback(stop.set)
     display_at, display_table = line.display_settings()
     addresses: dict[str, dict[str, Any]] = {

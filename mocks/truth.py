@@ -1,9 +1,9 @@
 """The hidden truth of the mock bench: what its cameras really are. Known to the bench and to tests, never on a wire.
 
-Each camera does what its data sheet says to within a smooth few per cent. The left one conceals two pieces of physics that
-a first model leaves out: a birefringent anti-alias filter and an infrared-cut filter; the right one conceals none. Beyond
+Each camera does what its data sheet says to within a smooth few per cent. By default the left one conceals two pieces of physics
+that a first model leaves out: a birefringent anti-alias filter and an infrared-cut filter; the right one conceals none. Beyond
 that there is a little of what no model of ours has (the filter's dispersion, pattern noise of neighbours that is a
-little alike), at levels that don't matter.
+little alike), at levels that don't matter. A bench that is told what to conceal conceals that, and nothing else.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
+from mocks.conceal import OF_THE_RADIOMETER, SIDES, Concealed, check
 from sim.camera import CameraModel, Geometry, Lens, Side
 from sim.effects.base import Effect
+from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.infrared_cut_filter import InfraredCutFilter
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.sensor.electrons import FixedPattern
@@ -29,7 +31,6 @@ ROWS, COLS, PITCH_UM = 480, 640, 3.0
 BASELINE_MM, DISTANCE_MM = 60.0, 900.0
 #: Every so many degrees the dark current doubles.
 DOUBLING_C = 7.0
-SIDES: tuple[Side, ...] = ("left", "right")
 #: Air at the bench, and by how much a camera's sensor is warmer. The models' dark currents hold there.
 AIR_C = 23.0
 SELF_HEATING_C: dict[Side, float] = {"left": 8.0, "right": 7.8}
@@ -61,7 +62,6 @@ class HiddenCamera:
     """One camera: model and concealed effects, its pixels' pattern, where it stands, and what its maker says.
 
     A point X of the rig's frame (mm; origin amid the cameras, z forward) is `rotation` (X - `centre_mm`) in the camera's.
-    `reference_temperature_c`: at which the model's dark current holds.
     """
 
     model: CameraModel
@@ -69,7 +69,6 @@ class HiddenCamera:
     pattern: FixedPattern
     rotation: FloatArray
     centre_mm: FloatArray
-    reference_temperature_c: float
     datasheet: Mapping[str, Any]
 
     @property
@@ -78,10 +77,10 @@ class HiddenCamera:
         assert self.model.geometry is not None
         return self.model.geometry
 
-    def dark_current_e_per_s(self, temperature_c: float) -> float:
-        """Mean dark current at a sensor temperature."""
-        doublings = (temperature_c - self.reference_temperature_c) / DOUBLING_C
-        return float(self.model.dark_current_e_per_s * 2.0**doublings)
+    @property
+    def acting(self) -> tuple[Effect, ...]:
+        """The effects that change the camera's frames: all but those of what the radiometer says."""
+        return tuple(effect for effect in self.effects if effect.name not in OF_THE_RADIOMETER)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,21 +128,23 @@ def _true_efficiency(rng: np.random.Generator) -> dict[str, Spectrum]:
     return curves
 
 
-def _pattern(rng: np.random.Generator, prnu_percent: float, dsnu_e: float) -> FixedPattern:
-    """Pattern noise with the stated standard deviations; a tenth of the PRNU's variance is shared by neighbours, a
-    fiftieth of the DSNU's by columns."""
-    white = rng.standard_normal((ROWS, COLS))
-    shared = ndimage.gaussian_filter(rng.standard_normal((ROWS, COLS)), 1.0, mode="wrap")
-    prnu = np.sqrt(0.9) * white + np.sqrt(0.1) * shared / shared.std()
-    dsnu = np.sqrt(0.98) * rng.standard_normal((ROWS, COLS)) + np.sqrt(0.02) * rng.standard_normal((1, COLS))
+def _pattern(
+    rng: np.random.Generator, shape: tuple[int, int], prnu_percent: float, dsnu_e: float, white: bool
+) -> FixedPattern:
+    """Pattern noise with the stated standard deviations. White, as the data sheet's figures mean it, or with a tenth of the PRNU's
+    variance shared by neighbours and a fiftieth of the DSNU's by columns."""
+    own, shared = rng.standard_normal(shape), ndimage.gaussian_filter(rng.standard_normal(shape), 1.0, mode="wrap")
+    dark, columns = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
+    prnu = own if white else np.sqrt(0.9) * own + np.sqrt(0.1) * shared / shared.std()
+    dsnu = dark if white else np.sqrt(0.98) * dark + np.sqrt(0.02) * columns
     prnu, dsnu = prnu - prnu.mean(), dsnu - dsnu.mean()
     return FixedPattern(prnu=prnu / prnu.std() * prnu_percent / 100.0, dsnu_e=dsnu / dsnu.std() * dsnu_e)
 
 
-def _datasheet() -> dict[str, Any]:
+def _datasheet(shape: tuple[int, int]) -> dict[str, Any]:
     return {
-        "rows": ROWS,
-        "cols": COLS,
+        "rows": shape[0],
+        "cols": shape[1],
         "pixel_pitch_um": PITCH_UM,
         "fill_factor": 0.8,
         "cfa": "RGGB",
@@ -183,14 +184,17 @@ _UNITS: dict[Side, dict[str, float]] = {
 }
 
 
-def _camera(side: Side, rng: np.random.Generator, effects: tuple[Effect, ...]) -> HiddenCamera:
-    sheet = _datasheet()
+def _camera(
+    side: Side, rng: np.random.Generator, effects: tuple[Effect, ...], shape: tuple[int, int], plain: bool
+) -> HiddenCamera:
+    sheet = _datasheet(shape)
+    rows, cols = shape
     unit = _UNITS[side]
     vary = rng.uniform(0.99, 1.01, 6)
     focal_px = 6.0 / (PITCH_UM * 1e-3) * rng.uniform(0.997, 1.003)
     model = CameraModel(
-        rows=ROWS,
-        cols=COLS,
+        rows=rows,
+        cols=cols,
         pixel_pitch_um=PITCH_UM,
         fill_factor=sheet["fill_factor"],
         cfa="RGGB",
@@ -203,12 +207,15 @@ def _camera(side: Side, rng: np.random.Generator, effects: tuple[Effect, ...]) -
         dark_current_e_per_s=unit["dark_current_e_per_s"] * vary[3],
         dsnu_e=1.05 * vary[4],
         prnu_percent=0.74 * vary[5],
+        dark_current_reference_c=AIR_C + SELF_HEATING_C[side],
+        # how it changes with the temperature, either the camera says or what is concealed
+        dark_current_doubling_c=None if any(isinstance(e, DarkCurrentTemperature) for e in effects) else DOUBLING_C,
         quantum_efficiency=_true_efficiency(rng),
         lens=Lens(f_number=4.0, focal_length_mm=6.0, transmittance=0.92),
         geometry=Geometry(
             camera_matrix=(
-                (focal_px, 0.0, (COLS - 1) / 2 + rng.uniform(-4, 4)),
-                (0.0, focal_px * rng.uniform(0.9998, 1.0002), (ROWS - 1) / 2 + rng.uniform(-4, 4)),
+                (focal_px, 0.0, (cols - 1) / 2 + rng.uniform(-4, 4)),
+                (0.0, focal_px * rng.uniform(0.9998, 1.0002), (rows - 1) / 2 + rng.uniform(-4, 4)),
                 (0.0, 0.0, 1.0),
             ),
             distortion=(rng.uniform(-0.13, -0.10), rng.uniform(0.04, 0.10), *rng.uniform(-2e-4, 2e-4, 2), 0.0),
@@ -221,16 +228,15 @@ def _camera(side: Side, rng: np.random.Generator, effects: tuple[Effect, ...]) -
     return HiddenCamera(
         model=model,
         effects=effects,
-        pattern=_pattern(rng, model.prnu_percent, model.dsnu_e),
+        pattern=_pattern(rng, shape, model.prnu_percent, model.dsnu_e, white=plain),
         rotation=turn.as_matrix(),
         centre_mm=np.array([outwards * BASELINE_MM / 2, 0.0, 0.0]) + rng.uniform(-0.3, 0.3, 3),
-        reference_temperature_c=AIR_C + SELF_HEATING_C[side],
         datasheet=sheet,
     )
 
 
 #: What the default bench conceals.
-CONCEALED: dict[Side, tuple[Effect, ...]] = {
+CONCEALED: Concealed = {
     "left": (
         DispersingLowPassFilter(displacement_x_um=2.06, displacement_y_um=1.94),
         RipplingInfraredCutFilter(cut_wavelength_nm=651.5, width_nm=3.2),
@@ -239,12 +245,19 @@ CONCEALED: dict[Side, tuple[Effect, ...]] = {
 }
 
 
-def hidden_truth(seed: int = 1, concealed: Mapping[Side, tuple[Effect, ...]] | None = None) -> Truth:
-    """The truth of a seed; `concealed` None: `CONCEALED`. The same seed with other effects has the same cameras otherwise."""
+def hidden_truth(seed: int = 1, concealed: Concealed | None = None, shape: tuple[int, int] = (ROWS, COLS)) -> Truth:
+    """The truth of a seed. `concealed` None: `CONCEALED`, and structure in the pixels' patterns; else that alone, in cameras that are
+    otherwise the same. `shape`: rows and columns of the frames; the same lens before a smaller sensor sees less.
+
+    Raises `mocks.conceal.ConcealError` for what the bench can't show.
+    """
     effects = CONCEALED if concealed is None else concealed
+    check(effects)
     return Truth(
         {
-            side: _camera(side, np.random.default_rng([seed, index]), effects.get(side, ()))
+            side: _camera(
+                side, np.random.default_rng([seed, index]), effects.get(side, ()), shape, concealed is not None
+            )
             for index, side in enumerate(SIDES)
         }
     )

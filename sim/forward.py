@@ -965,7 +965,7 @@ def _blurred_images(
         over = shares[1:] - shares[0]
 
         if few and not moves:
-            key = (channel, *lights, scene.kind, grid)
+            key = (channel, nodes.tobytes(), over.tobytes(), grid)
             make = partial(_layer_transfers, camera, nodes, over, grid, effects)
             spectrum = np.zeros((ny, nx // 2 + 1), complex)
             acting: Sequence[NDArray[np.complexfloating[Any]]] = make() if kept is None else kept.get(key, make)
@@ -1306,7 +1306,7 @@ def scene_light(
     x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
     y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
     for effect in effects:
-        shade = shade * effect.illumination(x_um, y_um, camera)
+        shade = shade * np.maximum(effect.illumination(x_um, y_um, camera), 0.0)
     images = {channel: _reflected(image, camera, effects) * shade for channel, image in images.items()}
     ambient = {c: sum(effect.ambient_e_per_s(c, camera) for effect in effects) for c in camera.channels}
     if not any(ambient.values()):
@@ -1322,7 +1322,7 @@ def collected_electrons(
     collected_s = exposure.exposure_s
     for effect in effects:
         collected_s = effect.exposure(collected_s)
-        source *= effect.drift(exposure.elapsed_s)
+        source *= max(effect.drift(exposure.elapsed_s), 0.0)
     if exposure.magnification != 0.0:
         source *= irradiance_factor(camera.lens.f_number, exposure.magnification) / irradiance_factor(
             camera.lens.f_number

@@ -14,20 +14,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mocks.bench import (
-    BOARD_POSES,
-    EDGE_ANGLES_DEG,
-    WAVELENGTH_NM,
-    Bench,
-    BenchError,
-    Clock,
-    LightSettings,
-    sphere_radiance,
-)
-from mocks.truth import SIDES, hidden_truth
+from mocks.bench import Bench, BenchError, Clock
+from mocks.conceal import SIDES
+from mocks.light_path import WAVELENGTH_NM, LightSettings, sphere_radiance
+from mocks.targets import BOARD_POSES, BOARD_SQUARES, EDGE_ANGLES_DEG, SQUARE_MM, board_pose, corners_px
+from mocks.truth import hidden_truth
 from sim.camera import Side
 from sim.forward import Exposure, edge_profile, expected
 from sim.scene.scenes import UniformField
+from sim.sensor.electrons import dark_current_e_per_s
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray, Spectrum
 
@@ -179,7 +174,7 @@ class TestFrames:
         long = np.array([bench.expose("left", 10.0) for _ in range(4)], float)
         gain = camera.model.conversion_gain_dn_per_e
         rate = (long.mean() - short.mean()) / gain / 10.0
-        expected_rate = camera.dark_current_e_per_s(bench.sensor_temperature_c("left"))
+        expected_rate = dark_current_e_per_s(camera.model, bench.sensor_temperature_c("left"))
         # 4 frames of 307,200 pixels, each with sqrt(58 + 5) e: 0.008 e in 10 s; the temperature swings by 0.1 degrees
         assert rate == pytest.approx(expected_rate, rel=0.015)
         pixels = short.mean(axis=0)
@@ -325,14 +320,11 @@ class TestTargets:
         assert len(ids) == (rows - 1) * (cols - 1)
 
     def test_all_boards_lie_inside_both_frames(self, bench: Bench) -> None:
-        from mocks.bench import BOARD_SQUARES, SQUARE_MM, _board_pose
-        from mocks.imaging import corners_px
-
         rows, cols = BOARD_SQUARES
         for side in SIDES:
             camera = hidden_truth(1).cameras[side]
             for name in BOARD_POSES:
-                warp = _board_pose(name).warp(camera, SQUARE_MM, (-cols / 2 * SQUARE_MM, -rows / 2 * SQUARE_MM))
+                warp = board_pose(name).warp(camera, SQUARE_MM, (-cols / 2 * SQUARE_MM, -rows / 2 * SQUARE_MM))
                 points = corners_px(warp, cols, rows)
                 assert points.min() > 8
                 assert np.all(points < [480 - 9, 640 - 9])

@@ -16,7 +16,7 @@ from drivers.monochromator.base import (
     filter_place,
     order_sorting_filters,
 )
-from mocks.bench import FILTER_CUT_ON_NM
+from mocks.light_path import FILTER_CUT_ON_NM
 
 
 @given(st.floats(400.0, 1100.0, exclude_max=True))

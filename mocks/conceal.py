@@ -1,0 +1,105 @@
+"""What a bench may be told to conceal: effects of the library, with parameters, on one side or on both.
+
+    left:nonlinearity:quadratic_percent=2
+    both:source_drift:drift_percent_per_min=0.5,settling_min=8
+
+Effects of the rig (lamp, monochromator, radiometer, screen, room, pair) act on both sides, as both cameras stand at one rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, get_origin
+
+from pydantic import ValidationError
+
+from sim.camera import Side
+from sim.effects.base import Effect, Stage
+from sim.effects.library import effects as library
+
+SIDES: tuple[Side, ...] = ("left", "right")
+Concealed = Mapping[Side, tuple[Effect, ...]]
+
+#: Effects that this bench can't show, and why.
+NOT_SHOWN: dict[str, str] = {
+    "stereo_time_offset": "every target of this bench stands still, and only what moves tells when a camera captures",
+}
+
+#: Effects of what the radiometer says: the light stays as it is.
+OF_THE_RADIOMETER = frozenset({"wavelength_offset", "radiometer_nonlinearity"})
+
+
+class ConcealError(ValueError):
+    """A specification that can't be used; the message is one line."""
+
+
+def parse(specs: Iterable[str]) -> Concealed:
+    """Effects by side. Raises `ConcealError` that names the effect, the parameter or the limit, and what may be chosen."""
+    found: dict[Side, tuple[Effect, ...]] = {"left": (), "right": ()}
+    for spec in specs:
+        sides, effect = _parsed(spec.strip())
+        for side in sides:
+            if any(type(other) is type(effect) for other in found[side]):
+                raise ConcealError(f"--conceal {spec}: {effect.name} is concealed on the {side} already; give it once")
+            found[side] = (*found[side], effect)
+    return found
+
+
+def _parsed(spec: str) -> tuple[tuple[Side, ...], Effect]:
+    where, _, rest = spec.partition(":")
+    name, _, text = rest.partition(":")
+    sides: tuple[Side, ...] = SIDES if where == "both" else tuple(side for side in SIDES if side == where)
+    if not sides:
+        raise ConcealError(
+            f"--conceal {spec}: {where!r} is no side; write SIDE:EFFECT:PARAMETER=VALUE with left, right or both"
+        )
+    if name not in library():
+        raise ConcealError(f"--conceal {spec}: no effect named {name!r}; there are {', '.join(library())}")
+    if name in NOT_SHOWN:
+        raise ConcealError(f"--conceal {spec}: the bench can't show {name}: {NOT_SHOWN[name]}")
+    kind = library()[name]
+    if kind.stage is Stage.RIG and sides != SIDES:
+        raise ConcealError(f"--conceal {spec}: {name} is of the rig before both cameras; write both:{name}:{text}")
+    return sides, _made(spec, kind, text)
+
+
+def _made(spec: str, kind: type[Effect], text: str) -> Effect:
+    quantities = kind.quantities()
+    others = [
+        field
+        for field, info in kind.model_fields.items()
+        if field not in quantities and (info.annotation in (int, float, bool) or get_origin(info.annotation) is Literal)
+    ]
+    known = ", ".join((*quantities, *others))
+    values: dict[str, Any] = {}
+    for part in text.split(",") if text else ():
+        field, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals or field not in (*quantities, *others):
+            raise ConcealError(
+                f"--conceal {spec}: {kind.name} has no parameter {field!r}; write PARAMETER=VALUE with {known}"
+            )
+        if field in values:
+            raise ConcealError(f"--conceal {spec}: {field} is given twice; give it once")
+        values[field] = value
+    try:
+        effect = kind.model_validate_strings(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = str(first["loc"][0]) if first["loc"] else ""
+        said = str(first["msg"]).removeprefix("Value error, ")
+        raise ConcealError(f"--conceal {spec}: {kind.name} {field}: {said}") from None
+    if effect == kind():
+        raise ConcealError(f"--conceal {spec}: nothing of {kind.name} would be there; give a value of {known}")
+    return effect
+
+
+def check(concealed: Concealed) -> None:
+    """Raises `ConcealError` for effects that the bench can't show, and for effects of the rig that differ from side to side."""
+    rig = {side: [effect for effect in concealed.get(side, ()) if effect.stage is Stage.RIG] for side in SIDES}
+    if rig["left"] != rig["right"]:
+        names = sorted({effect.name for side in SIDES for effect in rig[side]})
+        raise ConcealError(f"{', '.join(names)}: of the rig before both cameras; conceal the same on both sides")
+    for side in SIDES:
+        for effect in concealed.get(side, ()):
+            if effect.name in NOT_SHOWN:
+                raise ConcealError(f"the bench can't show {effect.name}: {NOT_SHOWN[effect.name]}")

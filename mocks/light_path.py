@@ -1,0 +1,107 @@
+"""The light before it meets a target: lamp, filter wheel, monochromator and integrating sphere; and the lit screen.
+
+lamp -> filter wheel -> monochromator (zero order at 0 nm) -> shutter -> integrating sphere
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import constants
+from scipy.special import expit
+
+from sim.spectrum import FloatArray
+
+#: The grid on which the bench computes light: finer than what the radiometer reports (1 nm) and the fits use.
+WAVELENGTH_NM: FloatArray = np.arange(350.0, 1000.1, 0.5)
+#: Reciprocal linear dispersion of the monochromator: FWHM of the slit function in nm = slit width in mm x this.
+DISPERSION_NM_PER_MM = 3.16
+#: Long-pass cut-on (nm) of each place of the filter wheel; None: an open place, infinity: a blank.
+FILTER_CUT_ON_NM: dict[int, float | None] = {1: None, 2: 375.0, 3: 550.0, 4: 780.0, 5: None, 6: np.inf}
+
+
+@dataclass(frozen=True)
+class LightSettings:
+    """How the shared light path is set: what identifies the light in front of the target."""
+
+    wavelength_nm: float = 0.0
+    shutter_open: bool = False
+    filter_place: int = 1
+    slit_um: float = 3000.0
+
+    @property
+    def first_order(self) -> bool:
+        """Whether light of one wavelength leaves the monochromator, and not all of the lamp's."""
+        return self.wavelength_nm > 0
+
+
+def lamp_radiance(wavelength_nm: FloatArray, temperature_k: float = 3050.0) -> FloatArray:
+    """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port in zero order with all filters out: a tungsten-halogen lamp.
+
+    Planck's law with the emissivity of tungsten falling from 0.47 to 0.33, behind glass that is opaque below 385 nm and a
+    heat filter that is opaque above 730 nm (half-way points), scaled to 0.03 at 560 nm.
+    """
+
+    def shape(w: FloatArray) -> FloatArray:
+        x = constants.h * constants.c / (w * 1e-9 * constants.k * temperature_k)
+        planck = 1.0 / (w**5 * np.expm1(x))
+        emissivity = 0.47 - 0.14 * (w - 340.0) / 660.0
+        return np.asarray(planck * emissivity * expit((w - 385.0) / 4.0) * expit((730.0 - w) / 4.0))
+
+    return 0.03 * shape(np.asarray(wavelength_nm, float)) / shape(np.array([560.0]))
+
+
+def screen_radiance(wavelength_nm: FloatArray) -> FloatArray:
+    """Radiance (W sr^-1 m^-2 nm^-1) of the lit screen: a blue diode and two phosphors, about 300 cd/m^2."""
+    w = np.asarray(wavelength_nm, float)
+    primaries = ((450.0, 9.0, 0.0090), (532.0, 24.0, 0.0042), (612.0, 17.0, 0.0051))
+    return np.asarray(sum(peak * np.exp(-0.5 * ((w - centre) / sd) ** 2) for centre, sd, peak in primaries))
+
+
+def grating_efficiency(wavelength_nm: FloatArray) -> FloatArray:
+    """Share of the light that a 1200 l/mm grating blazed at 500 nm sends into its first order."""
+    w = np.asarray(wavelength_nm, float)
+    return np.asarray(0.62 * np.exp(-0.5 * (np.log(w / 500.0) / 0.42) ** 2))
+
+
+def filter_transmittance(place: int, wavelength_nm: FloatArray) -> FloatArray:
+    """Transmittance of one place of the wheel: a long-pass with an edge 6 nm wide, 0.91 above it, 1e-5 below."""
+    cut_on = FILTER_CUT_ON_NM[place]
+    w = np.asarray(wavelength_nm, float)
+    if cut_on is None:
+        return np.ones_like(w)
+    if not np.isfinite(cut_on):
+        return np.zeros_like(w)
+    return np.asarray(1e-5 + 0.91 / (1.0 + np.exp(-np.clip((w - cut_on) / 2.5, -200, 200))))
+
+
+def slit_function(wavelength_nm: FloatArray, centre_nm: float, fwhm_nm: float) -> FloatArray:
+    """Transmittance (1 at the centre) of equal entrance and exit slits: a triangle, rounded by aberrations to sigma 0.25 nm."""
+    w = np.asarray(wavelength_nm, float)
+    offsets = np.linspace(-0.75, 0.75, 13)
+    weights = np.exp(-0.5 * (offsets / 0.25) ** 2)
+    shape = sum(
+        weight * np.clip(1.0 - np.abs(w - centre_nm - offset) / fwhm_nm, 0.0, None)
+        for weight, offset in zip(weights / weights.sum(), offsets, strict=True)
+    )
+    return np.asarray(shape)
+
+
+def sphere_radiance(light: LightSettings, wavelength_nm: FloatArray) -> FloatArray:
+    """Radiance (W sr^-1 m^-2 nm^-1) of the sphere's port for a setting of the light path.
+
+    Zero order passes all wavelengths. In first order at w the second order of w/2 leaves the slit at the same angle,
+    with half the width in wavelength: only the filter wheel keeps it out. Stray light: 1e-6 of zero order.
+    """
+    w = np.asarray(wavelength_nm, float)
+    if not light.shutter_open:
+        return np.zeros_like(w)
+    lamp = lamp_radiance(w) * filter_transmittance(light.filter_place, w)
+    if not light.first_order:
+        return lamp
+    fwhm_nm = light.slit_um * 1e-3 * DISPERSION_NM_PER_MM
+    width = light.slit_um / 3000.0  # a narrower entrance slit lets less light in
+    first = slit_function(w, light.wavelength_nm, fwhm_nm) * grating_efficiency(w)
+    second = slit_function(w, light.wavelength_nm / 2, fwhm_nm / 2) * 0.2 * grating_efficiency(2 * w)
+    return np.asarray(lamp * width * (first + second + 1e-6))
