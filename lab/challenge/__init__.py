@@ -1,4 +1,4 @@
-"""Concealed proof: sealed recordings with hidden truths, and the score of a diagnosis that hasn't seen them.
+"""Blind proof of the diagnosis: sealed recordings with concealed truths, and the score of what the diagnosis said of them.
 
-The recordings are made by a second image former beside the tests, which only a checkout of the project has.
+A second image former (`mocks.former`) makes the recordings: it shares no code with `sim`, by which the diagnosis predicts.
 """

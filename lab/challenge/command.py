@@ -21,6 +21,8 @@ commands = typer.Typer(
 
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes (all cores)")]
 EXIT_CHECK = 4
+#: The list of scored seeds, in a checkout of the project; an installation has none.
+PROOF_PAGE = Path(__file__).resolve().parents[2] / "docs" / "proof.md"
 
 
 def _say(text: str, share: float) -> None:
@@ -47,11 +49,10 @@ def make_command(
     jobs: Jobs = None,
 ) -> None:
     """Write sealed recording sets with concealed truths. An interrupted one goes on where it stopped."""
-    from lab.challenge.make import checkout, make
+    from lab.challenge.make import make
     from lab.challenge.proof import refuse_scored
     from lab.challenge.truth import FIRST_FRESH_SEED, FIRST_PROOF_SEED, purpose_of
 
-    root = checkout()
     if seed is None:
         seed = random.SystemRandom().randrange(
             *((FIRST_PROOF_SEED, FIRST_FRESH_SEED) if proof else (0, FIRST_PROOF_SEED))
@@ -65,7 +66,7 @@ def make_command(
             f"seed {seed}: seeds from {FIRST_PROOF_SEED} to {FIRST_FRESH_SEED - 1} are for proofs; give one below to tune, or --proof"
         )
     if proof:
-        refuse_scored(seed, root / "docs" / "proof.md")
+        refuse_scored(seed, PROOF_PAGE)
     file = truths if truths is not None else out.parent / f"{out.resolve().name}.truths.json"
     made = make(out, cases, seed, file, size, jobs or os.cpu_count() or 1, cfa=cfa, progress=_say)
     print(f"{out}: {len(made.truths)} cases, sealed in seals.json; the truths, seed among them, are in {file}")

@@ -2,68 +2,31 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
-import lab
-from lab.challenge.truth import Seals, Truth, Truths, digest, load, purpose_of, salted, seal, store
+from lab.challenge.draw import SIZES, draw
+from lab.challenge.truth import CaseTruth, Seals, Truths, digest, load, purpose_of, salted, seal, store
 from lab.errors import InputError
-from lab.formats import recording_set as recording
+from lab.formats import recording_set
 
 #: What all files of a challenge are dated, s since 1970: when one was written says nothing.
 FILE_TIME_S = 1_772_442_000
-PACKAGE = "calibench_former"
 
 
-def checkout() -> Path:
-    """The project's checkout, where the image former stands beside the tests; raises InputError where there is none."""
-    root = Path(lab.__file__).resolve().parents[1]
-    if not (root / "tests" / "proof" / "former" / "__init__.py").is_file():
-        raise InputError(
-            "challenge make: needs the project's checkout, whose tests hold the second image former; this is an installation without them"
-        )
-    return root
-
-
-def _draw() -> Any:
-    """The former's `draw`. Loaded by its file, for `tests` may be any project's; product code knows nothing of it."""
-    if PACKAGE not in sys.modules:
-        folder = checkout() / "tests" / "proof" / "former"
-        spec = importlib.util.spec_from_file_location(
-            PACKAGE, folder / "__init__.py", submodule_search_locations=[str(folder)]
-        )
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[PACKAGE] = module
-        spec.loader.exec_module(module)
-    return importlib.import_module(f"{PACKAGE}.draw").draw
-
-
-def sizes() -> tuple[str, ...]:
-    """Names of the frames' sizes."""
-    _draw()
-    return tuple(sys.modules[f"{PACKAGE}.draw"].SIZES)
-
-
-def _write_case(folder: Path, seed: int, index: int, size: str, cfa: str | None) -> Truth:
+def _write_case(folder: Path, seed: int, index: int, size: str, cfa: str | None) -> CaseTruth:
     """Draw one case and write its recording set; the truth with the set's digest."""
-    case = _draw()(seed, index, size, cfa=cfa)
+    case = draw(seed, index, size, cfa=cfa)
     if folder.exists():  # of a run that was stopped between this set and its truth
         shutil.rmtree(folder)
-    recording.write(case.recordings, folder)
+    recording_set.write(case.recordings, folder)
     for path in (folder, *folder.rglob("*")):
         os.utime(path, (FILE_TIME_S, FILE_TIME_S))
-    truth: dict[str, Any] = case.truth.model_dump(mode="json")  # the former's own copy of the class
-    return Truth.model_validate(truth | {"recordings_sha256": digest(folder)})
+    return case.truth.model_copy(update={"recordings_sha256": digest(folder)})
 
 
 def case_name(index: int) -> str:
@@ -79,8 +42,8 @@ def make(
     out, truths_file = out.resolve(), truths_file.resolve()
     if out in truths_file.parents or truths_file == out:
         raise InputError(f"{truths_file}: lies within the challenge's folder {out}; give a file outside it")
-    if size not in sizes():
-        raise InputError(f"size {size!r}: there is none; take one of {', '.join(sizes())}")
+    if size not in SIZES:
+        raise InputError(f"size {size!r}: there is none; take one of {', '.join(SIZES)}")
     held = Truths(purpose=purpose_of(seed), seed=seed, size=size, cases=cases)
     if truths_file.exists():
         there = load(Truths, truths_file)
@@ -96,7 +59,7 @@ def make(
     missing = [i for i in range(1, cases + 1) if case_name(i) not in truths or not (out / case_name(i)).is_dir()]
     arguments = {i: (out / case_name(i), seed, i, size, cfa) for i in missing}
 
-    def keep(index: int, truth: Truth) -> None:
+    def keep(index: int, truth: CaseTruth) -> None:
         nonlocal held
         truths[case_name(index)] = salted(truth)
         held = held.model_copy(update={"truths": dict(sorted(truths.items()))})

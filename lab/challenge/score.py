@@ -12,7 +12,7 @@ from typing import Literal
 from scipy.special import betaincinv
 
 from lab.challenge.run import CaseRun
-from lab.challenge.truth import Purpose, Seals, Truth, Truths, digest, seal
+from lab.challenge.truth import CaseTruth, Purpose, Seals, Truths, digest, seal
 from lab.formats.results import DiagnosisResult
 from sim.parameters import Frozen
 
@@ -240,7 +240,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
 # --- one case ------------------------------------------------------------------------------------------------------------
 
 
-def _case_score(case: str, truth: Truth, run: CaseRun) -> CaseScore:
+def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
     found = run.diagnosis
     effects = sorted(found.effects, key=lambda e: -e.probability) if found is not None else []
     named = tuple(e.name for e in effects)
@@ -260,7 +260,7 @@ def _case_score(case: str, truth: Truth, run: CaseRun) -> CaseScore:
     )  # fmt: skip
 
 
-def _removed(truth: Truth, found: DiagnosisResult | None) -> float | None:
+def _removed(truth: CaseTruth, found: DiagnosisResult | None) -> float | None:
     """(before - after) / (before - n) of held-out chi2, -1..1, where what is concealed left an excess to remove there."""
     held = found.held_out if found is not None else None
     if held is None or max((c.noncentrality for c in truth.concealed), default=0.0) <= STRONG:
@@ -271,7 +271,7 @@ def _removed(truth: Truth, found: DiagnosisResult | None) -> float | None:
     return max(-1.0, min(1.0, (held.chi2_before - held.chi2_after) / excess))
 
 
-def _covered(truth: Truth, found: DiagnosisResult | None) -> Iterable[bool]:
+def _covered(truth: CaseTruth, found: DiagnosisResult | None) -> Iterable[bool]:
     """Of every parameter that means the same in the library: whether its interval holds the truth."""
     named = {e.name: e for e in found.effects} if found is not None else {}
     for hidden in truth.concealed:

@@ -36,7 +36,7 @@ class Concealed(Frozen):
     noncentrality: float
 
 
-class Truth(Frozen):
+class CaseTruth(Frozen):
     """Of one case. `fault`: what is stated wrongly, or went wrong on the rig. `accepts`: names that aren't wrong beside the concealed
     ones. `recordings_sha256`: of every file of the set, so that the seal binds these, too."""
 
@@ -59,7 +59,7 @@ class Truth(Frozen):
 
 class SaltedTruth(Frozen):
     salt: str
-    truth: Truth
+    truth: CaseTruth
 
 
 class Truths(Frozen):
@@ -82,7 +82,7 @@ class Seals(Frozen):
     seals: dict[str, str] = {}
 
 
-def canonical(truth: Truth) -> str:
+def canonical(truth: CaseTruth) -> str:
     """JSON with sorted keys and no blanks: one text for one truth."""
     return json.dumps(truth.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
 
@@ -92,7 +92,7 @@ def seal(salted: SaltedTruth) -> str:
     return hashlib.sha256((salted.salt + canonical(salted.truth)).encode()).hexdigest()
 
 
-def salted(truth: Truth) -> SaltedTruth:
+def salted(truth: CaseTruth) -> SaltedTruth:
     """With a fresh salt of 128 bits: the seal can't be guessed from the few truths that are likely."""
     return SaltedTruth(salt=secrets.token_hex(16), truth=truth)
 

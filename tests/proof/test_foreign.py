@@ -6,18 +6,19 @@ from pathlib import Path
 
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.formats.recording_set import read
 from lab.formats.results import DiagnosisResult
-from tests.proof.former import Camera, Law
-from tests.proof.former.laws import (
-    ChargeDiffusion,
-    CoverGlassFringe,
-    Defocus,
-    InfraredCutFilter,
-    Nonlinearity,
-    OpticalLowPassFilter,
-    VeilingGlare,
+from mocks.former import ConcealedCamera, Law
+from mocks.former.laws import (
+    ChargeDiffusionLaw,
+    CoverGlassFringeLaw,
+    DefocusLaw,
+    InfraredCutFilterLaw,
+    NonlinearityLaw,
+    OpticalLowPassFilterLaw,
+    VeilingGlareLaw,
 )
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
@@ -54,8 +55,8 @@ def test_two_effects_of_another_image_former_are_named() -> None:
 
 CASES: list[tuple[str, tuple[Law, ...], str]] = [
     ("healthy mono", (), "MONO"),
-    ("glare", (VeilingGlare(2.0, 0),), "GRBG"),
-    ("bend", (Nonlinearity(2.0, 0),), "BGGR"),
+    ("glare", (VeilingGlareLaw(2.0, 0),), "GRBG"),
+    ("bend", (NonlinearityLaw(2.0, 0),), "BGGR"),
 ]
 
 
@@ -66,27 +67,27 @@ def named(concealed: tuple[Law, ...]) -> set[str]:
 @pytest.mark.slow  # the fresh cases try the like every day
 @pytest.mark.parametrize(("name", "concealed", "cfa"), CASES, ids=[c[0] for c in CASES])
 def test_one_effect_by_another_law_is_named_alone(name: str, concealed: tuple[Law, ...], cfa: str) -> None:
-    result = diagnose(Camera(900, concealed, cfa=cfa).record())
+    result = diagnose(recordings_of(ConcealedCamera(900, concealed, cfa=cfa)))
     assert {e.name for e in result.effects} == named(concealed)
     assert result.verdict == ("explained" if concealed else "no_mismatch")
 
 
 MORE: list[tuple[Law, ...]] = [
-    (Defocus(12.0, 1),), (ChargeDiffusion(0.7, 2),), (OpticalLowPassFilter(1.4, 1),), (InfraredCutFilter(55.0, 1),),
-    (Defocus(14.0, 1), Nonlinearity(1.5, 0)), (ChargeDiffusion(0.8, 1), VeilingGlare(2.0, 0)),
+    (DefocusLaw(12.0, 1),), (ChargeDiffusionLaw(0.7, 2),), (OpticalLowPassFilterLaw(1.4, 1),), (InfraredCutFilterLaw(55.0, 1),),
+    (DefocusLaw(14.0, 1), NonlinearityLaw(1.5, 0)), (ChargeDiffusionLaw(0.8, 1), VeilingGlareLaw(2.0, 0)),
 ]  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("concealed", MORE)
 def test_more_concealed_effects(concealed: tuple[Law, ...]) -> None:
-    result = diagnose(Camera(910, concealed, cfa="RGGB").record())
+    result = diagnose(recordings_of(ConcealedCamera(910, concealed, cfa="RGGB")))
     assert {e.name for e in result.effects} == named(concealed)
 
 
 @pytest.mark.slow
 def test_what_nobody_lists_is_located_and_not_named() -> None:
-    result = diagnose(Camera(920, [CoverGlassFringe(3.0)], cfa="GBRG").record())
+    result = diagnose(recordings_of(ConcealedCamera(920, [CoverGlassFringeLaw(3.0)], cfa="GBRG")))
     assert not result.effects
     assert result.verdict == "unexplained"
     assert any(m.measurement == "narrowband" for m in result.mismatches)

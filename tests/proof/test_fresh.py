@@ -13,27 +13,34 @@ from pathlib import Path
 
 import pytest
 
-from lab.challenge.truth import FIRST_FRESH_SEED, Kind, SaltedTruth, Truth, canonical, purpose_of, salted, seal
+from lab.challenge.draw import Case, draw
+from lab.challenge.truth import FIRST_FRESH_SEED, CaseTruth, Kind, SaltedTruth, canonical, purpose_of, salted, seal
 from lab.diagnose import diagnose
 from lab.formats.results import DiagnosisResult
-from tests.proof.former import Law
-from tests.proof.former.draw import Case, draw
-from tests.proof.former.laws import (
-    AbsorptionBand,
-    CompandingKnee,
-    CoverGlassFringe,
-    DustShadow,
-    InfraredCutFilter,
-    LampJump,
-    Nonlinearity,
-    OpticalLowPassFilter,
-    TapGain,
+from mocks.former import Law
+from mocks.former.laws import (
+    AbsorptionBandLaw,
+    CompandingKneeLaw,
+    CoverGlassFringeLaw,
+    DustShadowLaw,
+    InfraredCutFilterLaw,
+    LampJumpLaw,
+    NonlinearityLaw,
+    OpticalLowPassFilterLaw,
+    TapGainLaw,
 )
 
 #: Laws whose nominal strength is far above what small frames need, whatever the variant.
-PLAIN: tuple[type[Law], ...] = (OpticalLowPassFilter, InfraredCutFilter, Nonlinearity, OpticalLowPassFilter)
+PLAIN: tuple[type[Law], ...] = (OpticalLowPassFilterLaw, InfraredCutFilterLaw, NonlinearityLaw, OpticalLowPassFilterLaw)
 #: Of the kinds that no list names, some that are soon diagnosed.
-STRANGE: tuple[type[Law], ...] = (AbsorptionBand, CompandingKnee, CoverGlassFringe, DustShadow, LampJump, TapGain)
+STRANGE: tuple[type[Law], ...] = (
+    AbsorptionBandLaw,
+    CompandingKneeLaw,
+    CoverGlassFringeLaw,
+    DustShadowLaw,
+    LampJumpLaw,
+    TapGainLaw,
+)
 
 
 def fresh_seed() -> int:
@@ -69,7 +76,8 @@ def told(found: list[tuple[Case, SaltedTruth, str, DiagnosisResult]]) -> str:
 
 def sealed_as_before(found: list[tuple[Case, SaltedTruth, str, DiagnosisResult]]) -> bool:
     return all(
-        seal(SaltedTruth(salt=k.salt, truth=Truth.model_validate_json(canonical(k.truth)))) == s for _, k, s, _ in found
+        seal(SaltedTruth(salt=k.salt, truth=CaseTruth.model_validate_json(canonical(k.truth)))) == s
+        for _, k, s, _ in found
     )
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.measurements.blocks import evidence_of
+from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import effects
-from tests.proof.former import Camera, Plan
 
 DRAWS = 24
 
@@ -19,7 +20,7 @@ DRAWS = 24
 def test_the_threshold_holds_on_images(seed: int, cfa: str) -> None:
     """Of 24 draws at a rate of 1 %, more than 3 exceed it with a probability of 1e-5. No measurement's chi2 is above its number
     of values by more than 4 sigmas of a mean of 24: then its covariance would be too narrow."""
-    recordings = Camera(seed, cfa=cfa, rows=96, cols=128).record(Plan())
+    recordings = recordings_of(ConcealedCamera(seed, cfa=cfa, rows=96, cols=128), Plan())
     evidence, _ = evidence_of(recordings, "left")
     assert evidence is not None
     known = [e for e in effects().values() if e.shown_by]

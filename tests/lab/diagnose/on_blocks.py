@@ -7,17 +7,18 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.evidence import Evidence, chi2
 from lab.diagnose.measurements.summaries import Block, Study
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Law, Plan
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.forward import Exposure, electron_rate, sample
 from sim.scene.scenes import Darkness, UniformField
 from sim.spectrum import Spectrum
-from tests.proof.former import Camera, Law, Plan
 
 UNIFORM = ("dark", "flat", "narrowband")
 WAVELENGTH = np.arange(380.0, 781.0)
@@ -27,7 +28,7 @@ def former(
     seed: int, *laws: Law, cfa: str = "MONO", kinds: tuple[str, ...] = ("dark", "flat"), shuttle: bool = False
 ) -> RecordingSet:
     """A small session of the second image former."""
-    return Camera(seed, laws, cfa=cfa, rows=96, cols=128).record(Plan(kinds, shuttle=shuttle))
+    return recordings_of(ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128), Plan(kinds, shuttle=shuttle))
 
 
 def study(recordings: RecordingSet) -> Study:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.evidence import Evidence, Gaussian, Within, chi2
@@ -19,12 +20,11 @@ from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.unknown import discrepancy, predictive
 from lab.diagnose.measurements.summaries import Block, Label, Prediction
 from lab.formats.recording_set import Manifest, RecordingSet
+from mocks.former import ConcealedCamera, Plan
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import effect, effects
 from sim.spectrum import Spectrum
-from tests.proof.former import Camera as ConcealedCamera
-from tests.proof.former import Plan
 
 FREQUENCY = np.linspace(0.02, 0.9, 23)
 NOISE = 0.004
@@ -294,7 +294,9 @@ def test_gaussians_agree_with_their_formulas() -> None:
 
 @pytest.fixture(scope="module")
 def edges() -> RecordingSet:
-    return ConcealedCamera(7, cfa="RGGB", f_number=2.0, rows=280, cols=280).record(Plan(("dark", "slanted_edge")))
+    return recordings_of(
+        ConcealedCamera(7, cfa="RGGB", f_number=2.0, rows=280, cols=280), Plan(("dark", "slanted_edge"))
+    )
 
 
 def test_a_subset_is_judged_by_what_it_has(edges: RecordingSet) -> None:

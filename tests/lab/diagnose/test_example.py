@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 from scipy import stats
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose, examine
 from lab.formats.importers import read_foreign
 from lab.formats.recording_set import inspect
-from tests.proof.former import Camera, Plan
-from tests.proof.former import laws as concealed_laws
+from mocks.former import ConcealedCamera, Plan
+from mocks.former import laws as concealed_laws
 
 ROOT = Path(__file__).parents[3]
 DATA = ROOT.parent / "shared" / "data"
@@ -25,9 +26,10 @@ FLEA, CCD = DATA / "llanos_colorchecker", DATA / "emva1288_ccd"
 def test_the_mtf_that_fell_short_and_the_red_end_have_names_and_then_fit() -> None:
     """An anti-alias filter and an infrared filter, as in docs/diagnosis-example.md: both named, edges and narrowband light within the
     99.9 % quantile of noise on held-out captures, and nothing left where the improved model is the baseline."""
-    law = [concealed_laws.OpticalLowPassFilter(1.6), concealed_laws.InfraredCutFilter(60.0)]
-    recordings = Camera(20751, law, cfa="RGGB", f_number=4.0, rows=180, cols=240).record(
-        Plan(("dark", "flat", "narrowband", "slanted_edge"))
+    law = [concealed_laws.OpticalLowPassFilterLaw(1.6), concealed_laws.InfraredCutFilterLaw(60.0)]
+    recordings = recordings_of(
+        ConcealedCamera(20751, law, cfa="RGGB", f_number=4.0, rows=180, cols=240),
+        Plan(("dark", "flat", "narrowband", "slanted_edge")),
     )
     found = examine(recordings)
     assert {e.name for e in found.result.effects} == {"optical_low_pass_filter", "infrared_cut_filter"}

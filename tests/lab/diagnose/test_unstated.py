@@ -11,18 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.measurements.blocks import evidence_of
 from lab.diagnose.measurements.summaries import Study
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
-from tests.proof.former import Camera, Plan
+from mocks.former import ConcealedCamera, Plan
 
 
 @cache
 def _whole(seed: int = 4242) -> RecordingSet:
-    return Camera(seed, rows=96, cols=128).record(Plan())
+    return recordings_of(ConcealedCamera(seed, rows=96, cols=128), Plan())
 
 
 Change = Callable[[dict[str, Any]], None]

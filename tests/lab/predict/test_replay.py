@@ -5,19 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.measurements.summaries import Study
 from lab.errors import NotDetermined
 from lab.formats.recording_set import Narrowband, RecordingSet, SlantedEdge
 from lab.predict.camera_model import camera_model
 from lab.predict.replay import Replay
+from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import effect
 from sim.spectrum import FloatArray
-from tests.proof.former import Camera, Plan
 
 
 @pytest.fixture(scope="module")
 def recordings() -> RecordingSet:
-    return Camera(11, cfa="RGGB", rows=96, cols=128).record(Plan())
+    return recordings_of(ConcealedCamera(11, cfa="RGGB", rows=96, cols=128), Plan())
 
 
 @pytest.fixture(scope="module")

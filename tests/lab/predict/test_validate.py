@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.fit import fit_recording_set
 from lab.fit.psf.expected_kernel import expected_kernel
 from lab.formats.camera_file import fitted_camera
@@ -16,17 +17,17 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, ValidationResult
 from lab.predict.camera_model import camera_model
 from lab.predict.validate import validate
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former import laws as concealed_laws
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.forward import kernel, optical_transfer
-from tests.proof.former import Camera, Law, Plan
-from tests.proof.former import laws as concealed_laws
 
 DISPLACEMENT_UM = 1.6
 
 
 def _fitted(*concealed: Law) -> tuple[RecordingSet, FitResult]:
     # f/2: the lens leaves much beyond the pixels' Nyquist frequency
-    recordings = Camera(931, concealed, cfa="MONO", f_number=2.0).record()
+    recordings = recordings_of(ConcealedCamera(931, concealed, cfa="MONO", f_number=2.0))
     return recordings, fit_recording_set(recordings)
 
 
@@ -42,7 +43,7 @@ def test_a_healthy_camera_is_predicted_within_its_uncertainty() -> None:
 
 
 def test_a_concealed_filter_shows_in_edges_and_kernels_and_its_model_mends_it() -> None:
-    recordings, fit = _fitted(concealed_laws.OpticalLowPassFilter(DISPLACEMENT_UM))
+    recordings, fit = _fitted(concealed_laws.OpticalLowPassFilterLaw(DISPLACEMENT_UM))
     plain = validate(recordings, fit)
     assert _passed(plain) == {"colorchecker": True, "mtf": False, "psf": False}
     known = OpticalLowPassFilter(displacement_x_um=DISPLACEMENT_UM, displacement_y_um=DISPLACEMENT_UM)
@@ -55,7 +56,9 @@ def test_a_concealed_filter_shows_in_edges_and_kernels_and_its_model_mends_it() 
 
 
 def test_what_isn_t_there_is_skipped_with_its_reason() -> None:
-    result = validate(Camera(931, cfa="MONO").record(Plan(("dark",))), FitResult(source="", cameras={}))
+    result = validate(
+        recordings_of(ConcealedCamera(931, cfa="MONO"), Plan(("dark",))), FitResult(source="", cameras={})
+    )
     assert not result.checks
     assert {s.step for s in result.skipped} == {"validate colorchecker", "validate mtf", "validate psf"}
     assert all(s.reason for s in result.skipped)
@@ -66,7 +69,8 @@ def test_the_expected_kernel_of_a_soft_lens_is_the_forward_models() -> None:
     leave some 1e-3 of the maximum in the core. Of a sharp one the rims of the cells make it another."""
     for f_number, apart in ((8.0, (0.0, 6e-3)), (1.8, (2e-2, 0.2))):
         model = camera_model(
-            Camera(931, cfa="MONO", f_number=f_number, rows=32, cols=32).record(Plan(("dark",))), "left"
+            recordings_of(ConcealedCamera(931, cfa="MONO", f_number=f_number, rows=32, cols=32), Plan(("dark",))),
+            "left",
         )
         expected = expected_kernel(partial(optical_transfer, model, "Y", None), 9, 4.0)
         plain = kernel(model, "Y", None, 9)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.bootstrap import HealthyDraw, image_threshold
 from lab.diagnose.side import diagnose_side
-from tests.proof.former import Camera, Plan
+from mocks.former import ConcealedCamera, Plan
 
 
 def test_a_threshold_of_few_draws_is_that_of_many() -> None:
@@ -20,7 +21,7 @@ def test_a_threshold_of_few_draws_is_that_of_many() -> None:
 
 
 def test_a_threshold_is_never_below_that_of_drawn_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
-    recordings = Camera(9, cfa="MONO", rows=64, cols=96).record(Plan(kinds=("dark", "flat")))
+    recordings = recordings_of(ConcealedCamera(9, cfa="MONO", rows=64, cols=96), Plan(kinds=("dark", "flat")))
     tops = [30.0 + t for t in range(10)]
     monkeypatch.setattr("lab.diagnose.side.healthy_draws", lambda *_: [HealthyDraw(top, {}) for top in tops])
     plain, drawn = (diagnose_side(recordings, "left", None, None, lambda _: None, bootstrap=n) for n in (0, 10))

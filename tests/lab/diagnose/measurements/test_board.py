@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of, recordings_of_pair
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.evidence import Evidence
 from lab.diagnose.measurements.board import board_block, calibration_of
@@ -14,16 +15,15 @@ from lab.errors import NotDetermined
 from lab.fit.geometry.pinhole import distortion_of, matrix_of
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former import laws as concealed
 from sim.camera import Geometry, Side
-from tests.proof.former import Camera, Law, Plan
-from tests.proof.former import laws as concealed
-from tests.proof.former.camera import pair
 
 PLAN = Plan(kinds=("dark", "charuco"))
 
 
 def recorded(*laws: Law, noise_draw: int = 0) -> RecordingSet:
-    return Camera(41, laws, cfa="RGGB", rows=192, cols=256, noise_draw=noise_draw).record(PLAN)
+    return recordings_of(ConcealedCamera(41, laws, cfa="RGGB", rows=192, cols=256, noise_draw=noise_draw), PLAN)
 
 
 def study_of(recordings: RecordingSet, side: Side = "left") -> Study:
@@ -44,7 +44,7 @@ def calibrated() -> Geometry:
 
 def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself() -> None:
     """2 % of the corner's distance: of 3 px there, half a pixel where boards reach, against 0.006 px of a cell's mean."""
-    bent = recorded(concealed.LensDistortion(2.0, 0, 7), noise_draw=1)
+    bent = recorded(concealed.LensDistortionLaw(2.0, 0, 7), noise_draw=1)
     alone = judged(bent, None)
     assert not alone.named
     assert not alone.before
@@ -56,7 +56,7 @@ def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself()
 def test_the_same_lens_is_no_finding_and_one_that_slipped_is_decentred() -> None:
     known = calibrated()
     assert not judged(recorded(noise_draw=1), known).named
-    slipped = judged(recorded(concealed.LensDecentre(12.0, 0, 7), noise_draw=1), known)
+    slipped = judged(recorded(concealed.LensDecentreLaw(12.0, 0, 7), noise_draw=1), known)
     assert [c.effect.name for c in slipped.named] == ["decentre"]
 
 
@@ -64,10 +64,10 @@ def test_the_same_lens_is_no_finding_and_one_that_slipped_is_decentred() -> None
 @pytest.mark.parametrize("gain", [0.0, 8.0])
 def test_a_gain_that_only_scenes_show_is_named(gain: float) -> None:
     plan = Plan(kinds=("dark", "flat", "charuco"))
-    laws = [concealed.StereoGain(gain, 0, 7)] if gain else []
-    left = Camera(51, cfa="RGGB", rows=192, cols=256, pair_middle_mm=5.0)
-    right = Camera(52, laws, cfa="RGGB", rows=192, cols=256, side="right", offset_mm=10.0, pair_middle_mm=5.0)
-    study = study_of(pair(left, right, plan), "right")
+    laws = [concealed.StereoGainLaw(gain, 0, 7)] if gain else []
+    left = ConcealedCamera(51, cfa="RGGB", rows=192, cols=256, pair_middle_mm=5.0)
+    right = ConcealedCamera(52, laws, cfa="RGGB", rows=192, cols=256, side="right", offset_mm=10.0, pair_middle_mm=5.0)
+    study = study_of(recordings_of_pair(left, right, plan), "right")
     verdict = decide(Evidence((scene_gain_block(study),), study.camera), np.random.default_rng(3))
     assert [c.effect.name for c in verdict.named] == (["stereo_gain_mismatch"] if gain else [])
     if gain:
@@ -80,7 +80,7 @@ def test_a_gain_that_only_scenes_show_is_named(gain: float) -> None:
 
 
 def test_one_camera_has_no_pair_to_judge() -> None:
-    study = study_of(Camera(41, cfa="MONO", rows=32, cols=40).record(Plan(kinds=("dark", "flat"))))
+    study = study_of(recordings_of(ConcealedCamera(41, cfa="MONO", rows=32, cols=40), Plan(kinds=("dark", "flat"))))
     for make in (scene_gain_block, time_block):
         with pytest.raises(NotDetermined, match="pair of cameras"):
             make(study)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.evidence import Evidence
 from lab.diagnose.inference.locate import look
@@ -15,13 +16,15 @@ from lab.diagnose.measurements.neighbours import variance_block
 from lab.diagnose.measurements.summaries import Study
 from lab.diagnose.measurements.uniform import linearity_block
 from lab.predict.camera_model import camera_model, mean_dn
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
 from sim.effects.library import effect
-from tests.proof.former import Camera, Plan
-from tests.proof.former.laws import AdcNonlinearity, DigitalGain, Law, LossyCodes
 
 
 def _study(seed: int, laws: Sequence[Law] = (), cfa: str | None = None) -> Study:
-    recordings = Camera(seed, laws, cfa=cfa, rows=96, cols=128).record(Plan(("dark", "flat", "narrowband")))
+    recordings = recordings_of(
+        ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128), Plan(("dark", "flat", "narrowband"))
+    )
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
@@ -39,7 +42,7 @@ def test_even_converters_show_nothing(seed: int) -> None:
 def test_steps_are_measured_where_they_stand() -> None:
     """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale, and none elsewhere: within 3.5 of the standard
     uncertainties, seen and held out."""
-    law = AdcNonlinearity(3.0, 0, 2)
+    law = AdcNonlinearityLaw(3.0, 0, 2)
     block = code_block(_study(772302, (law,)))
     std = np.sqrt(np.diag(block.covariance))
     steps = [
@@ -52,7 +55,7 @@ def test_steps_are_measured_where_they_stand() -> None:
 
 @pytest.mark.parametrize("variant", [0, 1])
 def test_wrong_bits_are_named(variant: int) -> None:
-    law = AdcNonlinearity(4.0, variant, 2)
+    law = AdcNonlinearityLaw(4.0, variant, 2)
     study = _study(772302, (law,))
     blocks = (linearity_block(study), variance_block(study), code_block(study))
     verdict = decide(Evidence(blocks, study.camera), np.random.default_rng(0))
@@ -62,7 +65,7 @@ def test_wrong_bits_are_named(variant: int) -> None:
     assert abs(found["error_dn"] - law.a) < 3.0 * std
 
 
-@pytest.mark.parametrize("law", [DigitalGain(10.0), LossyCodes(0.05)], ids=lambda law: law.name)
+@pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)
 def test_other_combs_are_located_and_not_named(law: Law) -> None:
     study = _study(772021, (law,))
     evidence = Evidence((code_block(study),), study.camera)

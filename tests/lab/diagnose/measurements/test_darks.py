@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.evidence import Evidence, chi2
 from lab.diagnose.measurements import darks
@@ -18,6 +19,7 @@ from lab.diagnose.measurements.summaries import Block, Study
 from lab.errors import NotDetermined
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Law, Plan, laws
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import effect
@@ -27,8 +29,6 @@ from sim.scene.scenes import Darkness
 from sim.sensor.defects import odd_sizes, size_nodes
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import Spectrum
-from tests.proof.former import Camera as ConcealedCamera
-from tests.proof.former import Law, Plan, laws
 
 ROWS, COLS = 96, 128
 
@@ -64,7 +64,7 @@ def _sim_darks(
 
 
 def _concealed(seed: int, *built_in: Law, warm: bool = False) -> RecordingSet:
-    return ConcealedCamera(seed, built_in, rows=ROWS, cols=COLS).record(Plan(("dark",), warm=warm, repeats=4))
+    return recordings_of(ConcealedCamera(seed, built_in, rows=ROWS, cols=COLS), Plan(("dark",), warm=warm, repeats=4))
 
 
 def _blocks(recordings: RecordingSet) -> tuple[Study, list[Block], dict[str, str]]:
@@ -199,13 +199,13 @@ def test_healthy_darks_get_no_name(seed: int) -> None:
 @pytest.mark.parametrize(
     ("law", "names"),
     [
-        (laws.HotPixels(300.0, 1, 3), "hot_pixels"),
-        (laws.RandomTelegraphNoise(40.0, 0, 3), "random_telegraph_noise"),
-        (laws.AmplifierGlow(6.0, 1, 3), "amplifier_glow"),
-        (laws.RowNoise(1.5, 1, 3), "row_noise"),
-        (laws.ColumnNoise(1.5, 1, 3), "column_noise"),
-        (laws.DarkCurrentTemperature(1.0, 1, 3), "dark_current_temperature"),
-        (laws.BlackLevelDrift(0.5, 1, 3), "black_level_drift"),
+        (laws.HotPixelsLaw(300.0, 1, 3), "hot_pixels"),
+        (laws.RandomTelegraphNoiseLaw(40.0, 0, 3), "random_telegraph_noise"),
+        (laws.AmplifierGlowLaw(6.0, 1, 3), "amplifier_glow"),
+        (laws.RowNoiseLaw(1.5, 1, 3), "row_noise"),
+        (laws.ColumnNoiseLaw(1.5, 1, 3), "column_noise"),
+        (laws.DarkCurrentTemperatureLaw(1.0, 1, 3), "dark_current_temperature"),
+        (laws.BlackLevelDriftLaw(0.5, 1, 3), "black_level_drift"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )
@@ -242,7 +242,7 @@ def test_what_sim_renders_is_named_with_its_parameters(one: Effect) -> None:
 
 @pytest.mark.parametrize(
     ("law", "measurement"),
-    [(laws.PeriodicBanding(1.5, 0, 3), "dark_row_noise"), (laws.TapOffset(1.5, 0, 3), "dark_field")],
+    [(laws.PeriodicBandingLaw(1.5, 0, 3), "dark_row_noise"), (laws.TapOffsetLaw(1.5, 0, 3), "dark_field")],
     ids=["banding", "tap"],
 )
 def test_siblings_are_located_and_get_no_name(law: Law, measurement: str) -> None:

@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.evidence import chi2
 from lab.diagnose.measurements.edges import ASIDE, REAL_AT, _Edges, _interpolation, _spread, edge_block
 from lab.diagnose.measurements.summaries import Block, Study
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former import laws as concealed
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from sim.forward import edge_profile, optical_transfer
-from tests.proof.former import Camera, Law, Plan
-from tests.proof.former import laws as concealed
 
 EDGES = Plan(("dark", "slanted_edge"))
 
@@ -28,9 +29,9 @@ def _study(recordings: RecordingSet) -> Study:
 def _recorded(
     *laws: Law, seed: int = 7, plan: Plan = EDGES, pitch: float | None = None, rows: int = 112, **camera: Any
 ) -> Study:
-    former = Camera(seed, laws, rows=rows, cols=rows, **camera)
-    former.pitch = pitch or former.pitch
-    return _study(former.record(plan))
+    former = ConcealedCamera(seed, laws, rows=rows, cols=rows, **camera)
+    former.pitch_um = pitch or former.pitch_um
+    return _study(recordings_of(former, plan))
 
 
 def _misfit(block: Block, *acting: Effect, aside: bool | None = None) -> float:
@@ -92,7 +93,7 @@ def test_noise_is_what_the_covariance_says() -> None:
 def test_coma_shows_in_the_asymmetry_with_its_direction() -> None:
     """W131 r^2 (x cos t + y sin t), t drawn by the law: the effect of that size and direction explains it. (The former's path errors
     are delays, the library's are leads.)"""
-    law = concealed.Coma(0.3, 0)
+    law = concealed.ComaLaw(0.3, 0)
     block = edge_block(_recorded(law, cfa="MONO", f_number=2.8))
     turn, coma = 2.0 * np.pi * law.u[0], effect("coma")
     right = coma(w131_x_um=-0.3 * np.cos(turn), w131_y_um=-0.3 * np.sin(turn))
@@ -103,7 +104,7 @@ def test_coma_shows_in_the_asymmetry_with_its_direction() -> None:
 
 
 def test_a_blur_that_is_alike_on_both_sides_has_no_asymmetry() -> None:
-    block = edge_block(_recorded(concealed.Defocus(10.0, 1), cfa="MONO", f_number=2.8))
+    block = edge_block(_recorded(concealed.DefocusLaw(10.0, 1), cfa="MONO", f_number=2.8))
     assert _misfit(block, aside=False) > 5.0
     assert _misfit(block, aside=True) < 1.0
     assert _misfit(block, effect("defocus")(defocus_um=10.0)) < 1.0
@@ -113,7 +114,9 @@ def test_charge_that_crosses_colours_brings_their_edges_along() -> None:
     """In light of 460 and 640 nm a colour's pixels hold much of their neighbours' charge: the mosaic's mix explains it, the
     transfer of one channel by itself doesn't."""
     block = edge_block(
-        _recorded(concealed.Crosstalk(4.0, 0), cfa="RGGB", f_number=4.0, rows=96, plan=Plan(EDGES.kinds, lights=True))
+        _recorded(
+            concealed.CrosstalkLaw(4.0, 0), cfa="RGGB", f_number=4.0, rows=96, plan=Plan(EDGES.kinds, lights=True)
+        )
     )
     assert _misfit(block) > 1.0
     assert _misfit(block, effect("crosstalk")(share_percent=4.0)) < 1.0
@@ -121,7 +124,7 @@ def test_charge_that_crosses_colours_brings_their_edges_along() -> None:
 
 def test_shading_is_no_blur() -> None:
     """A fall-off towards the corners bends the light beside an edge; with it in the model the edges are the baseline's."""
-    block = edge_block(_recorded(concealed.Vignetting(15.0, 0), cfa="MONO", f_number=4.0, rows=96))
+    block = edge_block(_recorded(concealed.VignettingLaw(15.0, 0), cfa="MONO", f_number=4.0, rows=96))
     shaded = effect("vignetting")(corner_loss_percent=15.0)
     assert _misfit(block, shaded) < 1.0
     change = np.abs(block.predict((shaded,)).mean - block.predict(()).mean)
@@ -136,8 +139,8 @@ def test_directions_point_to_the_light() -> None:
 
 def test_field_curvature_needs_more_than_one_place() -> None:
     """Edges all in one place, wherever that is, tell nothing of what differs from place to place; two places do."""
-    former = Camera(7, (), cfa="MONO", f_number=4.0, rows=112, cols=112)
-    recordings = former.record(EDGES)
+    former = ConcealedCamera(7, (), cfa="MONO", f_number=4.0, rows=112, cols=112)
+    recordings = recordings_of(former, EDGES)
     manifest = recordings.manifest.model_dump(mode="json")
     bowl = effect("field_curvature")(curvature_um=30.0)
     changes = []

@@ -9,10 +9,9 @@ from lab.diagnose.measurements.flicker import flicker_block
 from lab.diagnose.measurements.shading import shading_block
 from lab.diagnose.measurements.uniform import linearity_block
 from lab.errors import NotDetermined
+from mocks.former.laws import LightFlickerLaw, PeriodicBandingLaw, RowNoiseLaw
 from sim.effects.light_flicker import LightFlicker
 from tests.lab.diagnose.on_blocks import evidence, former, names, rendered, sigmas, study, verdict
-from tests.proof.former.laws import LightFlicker as Flicker
-from tests.proof.former.laws import PeriodicBanding, RowNoise
 
 LOOKED_AT = (flicker_block, linearity_block, shading_block)
 
@@ -27,7 +26,7 @@ def test_rows_of_healthy_frames_are_noise() -> None:
 @pytest.mark.parametrize(("variant", "cfa"), [(0, "MONO"), pytest.param(1, "GRBG", marks=pytest.mark.slow)])
 def test_flicker_of_another_former_is_named(variant: int, cfa: str) -> None:
     """A sine and a rectified one; bands of half a period in these frames, of 0.3 % of the light at 5 ms."""
-    found = verdict(former(11, Flicker(1.0, variant, 3), cfa=cfa), *LOOKED_AT)
+    found = verdict(former(11, LightFlickerLaw(1.0, variant, 3), cfa=cfa), *LOOKED_AT)
     assert names(found) == ["light_flicker"]
 
 
@@ -43,13 +42,13 @@ def test_flicker_of_sim_is_named_with_its_bands() -> None:
 
 def test_bands_that_move_from_repeat_to_repeat_are_no_shot_noise() -> None:
     """The first guess of the gain, from differences of repeats, beside the same camera in steady light: within 5 %."""
-    steady, flickering = (study(former(11, *laws)).noise.gain for laws in ((), (Flicker(10.0, 0, 9),)))
+    steady, flickering = (study(former(11, *laws)).noise.gain for laws in ((), (LightFlickerLaw(10.0, 0, 9),)))
     assert flickering == pytest.approx(steady, rel=0.05)
 
 
 def test_noise_of_rows_is_no_flicker() -> None:
     """What dark frames' rows have as well: white from row to row, and a ripple of a fixed period."""
-    for law in (RowNoise(4.0), PeriodicBanding(3.0, 0, 5)):
+    for law in (RowNoiseLaw(4.0), PeriodicBandingLaw(3.0, 0, 5)):
         assert "light_flicker" not in names(verdict(former(12, law), *LOOKED_AT))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.evidence import Evidence
 from lab.diagnose.measurements.neighbours import PAIRS, correlations, held_out_flats, neighbour_block, variance_block
@@ -14,6 +15,8 @@ from lab.diagnose.measurements.summaries import Block, Study
 from lab.diagnose.measurements.uniform import linearity_block
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former.laws import BrighterFatterLaw, InterPixelCapacitanceLaw, OnChipSharpeningLaw, OnChipSmoothingLaw
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import effect
@@ -21,9 +24,6 @@ from sim.forward import Exposure, dark_electrons, expected_electrons, read_out
 from sim.scene.scenes import Darkness, UniformField
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
-from tests.proof.former import Camera as ConcealedCamera
-from tests.proof.former import Plan
-from tests.proof.former.laws import BrighterFatter, InterPixelCapacitance, Law, OnChipSharpening, OnChipSmoothing
 
 LIGHT = Spectrum.of([400.0, 700.0], [2e-3, 2e-3])
 
@@ -34,7 +34,7 @@ def _study(recordings: RecordingSet) -> Study:
 
 def _concealed(seed: int, laws: Sequence[Law] = (), cfa: str | None = None, repeats: int = 3) -> Study:
     camera = ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128)
-    return _study(camera.record(Plan(("dark", "flat"), repeats=repeats)))
+    return _study(recordings_of(camera, Plan(("dark", "flat"), repeats=repeats)))
 
 
 def _rendered(acting: Sequence[Effect], seed: int = 5, cfa: str = "MONO") -> Study:
@@ -142,11 +142,11 @@ def test_what_sim_renders_is_predicted_and_named(one: Effect, cfa: str) -> None:
 @pytest.mark.parametrize(
     ("law", "name"),
     [
-        (BrighterFatter(9.0, 1), "brighter_fatter"),
-        (OnChipSmoothing(0.06, 0), "on_chip_smoothing"),
-        (OnChipSmoothing(0.06, 1), "on_chip_smoothing"),
-        (OnChipSharpening(0.06, 1), "on_chip_sharpening"),
-        (InterPixelCapacitance(1.0), "inter_pixel_capacitance"),
+        (BrighterFatterLaw(9.0, 1), "brighter_fatter"),
+        (OnChipSmoothingLaw(0.06, 0), "on_chip_smoothing"),
+        (OnChipSmoothingLaw(0.06, 1), "on_chip_smoothing"),
+        (OnChipSharpeningLaw(0.06, 1), "on_chip_sharpening"),
+        (InterPixelCapacitanceLaw(1.0), "inter_pixel_capacitance"),
     ],
     ids=lambda v: v if isinstance(v, str) else f"{v.s:g}-{v.v}",
 )

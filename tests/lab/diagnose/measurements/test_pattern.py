@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.evidence import Evidence
 from lab.diagnose.inference.locate import look
@@ -16,12 +17,21 @@ from lab.diagnose.measurements.summaries import Block, Study
 from lab.diagnose.measurements.uniform import narrowband_block
 from lab.errors import NotDetermined
 from lab.predict.camera_model import camera_model
-from tests.proof.former import Camera, Plan
-from tests.proof.former.laws import ColumnNoise, Crosstalk, GreenImbalance, Law, LightFlicker, TapGain, Vignetting
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former.laws import (
+    ColumnNoiseLaw,
+    CrosstalkLaw,
+    GreenImbalanceLaw,
+    LightFlickerLaw,
+    TapGainLaw,
+    VignettingLaw,
+)
 
 
 def _study(seed: int, laws: Sequence[Law] = (), cfa: str = "RGGB") -> Study:
-    recordings = Camera(seed, laws, cfa=cfa, rows=96, cols=128).record(Plan(("dark", "flat", "narrowband")))
+    recordings = recordings_of(
+        ConcealedCamera(seed, laws, cfa=cfa, rows=96, cols=128), Plan(("dark", "flat", "narrowband"))
+    )
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
@@ -44,7 +54,7 @@ def test_a_mono_camera_has_no_greens() -> None:
         green_block(_study(771012, cfa="MONO"))
 
 
-@pytest.mark.parametrize("law", [Vignetting(8.0, 0, 1), LightFlicker(10.0, 0, 1)], ids=lambda law: law.name)
+@pytest.mark.parametrize("law", [VignettingLaw(8.0, 0, 1), LightFlickerLaw(10.0, 0, 1)], ids=lambda law: law.name)
 def test_greens_don_t_see_slopes_of_light(law: Law) -> None:
     block = green_block(_study(771013, (law,)))
     assert _chi2(block) < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
@@ -65,7 +75,7 @@ def test_the_seen_image_comes_first_whichever_frames_were_read_first(monkeypatch
 
 def test_unlike_greens_are_named_and_measured() -> None:
     """Concealed: 1 %, of either sign the same ratio of all levels and wavelengths."""
-    study = _study(771014, (GreenImbalance(1.0),))
+    study = _study(771014, (GreenImbalanceLaw(1.0),))
     verdict = decide(Evidence((green_block(study),), study.camera), np.random.default_rng(0))
     assert [c.effect.name for c in verdict.named] == ["green_imbalance"]
     assert verdict.named[0].effect.model_dump()["imbalance_percent"] == pytest.approx(1.0, abs=0.15)
@@ -73,7 +83,7 @@ def test_unlike_greens_are_named_and_measured() -> None:
 
 def test_crosstalk_along_rows_is_no_green_imbalance() -> None:
     """Half as much again along rows: greens differ by wavelength, as their neighbours do; 0.5 % and 0.75 % are 0.625 % and +-20 %."""
-    study = _study(771015, (Crosstalk(0.5, 2),))
+    study = _study(771015, (CrosstalkLaw(0.5, 2),))
     blocks = (green_block(study), narrowband_block(study))
     verdict = decide(Evidence(blocks, study.camera), np.random.default_rng(0))
     assert [c.effect.name for c in verdict.named] == ["crosstalk"]
@@ -83,7 +93,7 @@ def test_crosstalk_along_rows_is_no_green_imbalance() -> None:
 
 
 def test_a_tap_gain_is_a_step_in_the_middle_and_has_no_name() -> None:
-    study = _study(771016, (TapGain(1.0),))
+    study = _study(771016, (TapGainLaw(1.0),))
     block = line_block(study)
     evidence = Evidence((block,), study.camera)
     assert look(evidence, evidence.gaussian())[0].significant
@@ -97,5 +107,5 @@ def test_a_tap_gain_is_a_step_in_the_middle_and_has_no_name() -> None:
 
 def test_white_columns_are_no_steps() -> None:
     """Columns' fixed offsets are the columns' own scatter, by which steps are judged."""
-    evidence = Evidence((line_block(study := _study(771017, (ColumnNoise(1.0, 0),))),), study.camera)
+    evidence = Evidence((line_block(study := _study(771017, (ColumnNoiseLaw(1.0, 0),))),), study.camera)
     assert not look(evidence, evidence.gaussian())[0].significant

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.evidence import Evidence
 from lab.diagnose.measurements.patches import screen_block
@@ -24,17 +25,17 @@ from lab.diagnose.measurements.summaries import Block, Study
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Law, Plan
+from mocks.former import laws as concealed
 from sim.effects.defocus import Defocus
 from sim.effects.ghost import Ghost
 from sim.effects.screen_gamma import ScreenGamma
-from tests.proof.former import Camera, Law, Plan
-from tests.proof.former import laws as concealed
 
 PLAN = Plan(kinds=("dark", "flat", "screen"))
 
 
 def recorded(*laws: Law, seed: int = 61, cfa: str = "GRBG", plan: Plan = PLAN) -> RecordingSet:
-    return Camera(seed, laws, cfa=cfa, f_number=2.8, rows=96, cols=128).record(plan)
+    return recordings_of(ConcealedCamera(seed, laws, cfa=cfa, f_number=2.8, rows=96, cols=128), plan)
 
 
 def study_of(recordings: RecordingSet) -> Study:
@@ -73,12 +74,12 @@ def test_a_healthy_camera_keeps_the_contrast_that_the_model_says(seed: int, cfa:
 
 
 FOUND: list[tuple[Law, str]] = [
-    (concealed.Ghost(0.6, 0, 5), "ghost"),
-    (concealed.Ghost(2.0, 1, 5), "ghost"),
-    (concealed.ScreenPixelStructure(8.0, 0, 5), "screen_pixel_structure"),
-    (concealed.ScreenGamma(1.5, 0, 5), "screen_gamma"),
-    (concealed.ScreenGamma(4.0, 1, 5), "screen_gamma"),
-    (concealed.LateralColour(3.0, 0, 5), "lateral_chromatic_aberration"),
+    (concealed.GhostLaw(0.6, 0, 5), "ghost"),
+    (concealed.GhostLaw(2.0, 1, 5), "ghost"),
+    (concealed.ScreenPixelStructureLaw(8.0, 0, 5), "screen_pixel_structure"),
+    (concealed.ScreenGammaLaw(1.5, 0, 5), "screen_gamma"),
+    (concealed.ScreenGammaLaw(4.0, 1, 5), "screen_gamma"),
+    (concealed.LateralColourLaw(3.0, 0, 5), "lateral_chromatic_aberration"),
 ]
 
 
@@ -107,7 +108,7 @@ def test_a_copy_of_the_image_falls_into_the_dark_squares() -> None:
 def test_a_steep_gamma_over_wide_rims_is_predicted() -> None:
     """v^5 on rims of a standard deviation of 0.4 px: lit cells of 4 px lose a quarter of their width. Contrast comes out within noise,
     what rims lack to 5 %."""
-    study = study_of(recorded(concealed.ScreenGamma(4.0, 1, 5)))
+    study = study_of(recorded(concealed.ScreenGammaLaw(4.0, 1, 5)))
     effect = ScreenGamma(exponent=5.0, rim_px=0.4)
     contrasts = Evidence((contrast_block(study),), study.camera)
     n, covariance = len(contrasts.value), contrasts.gaussian().covariance
@@ -121,7 +122,7 @@ def test_a_steep_gamma_over_wide_rims_is_predicted() -> None:
 
 def test_defocus_changes_the_contrast_as_predicted() -> None:
     """12 um: far out of the noise, and with the effect within it, levels and the screen's own blur free."""
-    study = study_of(recorded(concealed.Defocus(12.0, 1)))
+    study = study_of(recorded(concealed.DefocusLaw(12.0, 1)))
     evidence = Evidence((contrast_block(study),), study.camera)
     for effects, low, high in (((), 5.0, 1e9), ((Defocus(defocus_um=12.0),), 0.0, 1.0)):
         model = evidence.gaussian(effects)
@@ -143,7 +144,9 @@ def test_what_was_measured_dies_with_its_study() -> None:
 
 def test_a_colours_contrast_is_that_of_its_own_place() -> None:
     """Red and blue land half a pixel out and more. Drawn where green is, they would lose 2 to 4 % below 0.25 cy/px."""
-    plain, moved = (contrast_block(study_of(recorded(*laws))) for laws in ((), (concealed.LateralColour(4.0, 0, 5),)))
+    plain, moved = (
+        contrast_block(study_of(recorded(*laws))) for laws in ((), (concealed.LateralColourLaw(4.0, 0, 5),))
+    )
     kept = {(k.channel, k.condition, round(k.x, 2)): v for k, v in zip(plain.labels, plain.value, strict=True)}
     lost = [
         kept[key] - v
@@ -159,7 +162,7 @@ def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
     """3 um a 100 nm in the corner: what each colour's light is apart from green's, by the block's own prediction at that size."""
     from sim.effects.lateral_chromatic_aberration import LateralChromaticAberration
 
-    law = concealed.LateralColour(3.0, 0, 5)
+    law = concealed.LateralColourLaw(3.0, 0, 5)
     block = colour_block(study_of(recorded(law)))
     expected = block.predict((LateralChromaticAberration(slope_um=law.a),)).mean
     std = np.sqrt(np.diag(block.covariance))

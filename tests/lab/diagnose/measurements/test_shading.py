@@ -14,9 +14,9 @@ from lab.diagnose.measurements.shading import (
     shading_block,
 )
 from lab.diagnose.measurements.uniform import linearity_block
+from mocks.former import Law
+from mocks.former.laws import DustShadowLaw, NonUniformIlluminationLaw, TapGainLaw, VignettingDecentreLaw, VignettingLaw
 from tests.lab.diagnose.on_blocks import evidence, former, names, sigmas, study, verdict
-from tests.proof.former import Law
-from tests.proof.former.laws import DustShadow, NonUniformIllumination, TapGain, Vignetting, VignettingDecentre
 
 LOOKED_AT = (shading_block, linearity_block)
 
@@ -31,7 +31,7 @@ def test_healthy_cells_scatter_as_they_should() -> None:
 @pytest.mark.parametrize("variant", [0, *(pytest.param(v, marks=pytest.mark.slow) for v in (1, 2))])
 def test_vignetting_is_named_whatever_its_power(variant: int) -> None:
     """As the square of the radius, two discs that part, as the fourth power."""
-    found = verdict(former(21, Vignetting(4.0, variant, 1), cfa="RGGB"), *LOOKED_AT)
+    found = verdict(former(21, VignettingLaw(4.0, variant, 1), cfa="RGGB"), *LOOKED_AT)
     assert names(found) == ["vignetting"]
     if variant == 0:
         one = found.named[0]
@@ -42,13 +42,13 @@ def test_vignetting_is_named_whatever_its_power(variant: int) -> None:
 
 @pytest.mark.parametrize("variant", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_fall_off_about_another_point_is_named(variant: int) -> None:
-    found = verdict(former(22, VignettingDecentre(0.3, variant, 2)), *LOOKED_AT)
+    found = verdict(former(22, VignettingDecentreLaw(0.3, variant, 2)), *LOOKED_AT)
     assert names(found) == ["vignetting_decentre"]
 
 
 @pytest.mark.parametrize("variant", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_slope_is_uneven_light_with_or_without_a_bow(variant: int) -> None:
-    truth = NonUniformIllumination(1.5, variant, 3)
+    truth = NonUniformIlluminationLaw(1.5, variant, 3)
     found = verdict(former(23, truth, cfa="GRBG"), *LOOKED_AT)
     assert names(found) == ["non_uniform_illumination"]
     for name, value in truth.stated().items():
@@ -58,7 +58,7 @@ def test_a_slope_is_uneven_light_with_or_without_a_bow(variant: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "law", [TapGain(1.0), pytest.param(DustShadow(2.0, 0, 4), marks=pytest.mark.slow)], ids=lambda law: law.name
+    "law", [TapGainLaw(1.0), pytest.param(DustShadowLaw(2.0, 0, 4), marks=pytest.mark.slow)], ids=lambda law: law.name
 )
 def test_what_no_law_fits_is_seen_and_gets_no_name(law: Law) -> None:
     found = verdict(former(24, law), *LOOKED_AT)

@@ -17,26 +17,26 @@ from lab.diagnose.measurements.uniform import (
     narrowband_block,
 )
 from lab.fit.levels import rounding_std_dn
+from mocks.former import Law
+from mocks.former.laws import (
+    AbsorptionBandLaw,
+    CoverGlassFringeLaw,
+    ExposureOffsetLaw,
+    NonlinearityLaw,
+    RedLeakLaw,
+    SourceBandwidthLaw,
+    SourceDriftLaw,
+    StrayLightLaw,
+    WavelengthOffsetLaw,
+)
 from sim.effects.second_order_light import SecondOrderLight
 from sim.spectrum import Spectrum
 from tests.lab.diagnose.on_blocks import UNIFORM, evidence, former, names, rendered, sigmas, study, verdict
-from tests.proof.former import Law
-from tests.proof.former.laws import (
-    AbsorptionBand,
-    CoverGlassFringe,
-    ExposureOffset,
-    Nonlinearity,
-    RedLeak,
-    SourceBandwidth,
-    SourceDrift,
-    StrayLight,
-    WavelengthOffset,
-)
 
 LEVELS: list[tuple[Law, bool]] = [
     (law, shuttle)
     for shuttle in (False, True)
-    for law in (SourceDrift(0.1, 0, 1), SourceDrift(0.2, 1, 1), Nonlinearity(0.5, 1), ExposureOffset(2.0))
+    for law in (SourceDriftLaw(0.1, 0, 1), SourceDriftLaw(0.2, 1, 1), NonlinearityLaw(0.5, 1), ExposureOffsetLaw(2.0))
 ]
 
 
@@ -58,9 +58,9 @@ def test_what_changes_levels_is_told_apart(law: Law, shuttle: bool) -> None:
 @pytest.mark.parametrize(
     "law",
     [
-        StrayLight(0.8, 1),
-        pytest.param(SourceBandwidth(3.0, 1), marks=pytest.mark.slow),
-        pytest.param(WavelengthOffset(-0.5, 0), marks=pytest.mark.slow),
+        StrayLightLaw(0.8, 1),
+        pytest.param(SourceBandwidthLaw(3.0, 1), marks=pytest.mark.slow),
+        pytest.param(WavelengthOffsetLaw(-0.5, 0), marks=pytest.mark.slow),
     ],
     ids=lambda law: law.name,
 )
@@ -71,13 +71,13 @@ def test_what_changes_narrow_lines_is_told_apart(law: Law) -> None:
 
 @pytest.mark.parametrize(
     "law",
-    [CoverGlassFringe(2.0, 0, 3)]
-    + [pytest.param(law, marks=pytest.mark.slow) for law in (RedLeak(8.0, 0, 3), AbsorptionBand(3.0, 0, 3))],
+    [CoverGlassFringeLaw(2.0, 0, 3)]
+    + [pytest.param(law, marks=pytest.mark.slow) for law in (RedLeakLaw(8.0, 0, 3), AbsorptionBandLaw(3.0, 0, 3))],
     ids=lambda law: law.name,
 )
 def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None:
     """The red leak of a grey sensor has no colour to be known by: a radiometer's law took some of it and left more."""
-    cfa = "MONO" if isinstance(law, RedLeak) else "RGGB"
+    cfa = "MONO" if isinstance(law, RedLeakLaw) else "RGGB"
     found = verdict(former(33, law, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
     assert not found.named
     assert {s.block.measurement for s in found.before} == {"narrowband"}
@@ -103,7 +103,7 @@ def test_healthy_levels_scatter_as_they_should() -> None:
 def test_a_drifting_lamp_doesn_t_scatter() -> None:
     """0.5 % a minute makes repeats differ by 0.17 %; a trend common to all levels leaves the scatter that there was, 0."""
     for shuttle in (False, True):
-        looked_at = study(former(34, SourceDrift(0.5), shuttle=shuttle))
+        looked_at = study(former(34, SourceDriftLaw(0.5), shuttle=shuttle))
         noise = looked_at.noise
         found = level_scatter(repeated_levels(looked_at, noise.black, noise.gain, noise.read_dn))
         assert found < 4e-4

@@ -9,8 +9,8 @@ from scipy import ndimage
 from lab.diagnose.measurements.edges import edge_block
 from lab.diagnose.measurements.patches import chart_block, screen_block
 from lab.diagnose.measurements.veils import Surroundings, harmonics
+from mocks.former import laws as concealed
 from tests.lab.diagnose.on_blocks import former, names, verdict
-from tests.proof.former import laws as concealed
 
 
 @pytest.mark.parametrize("std_px", [6.0, 20.0, 60.0])
@@ -29,7 +29,7 @@ def test_surroundings_are_what_a_filter_leaves(std_px: float) -> None:
 @pytest.mark.parametrize("variant", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_glare_has_its_name_whatever_its_reach(variant: int) -> None:
     """Evenly spread; half of it within a halo of a quarter of the frame; fading from the middle."""
-    law = concealed.VeilingGlare(2.0, variant, 9)
+    law = concealed.VeilingGlareLaw(2.0, variant, 9)
     recordings = former(104, law, cfa="RGGB", kinds=("dark", "flat", "chart", "slanted_edge", "screen"))
     found = verdict(recordings, edge_block, chart_block, screen_block)
     assert names(found) == ["veiling_glare"]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.evidence import Evidence, chi2
 from lab.diagnose.inference.unknown import discrepancy
@@ -17,10 +18,10 @@ from lab.diagnose.outcome.improved import improved_model
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.simulate import SimulateOptions, simulate
+from mocks.former import ConcealedCamera, Plan
+from mocks.former import laws as concealed_laws
 from sim.effects.base import Effect
 from sim.effects.nameless_correction import NamelessCorrection
-from tests.proof.former import Camera, Plan
-from tests.proof.former import laws as concealed_laws
 
 SET = RecordingSet(
     Manifest.model_validate(
@@ -31,13 +32,13 @@ KINDS = ("dark", "flat", "narrowband", "slanted_edge")
 
 
 def _found(seed: int, law: concealed_laws.Law) -> tuple[RecordingSet, Diagnosis]:
-    recordings = Camera(seed, [law], cfa="MONO", f_number=4.0, rows=240, cols=240).record(Plan(KINDS))
+    recordings = recordings_of(ConcealedCamera(seed, [law], cfa="MONO", f_number=4.0, rows=240, cols=240), Plan(KINDS))
     return recordings, examine(recordings)
 
 
 @pytest.fixture(scope="module")
 def filtered() -> tuple[RecordingSet, Diagnosis]:
-    return _found(20731, concealed_laws.InfraredCutFilter(60.0))
+    return _found(20731, concealed_laws.InfraredCutFilterLaw(60.0))
 
 
 def _through_a_file(content: CameraFile, folder: Path) -> CameraFile:

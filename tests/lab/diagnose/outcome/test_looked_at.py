@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Candidate, Verdict
 from lab.diagnose.inference.evidence import Evidence
 from lab.diagnose.measurements.summaries import Block, Label, Prediction
@@ -15,11 +16,11 @@ from lab.diagnose.outcome.looked_at import detectable, measurement_fits, places,
 from lab.diagnose.outcome.pictures import residual_pictures
 from lab.formats.camera_file import CameraFile, default_camera
 from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Plan
+from mocks.former import laws as concealed_laws
 from sim.effects.base import Effect
 from sim.effects.defocus import Defocus
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
-from tests.proof.former import Camera, Plan
-from tests.proof.former import laws as concealed_laws
 
 CAMERA = default_camera().camera
 FREQUENCY = np.linspace(0.05, 0.9, 18)
@@ -93,12 +94,12 @@ def test_every_place_is_told_before_and_after() -> None:
 
 def test_pictures_show_what_the_model_lacks_and_noise_once_it_has_it() -> None:
     """Cells' residuals of a right model are normal, of rms 1; the sensor's own patterns differ from their mean scatter by some per cent."""
-    law = concealed_laws.OpticalLowPassFilter(1.8)
-    camera = Camera(20771, [law], cfa="MONO", f_number=4.0, rows=160, cols=200)
-    recordings = camera.record(Plan(("flat", "slanted_edge")))
+    law = concealed_laws.OpticalLowPassFilterLaw(1.8)
+    camera = ConcealedCamera(20771, [law], cfa="MONO", f_number=4.0, rows=160, cols=200)
+    recordings = recordings_of(camera, Plan(("flat", "slanted_edge")))
     model = camera_model(recordings, "left").model_copy(
-        update={"black_level_dn": camera.black, "conversion_gain_dn_per_e": camera.gain, "read_noise_e": camera.read,
-                "prnu_percent": camera.prnu, "dark_current_e_per_s": camera.dark, "full_well_e": camera.full}
+        update={"black_level_dn": camera.black_level_dn, "conversion_gain_dn_per_e": camera.gain_dn_per_e, "read_noise_e": camera.read_noise_e,
+                "prnu_percent": camera.prnu_percent, "dark_current_e_per_s": camera.dark_e_per_s, "full_well_e": camera.full_well_e}
     )  # fmt: skip
     known = CameraFile("known", model, (OpticalLowPassFilter(displacement_x_um=1.8, displacement_y_um=1.8),))
     found = {p.kind: p for p in residual_pictures(recordings, "left", _verdict().evidence, known)}

@@ -6,40 +6,41 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
+from lab.challenge.recordings import recordings_of
 from lab.fit.mtf import edge_mtf
-from tests.proof.former import LISTED, OUTSIDE, Camera, Law, Plan
-from tests.proof.former.camera import poisson
-from tests.proof.former.laws import (
-    WL,
-    ChargeDiffusion,
-    Defocus,
-    OpticalLowPassFilter,
-    SphericalAberration,
-    VeilingGlare,
+from mocks.former import LISTED, OUTSIDE, WAVELENGTH_NM, ConcealedCamera, Law, Plan
+from mocks.former.camera import poisson
+from mocks.former.laws import (
+    ChargeDiffusionLaw,
+    DefocusLaw,
+    OpticalLowPassFilterLaw,
+    SphericalAberrationLaw,
+    VeilingGlareLaw,
 )
+from mocks.former.scenes import edge, pattern
 
-LINE = np.where(WL == 555.0, 1.0, 0.0)  # W sr^-1 m^-2 in one nm, at a node of the former's wavelengths
-LAMP = np.full_like(WL, 0.02)
+LINE = np.where(WAVELENGTH_NM == 555.0, 1.0, 0.0)  # W sr^-1 m^-2 in one nm, at a node of the former's wavelengths
+LAMP = np.full_like(WAVELENGTH_NM, 0.02)
 FREQUENCY = np.linspace(0.0, 1.0, 21)
 
 
-def mono(*laws: Law, seed: int = 31, rows: int = 96, cols: int = 128) -> Camera:
-    return Camera(seed, laws, cfa="MONO", rows=rows, cols=cols)
+def mono(*laws: Law, seed: int = 31, rows: int = 96, cols: int = 128) -> ConcealedCamera:
+    return ConcealedCamera(seed, laws, cfa="MONO", rows=rows, cols=cols)
 
 
-def without_aperture(camera: Camera, f: np.ndarray, angle: float = 0.0) -> np.ndarray:
-    side = np.sqrt(camera.fill) * camera.pitch
-    across = np.sinc(side * f / camera.pitch * np.cos(angle)) * np.sinc(side * f / camera.pitch * np.sin(angle))
-    return camera.otf(f, angle, LINE, "Y") / across
+def without_aperture(camera: ConcealedCamera, f: np.ndarray, angle: float = 0.0) -> np.ndarray:
+    side = np.sqrt(camera.fill_factor) * camera.pitch_um
+    across = np.sinc(side * f / camera.pitch_um * np.cos(angle)) * np.sinc(side * f / camera.pitch_um * np.sin(angle))
+    return camera.lens.otf(f, angle, LINE, "Y") / across
 
 
 def test_electrons_are_the_photons_of_a_line_times_efficiency() -> None:
     """555 nm: radiance L through an f/N cone of sin^2 = 1 / (4 N^2 + 1), on the pixel's sensitive area."""
     camera = mono()
     photon_j = 6.62607015e-34 * 2.99792458e8 / 555e-9
-    area = camera.fill * (camera.pitch * 1e-6) ** 2
-    irradiance = np.pi * 1e-3 * camera.tau / (4 * camera.n**2 + 1)
-    expected = irradiance * area / photon_j * np.interp(555.0, WL, camera.qe["Y"])
+    area = camera.fill_factor * (camera.pitch_um * 1e-6) ** 2
+    irradiance = np.pi * 1e-3 * camera.lens_transmittance / (4 * camera.f_number**2 + 1)
+    expected = irradiance * area / photon_j * np.interp(555.0, WAVELENGTH_NM, camera.quantum_efficiency["Y"])
     assert camera.rate(1e-3 * LINE, "Y") == pytest.approx(expected, rel=1e-6)
 
 
@@ -47,10 +48,10 @@ def test_flat_frames_hold_that_energy() -> None:
     camera = mono()
     t = camera.exposure_for(LAMP, 0.5)
     dn = camera.expose(camera.uniform(LAMP), t, 0).astype(float)
-    electrons = camera.rate(LAMP, "Y") * t * (camera.shade * camera.prnu_map).mean() + camera.dark * t
+    electrons = camera.rate(LAMP, "Y") * t * (camera.shading * camera.prnu_map).mean() + camera.dark_e_per_s * t
     # the fixed pattern's own mean stays; noise of the mean: sqrt(e + read^2) / sqrt(N) electrons
-    expected = camera.black + camera.gain * (electrons + camera.dsnu_map.mean())
-    std = camera.gain * np.sqrt((electrons + camera.read**2) / dn.size)
+    expected = camera.black_level_dn + camera.gain_dn_per_e * (electrons + camera.dsnu_map_e.mean())
+    std = camera.gain_dn_per_e * np.sqrt((electrons + camera.read_noise_e**2) / dn.size)
     assert abs(dn.mean() - expected) < 4 * std
 
 
@@ -58,8 +59,8 @@ def test_noise_is_poisson_s_and_the_read_out_s() -> None:
     camera = mono()
     t = camera.exposure_for(LAMP, 0.5)
     first, second = (camera.expose(camera.uniform(LAMP), t, k).astype(float) for k in (0, 1))
-    electrons = camera.rate(LAMP, "Y") * t * (camera.shade * camera.prnu_map).mean() + camera.dark * t
-    expected = camera.gain**2 * (electrons + camera.read**2) + 1 / 12  # rounding's variance
+    electrons = camera.rate(LAMP, "Y") * t * (camera.shading * camera.prnu_map).mean() + camera.dark_e_per_s * t
+    expected = camera.gain_dn_per_e**2 * (electrons + camera.read_noise_e**2) + 1 / 12  # rounding's variance
     # of N differences the variance is known to sqrt(2 / N)
     assert np.var(second - first) / 2 == pytest.approx(expected, rel=4 * np.sqrt(2 / first.size))
 
@@ -83,14 +84,14 @@ def test_more_light_never_leaves_fewer_electrons_in_the_same_draw() -> None:
 
 def test_a_perfect_lens_has_the_airy_transfer() -> None:
     camera = mono()
-    cutoff = camera.pitch / (0.555 * camera.n)
+    cutoff = camera.pitch_um / (0.555 * camera.f_number)
     # (2 / pi) (acos s - s sqrt(1 - s^2)) at half the cutoff: 0.39100
     assert without_aperture(camera, np.array([0.5 * cutoff]))[0].real == pytest.approx(0.39100, abs=1e-5)
-    assert abs(camera.otf(np.array([1.01 * cutoff]), 0.3, LINE, "Y")[0]) < 1e-12
+    assert abs(camera.lens.otf(np.array([1.01 * cutoff]), 0.3, LINE, "Y")[0]) < 1e-12
 
 
 def test_the_pupil_s_overlap_without_aberration_is_the_same() -> None:
-    perfect, numeric = mono(), mono(SphericalAberration(1e-9))
+    perfect, numeric = mono(), mono(SphericalAberrationLaw(1e-9))
     # 20 Gauss nodes over chords that end vertically: 2e-4
     for angle in (0.0, 0.7):
         a, b = (without_aperture(c, FREQUENCY, angle) for c in (perfect, numeric))
@@ -99,47 +100,47 @@ def test_the_pupil_s_overlap_without_aberration_is_the_same() -> None:
 
 def test_strong_defocus_blurs_by_a_disc() -> None:
     """Geometrical limit: a disc of diameter dz / N, 2 J1(q) / q with q = pi D f; the axis between the sphere and the parabola."""
-    camera = Camera(31, [Defocus(60.0, 1)], cfa="MONO", f_number=2.0, rows=32, cols=32)
+    camera = ConcealedCamera(31, [DefocusLaw(60.0, 1)], cfa="MONO", f_number=2.0, rows=32, cols=32)
     f = np.array([0.01, 0.02, 0.03, 0.04])
-    q = np.pi * 60.0 / camera.n * f / camera.pitch
-    blur = without_aperture(camera, f).real / Camera(31, cfa="MONO", f_number=2.0, rows=32, cols=32).diffraction(
-        f / camera.pitch, 0.555
-    )
+    q = np.pi * 60.0 / camera.f_number * f / camera.pitch_um
+    blur = without_aperture(camera, f).real / ConcealedCamera(
+        31, cfa="MONO", f_number=2.0, rows=32, cols=32
+    ).lens.diffraction(f / camera.pitch_um, 0.555)
     assert blur == pytest.approx(2 * j1(q) / q, abs=0.02)
 
 
 def test_a_split_has_its_null_and_diffusion_its_gaussian() -> None:
-    split, plain, spread = mono(OpticalLowPassFilter(2.0)), mono(), mono(ChargeDiffusion(0.8, 0))
-    null = np.array([plain.pitch / (2 * 2.0)])
-    assert abs(split.otf(null, 0.0, LAMP, "Y")[0]) < 1e-9
-    ratio = spread.otf(FREQUENCY[:10], 0.4, LAMP, "Y") / plain.otf(FREQUENCY[:10], 0.4, LAMP, "Y")
-    assert ratio == pytest.approx(np.exp(-2 * (np.pi * 0.8 * FREQUENCY[:10] / plain.pitch) ** 2), abs=1e-9)
+    split, plain, spread = mono(OpticalLowPassFilterLaw(2.0)), mono(), mono(ChargeDiffusionLaw(0.8, 0))
+    null = np.array([plain.pitch_um / (2 * 2.0)])
+    assert abs(split.lens.otf(null, 0.0, LAMP, "Y")[0]) < 1e-9
+    ratio = spread.lens.otf(FREQUENCY[:10], 0.4, LAMP, "Y") / plain.lens.otf(FREQUENCY[:10], 0.4, LAMP, "Y")
+    assert ratio == pytest.approx(np.exp(-2 * (np.pi * 0.8 * FREQUENCY[:10] / plain.pitch_um) ** 2), abs=1e-9)
 
 
 def test_an_edge_has_the_transfer_it_was_made_from() -> None:
     """Through the slanted-edge estimator, within four of its standard uncertainties and 0.003 for the short region's levels."""
     camera = mono(rows=200, cols=200)
     frequency = np.arange(1, 11) * 0.05
-    light = camera.edge(5.0, LAMP, 0.08)["Y"] / camera.rate(LAMP, "Y")
+    light = edge(camera, 5.0, LAMP, 0.08)["Y"] / camera.rate(LAMP, "Y")
     noisy = np.random.default_rng(8).poisson(20_000.0 * light).astype(float)
     found = edge_mtf(noisy[10:-10, 10:-10], frequency)
-    truth = np.abs(camera.otf(frequency, np.deg2rad(5.0), LAMP, "Y"))
+    truth = np.abs(camera.lens.otf(frequency, np.deg2rad(5.0), LAMP, "Y"))
     assert np.all(np.abs(found.mtf - truth) < 4 * found.mtf_std + 0.003)
 
 
 def test_a_pattern_keeps_its_light() -> None:
     """All lit, the middle has the rate itself; the sum over a pattern is that of its cells, but for what leaves at the rim."""
-    camera = mono(Defocus(12.0))
-    white = camera.pattern(np.ones((80, 104)), LAMP, 0.0)["Y"]
+    camera = mono(DefocusLaw(12.0))
+    white = pattern(camera, np.ones((80, 104)), LAMP, 0.0)["Y"]
     assert white[48, 64] == pytest.approx(camera.rate(LAMP, "Y"), rel=1e-6)
     dot = np.zeros((80, 104))
     dot[38:42, 50:54] = 1.0
-    lit = camera.pattern(dot, LAMP, 0.0)["Y"].sum() / camera.rate(LAMP, "Y")
+    lit = pattern(camera, dot, LAMP, 0.0)["Y"].sum() / camera.rate(LAMP, "Y")
     assert lit == pytest.approx(16 * 4.0**2, rel=0.01)  # the turned square's rim on the fine grid
 
 
 def test_glare_moves_light_and_makes_none() -> None:
-    camera = mono(VeilingGlare(3.0))
+    camera = mono(VeilingGlareLaw(3.0))
     image = np.random.default_rng(1).random((96, 128))
     for law in camera.laws:
         assert law.image(image).mean() == pytest.approx(image.mean(), rel=1e-12)
@@ -150,8 +151,8 @@ def test_a_law_changes_frames_and_nothing_else(kind: type[Law]) -> None:
     cfa = "RGGB" if kind.needs == "bayer" else "MONO"
     shown = {"screen" if k == "checkerboard" else k for k in kind.shown_by}
     plan = Plan(("dark", *sorted(shown - {"dark"})), warm=True, repeats=2)
-    healthy = Camera(5, cfa=cfa, rows=32, cols=40).record(plan)
-    other = Camera(5, [kind(kind.nominal, 0, 9)], cfa=cfa, rows=32, cols=40).record(plan)
+    healthy = recordings_of(ConcealedCamera(5, cfa=cfa, rows=32, cols=40), plan)
+    other = recordings_of(ConcealedCamera(5, [kind(kind.nominal, 0, 9)], cfa=cfa, rows=32, cols=40), plan)
     assert other.manifest == healthy.manifest
     for path in healthy.manifest.cameras["left"].quantum_efficiency.values():
         assert other.spectrum(path) == healthy.spectrum(path)

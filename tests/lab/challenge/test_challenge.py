@@ -9,15 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.challenge.draw import SHARES, draw, kind_of
+from lab.challenge.faults import FAULTS
 from lab.challenge.make import make
 from lab.challenge.run import run_all
 from lab.challenge.score import broken_seals, score
 from lab.challenge.truth import (
     FIRST_PROOF_SEED,
+    CaseTruth,
     Concealed,
     SaltedTruth,
     Seals,
-    Truth,
     Truths,
     canonical,
     load,
@@ -29,8 +31,7 @@ from lab.cli import main
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.results import DiagnosisResult
-from tests.proof.former import LISTED, OUTSIDE
-from tests.proof.former.draw import FAULTS, SHARES, draw, kind_of
+from mocks.former import LISTED, OUTSIDE
 
 #: Two cases of these kinds in a row: the quickest to draw.
 SEED = next(s for s in range(1000) if (kind_of(s, 1), kind_of(s, 2)) == ("healthy", "healthy"))
@@ -40,7 +41,9 @@ SEED = next(s for s in range(1000) if (kind_of(s, 1), kind_of(s, 2)) == ("health
 def challenge(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("challenge")
     folder, truths = root / "sets", root / "truths.json"
-    make(folder, 2, SEED, truths, "small", 1, cfa="MONO")
+    options = {"--cases": 2, "--seed": SEED, "--truths": truths, "--size": "small", "--jobs": 1, "--cfa": "MONO"}
+    words = [str(word) for option in options.items() for word in option]
+    assert main(["challenge", "make", "--out", str(folder), *words]) == 0
     return folder, truths
 
 
@@ -70,10 +73,10 @@ def test_seals_hold_and_break_when_anything_is_changed(copy: tuple[Path, Seals, 
 
 
 def test_a_seal_needs_its_salt() -> None:
-    truth = Truth(kind="healthy", cfa="MONO", f_number=2.8, frames=88, rows=96, cols=128)
+    truth = CaseTruth(kind="healthy", cfa="MONO", f_number=2.8, frames=88, rows=96, cols=128)
     one, two = salted(truth), salted(truth)
     assert seal(one) != seal(two)
-    assert seal(one) == seal(SaltedTruth(salt=one.salt, truth=Truth.model_validate_json(canonical(truth))))
+    assert seal(one) == seal(SaltedTruth(salt=one.salt, truth=CaseTruth.model_validate_json(canonical(truth))))
 
 
 def test_nothing_in_a_set_betrays_its_truth(challenge: tuple[Path, Path]) -> None:
@@ -186,15 +189,7 @@ def test_a_scored_proof_seed_is_refused(tmp_path: Path) -> None:
         refuse_scored(1000007, page)
 
 
-def test_without_a_checkout_the_command_says_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.setattr("lab.challenge.make.lab.__file__", str(tmp_path / "lab" / "__init__.py"))
-    assert main(["challenge", "make", "--out", str(tmp_path / "c")]) == 2
-    assert "needs the project's checkout" in capsys.readouterr().err
-
-
 def test_a_truth_s_names_are_those_of_the_list() -> None:
     hidden = Concealed(name="motion", strength=1.0, noncentrality=30.0)
-    truth = Truth(kind="outside", concealed=(hidden,), cfa="MONO", f_number=2.8, frames=1, rows=8, cols=8)
+    truth = CaseTruth(kind="outside", concealed=(hidden,), cfa="MONO", f_number=2.8, frames=1, rows=8, cols=8)
     assert truth.names == ()

@@ -1,7 +1,7 @@
-"""How strongly a concealed law shows: its non-centrality, by recordings with and without it and the diagnosis's own summaries.
+"""How strongly a concealed law shows: the non-centrality of its change of the diagnosis's summaries.
 
-The library of effects has no part in it. Both recordings are of the same camera with the same noise, so that their difference is
-the law's; the covariance is that of the recordings with it, free quantities marginalised.
+The library of effects has no part in it. Recordings with and without the law are of the same camera with the same noise, so that their
+difference is the law's. The covariance is that of the recordings with it, nuisance parameters marginalised.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
 
 
-def evidence(recordings: RecordingSet) -> Evidence | None:
-    """The summaries of the only side; None where nothing can be summarised."""
+def summaries(recordings: RecordingSet) -> Evidence | None:
+    """The summaries of a single camera's recordings; None where nothing can be summarised."""
     study = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     blocks = []
     for make in BLOCKS:
@@ -33,7 +33,7 @@ def evidence(recordings: RecordingSet) -> Evidence | None:
 
 
 def _keys(found: Evidence) -> list[Hashable]:
-    """What each number is of, alike in recordings of the same session."""
+    """Identity of each summary: the same in all recordings of one session."""
     count: Counter[Hashable] = Counter()
     keys: list[Hashable] = []
     for block in found.blocks:
@@ -45,18 +45,17 @@ def _keys(found: Evidence) -> list[Hashable]:
 
 
 def _change(present: Evidence, absent: Evidence) -> dict[Hashable, float]:
-    """What the law does to every number that both have and choice may see."""
+    """Change by the law of every summary that both have and that may be used for the choice."""
     other = dict(zip(_keys(absent), absent.value, strict=True))
     seen = zip(_keys(present), present.value, present.seen, strict=True)
     return {key: value - other[key] for key, value, use in seen if use and key in other}
 
 
 def noncentrality(pairs: Sequence[tuple[Evidence | None, Evidence | None]]) -> float:
-    """d1' C^-1 d2 of two pairs (with the law, without it), each of another draw of the noise, never below 0.
+    """d1' C^-1 d2 of two pairs (with the law, without it), never below 0; each pair is of another draw of the noise.
 
-    d is the difference of what both have, C the covariance under the baseline of the first pair's recordings with the law. Noise
-    that the difference leaves (a law that moves an edge moves it over other noise) is independent in d1 and d2, so that it doesn't
-    count; |d|^2 of one pair would have it twice.
+    d is the change of the summaries, C their covariance under the baseline in the first pair's recordings with the law. A law that moves
+    an edge moves it over other noise. That noise is independent in d1 and d2 and cancels on average; |d|^2 of one pair would count it twice.
     """
     (present, absent), (again, without) = pairs
     if present is None or absent is None or again is None or without is None:

@@ -9,18 +9,18 @@ import pytest
 from lab.challenge.proof import confusion, table, write_page
 from lab.challenge.run import CaseRun
 from lab.challenge.score import ChallengeScore, Rate, score
-from lab.challenge.truth import Concealed, Kind, Seals, Truth, Truths, salted, seal
+from lab.challenge.truth import CaseTruth, Concealed, Kind, Seals, Truths, salted, seal
 from lab.formats.results import DiagnosisResult, HeldOut, NamedEffect, ParameterValue, Rival
 
 
-def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, accepts: tuple[str, ...] = ()) -> Truth:
+def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, accepts: tuple[str, ...] = ()) -> CaseTruth:
     concealed = tuple(
         Concealed(
             name=name, effect=None if kind == "outside" else name, strength=1.0, noncentrality=size, parameters={"size_um": 2.0}
         )
         for name, size in hidden
     )  # fmt: skip
-    return Truth(
+    return CaseTruth(
         kind=kind, concealed=concealed, fault=fault, accepts=accepts, cfa="MONO", f_number=2.8, frames=9, rows=8, cols=8
     )
 
@@ -44,7 +44,7 @@ def named(
 
 
 HEALTHY = DiagnosisResult(source="", verdict="no_mismatch")
-CASES: tuple[tuple[Truth, DiagnosisResult | None], ...] = (
+CASES: tuple[tuple[CaseTruth, DiagnosisResult | None], ...] = (
     (truth("healthy"), HEALTHY),
     (truth("healthy"), HEALTHY),
     (truth("healthy"), named()),  # a false alarm without a name

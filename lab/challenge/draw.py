@@ -1,0 +1,155 @@
+"""The mix of a challenge: which cameras, what they conceal and how strongly, and what is stated wrongly of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lab.challenge.faults import FAULTS, spoilt
+from lab.challenge.noncentrality import noncentrality, summaries
+from lab.challenge.recordings import recording_set
+from lab.challenge.truth import CaseTruth, Concealed, Kind
+from lab.diagnose.inference.evidence import Evidence
+from lab.formats.recording_set import RecordingSet
+from mocks.former import LISTED, OUTSIDE, ConcealedCamera, Law, Plan, Session, record
+
+SIZES = {"small": (96, 128), "medium": (192, 256), "full": (384, 512)}
+#: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
+SHARES: tuple[tuple[Kind, int], ...] = (("healthy", 6), ("single", 7), ("compound", 3), ("outside", 4))
+WEAK, STRONG = (10.0, 50.0), (50.0, 2000.0)  # non-centralities aimed at, half of the cases each
+INVISIBLE = 1.0  # a non-centrality below which no strength is searched
+SIZING_ROUNDS, SIZING_FACTOR = 3, 1.6  # attempts to reach the non-centrality aimed at, and how near is near enough
+FAULT_SHARE = 0.35  # of the cases outside the library
+
+
+@dataclass(frozen=True)
+class Case:
+    """A recording set and what it conceals."""
+
+    recordings: RecordingSet
+    truth: CaseTruth
+
+
+def draw(
+    seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None, law: type[Law] | None = None, sized: bool = True
+) -> Case:  # fmt: skip
+    """Case number `index` of a challenge; the same arguments give the same case.
+
+    cfa, kind, law    None: drawn
+    sized             laws get the strength that gives a drawn non-centrality; else the nominal strength, and a non-centrality from one draw
+                      of the noise, which is quick and too high
+    """
+    rng = np.random.default_rng([seed, index])
+    what = kind or kind_of(seed, index)
+    rows, cols = SIZES[size]
+    camera_seed = int(rng.integers(1, 2**31))
+    plan = Plan(
+        lights=bool(rng.random() < 0.3),
+        warm=bool(rng.random() < 0.4),
+        shuttle=bool(rng.random() < 0.4),
+        exposures=bool(rng.random() < 0.3),
+    )
+    healthy = ConcealedCamera(camera_seed, cfa=cfa, rows=rows, cols=cols)
+    dealer = _Dealer(seed, index, rng, healthy.cfa)
+    laws: list[Law] = []
+    fault = None
+    if what in {"single", "compound"}:
+        laws = dealer.laws(LISTED if law is None else (law,), 1 if what == "single" else 2)
+    elif what == "outside":
+        if law is None and rng.random() < FAULT_SHARE:
+            able = [f for f in FAULTS if healthy.cfa != "MONO" or not f.colour_only]
+            fault = able[_card(seed, 3, index, len(able))]
+        else:
+            laws = dealer.laws(OUTSIDE if law is None else (law,), 1)
+    drop = "chart" if rng.random() < 0.15 else "screen" if rng.random() < 0.15 else ""
+    if laws and any(drop in one.shown_by or (drop == "screen" and "checkerboard" in one.shown_by) for one in laws):
+        drop = ""
+    kinds = tuple(k for k in plan.kinds if k != drop)
+    plan = replace(plan, kinds=kinds, warm=plan.warm or any(one.needs == "temperature" for one in laws))
+
+    def take(present: Sequence[Law], noise_draw: int = 0) -> Session:
+        return record(ConcealedCamera(camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw), plan)
+
+    targets = [float(np.exp(rng.uniform(*np.log(WEAK if rng.random() < 0.5 else STRONG)))) for _ in laws]
+    chosen, sizes = _sized(take, laws, targets if sized else [], (0, 1) if sized else (0, 0))
+    session = take(chosen)
+    if fault is not None:
+        session = spoilt(session, fault, rng)
+    concealed = tuple(
+        Concealed(
+            name=one.name, effect=one.effect, variant=one.variant, strength=one.strength, unit=one.unit,
+            parameters=one.library_parameters(), noncentrality=noncentrality_,
+        )
+        for one, noncentrality_ in zip(chosen, sizes, strict=True)
+    )  # fmt: skip
+    accepts = sorted({*(fault.accepts if fault else ()), *(a for one in chosen for a in one.accepts)})
+    truth = CaseTruth(
+        kind=what, concealed=concealed, fault=fault.name if fault else None, accepts=tuple(accepts), cfa=healthy.cfa, f_number=healthy.f_number,
+        frames=len(session.manifest["captures"]), rows=rows, cols=cols,
+    )  # fmt: skip
+    return Case(recording_set(session), truth)
+
+
+def kind_of(seed: int, index: int) -> Kind:
+    """Kind of case number `index` (from 1 on): every twenty hold the whole mix."""
+    deck = [name for name, count in SHARES for _ in range(count)]
+    order = np.random.default_rng([seed, 1000 + (index - 1) // len(deck)]).permutation(len(deck))
+    return deck[order[(index - 1) % len(deck)]]
+
+
+def _card(seed: int, which: int, index: int, count: int) -> int:
+    """Card number `index` of shuffled decks of `count`, one after the other: every card comes before one comes twice."""
+    return int(np.random.default_rng([seed, 2000 + which, index // count]).permutation(count)[index % count])
+
+
+class _Dealer:
+    """Deals laws that a case's camera can have."""
+
+    def __init__(self, seed: int, index: int, rng: np.random.Generator, cfa: str) -> None:
+        self.rng, self.mono, self.seed = rng, cfa == "MONO", seed
+        # laws are dealt over the cases of this kind, not over all cases
+        kinds = [kind_of(seed, i) for i in range(1, index + 1)]
+        self.count_of_kind = kinds.count(kinds[-1])
+
+    def laws(self, pool: Sequence[type[Law]], count: int) -> list[Law]:
+        able = [one for one in pool if one.needs not in ({"bayer"} if self.mono else {"mono"})] or list(pool)
+        kinds = [able[_card(self.seed, 1 + len(pool) + 100 * count, self.count_of_kind, len(able))]]
+        while len(kinds) < count:
+            other = able[int(self.rng.integers(len(able)))]
+            if other.effect != kinds[0].effect:
+                kinds.append(other)
+        return [k(k.nominal, int(self.rng.integers(k.variants)), int(self.rng.integers(2**31))) for k in kinds]
+
+
+def _resized(law: Law, strength: float) -> Law:
+    low, high = law.limits
+    return type(law)(float(np.clip(strength, low, high)), law.variant, law.seed)
+
+
+def _sized(
+    take: Callable[[Sequence[Law], int], Session], laws: list[Law], targets: list[float], draws: tuple[int, int]
+) -> tuple[list[Law], list[float]]:
+    """Laws at the strengths that come near the non-centralities aimed at, and the non-centralities reached."""
+    if not laws:
+        return [], []
+
+    def both(present: Sequence[Law]) -> list[Evidence | None]:
+        found = {k: summaries(recording_set(take(present, k))) for k in set(draws)}
+        return [found[k] for k in draws]
+
+    def shown(present: list[Evidence | None], absent: list[Evidence | None]) -> float:
+        return noncentrality(list(zip(present, absent, strict=True)))
+
+    none = both(())
+    for i, target in enumerate(targets):
+        for _ in range(SIZING_ROUNDS):
+            size = shown(both((laws[i],)), none)
+            if size < INVISIBLE or target / SIZING_FACTOR < size < SIZING_FACTOR * target:
+                break
+            ratio = float(np.clip((target / size) ** (0.5 / laws[i].power), 0.1, 10.0))
+            laws[i] = _resized(laws[i], laws[i].strength * ratio)
+    whole = both(laws)
+    without = [none] if len(laws) == 1 else [both([one for one in laws if one is not law]) for law in laws]
+    return laws, [shown(whole, absent) for absent in without]

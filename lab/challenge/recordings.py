@@ -1,0 +1,24 @@
+"""Sessions of the second image former as recording sets."""
+
+from __future__ import annotations
+
+from lab.formats.recording_set import Manifest, RecordingSet
+from mocks.former import WAVELENGTH_NM, WHOLE_SESSION, ConcealedCamera, Plan, Session, record, record_pair
+from sim.spectrum import Spectrum
+
+
+def recordings_of(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION) -> RecordingSet:
+    """What a camera records."""
+    return recording_set(record(camera, plan))
+
+
+def recordings_of_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan) -> RecordingSet:
+    """What the two cameras of a pair record."""
+    return recording_set(record_pair(left, right, plan))
+
+
+def recording_set(session: Session) -> RecordingSet:
+    """The recording set of a session; raises ValidationError where its manifest doesn't follow the format."""
+    spectra = {path: Spectrum.of(WAVELENGTH_NM, values) for path, values in session.spectra.items()}
+    manifest = Manifest.model_validate(session.manifest)
+    return RecordingSet(manifest, dict(session.frames), spectra, dict(session.targets), source=manifest.name)

@@ -1,0 +1,25 @@
+"""A second lab's camera: an image former of its own, which conceals physics in recordings.
+
+It shares no stage and no code with `sim`: an error of `sim` can't cancel against the same error here. `law` and `laws` hold the concealed physics,
+`camera` the sensor and its frames, `transfer` the lens, `scenes` the targets, `session` the order of the captures. What comes out is plain data
+(`Session`); `lab.challenge` makes recording sets of it.
+"""
+
+from mocks.former.camera import ConcealedCamera
+from mocks.former.law import WAVELENGTH_NM, Law
+from mocks.former.laws import BESIDE, LISTED, OUTSIDE
+from mocks.former.session import WHOLE_SESSION, Plan, Session, record, record_pair
+
+__all__ = [
+    "BESIDE",
+    "LISTED",
+    "OUTSIDE",
+    "WAVELENGTH_NM",
+    "WHOLE_SESSION",
+    "ConcealedCamera",
+    "Law",
+    "Plan",
+    "Session",
+    "record",
+    "record_pair",
+]

@@ -1,0 +1,228 @@
+"""Laws of the charge: collection, neighbours, dark current, and what one frame leaves to the next."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import convolve
+
+from mocks.former.law import DARK, OPTICAL, Array, Law
+
+
+class ChargeDiffusionLaw(Law):
+    """Lateral diffusion, a Gaussian. Variants: independent of the wavelength; growing with its square; by absorption depth in silicon (Stevens 1992)."""
+
+    name = effect = "charge_diffusion"
+    variants, unit, nominal, limits, power, shown_by = 3, "um", 0.7, (0.1, 2.5), 2.0, OPTICAL
+
+    def spectral_transfer(self, frequency_cy_um: Array, wavelength_um: float) -> Array:
+        d = self.strength
+        if self.variant < 2:
+            d = d * (1.0 if self.variant == 0 else (wavelength_um / 0.55) ** 2)
+            return np.exp(-2 * (np.pi * d * frequency_cy_um) ** 2)
+        depth, alpha = 4.0, 1 / (0.13 * (wavelength_um / 0.4) ** 5.5)
+        z = (np.arange(30) + 0.5) / 30 * depth
+        p = np.exp(-alpha * z)
+        spread = (1.6 * d) ** 2 * z / depth
+        return (
+            np.tensordot(p, np.exp(-2 * np.pi**2 * np.multiply.outer(spread, np.square(frequency_cy_um))), 1) / p.sum()
+        )
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"length_um": self.strength} if self.variant < 2 else {}
+
+
+class CrosstalkLaw(Law):
+    """Photocharge shared with neighbours. Variants: the four nearest; all eight; more along rows."""
+
+    name = effect = "crosstalk"
+    variants, unit, nominal, limits, shown_by = 3, "%", 0.8, (0.02, 5.0), frozenset({"slanted_edge", "narrowband"})
+
+    def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
+        c, d = self.strength / 100.0, 0.25 * self.strength / 100.0 if self.variant == 1 else 0.0
+        h = c * (1.5 if self.variant == 2 else 1.0)
+        kernel = np.array([[d, c, d], [h, 1 - 2 * c - 2 * h - 4 * d, h], [d, c, d]])
+        return convolve(electrons, kernel, mode="mirror")
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"share_percent": self.strength} if self.variant == 0 else {}
+
+
+class InterPixelCapacitanceLaw(Law):
+    """Neighbours are coupled after the charge was collected, so that noise is shared, too (related to crosstalk)."""
+
+    name, unit, nominal, limits = "inter_pixel_capacitance", "%", 0.8, (0.02, 6.0)
+    accepts = frozenset({"crosstalk", "inter_pixel_capacitance"})
+
+    def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
+        c = self.strength / 100
+        return convolve(electrons, np.array([[0, c, 0], [c, 1 - 4 * c, c], [0, c, 0]]), mode="mirror")
+
+
+class BrighterFatterLaw(Law):
+    """Charge repels charge. Variants: the variance falls with the signal; neighbours receive what is repelled (Antilogus 2014)."""
+
+    name = effect = "brighter_fatter"
+    variants, unit, nominal, limits = 2, "%", 4.0, (0.1, 20.0)
+
+    def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
+        x = np.clip(mean_e / self.camera.full_well_e, 0, 1)
+        away = electrons - mean_e
+        if self.variant == 0:
+            return mean_e + away * np.sqrt(1 - self.strength / 100.0 * x)
+        around = convolve(away, np.array([[0, 0.25, 0], [0.25, 0, 0.25], [0, 0.25, 0]]), mode="mirror")
+        return mean_e + away + 0.5 * self.strength / 100.0 * x * (around - away)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"loss_percent": self.strength} if self.variant == 0 else {}
+
+
+class GreenImbalanceLaw(Law):
+    """The two greens of a Bayer mosaic differ in response."""
+
+    name = effect = "green_imbalance"
+    unit, nominal, limits, needs = "%", 1.0, (0.02, 6.0), "bayer"
+
+    def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
+        cfa, out = str(self.camera.cfa), electrons.copy()
+        greens = [k for k, c in enumerate(cfa) if c == "G"]
+        for k, sign in zip(greens, (1, -1), strict=True):
+            out[k // 2 :: 2, k % 2 :: 2] *= 1 + sign * self.strength / 200.0
+        return out
+
+
+class TapGainLaw(Law):
+    """The right half of the sensor is read by another amplifier, with another gain."""
+
+    name, unit, nominal, limits = "tap_gain", "%", 1.0, (0.02, 8.0)
+
+    def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
+        out = electrons.copy()
+        out[:, out.shape[1] // 2 :] *= 1 + self.strength / 100
+        return out
+
+
+class TreeRingsLaw(Law):
+    """Rings of doping in the wafer: the response oscillates with the distance from a centre outside the frame."""
+
+    name, unit, nominal, limits = "tree_rings", "%", 1.0, (0.02, 10.0)
+
+    def relative_response(self, x: Array, y: Array) -> Array:
+        return 1 + self.strength / 100 * np.cos(
+            2 * np.pi * (1.5 + 2.0 * self.uniform[0]) * np.hypot(x + 1.2, y + 0.9) ** 1.5
+        )
+
+
+class ResponseTailLaw(Law):
+    """2 % of the pixels have a lower response, lognormal: dust on the sensor."""
+
+    name, unit, nominal, limits = "response_tail", "%", 2.0, (0.05, 20.0)
+
+    def relative_response(self, x: Array, y: Array) -> Array:
+        return 1 - np.where(
+            self.rng(9).random(np.shape(x)) < 0.02, self.strength / 100 * self.rng(10).lognormal(0, 0.7, np.shape(x)), 0
+        )
+
+
+class ExposureOffsetLaw(Law):
+    """Light is collected longer than requested."""
+
+    name = effect = "exposure_offset"
+    variants, unit, nominal, limits = 1, "us", 30.0, (0.2, 2000.0)
+
+    def collection_time_s(self, exposure_s: float) -> float:
+        return exposure_s + self.strength * 1e-6
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"offset_us": self.strength}
+
+
+class LeakyShutterLaw(Law):
+    """Light is still collected while rows wait for read-out, longer the later the row (related to the exposure offset)."""
+
+    name, unit, nominal, limits = "leaky_shutter", "us", 60.0, (0.5, 5000.0)
+
+    def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
+        return electrons + rate_e_per_s * self.strength * 1e-6 * (np.arange(len(electrons)) / len(electrons))[:, None]
+
+
+class SmearLaw(Law):
+    """Charge is shifted through the light: each column receives a share of its own mean."""
+
+    name, unit, nominal, limits = "smear", "%", 0.5, (0.01, 5.0)
+    shown_by = frozenset({"chart", "checkerboard"})
+
+    def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
+        return electrons + self.strength / 100 * electrons.mean(0, keepdims=True)
+
+
+class ImageLagLaw(Law):
+    """Charge of the previous frame that comes with this one. Variants: a constant share; a share that grows with the charge to the power of 0.3."""
+
+    name = effect = "image_lag"
+    variants, unit, nominal, limits, shown_by = 2, "%", 0.5, (0.01, 5.0), frozenset({"dark", "flat"})
+
+    def lag_e(self, previous_e: Array | None) -> Array:
+        if previous_e is None:
+            return 0.0
+        share = self.strength / 100.0
+        return (
+            share * previous_e
+            if self.variant == 0
+            else share * previous_e * (previous_e / self.camera.full_well_e).clip(0, 1) ** 0.3
+        )
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"lag_percent": self.strength} if self.variant == 0 else {}
+
+
+class DarkCurrentTemperatureLaw(Law):
+    """Dark current that rises with the temperature. Variants: exponential; Arrhenius. Strength: doublings in 10 degrees."""
+
+    name = effect = "dark_current_temperature"
+    variants, unit, nominal, limits, needs, shown_by = 2, "1/(10 C)", 1.3, (0.02, 3.0), "temperature", DARK
+
+    def dark_rate(self, rate_e_per_s: Array, temperature_c: float) -> Array:
+        if self.variant == 0:
+            return rate_e_per_s * 2.0 ** (self.strength * (temperature_c - 25.0) / 10.0)
+        slope = self.strength * np.log(2.0) / 10.0 * 298.15**2
+        return rate_e_per_s * np.exp(slope * (1 / 298.15 - 1 / (273.15 + temperature_c)))
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"doublings_per_c": self.strength / 10.0} if self.variant == 0 else {}
+
+
+class AmplifierGlowLaw(Law):
+    """Light of the output amplifier near a corner. Variants: exponential; Lorentzian."""
+
+    name = effect = "amplifier_glow"
+    variants, unit, nominal, limits, shown_by = 2, "e/s", 20.0, (0.2, 400.0), DARK
+
+    def dark_rate(self, rate_e_per_s: Array, temperature_c: float) -> Array:
+        x, y = self.camera.field_position
+        r = np.hypot(x - np.sign(self.uniform[0] - 0.5) * 0.8, y - np.sign(self.uniform[1] - 0.5) * 0.6)
+        return rate_e_per_s + self.strength * (np.exp(-r / 0.3) if self.variant == 0 else 1 / (1 + (r / 0.2) ** 2))
+
+
+class HotPixelsLaw(Law):
+    """A few pixels of high dark current. Variants: all equal; lognormal."""
+
+    name = effect = "hot_pixels"
+    variants, unit, nominal, limits, shown_by = 2, "e/s", 150.0, (5.0, 3000.0), DARK
+
+    def dark_rate(self, rate_e_per_s: Array, temperature_c: float) -> Array:
+        rng = self.rng(1)
+        hot = rng.random((self.camera.rows, self.camera.cols)) < 5e-4
+        hot[self.camera.rows // 3, self.camera.cols // 3] = True  # one at least
+        size = 1.0 if self.variant == 0 else rng.lognormal(-0.3, 0.8, hot.shape)
+        return rate_e_per_s + np.where(hot, self.strength * size, 0.0)
+
+
+class LightLeakLaw(Law):
+    """Light passes the lens cap, most of it about one position inside the frame (related to amplifier glow)."""
+
+    name, unit, nominal, limits, shown_by = "light_leak", "e/s", 5.0, (0.05, 400.0), DARK
+
+    def dark_rate(self, rate_e_per_s: Array, temperature_c: float) -> Array:
+        x, y = self.camera.field_position
+        r2 = (x - 0.8 * (self.uniform[0] - 0.5)) ** 2 + (y - 0.6 * (self.uniform[1] - 0.5)) ** 2
+        return rate_e_per_s + self.strength * np.exp(-0.5 * r2 / 0.3**2)

@@ -1,0 +1,224 @@
+"""Laws of the read-out: amplifier, converter, offsets and noise patterns, digital processing."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from scipy.ndimage import convolve, shift
+
+from mocks.former.law import DARK, OPTICAL, Array, Law
+
+
+class NonlinearityLaw(Law):
+    """The response bends. Variants: quadratic; hyperbolic tangent; power law."""
+
+    name = effect = "nonlinearity"
+    variants, unit, nominal, limits = 3, "%", 1.5, (0.01, 8.0)
+
+    def response(self, electrons: Array) -> Array:
+        a, x = self.strength / 100.0, electrons / self.camera.full_well_e
+        if self.variant == 0:
+            return electrons * (1 - a * x)
+        if self.variant == 1:
+            k = np.sqrt(3 * a)
+            return np.where(x > 0, self.camera.full_well_e * np.tanh(k * x) / k, electrons)
+        return electrons * np.clip(x, 1e-6, None) ** (-0.4 * a)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"quadratic_percent": -self.strength} if self.variant == 0 else {}
+
+
+class CompandingKneeLaw(Law):
+    """The response has a knee, a smaller slope above it (related to nonlinearity)."""
+
+    name, unit, nominal, limits = "companding_knee", "%", 3.0, (0.05, 20.0)
+
+    def response(self, electrons: Array) -> Array:
+        knee = (0.3 + 0.3 * self.uniform[0]) * self.camera.full_well_e
+        return electrons - self.strength / 100 * np.maximum(electrons - knee, 0)
+
+
+class AdcNonlinearityLaw(Law):
+    """Bit weights of the converter are wrong. Variants: the highest bit; the two highest."""
+
+    name = effect = "adc_nonlinearity"
+    variants, unit, nominal, limits, signed = 2, "DN", 3.0, (0.05, 20.0), True
+
+    def adc_output(self, dn: Array) -> Array:
+        out = dn + self.signed_strength * (dn >= 2048)
+        return out + (0.5 * self.signed_strength * ((dn % 2048) >= 1024) if self.variant == 1 else 0.0)
+
+
+class DigitalGainLaw(Law):
+    """Codes are multiplied after the converter: some occur twice as often or never (related to ADC nonlinearity)."""
+
+    name, unit, nominal, limits = "digital_gain", "%", 10.0, (1.0, 60.0)
+
+    def processed_dn(self, dn: Array) -> Array:
+        black = self.camera.black_level_dn
+        return np.floor(black + (np.round(dn) - black) * (1 + self.strength / 100))
+
+
+class LossyCodesLaw(Law):
+    """Codes are quantised in equal steps of their square root, as by lossy compression."""
+
+    name, unit, nominal, limits = "lossy_codes", "1", 0.05, (0.003, 0.5)
+
+    def processed_dn(self, dn: Array) -> Array:
+        return np.square(np.round(np.sqrt(np.clip(dn, 0, None)) / self.strength) * self.strength)
+
+
+class BlackLevelDriftLaw(Law):
+    """The black level moves with the time. Variants: linearly; exponentially towards a final value."""
+
+    name = effect = "black_level_drift"
+    variants, unit, nominal, limits, signed, shown_by = 2, "DN/min", 0.05, (0.002, 2.0), True, DARK
+
+    def offset_dn(self, elapsed_s: float, temperature_c: float) -> float:
+        minutes = elapsed_s / 60.0
+        return self.signed_strength * (minutes if self.variant == 0 else 10.0 * (1 - np.exp(-minutes / 10.0)))
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"drift_dn_per_min": self.signed_strength} if self.variant == 0 else {}
+
+
+class BlackLevelTemperatureLaw(Law):
+    """The black level follows the sensor's temperature."""
+
+    name, effect = "black_level_temperature", "black_level_drift"
+    unit, nominal, limits, signed, needs, shown_by = "DN/C", 0.2, (0.002, 5.0), True, "temperature", DARK
+
+    def offset_dn(self, elapsed_s: float, temperature_c: float) -> float:
+        return self.signed_strength * (temperature_c - 25.0)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"drift_dn_per_c": self.signed_strength}
+
+
+class TapOffsetLaw(Law):
+    """The right half of the sensor is read by another amplifier, with another black level."""
+
+    name, unit, nominal, limits, shown_by = "tap_offset", "e", 1.0, (0.02, 30.0), DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        return np.where(np.arange(shape[1]) < shape[1] // 2, 0.0, self.strength)[None, :] * np.ones((shape[0], 1))
+
+
+class RowNoiseLaw(Law):
+    """A temporal offset of each row. Variants: white; correlated between neighbouring rows."""
+
+    name = effect = "row_noise"
+    variants, unit, nominal, limits, power, shown_by = 2, "e", 2.0, (0.1, 30.0), 2.0, DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        white = self.rng(2, k).standard_normal(shape[0])
+        if self.variant == 1:
+            for i in range(1, len(white)):
+                white[i] = 0.6 * white[i - 1] + 0.8 * white[i]
+        return self.strength * white[:, None]
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"noise_e": self.strength}
+
+
+class PeriodicBandingLaw(Law):
+    """A sinusoidal offset over the rows, of fixed period and random phase in each frame (related to row noise)."""
+
+    name, unit, nominal, limits, power, shown_by = "periodic_banding", "e", 3.0, (0.1, 40.0), 2.0, DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        phase = self.rng(7, k).random()
+        return (
+            self.strength * np.sin(2 * np.pi * (np.arange(shape[0]) / (6.0 + 10.0 * self.uniform[0]) + phase))[:, None]
+        )
+
+
+class PinkNoiseLaw(Law):
+    """1/f noise along the read-out (related to row noise)."""
+
+    name, unit, nominal, limits, power, shown_by = "pink_noise", "e", 3.0, (0.2, 40.0), 2.0, DARK
+    accepts = frozenset({"row_noise"})
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        n = shape[0] * shape[1]
+        f = np.fft.rfftfreq(n)
+        f[0] = 1.0
+        wave = np.fft.irfft(np.fft.rfft(self.rng(12, k).standard_normal(n)) / np.sqrt(f), n)
+        return (self.strength * (wave - wave.mean()) / wave.std()).reshape(shape)
+
+
+class ColumnNoiseLaw(Law):
+    """A fixed offset of each column. Variants: white; an alternation of odd and even columns in addition."""
+
+    name = effect = "column_noise"
+    variants, unit, nominal, limits, shown_by = 2, "e", 1.0, (0.02, 30.0), DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        white = self.rng(3).standard_normal(shape[1])
+        return (
+            self.strength * (white if self.variant == 0 else 0.7 * white + 0.7 * (-1.0) ** np.arange(shape[1]))[None, :]
+        )
+
+
+class RandomTelegraphNoiseLaw(Law):
+    """Some pixels switch between two levels. Variants: equal amplitudes; exponentially distributed ones."""
+
+    name = effect = "random_telegraph_noise"
+    variants, unit, nominal, limits, power, shown_by = 2, "e", 15.0, (1.0, 200.0), 2.0, DARK
+
+    def noise_e(self, shape: tuple[int, int], k: int) -> Array:
+        still = self.rng(4)
+        odd = still.random(shape) < 0.004
+        size = self.strength * (np.ones(shape) if self.variant == 0 else still.exponential(0.7, shape))
+        return np.where(odd, size * (self.rng(5, k).integers(0, 2, shape) - 0.5), 0.0)
+
+
+class _Processing(Law):
+    """A 3 x 3 filter on the converter's output. Variants of the kernel: cross; binomial."""
+
+    variants, unit, nominal, limits, needs, shown_by = 2, "1", 0.1, (0.002, 0.6), "mono", OPTICAL
+    direction: ClassVar[float]
+
+    def processed_dn(self, dn: Array) -> Array:
+        cross = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
+        box = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 16.0
+        blurred = convolve(dn, cross if self.variant == 0 else box, mode="mirror")
+        return dn + self.direction * self.strength * (dn - blurred)
+
+
+class OnChipSharpeningLaw(_Processing):
+    """Sharpening in the camera."""
+
+    name = effect = "on_chip_sharpening"
+    direction = 1.0
+
+
+class OnChipSmoothingLaw(_Processing):
+    """Smoothing in the camera."""
+
+    name = effect = "on_chip_smoothing"
+    direction = -1.0
+
+
+class DefectInterpolationLaw(Law):
+    """Some pixels are replaced by the mean of two neighbours of their row: less noise there, broken edges."""
+
+    name, unit, nominal, limits = "defect_interpolation", "%", 5.0, (0.1, 60.0)
+
+    def processed_dn(self, dn: Array) -> Array:
+        odd = self.rng(11).random(dn.shape) < self.strength / 100
+        step = 1 if self.camera.cfa == "MONO" else 2
+        padded = np.pad(dn, [(0, 0), (step, step)], mode="reflect")
+        return np.where(odd, 0.5 * (padded[:, : -2 * step] + padded[:, 2 * step :]), dn)
+
+
+class JitteredRowsLaw(Law):
+    """Every other row is displaced by a part of a pixel, by a fault of the sensor's timing."""
+
+    name, unit, nominal, limits, power, needs, shown_by = "jittered_rows", "px", 0.3, (0.05, 1.0), 2.0, "mono", OPTICAL
+
+    def image(self, image: Array) -> Array:
+        out = image.copy()
+        out[1::2] = shift(image, (0.0, self.strength), order=3, mode="nearest")[1::2]
+        return out

@@ -1,0 +1,218 @@
+"""Sessions of a concealed camera: which captures it takes, in which order, and the data that come out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mocks.former.camera import STEP_S, ConcealedCamera
+from mocks.former.law import FULL_CODE_DN, WAVELENGTH_NM, Array
+from mocks.former.scenes import BoardPose, board, chart, edge, pattern
+
+BEGIN = datetime(2026, 3, 2, 9, tzinfo=UTC)
+LINE_SIGMA_NM = 4.2466  # a full width of 10 nm
+FLAT_LEVELS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8, 0.92)
+EDGE_ANGLES_DEG = (5.0, 95.0, -40.0, 2.6)
+BOARD_TILTS_DEG = (
+    (0, 0, 0), (35, 0, 3), (-35, 0, -4), (0, 35, 5), (0, -35, 2), (25, 25, -6), (-25, 25, 4), (25, -25, 8), (-25, -25, -3), (10, -15, 20),
+)  # fmt: skip
+DARK_SIDE = 0.08  # of an edge
+SCREEN_BLACK = 0.0035  # of its white
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which captures a session takes.
+
+    lights      edges in two narrowband lights, too
+    warm        darks at two higher temperatures, too
+    shuttle     flats up and down again
+    exposures   edges at a quarter of the exposure in four times the light, too
+    """
+
+    kinds: tuple[str, ...] = ("dark", "flat", "narrowband", "chart", "slanted_edge", "screen")
+    lights: bool = False
+    warm: bool = False
+    shuttle: bool = False
+    exposures: bool = False
+    repeats: int = 3
+
+
+WHOLE_SESSION = Plan()
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a session hands out, as plain data: the manifest of a recording set (docs/recording-set.md) and the files that it names.
+
+    Frames are raw DN, spectra values at WAVELENGTH_NM, targets cells of a screen.
+    """
+
+    manifest: dict[str, Any]
+    frames: Mapping[str, NDArray[np.uint16]]
+    spectra: Mapping[str, NDArray[np.float64]]
+    targets: Mapping[str, NDArray[np.uint8]]
+
+
+def record(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION, name: str = "camera") -> Session:
+    """Take a session. What is requested (exposures, order, names) doesn't depend on the laws."""
+    return _Recorder(camera).session(plan, name)
+
+
+def record_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan, name: str = "pair") -> Session:
+    """Both cameras' sessions in one; screen targets are the left one's."""
+    one, two = record(left, plan, name), record(right, plan, name)
+    manifest = {
+        "name": name,
+        "cameras": one.manifest["cameras"] | two.manifest["cameras"],
+        "captures": [*one.manifest["captures"], *two.manifest["captures"]],
+    }
+    return Session(manifest, {**one.frames, **two.frames}, {**one.spectra, **two.spectra}, one.targets)
+
+
+def lamp() -> Array:
+    """Spectral radiance of the flats, W sr^-1 m^-2 nm^-1."""
+    return 0.05 * np.exp((WAVELENGTH_NM - 560) / 400) * (1 + 0.1 * np.sin(WAVELENGTH_NM / 60))
+
+
+def line(centre_nm: float, peak: Array) -> Array:
+    """A monochromator's line of 10 nm."""
+    return peak * np.exp(-0.5 * ((WAVELENGTH_NM - centre_nm) / LINE_SIGMA_NM) ** 2)
+
+
+class _Recorder:
+    """One camera's captures in the order in which they are taken."""
+
+    def __init__(self, camera: ConcealedCamera) -> None:
+        self.camera = camera
+        self.prefix = "" if camera.side == "left" else "right-"
+        self.frames: dict[str, Any] = {}
+        self.spectra: dict[str, Any] = {}
+        self.targets: dict[str, Any] = {}
+        self.captures: list[dict[str, Any]] = []
+
+    def session(self, plan: Plan, name: str) -> Session:
+        camera = self.camera
+        curves = {c: self.noted(q) for c, q in camera.stated_efficiency.items()}
+        steps = {
+            "dark": self.darks, "flat": self.flats, "narrowband": self.sweep, "chart": self.chart, "slanted_edge": self.edges,
+            "charuco": self.boards, "screen": self.screen,
+        }  # fmt: skip
+        for kind in plan.kinds:
+            steps[kind](plan)
+        stated = {
+            "rows": camera.rows, "cols": camera.cols, "pixel_pitch_um": camera.pitch_um, "fill_factor": camera.fill_factor, "cfa": camera.cfa,
+            "bit_depth": 12, "black_level_dn": camera.black_level_dn, "white_level_dn": FULL_CODE_DN, "f_number": camera.f_number,
+            "focal_length_mm": camera.focal_length_mm, "lens_transmittance": camera.lens_transmittance, "quantum_efficiency": curves,
+        }  # fmt: skip
+        manifest = {"name": name, "cameras": {camera.side: stated}, "captures": self.captures}
+        return Session(manifest, self.frames, self.spectra, self.targets)
+
+    def take(
+        self, kind: str, images: dict[str, Array] | None, exposure_s: float, repeats: int = 1, temperature_c: float = 25.0, **more: Any
+    ) -> None:  # fmt: skip
+        """Expose and note `repeats` frames; `more`: what this kind of capture states besides."""
+        for law in self.camera.laws:
+            images = images and {c: image * law.scene_factor(kind) for c, image in images.items()}
+        for _ in range(repeats):
+            k = len(self.captures)
+            path = f"frames/{self.prefix}{k:04d}.npy"
+            self.frames[path] = self.camera.expose(images, exposure_s, k, temperature_c)
+            when = BEGIN + timedelta(seconds=STEP_S * k)
+            self.captures.append(
+                {"id": f"{self.prefix}c{k:04d}", "kind": kind, "side": self.camera.side, "frame": path, "exposure_s": exposure_s,
+                 "temperature_c": temperature_c, "time": when.isoformat(), **more}
+            )  # fmt: skip
+
+    def noted(self, spectrum: Array) -> str:
+        """The file in which a spectrum is kept: a reading of the radiometer, or a stated curve."""
+        path = f"spectra/{self.prefix}{len(self.spectra):03d}.csv"
+        self.spectra[path] = spectrum
+        return path
+
+    def darks(self, plan: Plan) -> None:
+        for exposure_s in (0.001, 0.5, 2.0):
+            self.take("dark", None, exposure_s, max(plan.repeats, 3))
+        for warmer_c in (35.0, 45.0) if plan.warm else ():
+            self.take("dark", None, 2.0, max(plan.repeats, 3), warmer_c)
+
+    def flats(self, plan: Plan) -> None:
+        light = lamp()
+        path, images = self.noted(light), self.camera.uniform(light)
+        levels = (*FLAT_LEVELS, *FLAT_LEVELS[::-1]) if plan.shuttle else FLAT_LEVELS
+        repeats = 2 if plan.shuttle else max(plan.repeats, 3)
+        for level in levels:
+            self.take("flat", images, self.camera.exposure_for(light, level), repeats, radiance=path)
+
+    def sweep(self, plan: Plan) -> None:
+        def light(centre_nm: float) -> Array:
+            return line(centre_nm, 0.004 * np.exp((centre_nm - 560) / 300))
+
+        exposure_s = min(self.camera.exposure_for(light(w), 0.8) for w in range(400, 721, 20))
+        for w in range(400, 721, 10):
+            images = self.camera.uniform(light(w), "narrowband")
+            path = self.noted(light(w))
+            self.take("narrowband", images, exposure_s, wavelength_nm=w, bandwidth_nm=10, radiance=path)
+
+    def chart(self, plan: Plan) -> None:
+        camera, light = self.camera, 0.3 * lamp()
+        box = round(0.14 * camera.rows), round(0.12 * camera.cols), round(0.86 * camera.rows), round(0.88 * camera.cols)
+        row0, col0, row1, col1 = box
+        corners = [[row0, col0], [row0, col1], [row1, col1], [row1, col0]]
+        images, exposure_s = chart(camera, light, box), camera.exposure_for(0.9 * light, 0.8)
+        path = self.noted(light)
+        self.take("chart", images, exposure_s, 2, chart="ColorChecker24", corners=corners, radiance=path)
+
+    def edges(self, plan: Plan) -> None:
+        camera, light = self.camera, lamp()
+        half = min(100, camera.rows // 2 - 4)
+        region = [camera.rows // 2 - half, camera.cols // 2 - half, camera.rows // 2 + half, camera.cols // 2 + half]
+        lights = [light]
+        if plan.lights:
+            lights += [line(w, 0.05) for w in (460.0, 640.0)]
+        if plan.exposures:
+            lights += [4.0 * light]
+        for light in lights:
+            path, exposure_s = self.noted(light), camera.exposure_for(light, 0.8)
+            for angle in EDGE_ANGLES_DEG:
+                self.take("slanted_edge", edge(camera, angle, light, DARK_SIDE), exposure_s, 2, region=region, angle_deg=angle,
+                          light_radiance=path, field_mm=[0.0, 0.0])  # fmt: skip
+
+    def boards(self, plan: Plan) -> None:
+        """A ChArUco board of 6 x 8 squares of 9 mm in ten poses, tilted to all sides."""
+        camera = self.camera
+        charuco = cv2.aruco.CharucoBoard((8, 6), 9.0, 6.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+        texture = np.asarray(charuco.generateImage((8 * 18, 6 * 18), marginSize=0, borderBits=1)) / 255.0
+        light = 0.6 * lamp()
+        # at this distance the board covers three quarters of the frame
+        distance = 9.0 * max(8 / camera.cols, 6 / camera.rows) / 0.75 * camera.focal_length_px
+        x = 0.1 * distance * camera.cols / camera.focal_length_px
+        y = 0.1 * distance * camera.rows / camera.focal_length_px
+        for k, tilt in enumerate(BOARD_TILTS_DEG):
+            centre = (x * ((k * 7) % 5 - 2) / 2, y * ((k * 3) % 5 - 2) / 2, distance * (1 + 0.03 * (k % 4)))
+            if camera.pair_middle_mm:
+                centre = (centre[0] + camera.pair_middle_mm, centre[1], centre[2])
+            images = board(camera, texture, 0.5, BoardPose(centre, tilt), light)
+            self.take("charuco", images, camera.exposure_for(light, 0.7), dictionary="DICT_4X4_50", squares=[6, 8],
+                      square_mm=9.0, marker_mm=6.0, pose=f"b{k}")  # fmt: skip
+
+    def screen(self, plan: Plan) -> None:
+        """White, black, a checkerboard and Bernoulli noise on a screen."""
+        camera, light = self.camera, 0.1 * lamp()
+        path = self.noted(light)
+        checkerboard = np.kron(np.indices((10, 13)).sum(0) % 2, np.ones((8, 8), int)).astype(np.uint8)
+        noise = np.zeros((80, 104), np.uint8)
+        noise[4:-4, 4:-4] = np.random.default_rng([camera.seed, 4]).integers(0, 2, (72, 96))
+        exposure_s = camera.exposure_for(light, 0.8)
+        where: Any = {"screen": {"pose": "p0", "cell_camera_px": 4.0, "radiance": path}}
+        self.take("white", pattern(camera, np.ones((80, 104)), light, SCREEN_BLACK), exposure_s, 3, **where)
+        self.take("black", pattern(camera, np.zeros((80, 104)), light, SCREEN_BLACK), exposure_s, 3, **where)
+        self.targets |= {"targets/0.npy": checkerboard, "targets/1.npy": noise}
+        for kind, (file, target) in zip(("checkerboard", "bernoulli"), self.targets.items(), strict=True):
+            self.take(kind, pattern(camera, target, light, SCREEN_BLACK), exposure_s, 3, target=file, **where)
