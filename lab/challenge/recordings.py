@@ -21,4 +21,6 @@ def recording_set(session: Session) -> RecordingSet:
     """The recording set of a session; raises ValidationError where its manifest doesn't follow the format."""
     spectra = {path: Spectrum.of(WAVELENGTH_NM, values) for path, values in session.spectra.items()}
     manifest = Manifest.model_validate(session.manifest)
+    # every field is written, null where it is unknown
+    manifest = Manifest.model_validate(manifest.model_dump(mode="json"))
     return RecordingSet(manifest, dict(session.frames), spectra, dict(session.targets), source=manifest.name)
