@@ -30,8 +30,8 @@ from lab.formats.recording_set import Bernoulli, Screen
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, expected_electrons, kernel
 from sim.optics.imaging import MeasuredPsf
-from sim.optics.prescription import read_zmx
-from sim.optics.trace import TableSettings, lens_table
+from sim.optics.traced_table import TableSettings, lens_table
+from sim.optics.zmx import read_zmx
 from sim.scene.render import Warp
 from sim.scene.scenes import ScreenPattern
 from sim.sensor.electrons import FixedPattern, sample_from

@@ -26,9 +26,9 @@ from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, sample
 from sim.optics import scatter
 from sim.optics.imaging import TracedLens
-from sim.optics.prescription import read_zmx
 from sim.optics.table import LensTable
-from sim.optics.trace import TableSettings, lens_table
+from sim.optics.traced_table import TableSettings, lens_table
+from sim.optics.zmx import read_zmx
 from sim.scene import ScreenPattern, SpectralImage, Warp
 from sim.scene.render import Grid, draw
 from sim.sensor.electrons import FixedPattern

@@ -170,8 +170,8 @@ def traced_table(
 
     Raises InputError for a prescription that can't be read or traced, and for a folder that can't be written to.
     """
-    from sim.optics.prescription import read_zmx
-    from sim.optics.trace import cached_table  # here, as compiled code takes a second to import
+    from sim.optics.traced_table import cached_table  # here, as compiled code takes a second to import
+    from sim.optics.zmx import read_zmx
 
     folder = cache or lens_cache()
     try:

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from lab.errors import InputError
-from sim.optics.prescription import GlassName, Prescription, PrescriptionError, read_zmx
+from sim.optics.prescription import GlassName, Prescription, PrescriptionError
 from sim.optics.table import LensTable
+from sim.optics.zmx import read_zmx
 from sim.parameters import Frozen
 
 if TYPE_CHECKING:
-    from sim.optics.trace import Focus, OpticalSystem
+    from sim.optics.system import Focus, OpticalSystem
 
 Progress = Callable[[str, float], None]
 
@@ -138,7 +139,8 @@ def trace_prescription(
 
     Raises InputError, in one line, for a file that can't be read or traced.
     """
-    from sim.optics.trace import OpticalSystem, OpticalTable, TableSettings  # compiled code: a second to import
+    from sim.optics.system import OpticalSystem  # compiled code: a second to import
+    from sim.optics.traced_table import OpticalTable, TableSettings
 
     try:
         prescription = read_zmx(file)

@@ -16,8 +16,8 @@ from lab.report import page_environment, write_page
 from lab.report.charts import Figure, Trace, axis, layout
 from lab.report.pictures import kernel_picture
 from sim.optics import rays as rt
+from sim.optics.system import OpticalSystem
 from sim.optics.table import LensTable
-from sim.optics.trace import OpticalSystem
 from sim.spectrum import FloatArray
 
 #: Apart for all common kinds of colour vision, and legible on white and on near-black.

@@ -10,7 +10,7 @@ from lab import cli
 from lab.errors import InputError
 from lab.predict.lens import LensResult, TracedPrescription, parse_glasses, trace_prescription, with_glasses
 from lab.report.lens import write_lens_report
-from sim.optics.prescription import parse_zmx
+from sim.optics.zmx import parse_zmx
 
 LENS = Path(__file__).parents[1] / "sim/optics/lenses/doublet.zmx"
 TILTED = LENS.with_name("tilted.zmx")

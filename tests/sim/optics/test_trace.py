@@ -11,8 +11,10 @@ from scipy.special import j1
 from sim.optics import rays as rt
 from sim.optics.diffraction import diffraction_otf
 from sim.optics.planewaves import interpolated, point_spread
-from sim.optics.prescription import Aperture, GlassName, Prescription, PrescriptionError, Surface, read_zmx
-from sim.optics.trace import OpticalSystem, OpticalTable, TableSettings, cached_table, lens_table
+from sim.optics.prescription import Aperture, GlassName, Prescription, PrescriptionError, Surface
+from sim.optics.system import OpticalSystem
+from sim.optics.traced_table import OpticalTable, TableSettings, cached_table, lens_table
+from sim.optics.zmx import read_zmx
 
 HERE = Path(__file__).parent
 SHARED = Path(__file__).parents[3] / "../shared/data/lenses"

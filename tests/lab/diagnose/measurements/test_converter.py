@@ -50,7 +50,7 @@ def test_steps_are_measured_where_they_stand() -> None:
     ]
     assert any(label.x == 2048.0 for label, _, _ in steps)
     for label, value, s in steps:
-        assert abs(value - (law.a if label.x == 2048.0 else 0.0)) < 3.5 * s
+        assert abs(value - (law.signed_strength if label.x == 2048.0 else 0.0)) < 3.5 * s
 
 
 @pytest.mark.parametrize("variant", [0, 1])
@@ -62,7 +62,7 @@ def test_wrong_bits_are_named(variant: int) -> None:
     assert [c.effect.name for c in verdict.named] == ["adc_nonlinearity"]
     found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std["error_dn"]
     assert std is not None
-    assert abs(found["error_dn"] - law.a) < 3.0 * std
+    assert abs(found["error_dn"] - law.signed_strength) < 3.0 * std
 
 
 @pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)

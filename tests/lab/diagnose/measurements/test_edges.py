@@ -95,7 +95,7 @@ def test_coma_shows_in_the_asymmetry_with_its_direction() -> None:
     are delays, the library's are leads.)"""
     law = concealed.ComaLaw(0.3, 0)
     block = edge_block(_recorded(law, cfa="MONO", f_number=2.8))
-    turn, coma = 2.0 * np.pi * law.u[0], effect("coma")
+    turn, coma = 2.0 * np.pi * law.uniform[0], effect("coma")
     right = coma(w131_x_um=-0.3 * np.cos(turn), w131_y_um=-0.3 * np.sin(turn))
     wrong = coma(w131_x_um=0.3 * np.cos(turn), w131_y_um=0.3 * np.sin(turn))
     assert _misfit(block, aside=True) > 2.0

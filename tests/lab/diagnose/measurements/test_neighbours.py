@@ -148,7 +148,7 @@ def test_what_sim_renders_is_predicted_and_named(one: Effect, cfa: str) -> None:
         (OnChipSharpeningLaw(0.06, 1), "on_chip_sharpening"),
         (InterPixelCapacitanceLaw(1.0), "inter_pixel_capacitance"),
     ],
-    ids=lambda v: v if isinstance(v, str) else f"{v.s:g}-{v.v}",
+    ids=lambda v: v if isinstance(v, str) else f"{v.strength:g}-{v.variant}",
 )
 def test_what_another_former_conceals_is_named(law: Law, name: str) -> None:
     """Non-centralities of 70 and more: by how what neighbours share grows with the level, darks among them."""

@@ -83,7 +83,7 @@ FOUND: list[tuple[Law, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("law", "name"), FOUND, ids=[f"{type(law).__name__}-{law.v}" for law, _ in FOUND])
+@pytest.mark.parametrize(("law", "name"), FOUND, ids=[f"{type(law).__name__}-{law.variant}" for law, _ in FOUND])
 def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
     verdict = verdict_of(recorded(law))
     assert [c.effect.name for c in verdict.named] == [name]
@@ -164,7 +164,7 @@ def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
 
     law = concealed.LateralColourLaw(3.0, 0, 5)
     block = colour_block(study_of(recorded(law)))
-    expected = block.predict((LateralChromaticAberration(slope_um=law.a),)).mean
+    expected = block.predict((LateralChromaticAberration(slope_um=law.signed_strength),)).mean
     std = np.sqrt(np.diag(block.covariance))
     assert np.abs(expected).max() > 8 * std.max()
     assert np.all(np.abs(block.value - expected) < 4 * std + 0.05 * np.abs(expected))

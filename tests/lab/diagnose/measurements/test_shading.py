@@ -51,7 +51,7 @@ def test_a_slope_is_uneven_light_with_or_without_a_bow(variant: int) -> None:
     truth = NonUniformIlluminationLaw(1.5, variant, 3)
     found = verdict(former(23, truth, cfa="GRBG"), *LOOKED_AT)
     assert names(found) == ["non_uniform_illumination"]
-    for name, value in truth.stated().items():
+    for name, value in truth.library_parameters().items():
         std = found.named[0].std[name]
         assert std is not None
         assert abs(found.named[0].effect.model_dump()[name] - value) < 3.0 * std

@@ -43,13 +43,13 @@ LEVELS: list[tuple[Law, bool]] = [
 @pytest.mark.parametrize(
     ("law", "shuttle"),
     [*LEVELS[:1], *(pytest.param(*case, marks=pytest.mark.slow) for case in LEVELS[1:])],
-    ids=lambda value: f"{value.name}-{value.v}" if isinstance(value, Law) else f"shuttle-{value}",
+    ids=lambda value: f"{value.name}-{value.variant}" if isinstance(value, Law) else f"shuttle-{value}",
 )
 def test_what_changes_levels_is_told_apart(law: Law, shuttle: bool) -> None:
     """Up only, where time and level go together but for the repeats; and up and down."""
     found = verdict(former(31, law, shuttle=shuttle), linearity_block)
     assert names(found) == [law.effect]
-    for name, value in law.stated().items():
+    for name, value in law.library_parameters().items():
         std = found.named[0].std[name]
         assert std is not None
         assert abs(found.named[0].effect.model_dump()[name] - value) < 3.5 * std

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.optics.prescription import PrescriptionError, decode, parse_zmx, read_zmx
+from sim.optics.prescription import PrescriptionError
+from sim.optics.zmx import decode, parse_zmx, read_zmx
 
 LENSES = Path(__file__).parent / "lenses"
 TEXT = (LENSES / "doublet.zmx").read_text()
