@@ -24,8 +24,10 @@ from lab.formats.camera_file import default_camera
 from sim import forward
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, sample
-from sim.optics import scatter
+from sim.optics.field_mapping import ImageFrame, field_mapping
 from sim.optics.imaging import TracedLens
+from sim.optics.kernels import Kernels
+from sim.optics.superposition import superpose
 from sim.optics.table import LensTable
 from sim.optics.traced_table import TableSettings, lens_table
 from sim.optics.zmx import read_zmx
@@ -129,12 +131,12 @@ def test_a_screen_through_a_traced_lens() -> None:
     def frame() -> None:
         sample(camera, Exposure(scene, 0.02), rng)
 
-    size = scatter.Kernels(
+    size = Kernels(
         table,
         np.ones((1, len(table.field_deg), table.wavelength_nm.size)),
-        scatter.Frame(camera.rows, camera.cols, camera.pixel_pitch_um, camera.fill_factor, (479.5, 639.5)),
+        ImageFrame(camera.rows, camera.cols, camera.pixel_pitch_um, camera.fill_factor, (479.5, 639.5)),
         3,
-        carried=True,
+        distorted=True,
     ).size
     grid = Grid(camera.rows, camera.cols, 3, 32)
     taps, samples = rng.random((4, size * size), np.float32), rng.random((size * size, 64), np.float32)
@@ -172,7 +174,7 @@ class Waves:
         return out
 
 
-def exact_region(table: LensTable, light: FloatArray, frame: scatter.Frame, picture: Waves) -> FloatArray:
+def exact_region(table: LensTable, light: FloatArray, frame: ImageFrame, picture: Waves) -> FloatArray:
     """The sum over all sources: each one's own function, in between the table's samples by cubic splines in height, row and column,
     averaged over a full pixel by 5 x 5 Gauss nodes. Sources are 4 x 4 a pixel, which for such a picture and a lens that passes
     less than 3.2 cy/px is the integral."""
@@ -184,7 +186,7 @@ def exact_region(table: LensTable, light: FloatArray, frame: scatter.Frame, pict
     functions = CubicSpline(np.arange(21.0), functions)(heights)
     functions = signal.resample(signal.resample(functions, 2 * n, axis=1), 2 * n, axis=2)  # by Fourier series
     spline = ndimage.spline_filter(functions.astype(np.float32), output=np.float32)
-    radius, place = scatter.distortion(table).heights(heights.size)
+    radius, place = field_mapping(table).heights(heights.size)
     node, share = np.polynomial.legendre.leggauss(5)
     reach = int(np.ceil(0.5 * n * pitch / frame.pitch_um + 0.5))
     offset = (np.arange(-4 * reach, 4 * (reach + 1)) + 0.5) / 4.0 - 0.5
@@ -218,13 +220,13 @@ def test_accuracy_of_a_traced_frame() -> None:
     light /= np.max(light) * table.wavelength_nm.size
     picture, rows = Waves(), []
     for place, (row, col) in {"axis": (476, 636), "half way": (700, 900), "corner": (945, 1265)}.items():
-        frame = scatter.Frame(8, 8, camera.pixel_pitch_um, 1.0, (479.5 - row, 639.5 - col))
+        frame = ImageFrame(8, 8, camera.pixel_pitch_um, 1.0, (479.5 - row, 639.5 - col))
         grid = Grid(8, 8, 3, 64)
-        kernels = scatter.Kernels(table, light[None], frame, 3, carried=False)
+        kernels = Kernels(table, light[None], frame, 3, distorted=False)
         kernels.lost = np.zeros_like(kernels.lost)  # what lies beyond the table's circle isn't in the sum
         got = np.zeros((8, 8))
         drawn = picture.at(*grid.axes_px(), 1.0 / 3.0).astype(np.float32)
-        scatter.scatter(drawn, grid, kernels, [[(0, 0)]], 1, got)
+        superpose(drawn, grid, kernels, [[(0, 0)]], 1, got)
         wanted = exact_region(table, light, frame, picture)
         error = float(np.sqrt(np.mean((got - wanted) ** 2)) / np.std(wanted))
         rows.append(Row(f"rms error, {place}", 1e3 * error, 3.0, "1e-3 of the contrast", "the error asked for"))

@@ -669,37 +669,42 @@ def _traced_image(
 ) -> FloatArray:
     """Electrons a second behind a traced lens: every pixel that of its own channel, (rows, cols).
 
-    A sum over few pictures: scattered, channel by channel, with the point spread functions of their light (summed over the
+    A sum over few pictures, each blurred channel by channel with the point spread functions of its light (summed over the
     table's wavelengths as it is detected). The effects' `transfer`, alike all over the frame, acts on the picture in the image
-    before it is scattered: the two commute but for what the lens changes within the reach of the effect, some 1e-3 of the blur.
+    before it is blurred: the two commute but for what the lens changes within the reach of the effect, some 1e-3 of the blur.
     """
-    from sim.optics import scatter  # here: the compiler's library takes a while to load
+    # here: the compiler's library takes a while to load
+    from sim.optics.distorted import distort
+    from sim.optics.field_mapping import ImageFrame, illumination, source_grid
+    from sim.optics.field_mapping import margin_px as blur_margin_px
+    from sim.optics.kernels import Kernels, Tile
+    from sim.optics.superposition import superpose
 
     if _light_moves(camera, effects):
         raise ValueError(
             "an effect moves the light of a traced lens, which does that itself: leave distortion and lateral colour to the prescription, or image by another model"
         )
     axis = optical_axis_px(camera)
-    frame = scatter.Frame(camera.rows, camera.cols, camera.pixel_pitch_um, camera.fill_factor, axis)
-    margin_px = max(margin_px, scatter.margin_px(table, camera.pixel_pitch_um))
+    frame = ImageFrame(camera.rows, camera.cols, camera.pixel_pitch_um, camera.fill_factor, axis)
+    margin_px = max(margin_px, blur_margin_px(table, camera.pixel_pitch_um))
     target = Grid(camera.rows, camera.cols, oversample, margin_px)
-    carried = placed == "ideal"
-    grid = scatter.source_grid(table, frame, oversample, margin_px) if carried else target
+    distorted = placed == "ideal"
+    grid = source_grid(table, frame, oversample, margin_px) if distorted else target
     period, phases = mosaic.step(camera.cfa), mosaic.phases(camera.cfa)
     image = np.zeros((camera.rows, camera.cols))
     ground, over, pictures = _pictures_by_rank(camera, table, scene, effects, grid)
     for channel, light in zip(camera.channels, ground, strict=True):
         for row0, col0 in phases[channel]:
-            image[row0::period, col0::period] += scatter.illumination(table, light, frame, (row0, col0), period)
+            image[row0::period, col0::period] += illumination(table, light, frame, (row0, col0), period)
     blurs = [effect for effect in _blurring(effects) if type(effect).transfer is not Effect.transfer]
-    tiles: list[scatter.Tile] | None = None
+    tiles: list[Tile] | None = None
     for weight, picture in zip(over, pictures, strict=True):
-        imaged = scatter.carry(picture, grid, target, table, frame) if carried else picture.astype(np.float32)
+        imaged = distort(picture, grid, target, table, frame) if distorted else picture.astype(np.float32)
         # Without blurring effects one picture serves all channels.
         shared = [list(range(len(weight)))] if not blurs else [[k] for k in range(len(weight))]
         spectrum = fft.rfft2(imaged) if blurs else None
         for members in shared:
-            kernels = scatter.Kernels(table, weight[members], frame, oversample, carried=carried)
+            kernels = Kernels(table, weight[members], frame, oversample, distorted=distorted)
             # The first picture, with most of the light, says how large tiles may be.
             tiles = kernels.tiles(target) if tiles is None else tiles
             seen = imaged
@@ -707,7 +712,7 @@ def _traced_image(
                 light = np.sum(weight[members[0]], axis=0)
                 transfer = _effects_transfer(camera, table, light, blurs, target)
                 seen = np.asarray(fft.irfft2(spectrum * transfer, imaged.shape), np.float32)
-            scatter.scatter(seen, target, kernels, [phases[camera.channels[k]] for k in members], period, image, tiles)
+            superpose(seen, target, kernels, [phases[camera.channels[k]] for k in members], period, image, tiles)
     return np.maximum(image, 0.0)
 
 

@@ -268,7 +268,7 @@ class MeasuredOtf(Frozen):
 
 
 class TracedLens(Frozen):
-    """A lens traced from its prescription, that images differently over the field. Frames go through `sim.optics.scatter`.
+    """A lens traced from its prescription, that images differently over the field. Its frames are blurred by `sim.optics.superposition`.
 
     A dump names the table by its `content_hash` alone (many megabytes of samples don't belong into a camera file): trace the
     prescription again, or `LensTable.load` the table, to come back from it. Two such lenses are equal where their tables' hashes are.

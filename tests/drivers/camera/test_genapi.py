@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.camera.genapi import Formula, NodeMap
+from drivers.camera.formula import Formula
+from drivers.camera.genapi import NodeMap
 from drivers.errors import InstrumentError
 
 HEAD = '<RegisterDescription xmlns="http://www.genicam.org/GenApi/Version_1_1">'

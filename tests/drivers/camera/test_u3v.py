@@ -13,7 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.camera.base import capture_together
-from drivers.camera.u3v import PIXEL_FORMATS, GenCp, PixelFormat, U3vCamera
+from drivers.camera.gencp import GenCp
+from drivers.camera.pixel_format import PIXEL_FORMATS, PixelFormat
+from drivers.camera.u3v import U3vCamera
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from mocks.bench import Bench
 from mocks.u3v import U3vDevice, pack_12p

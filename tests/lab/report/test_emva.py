@@ -12,7 +12,8 @@ from lab.fit.noise import fit_noise
 from lab.formats.recording_set import Camera, Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
 from lab.report import render_report
-from lab.report.emva import data_sheets, spectrogram
+from lab.report.emva import data_sheets
+from lab.report.emva_spatial import spectrogram
 from lab.report.provenance import provenance_of
 
 SHAPE = (64, 96)
