@@ -373,7 +373,7 @@ def test_a_full_disk_is_said_and_the_session_resumes(store: Store, monkeypatch: 
 
 
 def _spawn(store: Store, session: str, delay_s: float) -> subprocess.Popen[str]:
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     script = [sys.executable, "-m", "tests.lab.fake_bench", str(store.root), session, str(delay_s)]
     return subprocess.Popen(
         script, cwd=root, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}

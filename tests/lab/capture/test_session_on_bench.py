@@ -23,7 +23,7 @@ from lab.capture.store import Store
 from lab.errors import DeviceError
 from lab.formats.recording_set import inspect
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 RUN = """
 import sys
 from lab.capture.session import CaptureSession

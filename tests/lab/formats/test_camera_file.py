@@ -19,7 +19,7 @@ from sim.optics.imaging import MeasuredOtf, MeasuredPsf, TracedLens, ZernikePupi
 from sim.optics.table import LensTable
 from sim.parameters import declared
 
-LENSES = Path(__file__).parents[2].parent / "shared" / "data" / "lenses"
+LENSES = Path(__file__).parents[3].parent / "shared" / "data" / "lenses"
 
 
 def _with_lens(**changes: object) -> CameraFile:

@@ -19,7 +19,7 @@ from lab.formats import recording_set as recording
 from lab.formats.recording_set import Dark, Flat, Manifest, RecordingError, RecordingSet, read, write
 from sim.spectrum import Spectrum
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
 @pytest.fixture

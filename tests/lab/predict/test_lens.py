@@ -12,7 +12,7 @@ from lab.predict.lens import LensResult, TracedPrescription, parse_glasses, trac
 from lab.report.lens import write_lens_report
 from sim.optics.zmx import parse_zmx
 
-LENS = Path(__file__).parents[1] / "sim/optics/lenses/doublet.zmx"
+LENS = Path(__file__).parents[2] / "sim/optics/lenses/doublet.zmx"
 TILTED = LENS.with_name("tilted.zmx")
 
 

@@ -23,7 +23,7 @@ from sim.scene.catalogue import SCENES, NamedScene
 from sim.sensor.electrons import capacity_e
 from sim.spectrum import Spectrum
 
-LENSES = Path(__file__).parents[2].parent / "shared" / "data" / "lenses"
+LENSES = Path(__file__).parents[3].parent / "shared" / "data" / "lenses"
 Run = Callable[..., int]
 
 
@@ -224,7 +224,7 @@ def scene_row(scene: type[NamedScene]) -> str:
 
 
 def test_the_documentation_is_what_the_declarations_say() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "simulate.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "simulate.md").read_text()
     lines = text.splitlines()
     for model in (CameraModel, Lens):
         for key, quantity in declared(model).items():

@@ -15,7 +15,7 @@ from lab.formats import recording_set as recording
 from lab.formats.importers import read_foreign
 from lab.formats.importers.emva1288 import parse_descriptor, read_emva1288
 
-DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "emva1288_ccd"
+DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "emva1288_ccd"
 
 
 def image(file: Path, mean_dn: float, bits: int = 12, seed: int = 0, shape: tuple[int, int] = (20, 30)) -> None:

@@ -12,7 +12,7 @@ from lab.fit.stereo import fit_stereo
 from lab.formats import recording_set as recording
 from lab.formats.importers.raw_folder import read_checkerboard_pairs, read_raw_folder
 
-DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "opencv_stereo"
+DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "opencv_stereo"
 HEADER = (
     "frame,kind,side,exposure_s,wavelength_nm,radiance,region,corners,chart,screen.pose,screen.cell_camera_px,target\n"
 )
