@@ -48,7 +48,7 @@ TAGS = [
     {"name": "sessions", "description": "Capturing: start, follow, pause, resume, abort."},
     {"name": "captures", "description": "What was captured: pictures and raw frames."},
     {"name": "recordings", "description": "Recording sets that are sent in."},
-    {"name": "jobs", "description": "Fits, validations, diagnoses, reports."},
+    {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
     {"name": "knowledge", "description": "What the models know."},
 ]
 open_to_all = APIRouter()
@@ -132,8 +132,8 @@ def create_app(
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         yield
+        app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
-        app.state.service.jobs.close()
 
     app = FastAPI(
         title="calibench",

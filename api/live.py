@@ -12,14 +12,17 @@ from collections.abc import AsyncIterator, Callable
 import anyio
 
 from api.errors import Conflict
-from lab.capture.sequences.calibration import Calibration
+from lab.capture.sequences.calibration import Calibration, full_calibration
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.errors import DeviceError, InputError
+from lab.errors import Cancelled, DeviceError, InputError
+from lab.pipeline import Capturer, CaptureRequest
 
 log = logging.getLogger(__name__)
 RUNS = frozenset({"running", "paused"})
+#: How often (s) a job looks at the session that it captures, and how long it waits for the end of an aborted one.
+POLL_S, PATIENCE_S = 0.2, 60.0
 
 
 class LiveSession:
@@ -171,6 +174,42 @@ class LiveSessions:
             self._live[session_id] = live
             live.begin(capture)
 
+    def capturer(self, station: Station) -> Capturer:
+        """How a pipeline captures on `station`: as a session of this service, which can be followed, paused and aborted like any
+        other. Joins a session that is under way."""
+
+        def captured(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:
+            session_id = request.session
+            try:
+                if not session_id:
+                    calibration = request.calibration or full_calibration(station, request.quick)
+                    session_id = self.start(station, calibration, request.name, request.notes)
+                elif self.find(session_id) is None and self._store.session(session_id).state != "finished":
+                    self.resume(session_id, station)
+            except Conflict as error:
+                raise InputError(f"{error}; then start the job again") from error
+            live = self._live.get(session_id)
+            while live is not None and not live.join(POLL_S):
+                try:
+                    if live.latest is not None:
+                        tell(live.latest)
+                except Cancelled:
+                    self._end(session_id, live)
+                    raise
+            info = self._store.session(session_id)
+            if info.state == "finished":
+                return session_id
+            raise DeviceError(f"session {session_id} is {info.state}: {info.error}; resume it and start the job again")
+
+        return captured
+
+    def _end(self, session_id: str, live: LiveSession) -> None:
+        """Abort a run and wait for its end."""
+        if live.capture is not None:
+            live.capture.abort("the job that captured was cancelled")
+        if not live.join(PATIENCE_S):
+            log.error("session %s didn't end within %g s; look after its instruments", session_id, PATIENCE_S)
+
     def pause(self, session_id: str) -> None:
         """Pause when the step under way is done. Raises Conflict where nothing can be paused now."""
         capture, live = self._running(session_id)
@@ -186,7 +225,7 @@ class LiveSessions:
         capture, _ = self._running(session_id)
         capture.abort(reason)
 
-    def close(self, patience_s: float = 60.0) -> None:
+    def close(self, patience_s: float = PATIENCE_S) -> None:
         """End every run in good order: shutters closed, sessions resumable."""
         with self._lock:
             self._closed = True

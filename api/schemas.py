@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from api.keys import Permission
 from lab.capture.session import Progress
 from lab.capture.store import Run
+from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from sim.camera import Side
 
 #: Databases that forget the time zone give back UTC.
@@ -26,7 +27,7 @@ SessionState = Literal[
     "failed",
     "finished",
 ]
-JobKind = Literal["fit", "validate", "diagnose", "report"]
+JobKind = Literal["fit", "validate", "diagnose", "report", "pipeline"]
 JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
@@ -148,11 +149,39 @@ class Capture(Schema):
 
 
 class JobStart(Schema):
-    """What to compute."""
+    """What to compute. `pipeline`: everything, from what is left to capture to the report."""
 
     model_config = ConfigDict(json_schema_extra={"example": {"kind": "diagnose"}})
 
     kind: JobKind
+    resolve: bool = Field(
+        default=False,
+        description="pipeline of a session: while rivals are left, take the capture that tells them apart and diagnose again",
+    )
+    station: str | None = Field(
+        default=None,
+        max_length=100,
+        description="pipeline of a session: a station with the same instruments at other addresses; null: as it began",
+    )
+
+
+class PipelineStart(SessionStart):
+    """A new session, and the whole pipeline on it."""
+
+    model_config = ConfigDict(json_schema_extra={"example": {"station": "bench", "quick": True, "resolve": True}})
+
+    resolve: bool = Field(
+        default=False,
+        description="while rivals are left, take the capture that tells them apart and diagnose again",
+    )
+
+
+class PipelineResults(Schema):
+    """What a pipeline found; each part as `calibench fit`, `validate` and `diagnose` write it with `--json`."""
+
+    fit: FitResult
+    validation: ValidationResult
+    diagnosis: DiagnosisResult
 
 
 class Job(Schema):

@@ -18,7 +18,8 @@ from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
 from lab.capture.store import SessionInfo, Store
 from lab.errors import InputError
-from lab.jobs import JobInfo, JobRunner, ReportFile
+from lab.jobs import JobInfo, JobRunner
+from lab.pipeline import ReportFile
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Service:
         )
 
     def report(self, job_id: str) -> str:
-        """The page that a report's job wrote. Raises InputError where it is gone."""
+        """The page that a job of the kind `report` or `pipeline` wrote. Raises InputError where it is gone."""
         written = ReportFile.model_validate(self.store.result(job_id).document)
         try:
             return (self.store.root / written.path).read_text(encoding="utf-8")
@@ -94,6 +95,7 @@ Here = Annotated[Service, Depends(_service)]
 READ = Depends(Demand(Permission.READ))
 OPERATE = Depends(Demand(Permission.OPERATE))
 CALIBRATE = Depends(Demand(Permission.CALIBRATE))
+ADMIN = Depends(Demand(Permission.ADMIN))
 SessionId = Annotated[str, PathParameter(pattern=r"^[0-9A-Za-z-]{1,40}$")]
 HexId = Annotated[str, PathParameter(pattern=r"^[0-9a-f]{16}$")]
 RegistryId = Annotated[int, PathParameter(ge=1, le=2**31 - 1)]

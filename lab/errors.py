@@ -22,3 +22,7 @@ class NotDetermined(Exception):
         super().__init__(f"{step}: {reason}")
         self.step = step
         self.reason = reason
+
+
+class Cancelled(Exception):
+    """Raised by a progress callback to end the work that calls it."""

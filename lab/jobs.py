@@ -1,8 +1,9 @@
-"""Long work as jobs: fits, validation, diagnosis and reports on Dask, behind a table of our own.
+"""Long work as jobs: every goal of `lab.pipeline`, in the background, with a row each in a table of the registry.
 
-The table is what everyone asks: state, progress, result by id. Dask only carries the work: in this process by default, or
-on a cluster whose address the settings give. A task gets references (the store, a session's id or a recording set's folder),
-never arrays. Cancelling is cooperative: it sets a mark in the table, and the task ends at its next word of progress.
+The table holds state, progress and error; results are kept under the job's id. A job that needs no instrument runs on Dask: in
+this process by default, or on a cluster whose address the settings give. A job that captures runs in a thread of this process,
+because the instruments are connected to this computer. A job is given references (the store's address, a session's id or a
+recording set's folder), never arrays. `cancel` sets a mark in the table; the job ends at its next progress.
 """
 
 from __future__ import annotations
@@ -11,25 +12,27 @@ import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable
 from datetime import datetime
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, cast
 
 import sqlalchemy as sa
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
 from lab.capture.store import JobRow, JobState, Lock, Store, now
-from lab.errors import InputError, NotDetermined
-from lab.formats.recording_set import RecordingSet, read
-from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+from lab.errors import Cancelled, DeviceError, InputError, NotDetermined
+from lab.pipeline import (
+    STEPS,
+    Capturer,
+    CaptureRequest,
+    Goal,
+    PipelineProgress,
+    PipelineRequest,
+    run_pipeline,
+    source_recordings,
+)
 from sim.parameters import Frozen
 
-M = TypeVar("M", bound=BaseModel)
-JobKind = Literal["fit", "validate", "diagnose", "report"]
-#: Called with what is being done and the share of the work that is done, 0..1.
-Progress = Callable[[str, float], None]
-#: Words of progress are written to the table so often at most (s).
+#: The least time (s) between two rows of progress.
 _WRITE_EVERY_S = 0.2
 
 
@@ -39,7 +42,7 @@ class JobInfo(Frozen):
     model_config = ConfigDict(frozen=True, extra="ignore", from_attributes=True)
 
     id: str
-    kind: JobKind
+    kind: Goal
     source: str
     state: JobState
     progress: float
@@ -52,100 +55,22 @@ class JobInfo(Frozen):
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more will come of it."""
+        """Whether the job has ended."""
         return self.state in ("done", "failed", "cancelled")
 
 
-class Cancelled(Exception):
-    """Raised in a task at its word of progress after someone asked to cancel it."""
-
-
-def recordings_of(store: Store, source: str) -> RecordingSet:
-    """The recordings that a command is given: a stored session's id, or a recording set's folder.
-
-    Raises InputError if it is neither, or can't be used.
-    """
-    if store.has_session(source):
-        return store.recording_set(source)
-    if Path(source).exists():
-        return read(source)
-    raise InputError(f"{source}: neither a recording set's folder nor a session in {store.root}; correct it")
-
-
-# --- the tasks -----------------------------------------------------------------------------------------------------------
-
-
-class ReportFile(Frozen):
-    """Where a report lies: `path` in the data folder."""
-
-    path: str
-
-
-class _Task:
-    """What the verbs of `lab` are given: the recordings of a source, and what was found of them before."""
-
-    def __init__(self, store: Store, source: str, job_id: str, progress: Progress) -> None:
-        self.store, self.source, self.job_id, self.progress = store, source, job_id, progress
-        self.recordings = recordings_of(store, source)
-        #: A finished session doesn't change any more; a folder may have, so nothing old is taken for it.
-        self.is_settled = store.has_session(source) and store.session(source).state == "finished"
-
-    def _latest(self, kind: JobKind, model: type[M], make: Callable[[], M]) -> M:
-        """The newest stored result of a kind, else one made now, which is stored as well."""
-        if self.is_settled:
-            for result in self.store.results(self.source, kind)[:1]:
-                return model.model_validate(result.document)
-        made = make()
-        self.store.add_result(kind, self.source, made.model_dump(mode="json"))
-        return made
-
-    def fit(self) -> FitResult:
-        from lab.fit import fit_recording_set
-
-        return fit_recording_set(self.recordings, self.progress)
-
-    def validate(self) -> ValidationResult:
-        from lab.predict.validate import validate
-
-        return validate(self.recordings, self._latest("fit", FitResult, self.fit))
-
-    def diagnose(self) -> DiagnosisResult:
-        from lab.diagnose import examine
-
-        fitted = self._latest("fit", FitResult, self.fit)
-        return examine(self.recordings, fitted, self.progress, pictures=True).result
-
-    def report(self) -> ReportFile:
-        from lab.report import provenance_of, write_report
-
-        fitted = self._latest("fit", FitResult, self.fit)
-        validated = self._latest("validate", ValidationResult, self.validate)
-        diagnosed = self._latest("diagnose", DiagnosisResult, self.diagnose)
-        runs = self.store.runs(self.source) if self.store.has_session(self.source) else []
-        path = f"reports/{self.job_id}.html"
-        self.progress("writing the report", 0.95)
-        provenance = provenance_of(self.recordings, runs[-1].instruments if runs else None)
-        write_report(self.store.root / path, self.recordings, fitted, validated, diagnosed, provenance)
-        return ReportFile(path=path)
-
-
-TASKS: dict[str, Callable[[_Task], BaseModel]] = {
-    "fit": _Task.fit,
-    "validate": _Task.validate,
-    "diagnose": _Task.diagnose,
-    "report": _Task.report,
-}
+# --- the work ------------------------------------------------------------------------------------------------------------
 
 
 class _Reporter:
-    """Writes a task's progress to the table, and raises `Cancelled` where someone asked for that."""
+    """Writes a job's progress to the table, and raises `Cancelled` where someone asked for that."""
 
     def __init__(self, store: Store, job_id: str) -> None:
         self.store, self.job_id = store, job_id
         self._written_s = 0.0
         self._lock = threading.Lock()
 
-    def __call__(self, message: str, share: float) -> None:
+    def __call__(self, progress: PipelineProgress) -> None:
         with self._lock:
             if time.monotonic() - self._written_s < _WRITE_EVERY_S:
                 return
@@ -154,11 +79,14 @@ class _Reporter:
             row = db.get_one(JobRow, self.job_id)
             if row.cancel_requested:
                 raise Cancelled
-            row.progress, row.message = min(max(share, 0.0), 1.0), message
+            row.progress = min(max(progress.share, 0.0), 1.0)
+            row.message = ": ".join(part for part in (progress.step, progress.remark or progress.what) if part)
 
 
-def run_job(root: str, database_url: str | None, job_id: str) -> None:
-    """Do a job, wherever this runs; everything that comes of it goes to the table. Never raises."""
+def run_job(
+    root: str, database_url: str | None, job_id: str, resolve: bool = False, capturer: Capturer | None = None
+) -> None:
+    """Do a job, wherever this runs; what it finds goes to the registry. Never raises."""
     store = Store(root, database_url)
     try:
         with store.transaction() as db:
@@ -169,20 +97,36 @@ def run_job(root: str, database_url: str | None, job_id: str) -> None:
                 row.state, row.finished = "cancelled", now()
                 return
             row.state, row.started = "running", now()
-            kind, source = row.kind, row.source
+            kind, source = cast(Goal, row.kind), row.source
         try:
-            result = TASKS[kind](_Task(store, source, job_id, _Reporter(store, job_id)))
+            request = _request(store, kind, source, job_id, resolve)
+            run_pipeline(request, _Reporter(store, job_id), store=store, capturer=capturer)
         except Cancelled:
             _over(store, job_id, "cancelled", None)
-        except (InputError, NotDetermined) as error:
+        except (InputError, DeviceError, NotDetermined) as error:
             _over(store, job_id, "failed", str(error))
         except Exception as error:
             _over(store, job_id, "failed", f"{type(error).__name__}: {error}; this is a defect of calibench, report it")
         else:
-            store.add_result(kind, source, result.model_dump(mode="json"), job_id)
             _over(store, job_id, "done", None)
     finally:
         store.close()
+
+
+def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: bool) -> PipelineRequest:
+    """What a job asks of the pipeline. A pipeline on a session captures what is left of it, and computes every step anew."""
+    page = store.root / "reports" / f"{job_id}.html"
+    if kind in ("capture", "pipeline") and store.has_session(source):
+        capture = CaptureRequest(session=source)
+        return PipelineRequest(kind, capture=capture, source=source, job_id=job_id, resolve=resolve)
+    return PipelineRequest(
+        kind,
+        recordings=source_recordings(source, lambda: store),
+        source=source,
+        job_id=job_id,
+        reuse=kind != "pipeline",
+        report_file=page,
+    )
 
 
 def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None:
@@ -197,10 +141,10 @@ def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None
 
 
 class JobRunner:
-    """Takes jobs and has them done. One per process; `close` it (or use it in `with`) so that none is left behind.
+    """Takes jobs and has them done. One per process; `close` it, or use it in `with`, so that no job is left behind.
 
-    Jobs of a runner whose process ended are marked failed by whichever runner starts next: a runner holds a lock as long
-    as it lives.
+    A runner holds a lock as long as it lives. Jobs of a runner whose process ended are marked as failed by the next runner
+    that starts.
     """
 
     def __init__(
@@ -214,7 +158,7 @@ class JobRunner:
         self._lock = self._lock_of(self.id)
         self._lock.acquire()
         self._client: Any = None
-        self._futures: dict[str, Any] = {}
+        self._started: dict[str, Any] = {}  # Dask forgets a task whose future nobody holds
         self._starting = threading.Lock()
         self.fail_orphans()
 
@@ -271,12 +215,18 @@ class JobRunner:
                     ) from error
             return self._client
 
-    def submit(self, kind: JobKind, source: str) -> str:
-        """Queue a job on a session's id or a recording set's folder; its id is returned. Raises InputError for a kind
-        that there is no task for."""
-        if kind not in TASKS:
-            raise InputError(f"job {kind!r}: no such work; choose from {', '.join(TASKS)}")
-        client = self._dask()
+    def submit(self, kind: Goal, source: str, *, resolve: bool = False, capturer: Capturer | None = None) -> str:
+        """Queue a job on a session's id or a recording set's folder; returns the job's id.
+
+        `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`: of a
+        pipeline, take the captures that tell the remaining rivals apart. Raises InputError for an unknown kind, and for
+        `resolve` where the job can't capture.
+        """
+        if kind not in STEPS:
+            raise InputError(f"job {kind!r}: no such work; choose from {', '.join(STEPS)}")
+        if resolve and (kind != "pipeline" or capturer is None):
+            raise InputError(f"job {kind}: only a pipeline on a session's station can resolve; leave resolve out")
+        client = self._dask() if capturer is None else None
         job_id = secrets.token_hex(8)
         with self.store.transaction() as db:
             db.add(
@@ -289,9 +239,15 @@ class JobRunner:
                     created=now(),
                 )
             )
-        self._futures[job_id] = client.submit(
-            run_job, str(self.store.root), self.store.settings.database_url, job_id, key=f"job-{job_id}", pure=False
-        )
+        work = (str(self.store.root), self.store.settings.database_url, job_id)
+        if client is None:
+            thread = threading.Thread(
+                target=run_job, args=(*work, resolve, capturer), name=f"job {job_id}", daemon=True
+            )
+            self._started[job_id] = thread
+            thread.start()
+        else:
+            self._started[job_id] = client.submit(run_job, *work, key=f"job-{job_id}", pure=False)
         return job_id
 
     def job(self, job_id: str) -> JobInfo:
@@ -309,7 +265,7 @@ class JobRunner:
             return [JobInfo.model_validate(row) for row in rows]
 
     def cancel(self, job_id: str) -> JobInfo:
-        """Ask a job to end: at once if it is queued, else at its next word of progress. A finished job stays as it is."""
+        """Ask a job to end: at once if it is queued, else at its next progress. A finished job stays as it is."""
         with self.store.transaction() as db:
             row = db.get(JobRow, job_id)
             if row is not None:
@@ -328,15 +284,16 @@ class JobRunner:
         return info
 
     def close(self) -> None:
-        """End in good order: jobs that are under way are cancelled and marked so."""
+        """Cancel the jobs that are under way, wait for their end, and let go of Dask."""
         for info in self.jobs():
-            if info.id in self._futures and not info.is_over:
+            if info.id in self._started and not info.is_over:
                 self.cancel(info.id)
+        with contextlib.suppress(InputError, sa.exc.SQLAlchemyError):
+            for job_id in self._started:
+                self.wait(job_id, timeout_s=10.0)
         if self._client is not None:
             with contextlib.suppress(Exception):
-                for job_id in self._futures:
-                    self.wait(job_id, timeout_s=10.0)
-            self._client.close()
+                self._client.close()
             self._client = None
         self._lock.release()
         self._lock.path.unlink(missing_ok=True)

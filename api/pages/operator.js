@@ -220,9 +220,12 @@ function jobRow(job) {
     cancel.addEventListener("click", guarded("job-problem", () => post(`/jobs/${job.id}/cancel`)));
     actions.append(cancel);
   } else if (job.state === "done") {
-    const where = job.kind === "report" ? `${api}/jobs/${job.id}/report` : `${api}/jobs/${job.id}/result`;
-    const label = job.kind === "report" ? "Report" : "JSON";
-    actions.append(element("a", { href: where, textContent: label, target: "_blank", rel: "noopener" }));
+    const made = { report: ["report"], pipeline: ["report", "result"] }[job.kind] ?? ["result"];
+    for (const what of made) {
+      const label = what === "report" ? "Report" : "JSON";
+      const link = { href: `${api}/jobs/${job.id}/${what}`, textContent: label, target: "_blank", rel: "noopener" };
+      actions.append(element("a", link), " ");
+    }
   }
   const state = stateCell(job);
   if (job.state === "running") {
@@ -248,7 +251,7 @@ async function select(session) {
   $("session").hidden = false;
   $("session-problem").textContent = "";
   $("session-title").textContent = session.name || session.id;
-  const buttons = ["fit", "validate", "diagnose", "report"].map((kind) => {
+  const buttons = ["fit", "validate", "diagnose", "report", "pipeline"].map((kind) => {
     const button = element("button", { textContent: kind[0].toUpperCase() + kind.slice(1) });
     button.addEventListener(
       "click",

@@ -1,18 +1,21 @@
-"""Long work: fit, validate, diagnose and report as jobs; their results and reports."""
+"""Long work as jobs: fit, validate, diagnose, report, and the whole pipeline; their results and reports."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter, HTTPException, Response
+from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 from sse_starlette.sse import EventSourceResponse
 
 from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
-from api.schemas import Job, JobStart
-from api.security import REPORT_POLICY
-from api.service import CALIBRATE, READ, Here, HexId, Service, SessionId
+from api.keys import Permission
+from api.routes.sessions import calibration_of
+from api.schemas import Job, JobStart, PipelineResults, PipelineStart
+from api.security import REPORT_POLICY, Demand
+from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.jobs import JobInfo
+from lab.pipeline import ReportFile
 
 router = APIRouter()
 
@@ -26,10 +29,9 @@ def _job(service: Service, info: JobInfo) -> Job:
     )
 
 
-def _started(service: Service, start: JobStart, source: str, response: Response) -> Job:
-    job = _job(service, service.jobs.job(service.jobs.submit(start.kind, source)))
-    response.headers["Location"] = f"/api/v1/jobs/{job.id}"
-    return job
+def _accepted(service: Service, job_id: str, response: Response) -> Job:
+    response.headers["Location"] = f"/api/v1/jobs/{job_id}"
+    return _job(service, service.jobs.job(job_id))
 
 
 @router.post(
@@ -37,13 +39,41 @@ def _started(service: Service, start: JobStart, source: str, response: Response)
     status_code=202,
     tags=["jobs"],
     dependencies=[CALIBRATE],
-    responses=answers(401, 403, 404, 422),
+    responses=answers(401, 403, 404, 409, 422),
 )
-def start_session_job(service: Here, session_id: SessionId, start: JobStart, response: Response) -> Job:
-    """Start work on a session; `Location` says where to look. Validation, diagnosis and report rest on the newest fit, and
-    make one where there is none."""
-    service.session(session_id)
-    return _started(service, start, session_id, response)
+def start_session_job(
+    service: Here, request: Request, session_id: SessionId, start: JobStart, response: Response
+) -> Job:
+    """Start work on a session; `Location` says where to look. `validate`, `diagnose` and `report` rest on the newest results of a
+    finished session, and make those that are missing. `pipeline` captures what is left of the session, then makes all of them
+    anew; where it captures or resolves, the key's scope has to be `admin`."""
+    info = service.session(session_id)
+    if start.kind != "pipeline":
+        if start.station is not None:
+            raise HTTPException(422, f"station: a job of the kind {start.kind} doesn't capture; leave it out")
+        return _accepted(service, service.jobs.submit(start.kind, session_id, resolve=start.resolve), response)
+    if start.resolve or info.state != "finished":
+        Demand(Permission.ADMIN)(request, None, None)
+    station = service.station(start.station) if start.station is not None else service.store.station(session_id)
+    job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
+    return _accepted(service, job_id, response)
+
+
+@router.post(
+    "/pipelines",
+    status_code=202,
+    tags=["jobs"],
+    dependencies=[ADMIN],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def start_pipeline(service: Here, start: PipelineStart, response: Response) -> Job:
+    """Start a session and the whole pipeline on it: capture, fit, validate, diagnose, resolve, report. The job's `session_id` is the
+    session, which can be followed, paused and aborted as any other. 409 while another runs on the same instruments. The key's
+    scope has to be `admin`, for this captures and computes."""
+    station = service.station(start.station)
+    session_id = service.live.start(station, calibration_of(station, start), start.name, start.notes)
+    job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
+    return _accepted(service, job_id, response)
 
 
 @router.post(
@@ -54,8 +84,11 @@ def start_session_job(service: Here, session_id: SessionId, start: JobStart, res
     responses=answers(401, 403, 404, 422),
 )
 def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, response: Response) -> Job:
-    """Start work on recordings that were sent in; as on a session."""
-    return _started(service, start, str(service.recordings(recordings_id)), response)
+    """Start work on recordings that were sent in. They have no station, so nothing can be resolved."""
+    folder = str(service.recordings(recordings_id))
+    if start.station is not None:
+        raise HTTPException(422, "station: recordings that were sent in have none; leave it out")
+    return _accepted(service, service.jobs.submit(start.kind, folder, resolve=start.resolve), response)
 
 
 @router.get("/jobs", tags=["jobs"], dependencies=[READ], responses=answers(401))
@@ -78,7 +111,8 @@ def get_job(service: Here, job_id: HexId) -> Job:
     responses=answers(401, 403, 404, 422),
 )
 def cancel_job(service: Here, job_id: HexId) -> Job:
-    """Ask a job to end: at once if it is queued, else at its next word of progress. A finished one stays as it is."""
+    """Ask a job to end: at once if it is queued, else at its next progress; a session that it captures is aborted and can be
+    resumed. A finished job stays as it is."""
     service.job(job_id)
     return _job(service, service.jobs.cancel(job_id))
 
@@ -110,19 +144,28 @@ def _done(service: Service, job_id: str) -> JobInfo:
     return info
 
 
+REPORTS = ("report", "pipeline")
+
+
 @router.get(
     "/jobs/{job_id}/result",
     tags=["jobs"],
     dependencies=[READ],
-    response_model=FitResult | ValidationResult | DiagnosisResult,
+    response_model=FitResult | ValidationResult | DiagnosisResult | PipelineResults,
     responses=answers(401, 404, 409, 422),
 )
 def job_result(service: Here, job_id: HexId) -> JSONResponse:
-    """What `calibench fit`, `validate` or `diagnose` write with `--json`."""
-    if _done(service, job_id).kind == "report":
+    """What `calibench fit`, `validate` or `diagnose` write with `--json`; of a pipeline, all three."""
+    kind = _done(service, job_id).kind
+    if kind == "report":
         raise HTTPException(404, f"job {job_id} made a report; GET /api/v1/jobs/{job_id}/report")
     # As it was stored, byte for byte the schema: no second serialisation that could differ.
-    return JSONResponse(service.store.result(job_id).document)
+    document = service.store.result(job_id).document
+    if kind == "pipeline":
+        kept = ReportFile.model_validate(document).results
+        parts = {"fit": "fit", "validation": "validate", "diagnosis": "diagnose"}
+        document = {part: service.store.result(kept[goal]).document for part, goal in parts.items()}
+    return JSONResponse(document)
 
 
 @router.get(
@@ -133,8 +176,8 @@ def job_result(service: Here, job_id: HexId) -> JSONResponse:
     responses=answers(401, 404, 409, 422),
 )
 def job_report(service: Here, job_id: HexId) -> HTMLResponse:
-    """The report of a job of the kind `report`: one page that needs no network, and is given none."""
-    if _done(service, job_id).kind != "report":
+    """The report of a job of the kind `report` or `pipeline`: one page that needs no network, and is given none."""
+    if _done(service, job_id).kind not in REPORTS:
         raise HTTPException(404, f"job {job_id} made no report; GET /api/v1/jobs/{job_id}/result")
     page = known(f"the report of job {job_id} is gone; start it again", lambda: service.report(job_id))
     return HTMLResponse(page, headers={"Content-Security-Policy": REPORT_POLICY})

@@ -81,7 +81,8 @@ def _session(service: Service, session_id: str) -> Session:
     return Session(**_fields(service, service.session(session_id)))
 
 
-def _calibration(station: LabStation, start: SessionStart) -> Calibration:
+def calibration_of(station: LabStation, start: SessionStart) -> Calibration:
+    """The sequences that are asked for. Raises InputError where the station lacks what one of them needs."""
     everything = full_calibration(station, start.quick)
     if start.sequences is None:
         return everything
@@ -110,7 +111,7 @@ def list_sessions(service: Here) -> list[Session]:
 def start_session(service: Here, start: SessionStart, response: Response) -> Session:
     """Start a session; it runs on its own, follow its events. 409 while another runs on the same instruments."""
     station = service.station(start.station)
-    session_id = service.live.start(station, _calibration(station, start), start.name, start.notes)
+    session_id = service.live.start(station, calibration_of(station, start), start.name, start.notes)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
     return _session(service, session_id)
 

@@ -7,23 +7,35 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import IO
 
-from lab.errors import DeviceError
+from lab.cli.exit_codes import EXIT_INPUT
+from lab.errors import DeviceError, InputError
 
 BENCH_START_S, BENCH_END_S = 60.0, 10.0
 
 
 @contextlib.contextmanager
-def mock_bench() -> Iterator[Path]:
-    """Start the mock bench as a process of its own, and give its station file; it ends with the block, or with us."""
+def mock_bench(conceal: Sequence[str]) -> Iterator[Path]:
+    """Start `calibench bench` and give its station file; the bench ends with the block, or with this process.
+
+    `conceal`: what the bench's option of that name takes, one item an effect. Raises InputError with the bench's own line where
+    it refuses an option, DeviceError where it doesn't start.
+    """
     with tempfile.TemporaryDirectory(prefix="calibench-bench-") as folder:
         file = Path(folder) / "station.toml"
         command = [sys.executable, "-m", "lab.cli", "bench", "--station", str(file), "--with-parent"]
-        # Of its own session: Ctrl-C is for us, and the bench has to be there while the shutter closes.
+        command += [f"--conceal={item}" for item in conceal]
+        # A session of its own: Ctrl-C ends this process alone, and the bench serves until the shutter is closed.
         bench = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
         )
         try:
             _await_ready(bench)
@@ -39,16 +51,38 @@ def mock_bench() -> Iterator[Path]:
 
 
 def _await_ready(bench: subprocess.Popen[str]) -> None:
-    """Wait until the bench says that it is ready; what it says afterwards is read and dropped."""
-    ready = threading.Event()
+    """Wait until the bench prints `ready`. Afterwards its output is dropped, and its errors go to our stderr."""
+    ready, ended = threading.Event(), threading.Event()
+    complaints: list[str] = []
 
-    def listen() -> None:
-        assert bench.stdout is not None
-        for line in bench.stdout:
-            if line.strip() == "ready":
-                ready.set()
+    def listen(lines: IO[str]) -> None:
+        with lines:
+            for line in lines:
+                if line.strip() == "ready":
+                    ready.set()
+        ended.set()
         ready.set()
 
-    threading.Thread(target=listen, daemon=True).start()
-    if not ready.wait(BENCH_START_S) or bench.poll() is not None:
-        raise DeviceError("mock bench: it doesn't start; see what `calibench bench` says")
+    def complain(lines: IO[str]) -> None:
+        with lines:
+            for line in lines:
+                if ready.is_set() and not ended.is_set():
+                    print(line, end="", file=sys.stderr)
+                else:
+                    complaints.append(line.strip())
+
+    assert bench.stdout is not None
+    assert bench.stderr is not None
+    threading.Thread(target=listen, args=(bench.stdout,), daemon=True).start()
+    complaining = threading.Thread(target=complain, args=(bench.stderr,), daemon=True)
+    complaining.start()
+    if not ready.wait(BENCH_START_S):
+        raise DeviceError(f"mock bench: not ready within {BENCH_START_S:g} s; see what `calibench bench` prints")
+    if not ended.is_set():
+        return
+    code = bench.wait(BENCH_END_S)
+    complaining.join(BENCH_END_S)
+    why = "\n".join(line.removeprefix("calibench: ") for line in complaints if line)
+    if code == EXIT_INPUT and why:
+        raise InputError(why)
+    raise DeviceError(f"mock bench: it doesn't start ({why or f'exit code {code}'}); see what `calibench bench` prints")

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import check_writable, out, write_json
+from lab.cli.console import check_writable, err, make_folder, out, write_json
 from lab.cli.exit_codes import EXIT_CHECK
 from lab.cli.sources import (
     FitFile,
@@ -17,18 +17,17 @@ from lab.cli.sources import (
     Model,
     Source,
     camera_path,
-    examined,
-    fit_or_read,
-    instruments_of,
+    existing_store,
+    read_fit,
     read_models,
     recordings_of,
-    save_models,
-    validated,
+    run_here,
 )
 from lab.cli.tables import print_diagnosis, print_validation
 from lab.errors import InputError
+from lab.pipeline import PipelineRequest, PipelineResult
 
-#: Drawn cameras from which a threshold is taken: a standard deviation of fewer is known to a quarter and worse.
+#: The fewest drawn cameras for a threshold: of ten draws, the standard deviation is known to 1 / sqrt(2 (10 - 1)) = 24 %.
 FEWEST_DRAWS = 10
 
 commands = typer.Typer()
@@ -39,7 +38,10 @@ def validate(source: Source, json: Json = None, fit_file: FitFile = None, model:
     """Predicted against measured, for what the fit didn't use. Exit code 4 where a check falls short."""
     check_writable(json)
     recordings = recordings_of(source)
-    result = validated(recordings, fit_or_read(recordings, fit_file), read_models(recordings, model))
+    models = read_models(recordings, model)
+    request = PipelineRequest("validate", recordings=recordings, fit=read_fit(fit_file), models=models)
+    result = run_here(request).validation
+    assert result is not None
     if str(json) != "-":
         print_validation(result)
     write_json(result, json)
@@ -74,13 +76,36 @@ def diagnose(
     recordings = recordings_of(source)
     if save is not None:
         camera_path(recordings, recordings.sides[0], save)
-    baseline = read_models(recordings, model)
-    found = examined(recordings, fit_or_read(recordings, fit_file), baseline, pictures=False, bootstrap=bootstrap)
+    request = PipelineRequest(
+        "diagnose",
+        recordings=recordings,
+        fit=read_fit(fit_file),
+        models=read_models(recordings, model),
+        pictures=False,
+        bootstrap=bootstrap,
+    )
+    found = run_here(request)
+    assert found.diagnosis is not None
     if str(json) != "-":
-        print_diagnosis(found.result)
-    write_json(found.result, json)
+        print_diagnosis(found.diagnosis)
+    write_json(found.diagnosis, json)
     if save is not None:
-        save_models(recordings, found, save)
+        _save_models(found, save)
+
+
+def _save_models(found: PipelineResult, path: Path) -> None:
+    """Write each camera with what was found, and say on stderr what it has that the baseline hasn't."""
+    from lab.formats.camera_file import write_camera
+
+    assert found.diagnosis is not None
+    for side, content in found.improved.items():
+        file = camera_path(found.recordings, side, path)
+        make_folder(file.parent)
+        write_camera(file, content)
+        acting = ", ".join(one.name for one in content.effects) or "no effect beside the baseline"
+        err.print(escape(f"camera: {file}: {acting}"))
+    for item in found.diagnosis.unexplained:
+        err.print(escape(f"{item.side}: {item.correction}"))
 
 
 @commands.command()
@@ -90,14 +115,16 @@ def report(
     fit_file: FitFile = None,
 ) -> None:
     """Fit, validate, diagnose, and write one page with pictures."""
-    from lab.report import provenance_of, write_report
-
     check_writable(out_file)
-    recordings = recordings_of(source)
-    fitted = fit_or_read(recordings, fit_file)
-    validation, diagnosis = validated(recordings, fitted), examined(recordings, fitted).result
-    provenance = provenance_of(recordings, instruments_of(source))
-    out.print(f"report: {write_report(out_file, recordings, fitted, validation, diagnosis, provenance)}")
+    request = PipelineRequest(
+        "report",
+        recordings=recordings_of(source),
+        source=source,
+        keep=False,
+        fit=read_fit(fit_file),
+        report_file=out_file,
+    )
+    out.print(f"report: {run_here(request, existing_store()).report}")
 
 
 @commands.command()

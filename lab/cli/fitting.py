@@ -10,11 +10,13 @@ from rich.markup import escape
 
 from lab.cli.console import check_writable, err, make_folder, write_json
 from lab.cli.exit_codes import EXIT_CHECK
-from lab.cli.sources import Json, Source, fit_or_read, open_store, read_result, recordings_of
+from lab.cli.sources import Json, Source, existing_store, recordings_of, run_here
 from lab.cli.tables import print_comparison, print_fit
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
+from lab.formats.result_file import read_result
 from lab.formats.results import FitResult
+from lab.pipeline import PipelineRequest
 
 commands = typer.Typer()
 
@@ -38,7 +40,7 @@ def fit(
     """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
     check_writable(json)
     recordings = recordings_of(source)
-    result = fit_or_read(recordings, None)
+    result = _fit(recordings)
     if str(json) != "-":
         print_fit(recordings, result)
     write_json(result, json)
@@ -46,6 +48,12 @@ def fit(
         _write_cameras(recordings, result, cameras)
     if maps is not None:
         _write_maps(recordings, maps)
+
+
+def _fit(recordings: RecordingSet) -> FitResult:
+    found = run_here(PipelineRequest("fit", recordings=recordings)).fit
+    assert found is not None
+    return found
 
 
 def _write_maps(recordings: RecordingSet, folder: Path) -> None:
@@ -104,12 +112,9 @@ def compare(
 
 def _calibration(source: str) -> FitResult:
     """A fit: of a file that `--json` wrote, as a session keeps it, or of recordings that are fitted now."""
-    from lab.capture.store import Settings
-
     if Path(source).is_file():
         return read_result(FitResult, Path(source))
-    if not Path(source).exists() and Settings().data.is_dir():
-        kept = open_store().results(source, "fit")
-        if kept:
-            return FitResult.model_validate(kept[0].document)
-    return fit_or_read(recordings_of(source), None)
+    if not Path(source).exists() and (store := existing_store()) is not None:
+        for kept in store.results(source, "fit")[:1]:
+            return FitResult.model_validate(kept.document)
+    return _fit(recordings_of(source))

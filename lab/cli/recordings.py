@@ -11,9 +11,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from lab.cli.console import out, warn
-from lab.cli.sources import StoreFolder, open_store, stored_recordings
+from lab.cli.sources import StoreFolder, open_store
 from lab.errors import InputError
 from lab.formats import recording_set as recording
+from lab.pipeline import session_recordings
 
 commands = typer.Typer()
 
@@ -64,7 +65,7 @@ def export(
     data: StoreFolder = None,
 ) -> None:
     """Write a stored session as a recording set."""
-    recordings = stored_recordings(open_store(data), session)
+    recordings = session_recordings(open_store(data), session)
     warn(recordings.warnings)
     folder = recording.write(recordings, to)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")

@@ -715,7 +715,7 @@ class ResidualPicture(Frozen):
 
 
 class Resolution(Frozen):
-    """What was undecided, the capture that was taken to settle it, and where its frames lie; the result itself is the decision after."""
+    """One capture that `run --resolve` took: what it is, the session that holds its frames, and the diagnosis before it."""
 
     capture: str
     session: str
@@ -734,7 +734,7 @@ class DiagnosisResult(Frozen):
     held_out: HeldOut | None = None
     next_capture: str | None = None
     next_captures: tuple[NextCapture, ...] = ()  # best first, side by side
-    resolution: Resolution | None = None
+    resolutions: tuple[Resolution, ...] = ()  # in the order in which they were taken
     places: tuple[Place, ...] = ()
     measurements: tuple[MeasurementFit, ...] = ()
     visibility: tuple[Visibility, ...] = ()

@@ -74,7 +74,7 @@ def test_the_schema_is_closed(shared: Running) -> None:
 def test_results_are_described_by_the_models_of_the_command_line(shared: Running) -> None:
     answer = shared.app.openapi()["paths"]["/api/v1/jobs/{job_id}/result"]["get"]["responses"]["200"]
     named = {one["$ref"].rpartition("/")[2] for one in answer["content"]["application/json"]["schema"]["anyOf"]}
-    assert named == {"FitResult", "ValidationResult", "DiagnosisResult"}
+    assert named == {"FitResult", "ValidationResult", "DiagnosisResult", "PipelineResults"}
 
 
 @pytest.mark.parametrize("path", ["/", "/docs"])

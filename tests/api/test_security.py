@@ -34,6 +34,7 @@ ROUTES = [
     ("GET", "/sessions/{session_id}/captures/{capture_id}/preview.png", "read"),
     ("GET", "/sessions/{session_id}/captures/{capture_id}/frame.npy", "read"),
     ("POST", "/sessions/{session_id}/jobs", "calibrate"),
+    ("POST", "/pipelines", "admin"),
     ("GET", "/recordings", "read"),
     ("POST", "/recordings", "calibrate"),
     ("GET", "/recordings/{recordings_id}", "read"),
@@ -45,7 +46,11 @@ ROUTES = [
     ("GET", "/jobs/{job_id}/result", "read"),
     ("GET", "/jobs/{job_id}/report", "read"),
 ]
-BODIES: dict[str, Any] = {"/sessions": {"station": "nowhere"}, "jobs": {"kind": "fit"}}
+BODIES: dict[str, Any] = {
+    "/sessions": {"station": "nowhere"},
+    "/pipelines": {"station": "nowhere"},
+    "jobs": {"kind": "fit"},
+}
 
 
 def test_the_list_of_routes_is_complete(shared: Running) -> None:

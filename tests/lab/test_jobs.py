@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -15,10 +14,11 @@ from distributed import LocalCluster
 import lab.jobs
 from lab.capture.sequences.calibration import Calibration
 from lab.capture.sequences.dark import DarkSequence
-from lab.capture.session import CaptureSession
+from lab.capture.session import CaptureSession, Progress
 from lab.capture.store import JobRow, Store
 from lab.errors import InputError, NotDetermined
-from lab.jobs import JobInfo, JobRunner, ReportFile
+from lab.jobs import JobInfo, JobRunner
+from lab.pipeline import CaptureRequest, Goal, PipelineProgress, PipelineRequest, Tell, capture_here
 from tests.lab import fake_bench
 
 
@@ -36,18 +36,24 @@ def session(store: Store) -> str:
     return run.run().id
 
 
-def with_task(monkeypatch: pytest.MonkeyPatch, task: Any) -> None:
-    monkeypatch.setitem(lab.jobs.TASKS, "fit", task)
+def with_task(monkeypatch: pytest.MonkeyPatch, task: Callable[[PipelineRequest, Tell], object]) -> None:
+    """Jobs do `task` in place of the pipeline; what it returns is kept under the job's id, as the pipeline keeps its goal."""
+
+    def pipeline(request: PipelineRequest, tell: Tell, *, store: Store, capturer: object) -> None:
+        task(request, tell)
+        store.add_result(request.goal, request.source, {"path": "made"}, request.job_id)
+
+    monkeypatch.setattr(lab.jobs, "run_pipeline", pipeline)
 
 
 def test_a_job_goes_from_the_queue_to_its_result(store: Store, session: str, monkeypatch: pytest.MonkeyPatch) -> None:
     go, seen = threading.Event(), []
 
-    def task(asked: Any) -> ReportFile:
-        asked.progress("half of it", 0.5)
+    def task(asked: PipelineRequest, tell: Tell) -> None:
+        tell(PipelineProgress("fit", "half of it", 0.5))
+        assert asked.recordings is not None
         seen.append(len(asked.recordings.captures()))
         assert go.wait(20)
-        return ReportFile(path="made")
 
     with_task(monkeypatch, task)
     with JobRunner(store) as runner:
@@ -57,7 +63,7 @@ def test_a_job_goes_from_the_queue_to_its_result(store: Store, session: str, mon
             assert time.monotonic() < until
             time.sleep(0.01)
         info = runner.job(job)
-        assert (info.state, info.message, info.started is not None) == ("running", "half of it", True)
+        assert (info.state, info.message, info.started is not None) == ("running", "fit: half of it", True)
         go.set()
         info = runner.wait(job, 20)
         assert (info.state, info.progress, info.error) == ("done", 1.0, None)
@@ -78,11 +84,10 @@ def test_a_job_goes_from_the_queue_to_its_result(store: Store, session: str, mon
 def test_a_failure_is_said_and_the_runner_goes_on(
     store: Store, session: str, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ) -> None:
-    def task(asked: Any) -> ReportFile:
+    def task(asked: PipelineRequest, tell: Tell) -> None:
         if not store.results():
             store.add_result("validate", session, {})
             raise error
-        return ReportFile(path="made")
 
     with_task(monkeypatch, task)
     with JobRunner(store) as runner:
@@ -96,13 +101,13 @@ def test_cancelling_ends_a_job_at_its_next_word_and_the_next_one_starts(
 ) -> None:
     began, calls = threading.Event(), []
 
-    def task(asked: Any) -> ReportFile:
+    def task(asked: PipelineRequest, tell: Tell) -> None:
         calls.append(asked.job_id)
         if len(calls) > 1:
-            return ReportFile(path="made")
+            return
         began.set()
         for step in range(2000):  # 20 s, if nothing ended it
-            asked.progress(f"step {step}", step / 2000)
+            tell(PipelineProgress("fit", f"step {step}", step / 2000))
             time.sleep(0.01)
         raise AssertionError("not cancelled")
 
@@ -122,10 +127,10 @@ def test_cancelling_ends_a_job_at_its_next_word_and_the_next_one_starts(
 def test_closing_the_runner_ends_what_is_under_way(store: Store, session: str, monkeypatch: pytest.MonkeyPatch) -> None:
     began = threading.Event()
 
-    def task(asked: Any) -> ReportFile:
+    def task(asked: PipelineRequest, tell: Tell) -> None:
         began.set()
         while True:
-            asked.progress("on and on", 0.1)
+            tell(PipelineProgress("fit", "on and on", 0.1))
             time.sleep(0.01)
 
     with_task(monkeypatch, task)
@@ -157,11 +162,11 @@ def test_what_is_not_there_is_said(store: Store) -> None:
     with JobRunner(store) as runner:
         with pytest.raises(InputError, match="job 'x'"):
             runner.job("x")
-        with pytest.raises(InputError, match="choose from fit, validate, diagnose, report"):
+        with pytest.raises(InputError, match="choose from capture, fit, validate, diagnose, report, pipeline"):
             runner.submit("paint", "s")  # type: ignore[arg-type]
         info = runner.wait(runner.submit("fit", "/no/such/folder"), 20)
         assert info.state == "failed"
-        assert "neither a recording set's folder nor a session" in (info.error or "")
+        assert "no such folder" in (info.error or "")
 
 
 def test_a_real_fit_on_a_worker_process(store: Store, session: str) -> None:
@@ -185,11 +190,30 @@ def test_a_scheduler_that_is_not_there_is_said(store: Store) -> None:
         runner.submit("fit", "s")
 
 
-def test_a_settled_sessions_fit_is_not_made_twice(store: Store, session: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    fitted = lab.jobs.FitResult(source=session, cameras={})
-    made: list[int] = []
-    monkeypatch.setattr(lab.jobs._Task, "fit", lambda asked: made.append(1) or fitted)
-    task = lab.jobs._Task(store, session, "j", lambda what, share: None)
-    for _ in range(2):
-        assert task._latest("fit", lab.jobs.FitResult, task.fit) == fitted
-    assert made == [1]
+def test_a_job_that_captures_runs_here_and_is_cancelled_in_good_order(store: Store) -> None:
+    bench = fake_bench.Bench(delay_s=0.05)
+    darks = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.1), frames=2))
+    waiting = CaptureSession.start(store, fake_bench.station(), darks, connect=bench.drivers).id
+
+    def capturer(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:
+        return capture_here(store, fake_bench.station(), request, tell, bench.drivers)
+
+    with JobRunner(store, scheduler="tcp://127.0.0.1:9") as runner:  # no Dask: nobody answers there
+        job = runner.submit("pipeline", waiting, capturer=capturer)
+        until = time.monotonic() + 20
+        while not bench.shots:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        runner.cancel(job)
+        info = runner.wait(job, 20)
+        assert (info.state, info.error) == ("cancelled", None)
+    found = store.session(waiting)
+    assert found.state == "interrupted" and found.steps_done < found.steps
+    assert not bench.opened  # the shutter is closed
+    assert store.results() == []
+
+
+@pytest.mark.parametrize("kind", ["fit", "pipeline"])
+def test_only_a_pipeline_that_captures_resolves(store: Store, session: str, kind: Goal) -> None:
+    with JobRunner(store) as runner, pytest.raises(InputError, match="leave resolve out"):
+        runner.submit(kind, session, resolve=True)

@@ -1,4 +1,4 @@
-"""Jobs over REST; the work itself is a stand-in, that of `lab.jobs` is tested there."""
+"""Jobs over REST. The work is a stand-in; `lab.pipeline` and `lab.jobs` have tests of their own."""
 
 from __future__ import annotations
 
@@ -9,27 +9,46 @@ from typing import Any
 
 import httpx
 import pytest
+from pydantic import BaseModel
 
+import lab.diagnose
+import lab.fit
 import lab.jobs
+import lab.predict.validate
+import lab.report
 from api.security import REPORT_POLICY
+from lab.capture.store import Store
+from lab.diagnose import Diagnosis
 from lab.errors import InputError
-from lab.formats.results import CameraFit, FitResult, NoiseFit
-from lab.jobs import ReportFile
-from tests.api.conftest import Running, events, until
+from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NoiseFit, ValidationResult
+from lab.pipeline import PipelineProgress, PipelineRequest, ReportFile, Tell
+from tests.api.conftest import Running, events, serving, until, until_state
 
 FIT = FitResult(source="x", cameras={"left": CameraFit(noise=NoiseFit(read_noise_e=2.0, read_noise_e_std=0.1))})
 PAGE = "<!doctype html><title>a report</title><script>1</script>"
 
 
 @pytest.fixture
-def with_tasks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """`with_tasks(fit=...)`: what the kinds of work do instead."""
+def with_task(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., BaseModel]], None]:
+    """`with_task(task)`: jobs do `task(tell)` in place of the pipeline; what it returns is kept as the job's result."""
 
-    def change(**tasks: Any) -> None:
-        for kind, task in tasks.items():
-            monkeypatch.setitem(lab.jobs.TASKS, kind, task)
+    def change(task: Callable[..., BaseModel]) -> None:
+        def pipeline(request: PipelineRequest, tell: Tell, *, store: Store, capturer: object) -> None:
+            store.add_result(request.goal, request.source, task(tell).model_dump(mode="json"), request.job_id)
+
+        monkeypatch.setattr(lab.jobs, "run_pipeline", pipeline)
 
     return change
+
+
+@pytest.fixture
+def quick_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The steps of the pipeline find what costs nothing."""
+    diagnosis = DiagnosisResult(source="x", verdict="no_mismatch")
+    monkeypatch.setattr(lab.fit, "fit_recording_set", lambda *_: FIT)
+    monkeypatch.setattr(lab.predict.validate, "validate", lambda *_, **__: ValidationResult(source="x", checks=()))
+    monkeypatch.setattr(lab.diagnose, "examine", lambda *_, **__: Diagnosis(diagnosis, {}))
+    monkeypatch.setattr(lab.report, "write_report", lambda file, *_: file.write_text(PAGE) and file)
 
 
 def submit(client: httpx.Client, running: Running, kind: str) -> dict[str, Any]:
@@ -42,8 +61,8 @@ def submit(client: httpx.Client, running: Running, kind: str) -> dict[str, Any]:
     return job
 
 
-def test_a_result_is_what_the_command_line_writes(shared: Running, with_tasks: Callable[..., None]) -> None:
-    with_tasks(fit=lambda task: FIT)
+def test_a_result_is_what_the_command_line_writes(shared: Running, with_task: Callable[..., None]) -> None:
+    with_task(lambda tell: FIT)
     with shared.client("calibrate") as client:
         job = submit(client, shared, "fit")
         path = f"/api/v1/jobs/{job['id']}"
@@ -55,14 +74,14 @@ def test_a_result_is_what_the_command_line_writes(shared: Running, with_tasks: C
         assert client.post(f"{path}/cancel").json()["state"] == "done"
 
 
-def test_progress_is_told_and_a_cancelled_job_has_no_result(shared: Running, with_tasks: Callable[..., None]) -> None:
-    def slow(task: Any) -> FitResult:
+def test_progress_is_told_and_a_cancelled_job_has_no_result(shared: Running, with_task: Callable[..., None]) -> None:
+    def slow(tell: Tell) -> FitResult:
         for step in range(1000):
-            task.progress(f"step {step}", step / 1000)
+            tell(PipelineProgress("fit", f"step {step}", step / 1000))
             time.sleep(0.02)
         return FIT
 
-    with_tasks(fit=slow)
+    with_task(slow)
     with shared.client("calibrate") as client:
         path = f"/api/v1/jobs/{submit(client, shared, 'fit')['id']}"
         until(client, path, lambda now: now["state"] == "running" and now["message"] != "")
@@ -73,11 +92,11 @@ def test_progress_is_told_and_a_cancelled_job_has_no_result(shared: Running, wit
         assert "cancelled" in client.get(f"{path}/result").json()["detail"]
 
 
-def test_a_job_that_fails_says_why(shared: Running, with_tasks: Callable[..., None]) -> None:
-    def failing(task: Any) -> FitResult:
+def test_a_job_that_fails_says_why(shared: Running, with_task: Callable[..., None]) -> None:
+    def failing(tell: Tell) -> FitResult:
         raise InputError("flat-3: saturated; expose less")
 
-    with_tasks(fit=failing)
+    with_task(failing)
     with shared.client("calibrate") as client:
         path = f"/api/v1/jobs/{submit(client, shared, 'fit')['id']}"
         told = events(client, f"{path}/events")
@@ -86,14 +105,14 @@ def test_a_job_that_fails_says_why(shared: Running, with_tasks: Callable[..., No
         assert response.status_code == 409 and "saturated" in response.json()["detail"]
 
 
-def test_a_report_runs_its_scripts_and_reaches_nothing(shared: Running, with_tasks: Callable[..., None]) -> None:
-    def report(task: Any) -> ReportFile:
+def test_a_report_runs_its_scripts_and_reaches_nothing(shared: Running, with_task: Callable[..., None]) -> None:
+    def report(tell: Tell) -> ReportFile:
         file = shared.store.root / "reports" / "r.html"
         file.parent.mkdir(exist_ok=True)
         file.write_text(PAGE)
         return ReportFile(path="reports/r.html")
 
-    with_tasks(report=report)
+    with_task(report)
     with shared.client("calibrate") as client:
         path = f"/api/v1/jobs/{submit(client, shared, 'report')['id']}"
         until(client, path, lambda now: now["state"] == "done")
@@ -109,9 +128,9 @@ def test_a_report_runs_its_scripts_and_reaches_nothing(shared: Running, with_tas
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="reads Linux's list of sockets")
-def test_jobs_open_no_door_to_the_network(shared: Running, with_tasks: Callable[..., None]) -> None:
+def test_jobs_open_no_door_to_the_network(shared: Running, with_task: Callable[..., None]) -> None:
     """Dask has HTTP servers of its own, which by default listen to everyone."""
-    with_tasks(fit=lambda task: FIT)
+    with_task(lambda tell: FIT)
     with shared.client("calibrate") as client:
         path = f"/api/v1/jobs/{submit(client, shared, 'fit')['id']}"
         until(client, path, lambda now: now["state"] == "done")
@@ -128,3 +147,81 @@ def test_unknown_work_is_refused(shared: Running) -> None:
         assert client.post("/api/v1/sessions/none/jobs", json={"kind": "fit"}).status_code == 404
         assert client.get("/api/v1/jobs/" + "0" * 16).status_code == 404
         assert client.get("/api/v1/jobs/abc").status_code == 422
+
+
+# --- pipelines -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_pipeline_captures_and_brings_all_results_and_the_report(running: Running, quick_steps: None) -> None:
+    with running.client("admin") as client:
+        asked = {"station": "fakes", "name": "all", "quick": True, "sequences": ["dark"], "resolve": True}
+        response = client.post("/api/v1/pipelines", json=asked)
+        assert response.status_code == 202, response.text
+        job = response.json()
+        assert response.headers["location"] == f"/api/v1/jobs/{job['id']}" and job["kind"] == "pipeline"
+        path = f"/api/v1/jobs/{job['id']}"
+        told = events(client, f"{path}/events")
+        assert told[-1][1]["state"] == "done" and told[-1][1]["error"] is None
+        session = client.get(f"/api/v1/sessions/{job['session_id']}").json()
+        assert (session["name"], session["state"]) == ("all", "finished")
+        result = client.get(f"{path}/result").json()
+        assert result["fit"] == FIT.model_dump(mode="json")
+        assert result["validation"]["format"] == "calibench-validation"
+        assert result["diagnosis"]["verdict"] == "no_mismatch"
+        assert client.get(f"{path}/report").text == PAGE
+        # Again on the same session, which is finished: no instrument is needed, and so no more than `calibrate`.
+        again = f"/api/v1/sessions/{job['session_id']}/jobs"
+        with running.client("calibrate") as other:
+            assert other.post(again, json={"kind": "pipeline", "resolve": True}).status_code == 403
+            started = other.post(again, json={"kind": "pipeline"})
+            assert started.status_code == 202
+        until(client, f"/api/v1/jobs/{started.json()['id']}", lambda now: now["state"] == "done")
+
+
+def test_cancelling_a_pipeline_ends_its_capture_and_another_goes_on_from_there(
+    tmp_path: Path, quick_steps: None
+) -> None:
+    with serving(tmp_path, delay_s=0.05) as running, running.client("admin") as client:
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"]}
+        job = client.post("/api/v1/pipelines", json=asked).json()
+        here = f"/api/v1/sessions/{job['session_id']}"
+        assert client.post("/api/v1/pipelines", json=asked).status_code == 409  # on the same instruments
+        until(client, here, lambda now: now["steps_done"] > 0)
+        assert client.post(f"/api/v1/jobs/{job['id']}/cancel").status_code == 202
+        assert (
+            until(client, f"/api/v1/jobs/{job['id']}", lambda now: now["state"] not in ("queued", "running"))["state"]
+            == "cancelled"
+        )
+        session = client.get(here).json()
+        assert session["state"] == "interrupted" and session["steps_done"] < session["steps"]
+        assert not running.bench.opened
+        with running.client("calibrate") as other:  # capturing needs more
+            assert other.post(f"{here}/jobs", json={"kind": "pipeline"}).status_code == 403
+        started = client.post(f"{here}/jobs", json={"kind": "pipeline", "station": "fakes"}).json()
+        until(client, f"/api/v1/jobs/{started['id']}", lambda now: now["state"] == "done")
+        assert client.get(here).json()["state"] == "finished"
+
+
+def test_an_aborted_session_fails_its_pipeline(tmp_path: Path, quick_steps: None) -> None:
+    with serving(tmp_path, delay_s=0.05) as running, running.client("admin") as client:
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"]}
+        job = client.post("/api/v1/pipelines", json=asked).json()
+        until_state(client, job["session_id"], "running")
+        assert client.post(f"/api/v1/sessions/{job['session_id']}/abort").status_code == 202
+        ended = until(client, f"/api/v1/jobs/{job['id']}", lambda now: now["state"] not in ("queued", "running"))
+        assert ended["state"] == "failed" and "aborted over the network; resume it" in ended["error"]
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"kind": "fit", "resolve": True}, "leave resolve out"),
+        ({"kind": "fit", "station": "fakes"}, "doesn't capture"),
+        ({"kind": "capture"}, "kind"),
+    ],
+)
+def test_only_pipelines_capture(shared: Running, body: dict[str, Any], said: str) -> None:
+    session_id = shared.store.sessions()[0].id
+    with shared.client("admin") as client:
+        response = client.post(f"/api/v1/sessions/{session_id}/jobs", json=body)
+    assert response.status_code == 422 and said in response.json()["detail"]

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import pytest
 
-import lab.jobs
+import lab.fit
 from api.service import Limits
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import RecordingSet
@@ -52,10 +52,7 @@ def kept(running: Running) -> list[str]:
 def test_recordings_are_taken_in_and_worked_on(
     running: Running, folder: Path, top: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fit(task: Any) -> FitResult:
-        return FitResult(source="sent", cameras={}, skipped=())
-
-    monkeypatch.setitem(lab.jobs.TASKS, "fit", fit)
+    monkeypatch.setattr(lab.fit, "fit_recording_set", lambda *_: FitResult(source="sent", cameras={}, skipped=()))
     with running.client("calibrate") as client:
         response = send(client, packed(folder, top))
         assert response.status_code == 201, response.text
@@ -69,6 +66,9 @@ def test_recordings_are_taken_in_and_worked_on(
         assert job.status_code == 202
         assert job.json()["recordings_id"] == found["id"] and job.json()["session_id"] is None
         until(client, job.headers["location"], lambda now: now["state"] == "done")
+        for asked in ({"kind": "pipeline", "resolve": True}, {"kind": "pipeline", "station": "fakes"}):
+            refused = client.post(f"{path}/jobs", json=asked)
+            assert refused.status_code == 422 and "leave" in refused.json()["detail"]
 
 
 def test_a_streamed_archive_is_taken_in(running: Running, folder: Path) -> None:

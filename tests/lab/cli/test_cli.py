@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import lab.diagnose
+import lab.fit
 from lab import cli
-from lab.capture.sequences.calibration import Calibration
-from lab.capture.sequences.dark import DarkSequence
-from lab.cli import capturing, diagnosis, fitting, sources
+from lab.cli import bench_process, capturing, diagnosis, fitting
 from lab.diagnose import Diagnosis
-from lab.diagnose.outcome.next_capture import Proposal
 from lab.errors import DeviceError
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import Manifest, RecordingSet
@@ -25,12 +24,13 @@ from lab.formats.results import (
     Check,
     DiagnosisResult,
     FitResult,
-    NextCapture,
     NoiseFit,
     Resolution,
     Skipped,
     ValidationResult,
 )
+from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult
+from lab.predict import validate as validation
 from sim.effects.library import effects
 
 
@@ -204,20 +204,19 @@ def test_a_check_that_falls_short(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passed: bool, code: int
 ) -> None:
     check = Check(name="mtf", side="left", capture="edge-1", n=10, chi2=11.0, rms_relative_percent=1.0, passed=passed)
-    monkeypatch.setattr(diagnosis, "validated", lambda *_: ValidationResult(source="x", checks=(check,)))
+    result = ValidationResult(source="x", checks=(check,))
+    monkeypatch.setattr(validation, "validate", lambda *_, models: result)
     assert cli.main(["validate", str(flats), "--json", str(tmp_path / "v.json")]) == code
-    assert ValidationResult.model_validate_json((tmp_path / "v.json").read_text()).checks == (check,)
+    assert ValidationResult.model_validate_json((tmp_path / "v.json").read_text()) == result
 
 
 def test_diagnosis_with_a_stored_fit(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["fit", str(flats), "--json", str(tmp_path / "fit.json")]) == 0
-    monkeypatch.setattr(sources, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
+    monkeypatch.setattr(lab.fit, "fit_recording_set", lambda *_: pytest.fail("fitted again"))
     result = DiagnosisResult(source="x", verdict="no_mismatch", skipped=(Skipped(step="mtf", reason="no [edges]"),))
-    monkeypatch.setattr(
-        diagnosis, "examined", lambda recordings, fit, baseline, pictures, bootstrap: Diagnosis(result, {})
-    )
+    monkeypatch.setattr(lab.diagnose, "examine", lambda *_, **__: Diagnosis(result, {}))
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 0
     shown = capsys.readouterr().out
     assert "verdict: no_mismatch" in shown
@@ -278,7 +277,7 @@ def test_device_failures_interruptions_and_defects(
         def fail(*_: object, error: BaseException = error) -> str:
             raise error
 
-        monkeypatch.setattr(capturing, "_captured", fail)
+        monkeypatch.setattr(capturing, "run_here", fail)
         assert cli.main(["capture"]) == code
         shown = capsys.readouterr().err
         assert words in shown
@@ -286,98 +285,81 @@ def test_device_failures_interruptions_and_defects(
 
 
 def test_the_main_job_says_where_the_report_is_and_what_it_says(
-    small_set: Callable[..., RecordingSet],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    small_set: Callable[..., RecordingSet], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The order of the main job, on a session that was captured, with results that cost nothing."""
-    recordings = small_set()
-
-    class Shelf:
-        """What `run` needs of a store."""
-
-        def __init__(self) -> None:
-            self.kept: list[str] = []
-
-        def folder(self, session_id: str) -> Path:
-            return tmp_path
-
-        def recording_set(self, session_id: str) -> RecordingSet:
-            return recordings
-
-        def add_result(self, kind: str, source: str, document: dict[str, Any]) -> None:
-            self.kept.append(kind)
-
-        def runs(self, session_id: str) -> list[Any]:
-            return []
-
-    shelf = Shelf()
     fit = FitResult(source="s", cameras={"left": CameraFit(noise=NoiseFit(conversion_gain_dn_per_e=0.4))})
-    found = DiagnosisResult(source="s", verdict="no_mismatch")
-    monkeypatch.setattr(capturing, "open_store", lambda folder=None: shelf)
-    monkeypatch.setattr(capturing, "_captured", lambda *_: "session-1")
-    monkeypatch.setattr(capturing, "fit_or_read", lambda *_: fit)
-    monkeypatch.setattr(capturing, "validated", lambda *_: ValidationResult(source="s", checks=()))
-    monkeypatch.setattr(capturing, "examined", lambda *_: Diagnosis(found, {}))
-    assert cli.main(["run"]) == 0
+    taken = Resolution(capture="dark frames", session="session-2", verdict_before="partly_explained", effects_before=())
+    diagnosed = DiagnosisResult(source="s", verdict="no_mismatch", next_capture="Darks.", resolutions=(taken,))
+    asked: list[PipelineRequest] = []
+
+    def pipeline(request: PipelineRequest, *_: object) -> PipelineResult:
+        asked.append(request)
+        return PipelineResult(
+            recordings=small_set(),
+            session="session-1",
+            fit=fit,
+            validation=ValidationResult(source="s", checks=()),
+            diagnosis=diagnosed,
+            report=Path("somewhere/report.html"),
+        )
+
+    monkeypatch.setattr(capturing, "run_here", pipeline)
+    assert cli.main(["run", "--quick", "--name", "mine", "--resolve"]) == 0
+    session = CaptureRequest(quick=True, name="mine")
+    assert asked == [PipelineRequest("pipeline", capture=session, resolve=True)]
     shown = capsys.readouterr().out
     for words in (
         "conversion gain",
         "0.4 DN/e",
         "The baseline model explains",
+        "Resolved with: dark frames (session session-2)",
+        "Next: Darks.",
         "session: session-1",
-        f"{tmp_path}/report.html",
+        "report: somewhere/report.html",
     ):
         assert words in shown
-    assert shelf.kept == ["fit", "validate", "diagnose"]
-    assert DiagnosisResult.model_validate_json((tmp_path / "diagnose.json").read_text()) == found
-    assert (tmp_path / "report.html").stat().st_size > 1e6
 
 
-@pytest.mark.parametrize("settles", [True, False])
-def test_resolve_takes_the_capture_and_decides_again(
-    settles: bool,
-    small_set: Callable[..., RecordingSet],
+def test_only_the_mock_bench_conceals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("run", "capture"):
+        assert cli.main([command, "--station", str(tmp_path / "s.toml"), "--conceal", "left:coma:x=1"]) == 2
+        assert "--conceal: only the mock bench conceals effects" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("code", "lines", "exit_code", "said"),
+    [
+        (
+            2,
+            ["--conceal left:fog: no such effect; write EFFECT"],
+            2,
+            "calibench: --conceal left:fog: no such effect; write EFFECT",
+        ),
+        (1, ["a defect"], 3, "calibench: mock bench: it doesn't start (a defect); see what `calibench bench` prints"),
+        (0, [], 3, "calibench: mock bench: it doesn't start (exit code 0); see what `calibench bench` prints"),
+    ],
+)
+def test_what_the_bench_refuses_is_passed_on(
+    code: int,
+    lines: list[str],
+    exit_code: int,
+    said: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Only where it would settle something, and what stood before is told."""
-
-    class Shelf:
-        def recording_set(self, session_id: str) -> RecordingSet:
-            return small_set()
-
-    plan = Calibration(dark=DarkSequence(exposures_s=(0.1,), frames=2))
-    capture = NextCapture(
-        side="left",
-        capture="dark frames",
-        rivals=("defocus", "coma"),
-        distance=9.0 if settles else 0.1,
-        told_apart=0.98,
-    )
-    taken: list[Calibration | None] = []
-    captured = lambda *given: taken.append(given[-1]) or "session-2"  # noqa: E731
-    after = Diagnosis(DiagnosisResult(source="s", verdict="explained"), {})
-    monkeypatch.setattr(capturing, "_captured", captured)
-    monkeypatch.setattr(
-        capturing, "examined", lambda joined, fit: after if len(joined.captures()) > n else pytest.fail("not joined")
-    )
-    recordings = small_set()
-    n = len(recordings.captures())
-    before = Diagnosis(DiagnosisResult(source="s", verdict="partly_explained"), {}, (Proposal(capture, plan),))
-    found = capturing._resolved(Shelf(), None, recordings, FitResult(source="s", cameras={}), before)  # type: ignore[arg-type]
-    if not settles:
-        assert found is before
-        assert not taken
-        return
-    assert taken == [plan]
-    assert found.result.verdict == "explained"
-    assert found.result.resolution == Resolution(
-        capture="dark frames", session="session-2", verdict_before="partly_explained", effects_before=()
-    )
-    assert "dark frames, to tell defocus from coma" in capsys.readouterr().out
+    """A stand-in for the bench's process: it writes what it was called with, says its lines, and ends."""
+    bench = tmp_path / "bench"
+    told = "".join(f"echo '{line}' >&2\n" for line in lines)
+    bench.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/called\n{told}exit {code}\n')
+    bench.chmod(0o755)
+    monkeypatch.setattr(bench_process.sys, "executable", str(bench))
+    given = ["left:fog:x=1", "right:coma:y=2,z=3"]
+    assert cli.main(["run", *(part for one in given for part in ("--conceal", one))]) == exit_code
+    assert capsys.readouterr().err.splitlines() == [said]
+    called = (tmp_path / "called").read_text().split()
+    assert called[:3] == ["-m", "lab.cli", "bench"]
+    assert called[-2:] == [f"--conceal={one}" for one in given]
 
 
 def test_import_writes_a_set_or_nothing(tmp_path: Path, flats: Path, capsys: pytest.CaptureFixture[str]) -> None:

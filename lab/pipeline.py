@@ -1,0 +1,507 @@
+"""The whole job as one verb: capture, fit, validate, diagnose, resolve, report.
+
+`run_pipeline` carries out a `PipelineRequest`. The command line, the jobs and the REST routes call it; none of them composes
+the steps itself. A step starts when the step before it has ended, and its result is kept before the next one starts.
+
+Instruments are reached through a `Capturer`, a function of the caller: the command line captures in its own thread, on a
+station or on a mock bench that it starts; the REST service captures through its live sessions.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+from pydantic import BaseModel
+
+from lab.errors import Cancelled, InputError
+from lab.formats import recording_set
+from lab.formats.recording_set import RecordingError, RecordingSet
+from lab.formats.results import DiagnosisResult, FitResult, NextCapture, Resolution, ValidationResult
+from sim.camera import Side
+from sim.parameters import Frozen
+
+if TYPE_CHECKING:
+    from lab.capture.sequences.calibration import Calibration
+    from lab.capture.session import Progress as CaptureProgress
+    from lab.capture.station import Drivers, Station
+    from lab.capture.store import Store
+    from lab.diagnose import Diagnosis
+    from lab.diagnose.outcome.next_capture import Proposal
+    from lab.formats.camera_file import CameraFile
+
+M = TypeVar("M", bound=BaseModel)
+Goal = Literal["capture", "fit", "validate", "diagnose", "report", "pipeline"]
+Step = Literal["capture", "fit", "validate", "diagnose", "resolve", "report"]
+
+#: The steps that lead to each goal. A pipeline captures and resolves only where its request asks for it.
+STEPS: dict[Goal, tuple[Step, ...]] = {
+    "capture": ("capture",),
+    "fit": ("fit",),
+    "validate": ("fit", "validate"),
+    "diagnose": ("fit", "diagnose"),
+    "report": ("fit", "validate", "diagnose", "report"),
+    "pipeline": ("capture", "fit", "validate", "diagnose", "resolve", "report"),
+}
+#: Typical duration (s) of each step, for the share of the work that is done: a full stereo session on the mock bench, two cores.
+TYPICAL_S: dict[Step, float] = {
+    "capture": 90.0,
+    "fit": 60.0,
+    "validate": 5.0,
+    "diagnose": 100.0,
+    "resolve": 110.0,
+    "report": 10.0,
+}
+#: A tie between two rivals is given up when its captures, by their predictions, would have left it open with less than this probability.
+GIVE_UP_PROBABILITY = 1e-3
+
+
+# --- what is asked for ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CaptureRequest:
+    """A session to capture: what is left of the session `session`, or a new one where that is empty.
+
+    calibration : the sequences of a new session; None: all that the station has the instruments and targets for
+    quick : fewer exposures and repeats, where `calibration` is None
+    """
+
+    session: str = ""
+    calibration: Calibration | None = None
+    quick: bool = False
+    name: str = ""
+    notes: str = ""
+
+
+@dataclass(frozen=True)
+class PipelineRequest:
+    """What the pipeline is to do. Either `recordings` or `capture` is given.
+
+    goal : the last result that is wanted; `STEPS` lists what leads to it
+    recordings : what is evaluated
+    capture : the session that is captured first and evaluated then
+    source : the session or folder that the results belong to; empty: the session of `capture`, else none
+    keep : keep the results of `source` in the registry
+    job_id : the job for which the goal's result is kept
+    reuse : take the kept results of a finished session in place of computing the goal's inputs again
+    fit : a fit to rest on in place of a new one
+    models : camera files that replace the fitted cameras, by side, in validation and diagnosis
+    resolve : after the diagnosis, take the captures that tell the remaining rivals apart
+    pictures : draw the residual pictures of the diagnosis
+    bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
+    report_file : the page to write; None: `report.html` in the session's folder, with the results and cameras beside it
+    """
+
+    goal: Goal
+    recordings: RecordingSet | None = None
+    capture: CaptureRequest | None = None
+    source: str = ""
+    keep: bool = True
+    job_id: str | None = None
+    reuse: bool = False
+    fit: FitResult | None = None
+    models: Mapping[Side, CameraFile] = field(default_factory=dict)
+    resolve: bool = False
+    pictures: bool = True
+    bootstrap: int = 0
+    report_file: Path | None = None
+
+    def __post_init__(self) -> None:
+        if (self.recordings is None) == (self.capture is None):
+            raise ValueError("PipelineRequest: give either recordings or capture")
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps that this request takes."""
+        left_out = {"capture": self.capture is None, "resolve": not self.resolve}
+        return tuple(step for step in STEPS[self.goal] if not left_out.get(step, False))
+
+
+@dataclass(frozen=True)
+class PipelineProgress:
+    """How far a pipeline is.
+
+    share, share_of_step : the part of the whole and of the step that is done, 0..1
+    capture : where the session stands, while a step captures
+    remark : what the user should know: a warning, or why a step did nothing
+    """
+
+    step: Step
+    what: str
+    share: float
+    share_of_step: float = 0.0
+    capture: CaptureProgress | None = None
+    remark: str | None = None
+
+
+#: Called at every piece of progress. It may raise `Cancelled`, which ends the pipeline; instruments are brought to a safe state first.
+Tell = Callable[[PipelineProgress], None]
+#: Captures a session to its end and returns its id; passes the session's progress on, and ends the session where that raises `Cancelled`.
+Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
+
+
+class ReportFile(Frozen):
+    """A report: its path, relative to the data folder if it lies there, and the ids of the results that it shows, by kind."""
+
+    path: str
+    results: dict[str, str] = {}
+
+
+@dataclass(frozen=True)
+class PipelineResult:
+    """What a pipeline found; None for what its goal doesn't need."""
+
+    recordings: RecordingSet
+    session: str | None = None
+    fit: FitResult | None = None
+    validation: ValidationResult | None = None
+    diagnosis: DiagnosisResult | None = None
+    improved: Mapping[Side, CameraFile] = field(default_factory=dict)
+    report: Path | None = None
+
+
+# --- what is evaluated, and on what --------------------------------------------------------------------------------------
+
+
+def session_recordings(store: Store, session_id: str) -> RecordingSet:
+    """A stored session as a recording set, inspected as a folder would be. Raises InputError where it can't be used."""
+    recordings = store.recording_set(session_id)
+    if not recordings.captures():
+        raise InputError(f"session {session_id}: nothing was captured yet; resume it with `calibench capture --resume`")
+    problems, warnings = recording_set.inspect(recordings)
+    if problems:
+        raise RecordingError(problems)
+    recordings.warnings = tuple(warnings)
+    return recordings
+
+
+def source_recordings(source: str, open_store: Callable[[], Store | None]) -> RecordingSet:
+    """The recordings of `source`, a recording set's folder or a stored session's id. Raises InputError if it is neither.
+
+    The store is opened only where `source` isn't a path; `open_store` returns None where there is no data folder.
+    """
+    if Path(source).exists() or os.sep in source:
+        return recording_set.read(source)
+    store = open_store()
+    if store is None or not store.has_session(source):
+        where = "there is no data folder" if store is None else f"no session in {store.root}"
+        raise InputError(f"{source}: no such folder, and {where}; give a recording set's folder or a session's id")
+    return session_recordings(store, source)
+
+
+def capture_here(
+    store: Store,
+    station: Station,
+    request: CaptureRequest,
+    tell: Callable[[CaptureProgress], None],
+    connect: Callable[[Station], Drivers] | None = None,
+) -> str:
+    """Capture a session in this thread, on `station`; returns its id. `connect` makes the drivers, by default the station's.
+
+    Raises what `CaptureSession.run` raises, and `Cancelled` if `tell` does: the session can then be resumed.
+    """
+    from lab.capture.session import CaptureSession
+    from lab.capture.station import drivers_of
+
+    drivers = connect or drivers_of
+    cancelled = threading.Event()
+
+    def told(progress: CaptureProgress) -> None:
+        if cancelled.is_set():
+            return
+        try:
+            tell(progress)
+        except Cancelled:
+            cancelled.set()
+            # `abort` waits for the thread that calls this.
+            threading.Thread(target=session.abort, args=("cancelled",), daemon=True).start()
+
+    if request.session:
+        session = CaptureSession(store, request.session, station=station, on_progress=told, connect=drivers)
+    else:
+        session = CaptureSession.start(
+            store,
+            station,
+            request.calibration,
+            quick=request.quick,
+            name=request.name,
+            notes=request.notes,
+            on_progress=told,
+            connect=drivers,
+        )
+    session.run()
+    if cancelled.is_set():
+        raise Cancelled
+    return session.id
+
+
+# --- the pipeline --------------------------------------------------------------------------------------------------------
+
+
+def run_pipeline(
+    request: PipelineRequest,
+    tell: Tell | None = None,
+    *,
+    store: Store | None = None,
+    capturer: Capturer | None = None,
+) -> PipelineResult:
+    """Take the steps of `request` and return what they found.
+
+    `store` keeps the results, under the request's source; without one nothing is kept. `capturer` is needed for a request that
+    captures or resolves. Raises InputError, DeviceError, NotDetermined, and what `tell` raises.
+    """
+    return _Pipeline(request, tell, store, capturer).run()
+
+
+class _Pipeline:
+    """One run of the pipeline: the steps, and what the steps before have found."""
+
+    def __init__(
+        self, request: PipelineRequest, tell: Tell | None, store: Store | None, capturer: Capturer | None
+    ) -> None:
+        self.request, self.store, self.capturer = request, store, capturer
+        self._tell = tell
+        self._source = request.source
+        self._session = self._known_session(request.source)
+        self._recordings = request.recordings
+        self._results: dict[str, str] = {}
+        self._fit = request.fit
+        self._validation: ValidationResult | None = None
+        self._diagnosis: DiagnosisResult | None = None
+        self._examined: Diagnosis | None = None
+        self._report: Path | None = None
+
+    def run(self) -> PipelineResult:
+        for step in self.request.steps:
+            self._say(step, "")
+            getattr(self, f"_{step}_step")()
+        return PipelineResult(
+            recordings=self.recordings,
+            session=self._session,
+            fit=self._fit,
+            validation=self._validation,
+            diagnosis=self._diagnosis,
+            improved=self._examined.improved if self._examined is not None else {},
+            report=self._report,
+        )
+
+    @property
+    def recordings(self) -> RecordingSet:
+        assert self._recordings is not None  # `capture` is the first step of a request without recordings
+        return self._recordings
+
+    @property
+    def fitted(self) -> FitResult:
+        assert self._fit is not None  # `fit` is a step of every goal
+        return self._fit
+
+    def _say(
+        self,
+        step: Step,
+        what: str,
+        share: float = 0.0,
+        capture: CaptureProgress | None = None,
+        remark: str | None = None,
+    ) -> None:
+        if self._tell is None:
+            return
+        durations = [TYPICAL_S[one] for one in self.request.steps]
+        at = self.request.steps.index(step)
+        done = (sum(durations[:at]) + share * durations[at]) / sum(durations)
+        self._tell(PipelineProgress(step, what, done, share, capture, remark))
+
+    # --- keeping ---------------------------------------------------------------------------------------------------------
+
+    def _known_session(self, source: str) -> str | None:
+        return source if source and self.store is not None and self.store.has_session(source) else None
+
+    def _keep(self, kind: Goal, result: BaseModel) -> None:
+        """Keep a result in the registry, under the job's id if it is what the job is for."""
+        if self.store is None or not self._source or not self.request.keep:
+            return
+        job_id = self.request.job_id if kind == self.request.goal else None
+        self._results[kind] = self.store.add_result(kind, self._source, result.model_dump(mode="json"), job_id)
+
+    def _kept(self, kind: Goal, model: type[M]) -> M | None:
+        """The newest kept result of a kind, where it may be reused: a folder, unlike a finished session, may have changed."""
+        if not self.request.reuse or kind == self.request.goal or self.store is None or self._session is None:
+            return None
+        if self.store.session(self._session).state != "finished":
+            return None
+        for found in self.store.results(self._session, kind)[:1]:
+            self._results[kind] = found.id
+            return model.model_validate(found.document)
+        return None
+
+    # --- the steps -------------------------------------------------------------------------------------------------------
+
+    def _capture_step(self) -> None:
+        assert self.request.capture is not None
+        assert self.store is not None
+        self._session = self._captured("capture", self.request.capture)
+        self._source = self._source or self._session
+        if self.request.goal == "capture":
+            self._recordings = self.store.recording_set(self._session)
+            return
+        self._recordings = session_recordings(self.store, self._session)
+        for warning in self._recordings.warnings:
+            self._say("capture", "done", 1.0, remark=f"warning: {warning}")
+
+    def _captured(self, step: Step, request: CaptureRequest) -> str:
+        """Capture a session, or what is left of it; its id."""
+        assert self.store is not None
+        if request.session and self.store.session(request.session).state == "finished":
+            return request.session
+        if self.capturer is None:
+            raise InputError(f"{step}: no station to capture on; name one")
+
+        def told(standing: CaptureProgress) -> None:
+            what = f"{standing.sequence} {standing.what}".strip()
+            share = standing.done / max(standing.total, 1)
+            # Of resolving, the capture is about a tenth; the diagnosis after it is the rest.
+            self._say(step, what, share if step == "capture" else 0.1 * share, standing, standing.remark)
+
+        return self.capturer(request, told)
+
+    def _fit_step(self) -> None:
+        from lab.fit import fit_recording_set
+
+        if self._fit is None:
+            self._fit = self._kept("fit", FitResult)
+        if self._fit is None:
+            self._fit = fit_recording_set(self.recordings, lambda what, share: self._say("fit", what, share))
+            self._keep("fit", self._fit)
+
+    def _validate_step(self) -> None:
+        from lab.predict.validate import validate
+
+        self._validation = self._kept("validate", ValidationResult)
+        if self._validation is None:
+            self._validation = validate(self.recordings, self.fitted, models=self.request.models)
+            self._keep("validate", self._validation)
+
+    def _diagnose_step(self) -> None:
+        self._diagnosis = self._kept("diagnose", DiagnosisResult)
+        if self._diagnosis is None:
+            self._examined = self._diagnosed(self.recordings, "diagnose")
+            self._diagnosis = self._examined.result
+            self._keep("diagnose", self._diagnosis)
+
+    def _diagnosed(self, recordings: RecordingSet, step: Step) -> Diagnosis:
+        from lab.diagnose import examine
+
+        begun = 0.1 if step == "resolve" else 0.0
+        return examine(
+            recordings,
+            self.fitted,
+            lambda what, share: self._say(step, what, begun + (1.0 - begun) * share),
+            baseline=self.request.models,
+            pictures=self.request.pictures,
+            bootstrap=self.request.bootstrap,
+        )
+
+    def _resolve_step(self) -> None:
+        """Take the best capture that a station can take by itself, and diagnose with it again, until no rivals are left or no
+        capture is worth taking."""
+        from dataclasses import replace
+
+        assert self._examined is not None
+        assert self.store is not None
+        examined, recordings = self._examined, self.recordings
+        ties = _Ties()
+        resolutions: list[Resolution] = []
+        while (proposal := ties.next_to_take(examined.proposals)) is not None:
+            capture = proposal.capture
+            self._say("resolve", f"{capture.capture}, to tell {' from '.join(capture.rivals)}")
+            name = f"{self.recordings.manifest.name} resolve".strip()
+            session = self._captured("resolve", CaptureRequest(calibration=proposal.plan, name=name))
+            ties.taken(capture)
+            resolutions.append(
+                Resolution(
+                    capture=capture.capture,
+                    session=session,
+                    verdict_before=examined.result.verdict,
+                    effects_before=examined.result.effects,
+                )
+            )
+            folder = "resolve" if len(resolutions) == 1 else f"resolve-{len(resolutions)}"
+            recordings = recordings.joined(session_recordings(self.store, session), folder)
+            again = self._diagnosed(recordings, "resolve")
+            examined = replace(again, result=again.result.model_copy(update={"resolutions": tuple(resolutions)}))
+            self._examined, self._diagnosis = examined, examined.result
+            self._keep("diagnose", examined.result)
+        self._say("resolve", "done", 1.0, remark=ties.verdict(examined.proposals))
+
+    def _report_step(self) -> None:
+        from lab.report import provenance_of, write_report
+
+        runs = self.store.runs(self._session) if self.store is not None and self._session is not None else []
+        file = self.request.report_file or self._session_files()
+        provenance = provenance_of(self.recordings, runs[-1].instruments if runs else None)
+        self._report = write_report(file, self.recordings, self.fitted, self._validation, self._diagnosis, provenance)
+        within = self.store is not None and self._report.is_relative_to(self.store.root)
+        path = self._report.relative_to(self.store.root) if self.store is not None and within else self._report
+        self._keep(self.request.goal, ReportFile(path=str(path), results=dict(self._results)))
+
+    def _session_files(self) -> Path:
+        """Write the results and the improved cameras into the session's folder; where its report belongs."""
+        from lab.formats.camera_file import write_camera
+        from lab.formats.result_file import write_result
+
+        assert self.store is not None
+        assert self._session is not None
+        folder = self.store.folder(self._session)
+        for kind, result in (("fit", self._fit), ("validate", self._validation), ("diagnose", self._diagnosis)):
+            if result is not None:
+                write_result(result, folder / f"{kind}.json")
+        cameras = self._examined.improved if self._examined is not None else {}
+        (folder / "cameras").mkdir(exist_ok=True)
+        for side, content in cameras.items():
+            write_camera(folder / "cameras" / f"{side}.toml", content)
+        return folder / "report.html"
+
+
+class _Ties:
+    """The captures that were taken to settle ties between rivals."""
+
+    def __init__(self) -> None:
+        self._taken: set[tuple[Side, str]] = set()
+        #: By side and rivals: how probably the captures taken would have left the tie open, as they were predicted.
+        self._open: dict[tuple[Side, frozenset[str]], float] = {}
+
+    def taken(self, capture: NextCapture) -> None:
+        """Note that a capture was taken."""
+        tie = (capture.side, frozenset(capture.rivals))
+        self._taken.add((capture.side, capture.capture))
+        self._open[tie] = self._open.get(tie, 1.0) * (1.0 - capture.told_apart)
+
+    def _may_settle(self, proposal: Proposal) -> bool:
+        """Whether a station can take the capture, it is worth taking, and the tie isn't given up."""
+        from lab.diagnose.outcome.next_capture import WORTH_TAKING
+
+        capture = proposal.capture
+        return (
+            proposal.plan is not None
+            and capture.distance >= WORTH_TAKING
+            and (capture.side, capture.capture) not in self._taken
+            and self._open.get((capture.side, frozenset(capture.rivals)), 1.0) >= GIVE_UP_PROBABILITY
+        )
+
+    def next_to_take(self, proposals: tuple[Proposal, ...]) -> Proposal | None:
+        """The best capture that may settle a tie; None where there is none. `proposals`: best first."""
+        return next((proposal for proposal in proposals if self._may_settle(proposal)), None)
+
+    def verdict(self, proposals: tuple[Proposal, ...]) -> str:
+        """Why nothing more is captured."""
+        if not proposals:
+            return "resolve: no rivals are left"
+        capture = proposals[0].capture
+        rivals = " from ".join(capture.rivals)
+        if (capture.side, frozenset(capture.rivals)) in self._open:
+            return f"resolve: the captures that were taken didn't tell {rivals}, and no other that the station takes by itself would"
+        return f"resolve: no capture that the station takes by itself would tell {rivals}"
