@@ -22,6 +22,7 @@ Concealed = Mapping[Side, tuple[Effect, ...]]
 
 #: Effects that this bench can't show, and why.
 NOT_SHOWN: dict[str, str] = {
+    "second_order_light": "the lamp's light ends at 730 nm, and the cameras see nothing of half the wavelength",
     "stereo_time_offset": "every target of this bench stands still, and only what moves tells when a camera captures",
 }
 

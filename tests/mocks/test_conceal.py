@@ -1,0 +1,280 @@
+"""Every effect of the library is concealed on the bench, and what the bench then gives is what the forward model predicts.
+
+Predictions start from what stands in front and from what the radiometer says, and take `sim.forward.expected_sequence`; the
+bench takes its frames one by one, from its own settings, clock and temperature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from mocks.bench import MARGIN_PX, OVERSAMPLE, SCREEN_OVERSAMPLE, Bench
+from mocks.command import commands
+from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, parse
+from mocks.light_path import LightSettings
+from mocks.targets import Shown, scene
+from mocks.truth import HiddenCamera, hidden_truth
+from sim.camera import Side
+from sim.effects.base import Effect
+from sim.effects.library import effects as library
+from sim.forward import Exposure, dark_electrons, expected_sequence, read_out
+from sim.scene import Darkness, Scene, ScreenPattern, UniformField
+from sim.sensor.electrons import dn_moments
+from sim.spectrum import FloatArray, Spectrum
+
+SHAPE = 96, 128
+PATTERN = np.random.default_rng(5).integers(0, 2, (60, 80)).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Take:
+    """One set-up of the bench and an exposure of it."""
+
+    target: str = "sphere"
+    exposure_s: float = 0.002
+    light: LightSettings = field(default_factory=lambda: LightSettings(shutter_open=True, filter_place=2))
+    pattern: bool = False
+    cell_px: int = 6
+    wait_s: float = 0.0
+
+
+FLAT, DARK = Take(), Take("cap", 2.0)
+LATER = replace(FLAT, wait_s=120.0)
+SWEPT = Take(exposure_s=0.02, light=LightSettings(560.0, True, 3, 3000.0))
+RED = Take(exposure_s=0.05, light=LightSettings(660.0, True, 3, 3000.0))
+EDGE = Take("edge-1", 0.003)
+SCREEN, BOARD, CHART = Take("screen", 0.02, pattern=True), Take("charuco-02", 0.003), Take("colorchecker", 0.003)
+OVERFULL = Take("screen", 0.4, pattern=True, cell_px=40)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is concealed, and frames of which at least one shows it; `tolerance` of chi2 over the number of pixels."""
+
+    spec: str
+    takes: tuple[Take, ...]
+    tolerance: float = 0.06
+    side: Side = "left"
+    warm_up_c: float = 0.0
+
+
+CASES = (
+    Case("left:adc_nonlinearity:error_dn=40", (replace(FLAT, exposure_s=0.004),)),
+    Case("both:ambient_light:rate_e_per_s=100000,red_over_blue=3", (FLAT, replace(FLAT, light=LightSettings()))),
+    Case("left:amplifier_glow:glow_e_per_s=300,reach_mm=0.2,corner=bottom_left", (DARK,)),
+    Case("left:astigmatism:defocus_x_um=40", (EDGE, SCREEN)),
+    Case("left:axial_chromatic_aberration:slope_um=40", (EDGE, SCREEN)),
+    Case("left:black_level_drift:drift_dn_per_min=5", (LATER, replace(DARK, wait_s=60.0))),
+    Case("left:blooming:share_percent=40", (OVERFULL,)),
+    Case("left:brighter_fatter:loss_percent=60,shared_percent=30", (FLAT,)),
+    Case("left:charge_diffusion:length_um=2.5", (EDGE, SCREEN)),
+    Case("left:column_noise:offset_e=6,odd_even_e=4", (DARK,)),
+    Case("left:coma:w131_x_um=0.5", (EDGE, SCREEN)),
+    Case("left:cover_glass:thickness_mm=20", (EDGE, SCREEN)),
+    Case("left:crosstalk:share_percent=4", (SWEPT, SCREEN, CHART)),
+    Case("left:dark_current_temperature:doublings_per_c=0.3", (replace(DARK, wait_s=300.0),), warm_up_c=8.0),
+    Case("left:decentre:shift_x_um=8", (BOARD, EDGE)),
+    Case("left:defocus:defocus_um=40", (EDGE, BOARD)),
+    Case("left:distortion:corner_percent=3", (BOARD, EDGE, SCREEN)),
+    Case("left:exposure_offset:offset_us=300", (FLAT,)),
+    Case("left:field_curvature:curvature_um=60,tilt_x_um=30", (EDGE,)),
+    Case("left:ghost:share_percent=10", (EDGE, SCREEN)),
+    Case("left:green_imbalance:imbalance_percent=6", (FLAT, SWEPT)),
+    Case("left:hot_pixels:excess_e_per_s=400,share_ppm=20000", (DARK,)),
+    Case("left:image_lag:lag_percent=5", (FLAT, DARK)),
+    Case("left:infrared_cut_filter:cut_wavelength_nm=650,width_nm=5", (RED, CHART)),
+    Case("left:inter_pixel_capacitance:share_percent=4", (SCREEN, FLAT)),
+    Case("left:lateral_chromatic_aberration:slope_um=12", (EDGE, BOARD)),
+    Case("both:light_flicker:modulation_percent=20,frequency_hz=100,line_time_us=80", (FLAT, SCREEN)),
+    Case("left:nameless_correction:strength=1", (SCREEN, EDGE)),
+    Case("both:non_uniform_illumination:gradient_x_percent=8,gradient_y_percent=4", (FLAT, SWEPT)),
+    Case("left:nonlinearity:quadratic_percent=10", (FLAT, CHART)),
+    Case("left:on_chip_sharpening:strength=0.5", (replace(EDGE, exposure_s=0.0006), DARK)),
+    Case("left:on_chip_smoothing:strength=0.4", (EDGE, DARK)),
+    Case("left:optical_low_pass_filter:displacement_x_um=2,displacement_y_um=2", (EDGE, SCREEN)),
+    Case("left:other_f_number:ratio=2", (EDGE, SCREEN)),
+    Case("left:pixel_aperture:side_change_um=1.5", (SCREEN,)),
+    Case("both:radiometer_nonlinearity:exponent_percent=12,growth=0.5", (SWEPT,)),
+    Case("left:random_telegraph_noise:amplitude_e=40,share_percent=10", (DARK,)),
+    Case("left:row_noise:noise_e=4,offset_e=4", (DARK,), tolerance=0.4),
+    Case("both:screen_gamma:exponent=2.5", (SCREEN,)),
+    Case("both:screen_pixel_structure:amplitude_percent=60", (replace(SCREEN, cell_px=8),)),
+    Case("both:source_bandwidth:width_nm=20", (RED, SWEPT)),
+    Case("both:source_drift:drift_percent_per_min=5", (FLAT, LATER)),
+    Case("left:spherical_aberration:w040_um=0.4", (EDGE, SCREEN)),
+    Case("both:stereo_gain_mismatch:gain_percent=10", (CHART, SCREEN, FLAT), side="right"),
+    Case("both:stray_light:share_percent=10", (RED, SWEPT)),
+    Case("left:veiling_glare:share_percent=20,halo_share=0.5", (EDGE, BOARD)),
+    Case("both:vibration_blur:amplitude_x_um=3", (EDGE, SCREEN)),
+    Case("left:vignetting:corner_loss_percent=30", (FLAT, SCREEN)),
+    Case("left:vignetting_decentre:fall_off_percent=30,centre_x=0.4", (FLAT,)),
+    Case("both:wavelength_offset:offset_nm=6", (SWEPT, RED)),
+)
+
+
+def test_every_effect_is_tried_or_refused() -> None:
+    tried = [case.spec.split(":")[1] for case in CASES]
+    assert sorted([*tried, *NOT_SHOWN]) == sorted(library())
+
+
+def set_up(bench: Bench, take: Take) -> Shown:
+    bench.set_wavelength(take.light.wavelength_nm)
+    bench.set_filter(take.light.filter_place)
+    bench.set_slit_um(take.light.slit_um)
+    bench.set_shutter(take.light.shutter_open)
+    bench.place(take.target)
+    bench.clock.sleep(take.wait_s)
+    if not take.pattern:
+        return Shown()
+    pattern = PATTERN[: 960 // take.cell_px, : 1800 // take.cell_px]
+    bench.show(pattern, take.cell_px)
+    return Shown(pattern, take.cell_px)
+
+
+def read_by(bench: Bench, kind: str) -> UniformField:
+    """What a session knows of the sphere: the mean of some readings of the radiometer."""
+    readings = [bench.radiance() for _ in range(8)]
+    mean = np.mean([reading.value for reading in readings], axis=0)
+    return UniformField(Spectrum.of(readings[0].arrays[0], mean), kind=kind)
+
+
+def predicted(
+    camera: HiddenCamera, exposures: Sequence[Exposure], effects: tuple[Effect, ...], gains: Sequence[float]
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Mean and variance (DN) of every frame of a sequence, by the forward model; `gains` of the light."""
+    found = []
+    model = camera.model
+    fine = any(isinstance(exposure.scene, ScreenPattern) for exposure in exposures)
+    means = expected_sequence(
+        model, exposures, effects, oversample=SCREEN_OVERSAMPLE if fine else OVERSAMPLE, margin_px=MARGIN_PX
+    )
+    for exposure, electrons, gain in zip(exposures, means, gains, strict=True):
+        dark = dark_electrons(model, exposure, effects)
+        lit = dark + (electrons - dark) * gain
+        out = read_out(model, exposure, effects)
+        found.append(dn_moments(lit, model, 0.0, out, camera.pattern, dark_electrons=dark))
+    return found
+
+
+@cache
+def healthy(take: Take, side: Side) -> tuple[FloatArray, FloatArray]:
+    """What a camera with nothing to conceal would give."""
+    bench = Bench(1, concealed={}, shape=SHAPE)
+    camera = bench._truth.cameras[side]
+    seen = scene(camera, take.target, take.light, set_up(bench, take))
+    exposure = Exposure(seen, take.exposure_s, temperature_c=camera.model.dark_current_reference_c)
+    return predicted(camera, [exposure], (), [1.0])[0]
+
+
+def chi2(frame: NDArray[np.uint16], moments: tuple[FloatArray, FloatArray]) -> float:
+    """Mean squared departure of a frame over its variance, where it isn't clipped."""
+    mean, variance = moments
+    return float(np.mean(((frame - mean) ** 2)[variance > 0.1] / variance[variance > 0.1]))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.spec.split(":")[1])
+def test_the_bench_shows_what_the_forward_model_predicts(case: Case) -> None:
+    bench = Bench(1, concealed=parse([case.spec]), shape=SHAPE, warm_up_c=case.warm_up_c)
+    camera = bench._truth.cameras[case.side]
+    (effect,) = camera.effects
+    of_radiometer = effect.name in OF_THE_RADIOMETER
+    frames, exposures, gains = [], [], []
+    began_s = bench.clock.now() + case.takes[0].wait_s
+    for take in case.takes:
+        shown = set_up(bench, take)
+        seen: Scene = scene(camera, take.target, take.light, shown)
+        if of_radiometer:
+            assert isinstance(seen, UniformField)
+            seen = read_by(bench, seen.kind)
+        elapsed_s, temperature_c = bench.clock.now() - began_s, bench.sensor_temperature_c(case.side)
+        exposures.append(Exposure(seen, take.exposure_s, 0.0, temperature_c, elapsed_s))
+        uniform = isinstance(seen, UniformField | Darkness)
+        gains.append(1.0 if uniform else 1.0 + 0.01 * getattr(effect, "gain_percent", 0.0))
+        frames.append(bench.expose(case.side, take.exposure_s))
+    told = predicted(camera, exposures, (effect,), gains)
+    untold = [
+        predicted(camera, [exposure], (), [1.0])[0] if of_radiometer else healthy(take, case.side)
+        for take, exposure in zip(case.takes, exposures, strict=True)
+    ]
+    departures = [abs(chi2(frame, moments) - 1.0) for frame, moments in zip(frames, untold, strict=True)]
+    assert max(departures) > 3.0 * case.tolerance, departures
+    # 12 288 pixels: one standard deviation is 0.013, more where rows or neighbours have noise in common
+    for take, frame, moments in zip(case.takes, frames, told, strict=True):
+        assert chi2(frame, moments) == pytest.approx(1.0, abs=case.tolerance), (take, departures)
+
+
+@pytest.mark.parametrize("name", ["stray_light:share_percent=20", "source_drift:drift_percent_per_min=10"])
+def test_what_goes_wrong_behind_the_radiometer_is_not_in_its_readings(name: str) -> None:
+    told, plain = (Bench(1, concealed=concealed, shape=(8, 8)) for concealed in (parse([f"both:{name}"]), {}))
+    for bench in (told, plain):
+        set_up(bench, SWEPT)
+        bench.expose("left", 0.1)
+        bench.clock.sleep(60.0)
+    assert np.array_equal(told.radiance().value, plain.radiance().value)
+
+
+def test_a_healthy_bench_conceals_nothing() -> None:
+    truth = hidden_truth(3, {})
+    for side in SIDES:
+        assert truth.cameras[side].effects == ()
+        # white: neighbours have nothing in common, columns no offset
+        prnu, dsnu = truth.cameras[side].pattern.prnu, truth.cameras[side].pattern.dsnu_e
+        assert abs(np.mean(prnu[:, 1:] * prnu[:, :-1]) / prnu.var()) < 4.0 / np.sqrt(prnu.size)
+        assert dsnu.mean(axis=0).var() / dsnu.var() * len(dsnu) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 640.0))
+
+
+@pytest.mark.parametrize(
+    ("spec", "complaint"),
+    [
+        ("middle:defocus:defocus_um=3", "'middle' is no side"),
+        ("left:frobnication:x=1", "no effect named 'frobnication'; there are adc_nonlinearity, "),
+        ("left:defocus:depth=3", "no parameter 'depth'; write PARAMETER=VALUE with defocus_um"),
+        ("left:defocus:defocus_um", "no parameter 'defocus_um'; write PARAMETER=VALUE"),
+        ("left:defocus:defocus_um=900", "above the upper limit 200.0 um"),
+        ("left:defocus:defocus_um=much", "valid number"),
+        ("left:defocus", "nothing of defocus would be there"),
+        ("left:source_drift:drift_percent_per_min=1", "write both:source_drift"),
+        ("both:stereo_time_offset:delay_ms=3", "every target of this bench stands still"),
+        ("left:amplifier_glow:glow_e_per_s=1,corner=middle", "'top_left'"),
+        ("left:defocus:defocus_um=1,defocus_um=2", "given twice"),
+    ],
+)
+def test_what_cannot_be_concealed_is_one_line(spec: str, complaint: str) -> None:
+    with pytest.raises(ConcealError) as raised:
+        parse([spec])
+    assert complaint in str(raised.value)
+    assert spec in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_an_effect_is_concealed_once() -> None:
+    with pytest.raises(ConcealError, match="on the left already"):
+        parse(["both:defocus:defocus_um=3", "left:defocus:defocus_um=4"])
+
+
+def test_effects_of_the_rig_are_the_same_for_both() -> None:
+    one = parse(["both:source_drift:drift_percent_per_min=1"])["left"]
+    with pytest.raises(ConcealError, match="of the rig"):
+        Bench(concealed={"left": one})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment", "complaint"),
+    [
+        (("--conceal", "left:defocus:depth=3"), "", "no parameter 'depth'"),
+        ((), "left:defocus:defocus_um=3; left:defocus:depth=3", "no parameter 'depth'"),
+        (("--healthy", "--conceal", "left:defocus:defocus_um=3"), "", "--healthy conceals nothing"),
+    ],
+)
+def test_the_command_refuses_in_one_line(arguments: tuple[str, ...], environment: str, complaint: str) -> None:
+    done = CliRunner().invoke(commands, ["bench", *arguments], env={"CALIBENCH_CONCEAL": environment})
+    assert done.exit_code == 2
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1
