@@ -11,7 +11,7 @@ from lab.challenge.faults import FAULTS, spoilt
 from lab.challenge.noncentrality import noncentrality, summaries
 from lab.challenge.recordings import recording_set
 from lab.challenge.truth import CaseTruth, Concealed, Kind
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.formats.recording_set import RecordingSet
 from mocks.former import LISTED, OUTSIDE, ConcealedCamera, Law, Plan, Session, record
 
@@ -135,11 +135,11 @@ def _sized(
     if not laws:
         return [], []
 
-    def both(present: Sequence[Law]) -> list[Evidence | None]:
+    def both(present: Sequence[Law]) -> list[MeasurementModel | None]:
         found = {k: summaries(recording_set(take(present, k))) for k in set(draws)}
         return [found[k] for k in draws]
 
-    def shown(present: list[Evidence | None], absent: list[Evidence | None]) -> float:
+    def shown(present: list[MeasurementModel | None], absent: list[MeasurementModel | None]) -> float:
         return noncentrality(list(zip(present, absent, strict=True)))
 
     none = both(())

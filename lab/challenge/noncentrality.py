@@ -13,14 +13,14 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from lab.diagnose import BLOCKS
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.summaries import Study
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
 
 
-def summaries(recordings: RecordingSet) -> Evidence | None:
+def summaries(recordings: RecordingSet) -> MeasurementModel | None:
     """The summaries of a single camera's recordings; None where nothing can be summarised."""
     study = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     blocks = []
@@ -29,10 +29,10 @@ def summaries(recordings: RecordingSet) -> Evidence | None:
             blocks.append(make(study))
         except NotDetermined:
             continue
-    return Evidence(tuple(blocks), study.camera) if blocks else None
+    return MeasurementModel(tuple(blocks), study.camera) if blocks else None
 
 
-def _keys(found: Evidence) -> list[Hashable]:
+def _keys(found: MeasurementModel) -> list[Hashable]:
     """Identity of each summary: the same in all recordings of one session."""
     count: Counter[Hashable] = Counter()
     keys: list[Hashable] = []
@@ -44,14 +44,14 @@ def _keys(found: Evidence) -> list[Hashable]:
     return keys
 
 
-def _change(present: Evidence, absent: Evidence) -> dict[Hashable, float]:
+def _change(present: MeasurementModel, absent: MeasurementModel) -> dict[Hashable, float]:
     """Change by the law of every summary that both have and that may be used for the choice."""
     other = dict(zip(_keys(absent), absent.value, strict=True))
     seen = zip(_keys(present), present.value, present.seen, strict=True)
     return {key: value - other[key] for key, value, use in seen if use and key in other}
 
 
-def noncentrality(pairs: Sequence[tuple[Evidence | None, Evidence | None]]) -> float:
+def noncentrality(pairs: Sequence[tuple[MeasurementModel | None, MeasurementModel | None]]) -> float:
     """d1' C^-1 d2 of two pairs (with the law, without it), never below 0; each pair is of another draw of the noise.
 
     d is the change of the summaries, C their covariance under the baseline in the first pair's recordings with the law. A law that moves

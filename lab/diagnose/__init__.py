@@ -1,10 +1,11 @@
-"""Diagnosis: where recordings and the baseline part, what physics was left out, and what the named effects gain.
+"""Diagnosis: where recordings and the baseline differ, which effect was left out, and what naming it gains.
 
-blocks.py     what is looked at: BLOCKS; one side's evidence
-decide.py     the chain on that evidence: score, refit, weigh, hold out
-side.py       what is told of one side
-processes.py  the sides at the same time
-findings.py   all sides in one result
+policy.py       every number by which a diagnosis decides
+measurements/   what is looked at: numbers with covariance, and how a model predicts them
+inference/      the measurement model; locate, score, search, weigh, name
+outcome/        what is told: result, improved model, next capture
+visibility.py   which measurements show each effect, and which effects are rivals
+side.py         the chain for one side; processes.py runs the sides at the same time
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from lab.diagnose.measurements.blocks import BLOCKS
-from lab.diagnose.outcome.findings import merged
+from lab.diagnose.outcome.merge_sides import merged
 from lab.diagnose.outcome.next_capture import Proposal
+from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.processes import in_processes
 from lab.diagnose.side import SideFindings, diagnose_side
 from lab.formats.camera_file import CameraFile
@@ -22,14 +24,15 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult
 from sim.camera import Side
 
-__all__ = ["BLOCKS", "Diagnosis", "Progress", "diagnose", "examine"]
+__all__ = ["BLOCKS", "DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
+
 #: Called with what is being done and the share of the work that is done, 0..1.
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found; each side's model with it (of the sides that could be judged); and what to capture next, best first."""
+    """The result; the improved model of every side that could be judged; and what to capture next, best first."""
 
     result: DiagnosisResult
     improved: dict[Side, CameraFile]
@@ -56,15 +59,20 @@ def examine(
     at_once: bool = True,
     pictures: bool = False,
     bootstrap: int = 0,
+    policy: DecisionPolicy | None = None,
 ) -> Diagnosis:
-    """Diagnose every side. `fit` gives the geometry and, where the maker states no curves, the sensitivities; None: neither.
+    """Diagnose every side.
 
-    Noise and levels are taken from the recordings anew, as free quantities of the same model. What the recordings don't
-    determine is not judged, and stands in `skipped`. `baseline`: cameras with their effects, in place of the maker's word and the
-    fit, for the sides that it has. Several sides are worked on at the same time, each in a process of its own; one side, or with
-    `at_once` False each in its turn, in this one. `pictures`: draw residual pictures, for the report.
-    `bootstrap`: so many healthy cameras like the baseline are drawn frame by frame, whose scores the threshold has to hold. `progress` is called in the caller's thread.
+    fit         gives geometry and sensitivities; None: neither, where the maker states none. Noise and levels are nuisance parameters
+                of the measurement model. What the recordings don't determine stands in `skipped`.
+    progress    is called in the caller's thread with a text and the share of the work that is done.
+    baseline    cameras with their effects, by side, in place of the maker's word and the fit.
+    at_once     several sides run at the same time, each in a process of its own; else one after the other in this one.
+    pictures    draw residual pictures, for the report.
+    bootstrap   healthy cameras like the baseline that are drawn frame by frame; the threshold is at least what their scores say.
+    policy      the rules of decision; None: `DecisionPolicy()`.
     """
+    policy = policy or DecisionPolicy()
     shares = dict.fromkeys(recordings.sides, 0.0)
     cameras = baseline or {}
 
@@ -80,16 +88,17 @@ def examine(
             fit,
             cameras.get(side),
             lambda text: report(side, text),
+            policy=policy,
             pictures=pictures,
             bootstrap=bootstrap,
         )
 
     if at_once and len(shares) > 1:
-        found = in_processes(recordings, fit, cameras, report, pictures=pictures, bootstrap=bootstrap)
+        found = in_processes(recordings, fit, cameras, report, policy=policy, pictures=pictures, bootstrap=bootstrap)
     else:
         found = [alone(side) for side in recordings.sides]
     if progress is not None:
         progress("done", 1.0)
     improved = {findings.side: findings.improved for findings in found if findings.improved is not None}
     offered = sorted((p for findings in found for p in findings.proposals), key=lambda p: -p.capture.distance)
-    return Diagnosis(merged(recordings.source, found), improved, tuple(offered))
+    return Diagnosis(merged(recordings.source, found, policy), improved, tuple(offered))

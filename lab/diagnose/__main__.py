@@ -1,4 +1,4 @@
-"""`python -m lab.diagnose`: one side of a recording set for `processes.py`, which hands over the work and hears what was found."""
+"""`python -m lab.diagnose`: diagnose one side for `processes.py`, which sends the task and reads the findings."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from lab.diagnose.side import SideFindings, diagnose_side
 
 
 def _serve() -> None:
-    """What a process does: one side, and everything that it says as pickles on what was the standard output."""
+    """Read a task from standard input, diagnose that side, and write progress and findings as pickles to standard output."""
     with os.fdopen(os.dup(1), "wb") as to:
-        os.dup2(2, 1)  # what a library prints mustn't get between
+        os.dup2(2, 1)  # what a library prints goes to standard error
 
         def say(what: str | SideFindings | Exception) -> None:
             to.write(pickle.dumps(what, pickle.HIGHEST_PROTOCOL))
@@ -22,19 +22,22 @@ def _serve() -> None:
         try:
             task = pickle.load(sys.stdin.buffer)
         except (EOFError, pickle.UnpicklingError):
-            os._exit(1)  # who started this was interrupted before it had handed over the work
-        recordings, side, fit, baseline, pictures, bootstrap = task
+            os._exit(1)  # the caller was interrupted before it had sent the task
+        recordings, side, fit, baseline, policy, pictures, bootstrap = task
         try:
-            say(diagnose_side(recordings, side, fit, baseline, say, pictures=pictures, bootstrap=bootstrap))
+            found = diagnose_side(
+                recordings, side, fit, baseline, say, policy=policy, pictures=pictures, bootstrap=bootstrap
+            )
+            say(found)
         except BrokenPipeError:
-            os._exit(1)  # nobody listens any more
+            os._exit(1)  # the caller is gone
         except Exception as error:
             error.add_note(traceback.format_exc())
             say(_sendable(error))
 
 
 def _sendable(error: Exception) -> Exception:
-    """The error itself where it survives being sent, else one of the same words."""
+    """The error itself where it can be pickled, else one with the same text."""
     try:
         return error if isinstance(pickle.loads(pickle.dumps(error)), Exception) else RuntimeError(str(error))
     except Exception:

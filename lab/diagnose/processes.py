@@ -1,8 +1,8 @@
-"""The sides of a recording set at the same time, each in a process of its own, for Python computes in one thread at a time.
+"""The sides of a recording set at the same time, each in an OS process of its own, as Python computes in one thread at a time.
 
-A process is a plain `python -m lab.diagnose`. It is handed its work through its standard input, and says through its
-standard output how far it is and what it found. Unlike a pool's workers it needs nothing of the caller's main module, may be
-started by a pool's worker, and ends when whoever started it is gone.
+A process is `python -m lab.diagnose`. It receives its task on standard input, and sends progress and findings as pickles on standard
+output. Unlike a pool's worker it needs nothing of the caller's main module, may be started by a pool's worker, and ends with the process
+that started it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any
 
+from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import SideFindings
 from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
@@ -37,19 +38,20 @@ def in_processes(
     baseline: Mapping[Side, CameraFile],
     report: Callable[[Side, str], None],
     *,
+    policy: DecisionPolicy,
     pictures: bool = False,
     bootstrap: int = 0,
 ) -> list[SideFindings]:
-    """What every side shows, in the order of the sides. `report` is called in the caller's thread; what it raises, or what a
-    process raised, ends all of them. Raises InputError where a process was ended from outside."""
-    recordings.let_go()  # every side reads its own, while this process waits
+    """The findings of every side, in the order of the sides. `report` is called in the caller's thread. An exception in it, or in a process,
+    ends all processes. Raises InputError where a process was ended from outside."""
+    recordings.let_go()  # every process reads its own frames
     said: queue.SimpleQueue[tuple[Side, Any]] = queue.SimpleQueue()
     found: dict[Side, SideFindings] = {}
     with contextlib.ExitStack() as stack:
         for side in recordings.sides:
             # registered before it starts: an interrupt in between must find it
             stack.enter_context(
-                _Process(side, (recordings, side, fit, baseline.get(side), pictures, bootstrap), said)
+                _Process(side, (recordings, side, fit, baseline.get(side), policy, pictures, bootstrap), said)
             ).start()
         while len(found) < len(recordings.sides):
             try:
@@ -66,7 +68,7 @@ def in_processes(
 
 
 class _Process:
-    """One side's process, with a thread that listens to it. Leaving the block ends both."""
+    """One side's process, and a thread that reads its output. Leaving the context ends both."""
 
     def __init__(self, side: Side, task: tuple[Any, ...], said: queue.SimpleQueue[tuple[Side, Any]]) -> None:
         self._side, self._task, self._said = side, task, said
@@ -98,7 +100,7 @@ class _Process:
             self._listener.join()
 
     def _listen(self) -> None:
-        """Hand over the task, and put what the process says into the queue until it has said all."""
+        """Send the task; put what the process sends into the queue until its findings have come."""
         assert self._process is not None
         assert self._process.stdin is not None
         assert self._process.stdout is not None

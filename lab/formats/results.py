@@ -723,6 +723,16 @@ class Resolution(Frozen):
     effects_before: tuple[NamedEffect, ...]
 
 
+class PolicyRule(Frozen):
+    """One number by which a diagnosis decided (`lab.diagnose.policy.DecisionPolicy` declares them)."""
+
+    name: str
+    group: str
+    value: float
+    unit: str
+    meaning: str
+
+
 class DiagnosisResult(Frozen):
     format: Literal["calibench-diagnosis"] = "calibench-diagnosis"
     version: Literal[1] = 1
@@ -744,3 +754,4 @@ class DiagnosisResult(Frozen):
     curves: tuple[ResidualCurve, ...] = ()
     skipped: tuple[Skipped, ...] = ()
     summary: tuple[str, ...] = ()  # the diagnosis in sentences
+    policy: tuple[PolicyRule, ...] = ()  # the rules of decision

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from lab.diagnose.inference.evidence import chi2
+from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.patches import Patch as PatchLevel
 from lab.diagnose.measurements.patches import patch_covariance, patch_levels
 from lab.diagnose.measurements.summaries import Study

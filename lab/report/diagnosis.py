@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from lab.diagnose.outcome.looked_at import detectable
+from lab.diagnose.outcome.detectability import detectable
 from lab.formats.results import DiagnosisResult, Place, ResidualCurve, ResidualPicture, Visibility
 from lab.report.charts import Figure, axis, layout
 from lab.report.figures import SHOWN_UNITS

@@ -33,3 +33,8 @@ def effect(name: str) -> type[Effect]:
     if name not in known:
         raise KeyError(f"no effect named {name!r}; there are: {', '.join(known)}")
     return known[name]
+
+
+def candidates() -> tuple[type[Effect], ...]:
+    """The effects that a diagnosis looks for."""
+    return tuple(kind for kind in effects().values() if kind.shown_by)

@@ -8,7 +8,7 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.score import signatures
-from lab.diagnose.measurements.blocks import evidence_of
+from lab.diagnose.measurements.blocks import measurement_model
 from mocks.former import ConcealedCamera, Plan
 from sim.effects.library import effects
 
@@ -21,11 +21,11 @@ def test_the_threshold_holds_on_images(seed: int, cfa: str) -> None:
     """Of 24 draws at a rate of 1 %, more than 3 exceed it with a probability of 1e-5. No measurement's chi2 is above its number
     of values by more than 4 sigmas of a mean of 24: then its covariance would be too narrow."""
     recordings = recordings_of(ConcealedCamera(seed, cfa=cfa, rows=96, cols=128), Plan())
-    evidence, _ = evidence_of(recordings, "left")
-    assert evidence is not None
+    model, _ = measurement_model(recordings, "left")
+    assert model is not None
     known = [e for e in effects().values() if e.shown_by]
-    threshold = signatures(evidence, evidence.camera, (), known).threshold(np.random.default_rng(0), 0.99)
-    draws = healthy_draws(recordings, "left", evidence, DRAWS, np.random.default_rng(seed))
+    threshold = signatures(model, model.camera, (), known).threshold(np.random.default_rng(0), 0.99, 400)
+    draws = healthy_draws(recordings, "left", model, DRAWS, np.random.default_rng(seed))
     tops = sorted(d.top_score for d in draws)
     print(f"{cfa}: threshold {threshold:.1f}, scores {tops[len(tops) // 2]:.1f} in the middle, {tops[-1]:.1f} at most")
     assert len(draws) == DRAWS

@@ -1,8 +1,7 @@
-"""A bootstrap of images: what a healthy camera like the fitted baseline would score, drawn frame by frame by the forward model.
+"""An image-level bootstrap: scores of healthy cameras like the fitted baseline, drawn frame by frame by the forward model.
 
-The threshold in `decide.py` is drawn from the covariance of the measurements, in no time. Here the baseline's frames are drawn instead, with
-patterns and noise of their own, and go through every estimator: what a covariance leaves out (estimators' errors, an edge's tail, rounding)
-shows in the scores.
+The threshold of `decide.py` is drawn from the covariance of the measurements. Here whole frames with their own patterns and noise go through
+every estimator, so that the scores hold what a covariance leaves out: estimators' errors, an edge's tail, rounding.
 """
 
 from __future__ import annotations
@@ -12,16 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.diagnose.inference.evidence import Evidence, chi2
+from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import signatures
-from lab.diagnose.measurements.blocks import evidence_of
+from lab.diagnose.measurements.blocks import measurement_model
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import Flat, Narrowband, RecordingSet
 from lab.formats.results import FitResult
 from lab.predict.replay import Replay
 from sim.camera import CameraModel, Side
-from sim.effects.library import effects as library
+from sim.effects.library import candidates
 from sim.spectrum import Spectrum
+
+#: Flats whose predicted signal is below this share of the range say too little of the level.
+LEAST_SIGNAL_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -35,55 +38,54 @@ class HealthyDraw:
 def healthy_draws(
     recordings: RecordingSet,
     side: Side,
-    evidence: Evidence,
+    model: MeasurementModel,
     count: int,
     rng: np.random.Generator,
     fit: FitResult | None = None,
     baseline: CameraFile | None = None,
 ) -> list[HealthyDraw]:
-    """`count` draws of the recordings by the baseline of `evidence`; measurements of captures that can't be replayed are left out."""
-    camera = _at_recorded_levels(recordings, side, evidence.camera)
+    """`count` draws of the recordings by the baseline of `model`; measurements of captures that can't be replayed are left out."""
+    camera = _at_recorded_levels(recordings, side, model.camera)
     replay = Replay(recordings, side, camera)
     others = {c.id for c in recordings.captures(side=side)} - {c.id for c in replay.captures}
     found = []
     for _ in range(count):
-        again, _ = evidence_of(replay.drawn(rng).without(others), side, fit, baseline)
+        again, _ = measurement_model(replay.drawn(rng).without(others), side, fit, baseline)
         if again is not None:
             found.append(_draw_of(again))
     return found
 
 
 def image_threshold(draws: Sequence[HealthyDraw], false_alarm_rate: float) -> float:
-    """The score that a share `false_alarm_rate` of healthy cameras exceeds, of the extreme-value distribution (Gumbel's) that
-    has the draws' mean and standard deviation: the largest of many scores follows it, and few draws fix it."""
+    """The score that a share `false_alarm_rate` of healthy cameras exceeds: the quantile of Gumbel's extreme-value distribution with the
+    draws' mean and standard deviation. The largest of many scores follows it, and few draws fix it."""
     tops = np.array([d.top_score for d in draws])
     scale = float(np.std(tops, ddof=1)) * np.sqrt(6.0) / np.pi
     return float(np.mean(tops)) - scale * (np.euler_gamma + float(np.log(-np.log1p(-false_alarm_rate))))
 
 
-def _draw_of(evidence: Evidence) -> HealthyDraw:
-    known = [effect for effect in library().values() if effect.shown_by]
-    scores = signatures(evidence, evidence.camera, (), known).scores()
-    model = evidence.gaussian()
+def _draw_of(model: MeasurementModel) -> HealthyDraw:
+    scores = signatures(model, model.camera, (), candidates()).scores()
+    gaussian = model.gaussian()
     blocks = {}
-    for block, at in zip(evidence.blocks, evidence.slices, strict=True):
-        index = np.arange(at.start, at.stop)[evidence.seen[at]]
-        residual = (evidence.value - model.mean)[index]
-        blocks[block.measurement] = chi2(residual, model.covariance[np.ix_(index, index)]), len(index)
+    for block, at in zip(model.blocks, model.slices, strict=True):
+        index = np.arange(at.start, at.stop)[model.seen[at]]
+        residual = (model.value - gaussian.mean)[index]
+        blocks[block.measurement] = chi2(residual, gaussian.covariance[np.ix_(index, index)]), len(index)
     return HealthyDraw(max((s.value for s in scores), default=0.0), blocks)
 
 
 def _at_recorded_levels(recordings: RecordingSet, side: Side, camera: CameraModel) -> CameraModel:
-    """The camera with sensitivities that give the recorded levels: the baseline leaves their scale free, and a level that is off
-    would clip, or lose itself in noise."""
+    """The camera with sensitivities scaled so that it gives the recorded levels. Their scale is a nuisance parameter of the baseline; at a
+    wrong one, frames would clip or be lost in noise."""
     replay = Replay(recordings, side, camera)
     ratios = []
     for capture in replay.captures:
         if isinstance(capture, Flat | Narrowband):
             lit = float(recordings.frame(capture).mean()) - camera.black_level_dn
-            promised = float(replay.expected(capture).mean()) - camera.black_level_dn
-            if promised > 0.05 * (camera.white_level_dn - camera.black_level_dn):
-                ratios.append(lit / promised)
+            predicted = float(replay.expected(capture).mean()) - camera.black_level_dn
+            if predicted > LEAST_SIGNAL_SHARE * (camera.white_level_dn - camera.black_level_dn):
+                ratios.append(lit / predicted)
     if not ratios:
         return camera
     highest = max(max(curve.value) for curve in camera.quantum_efficiency.values())

@@ -1,4 +1,4 @@
-"""Where prediction and recording part: chi2 by slice, corrected for the number of slices looked at."""
+"""Where prediction and recording differ: chi2 by slice of a measurement, corrected for the number of slices."""
 
 from __future__ import annotations
 
@@ -8,60 +8,64 @@ from itertools import pairwise
 import numpy as np
 from scipy import special
 
-from lab.diagnose.inference.evidence import Evidence, Gaussian, chi2
+from lab.diagnose.inference.gaussian import Gaussian, chi2
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.summaries import Block
+from lab.diagnose.policy import DecisionPolicy
 from sim.spectrum import FloatArray
 
-#: Slices whose corrected probability is below this are mismatches: one healthy set in two hundred shows one.
-SIGNIFICANT = 0.005
-#: Systematic parts of the covariance are known to about this share: chi2 is divided by (1 + SLACK)^2.
-SLACK = 0.15
-#: Different places on an axis from which on its quarters are looked at by themselves.
+#: Distinct places on an axis from which on its quarters are slices, too: two a quarter.
 FEWEST_QUARTERED = 8
+#: Below this logarithm of a probability the normal quantile follows from the tail's asymptote, as exp would underflow.
+LOG_UNDERFLOW = -650.0
 
 
 @dataclass(frozen=True)
 class Slice:
-    """A part of one measurement that may be off."""
+    """A part of one measurement: a range of its axis, a channel or a condition. `log_probability`: of a chi2 as large by chance, corrected
+    for the number of slices (Bonferroni)."""
 
     block: Block
     axis: str
     where: str
-    members: np.ndarray  # of the whole vector
-    chi2: float
+    members: np.ndarray  # indices into the model's vector
+    chi2: float  # over (1 + slack)^2
     n: int
-    log_probability: float  # of so large a chi2 by chance, corrected
+    log_probability: float
 
     @property
     def significance_sigma(self) -> float:
-        """Of a normal distribution, one-sided."""
-        if self.log_probability > -650.0:
+        """The probability as a one-sided quantile of the normal distribution."""
+        if self.log_probability > LOG_UNDERFLOW:
             return float(max(-special.ndtri(np.exp(self.log_probability)), 0.0))
         twice = -2.0 * self.log_probability
-        return float(np.sqrt(twice - np.log(2.0 * np.pi * twice)))  # of the tail exp(-z^2 / 2) / (z sqrt(2 pi))
-
-    @property
-    def significant(self) -> bool:
-        return self.log_probability < np.log(SIGNIFICANT)
+        return float(np.sqrt(twice - np.log(2.0 * np.pi * twice)))  # tail: exp(-z^2 / 2) / (z sqrt(2 pi))
 
 
-def look(evidence: Evidence, model: Gaussian) -> list[Slice]:
-    """Every slice of the seen numbers under a model, most significant first."""
-    residual = evidence.value - model.mean
+def chi2_by_slice(model: MeasurementModel, gaussian: Gaussian, policy: DecisionPolicy) -> list[Slice]:
+    """Every slice of the seen numbers under a distribution of all numbers, most significant first."""
+    residual = model.value - gaussian.mean
     candidates: list[tuple[Block, str, str, np.ndarray]] = []
-    for block, at in zip(evidence.blocks, evidence.slices, strict=True):
-        candidates += _slices(block, at, evidence.seen)
+    for block, at in zip(model.blocks, model.slices, strict=True):
+        candidates += _slices(block, at, model.seen)
     found = []
     for block, axis, where, members in candidates:
-        value = chi2(residual[members], model.covariance[np.ix_(members, members)]) / (1.0 + SLACK) ** 2
+        value = chi2(residual[members], gaussian.covariance[np.ix_(members, members)])
+        value /= (1.0 + policy.covariance_slack) ** 2
         n = len(members)
         log_p = min(_log_tail(value, n) + np.log(len(candidates)), 0.0)
         found.append(Slice(block, axis, where, members, value, n, log_p))
     return sorted(found, key=lambda s: s.log_probability)
 
 
+def mismatches(model: MeasurementModel, gaussian: Gaussian, policy: DecisionPolicy) -> tuple[Slice, ...]:
+    """The slices whose corrected probability is below `slice_false_alarm_rate`, most significant first."""
+    limit = np.log(policy.slice_false_alarm_rate)
+    return tuple(s for s in chi2_by_slice(model, gaussian, policy) if s.log_probability < limit)
+
+
 def _log_tail(value: float, n: int) -> float:
-    """Logarithm of the probability of a larger chi2 with n degrees of freedom; far out by the tail's leading term."""
+    """log P(chi2_n > value); far out by the tail's leading term."""
     exact = float(special.chdtrc(n, value))
     if exact > 0.0:
         return float(np.log(exact))
@@ -69,6 +73,7 @@ def _log_tail(value: float, n: int) -> float:
 
 
 def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str, str, np.ndarray]]:
+    """The block as a whole, its channels, its conditions, and the quarters of its axis: (block, axis, words, indices)."""
     index = np.arange(at.start, at.stop)
     use = seen[index]
     x = np.array([label.x for label in block.labels])
@@ -105,18 +110,22 @@ def _range(block: Block, x: FloatArray) -> str:
     return f"{low:.4g}..{high:.4g} {block.unit}"
 
 
-def describe(evidence: Evidence, model: Gaussian, part: Slice) -> tuple[str, tuple[str, ...]]:
-    """Where in words (range on the axis of what sticks out, channels, conditions), and the captures concerned."""
+def describe(model: MeasurementModel, gaussian: Gaussian, part: Slice) -> tuple[str, tuple[str, ...]]:
+    """A mismatch in words, and the captures concerned.
+
+    The words give range, channels and conditions of the numbers whose residuals are largest: at least 3 standard deviations and 0.3 of the
+    largest; where all are smaller, by noise alone, 2 standard deviations and 0.5 of the largest.
+    """
     block = part.block
-    at = evidence.slices[evidence.blocks.index(block)]
+    at = model.slices[model.blocks.index(block)]
     index = np.arange(at.start, at.stop)
-    index = index[evidence.seen[index]]
-    z = (evidence.value - model.mean)[index] / np.sqrt(np.diag(model.covariance)[index])
-    noise = np.sqrt(np.diag(block.covariance))[index - at.start]
-    bare = (evidence.value - model.mean)[index] / noise
-    strong = np.abs(z) > max(3.0, 0.3 * float(np.abs(z).max()))
+    index = index[model.seen[index]]
+    residual = (model.value - gaussian.mean)[index]
+    total = np.abs(residual / np.sqrt(np.diag(gaussian.covariance)[index]))
+    noise = np.abs(residual / np.sqrt(np.diag(block.covariance))[index - at.start])
+    strong = total > max(3.0, 0.3 * float(total.max()))
     if not strong.any():
-        strong = np.abs(bare) >= max(2.0, 0.5 * float(np.abs(bare).max()))
+        strong = noise >= max(2.0, 0.5 * float(noise.max()))
     labels = [block.labels[i - at.start] for i in index[strong]]
     if not labels:
         labels = [block.labels[i - at.start] for i in part.members]

@@ -1,4 +1,7 @@
-"""The score of every effect: how much of the residual its signature takes, free quantities and known effects projected out."""
+"""The score of every effect: how much of the residual its signature takes, nuisance parameters and known effects projected out.
+
+A signature is the change of the prediction by a small or typical instance of the effect (its prototypes), whitened by the covariance.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,23 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import nnls
 
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.summaries import Effects
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray
 
+#: Ridge on unit columns in non-negative least squares, a relative change of 1e-8: without it, the active set cycles between columns that
+#: are all but equal.
+RIDGE = 1e-4
+#: A refit starts within this share of the way from `absent` to a bound.
+INSIDE_BOUND = 0.9
+
 
 @dataclass(frozen=True)
 class Score:
-    """S = |r|^2 - min over u >= 0 of |r - G u|^2, r and G whitened: the likelihood-ratio statistic of a small effect."""
+    """S = |r|^2 - min over u >= 0 of |r - G u|^2, r the whitened residual, G the whitened signatures: the likelihood-ratio statistic of a small
+    effect, twice the log-likelihood that it gains."""
 
     effect: type[Effect]
     value: float
@@ -27,7 +37,7 @@ class Score:
 
     @cached_property
     def start(self) -> Effect:
-        """Where a refit begins."""
+        """The instance from which a refit starts."""
         return self.begin()
 
 
@@ -41,45 +51,49 @@ class Pair:
 
 @dataclass(frozen=True)
 class Signatures:
-    """Whitened signatures of all candidates about one model."""
+    """Whitened residual and signatures of all candidates, linearised about one set of effects.
 
-    white: FloatArray  # residual
+    `columns`: of every candidate and each of its alternative sets of prototypes, the prototypes and their signatures (n, prototypes).
+    `whitened_changes` gives the signatures of any effects as they stand, (n, effects).
+    """
+
+    white: FloatArray
     columns: list[tuple[type[Effect], tuple[Effect, ...], FloatArray]]
-    table_of: Callable[[Sequence[Effect]], FloatArray]  # signatures of any effects as they stand, (n, effects)
+    whitened_changes: Callable[[Sequence[Effect]], FloatArray]
 
     def scores(self) -> list[Score]:
+        """Of every candidate, highest first; of alternative prototypes, the best."""
         best: dict[str, tuple[float, Effect]] = {}
-        plain: dict[str, list[tuple[float, Effect]]] = {}
+        single: dict[str, list[tuple[float, Effect]]] = {}
         for effect, prototypes, table in self.columns:
-            value, share = _cone(table, self.white)
+            value, share = _cone_score(table, self.white)
             if effect.name not in best or value > best[effect.name][0]:
                 best[effect.name] = value, _combined(effect, prototypes, share)
             if len(prototypes) == 1:
-                plain.setdefault(effect.name, []).append((self._taken(table[:, 0]), prototypes[0]))
+                single.setdefault(effect.name, []).append((self._chi2_taken(table[:, 0]), prototypes[0]))
         found = [
-            Score(type(scaled), value, partial(self._nearest, scaled, plain.get(name, [])))
+            Score(type(scaled), value, partial(self._nearest, scaled, single.get(name, [])))
             for name, (value, scaled) in best.items()
         ]
         return sorted(found, key=lambda s: -s.value)
 
-    def _nearest(self, scaled: Effect, plain: Sequence[tuple[float, Effect]]) -> Effect:
-        """Scaled by what a small change promises, a large one may be far off: a prototype itself may lie nearer."""
-        taken, prototype = max(plain, key=lambda one: one[0], default=(0.0, scaled))
-        is_nearer = taken > 0.0 and taken > self._taken(self.table_of([scaled])[:, 0])
+    def _nearest(self, scaled: Effect, prototypes: Sequence[tuple[float, Effect]]) -> Effect:
+        """The prototype as it stands where that takes more of the residual than the linearly scaled one: of large changes, linear scaling may
+        be far off."""
+        taken, prototype = max(prototypes, key=lambda one: one[0], default=(0.0, scaled))
+        is_nearer = taken > 0.0 and taken > self._chi2_taken(self.whitened_changes([scaled])[:, 0])
         return prototype if is_nearer else scaled
 
-    def _taken(self, signature: FloatArray) -> float:
-        """Of the residual's square, by an effect as it stands; negative where it only adds."""
+    def _chi2_taken(self, signature: FloatArray) -> float:
+        """|r|^2 - |r - g|^2 of an effect as it stands; negative where it only adds."""
         return float(2.0 * signature @ self.white - signature @ signature)
 
     def pairs(self, count: int) -> list[Pair]:
-        """The best pairs of two effects by what their signatures take together, highest first.
-
-        Of two effects that act on the same numbers neither may be the best alone. Small tables: only the signatures' span matters.
-        """
+        """The best pairs of two effects by their common score, highest first. Of two effects that act on the same numbers, neither may be the
+        best alone. Computed in the span of the signatures, which is of low dimension."""
         best: dict[str, tuple[float, tuple[Effect, ...], FloatArray]] = {}
         for effect, prototypes, table in self.columns:
-            value, _ = _cone(table, self.white)
+            value, _ = _cone_score(table, self.white)
             if effect.name not in best or value > best[effect.name][0]:
                 best[effect.name] = value, prototypes, table
         if len(best) < 2:
@@ -89,7 +103,7 @@ class Signatures:
         members = [(prototypes, basis.T @ table) for _, prototypes, table in best.values()]
         found = []
         for (first, one), (second, two) in combinations(members, 2):
-            value, share = _cone(np.concatenate([one, two], axis=1), white)
+            value, share = _cone_score(np.concatenate([one, two], axis=1), white)
             found.append((value, first, share[: len(first)], second, share[len(first) :]))
         found.sort(key=lambda pair: -pair[0])
         return [
@@ -98,10 +112,10 @@ class Signatures:
             if mine.any() and other.any()
         ]
 
-    def threshold(self, rng: np.random.Generator, quantile: float, draws: int = 400) -> float:
-        """The quantile of the largest score over a bootstrap of the model: noise drawn as the covariance says.
+    def threshold(self, rng: np.random.Generator, quantile: float, draws: int) -> float:
+        """The quantile of the largest score over draws of white noise, projected on the span of the signatures.
 
-        Only the span of the signatures matters, in which white noise stays white.
+        Of several prototypes, the norm of the projection on their span is an upper bound of the cone's score.
         """
         if not self.columns:
             return float("inf")
@@ -116,46 +130,47 @@ class Signatures:
                 if size > 0:
                     top = np.maximum(top, np.square(np.maximum(noise @ table[:, 0] / size, 0.0)))
             else:
-                # both signs of a parameter, or several: the norm of the projection bounds the cone's score from above
                 span = _span(table)
                 top = np.maximum(top, np.square(noise @ span).sum(1))
         return float(np.quantile(top, quantile))
 
 
 def signatures(
-    evidence: Evidence,
+    model: MeasurementModel,
     camera: CameraModel,
     current: Effects,
     candidates: Iterable[type[Effect]],
-    tangents: FloatArray | None = None,
+    jacobian: FloatArray | None = None,
 ) -> Signatures:
-    """About a model with `current` effects; `tangents` (n, p): slopes by the parameters of these, projected out."""
-    seen = evidence.seen
-    model = evidence.seen_gaussian(current)
-    base = evidence.mean(current)
-    white = model.white(evidence.seen_value - model.mean)
+    """Residual and signatures about a set of `current` effects. `jacobian` (n, p) by the parameters of these is projected out.
+    Candidates that change nothing that was measured are left out."""
+    seen = model.seen
+    gaussian = model.seen_gaussian(current)
+    base = model.mean(current)
+    white = gaussian.whiten(model.seen_value - gaussian.mean)
     out = np.zeros((len(white), 0))
-    if tangents is not None and tangents.size:
-        out = _span(model.white(tangents[seen]))
+    if jacobian is not None and jacobian.size:
+        out = _span(gaussian.whiten(jacobian[seen]))
         white = white - out @ (out.T @ white)
 
-    def table_of(prototypes: Sequence[Effect]) -> FloatArray:
-        raw = np.stack([evidence.mean((*current, p)) - base for p in prototypes], axis=1)[seen]
-        table = model.white(raw)
+    def whitened_changes(effects: Sequence[Effect]) -> FloatArray:
+        raw = np.stack([model.mean((*current, e)) - base for e in effects], axis=1)[seen]
+        table = gaussian.whiten(raw)
         return np.asarray(table - out @ (out.T @ table))
 
     columns = []
     for effect in candidates:
-        if not evidence.touched(effect).any():
+        if not model.affected(effect).any():
             continue
         for prototypes in effect.prototypes(camera):
-            table = table_of(prototypes)
+            table = whitened_changes(prototypes)
             if np.any(table):
                 columns.append((effect, prototypes, table))
-    return Signatures(white, columns, table_of)
+    return Signatures(white, columns, whitened_changes)
 
 
 def _span(table: FloatArray) -> FloatArray:
+    """Orthonormal basis of the columns' span, relative singular values above 1e-6."""
     if table.shape[1] == 0:
         return table
     size = np.linalg.norm(table, axis=0)
@@ -164,22 +179,18 @@ def _span(table: FloatArray) -> FloatArray:
     return np.asarray(u[:, s > 1e-6 * max(float(s.max(initial=0.0)), 1e-300)])
 
 
-#: Weight of the columns' own sizes in their fit: 1e-8 of a score.
-ALIKE = 1e-4
-
-
-def _cone(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray]:
+def _cone_score(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray]:
+    """|r|^2 - min over u >= 0 of |r - G u|^2, and u."""
     size = np.linalg.norm(table, axis=0)
     unit = table / np.where(size > 0, size, 1.0)
-    # next to nothing holds columns apart that are all but the same, between which the active set would go round in circles
-    held = np.vstack([unit, ALIKE * np.eye(unit.shape[1])])
+    held = np.vstack([unit, RIDGE * np.eye(unit.shape[1])])
     share, rest = nnls(held, np.concatenate([white, np.zeros(unit.shape[1])]))
     return max(float(white @ white - rest**2), 0.0), share / np.where(size > 0, size, 1.0)
 
 
 def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray) -> Effect:
-    """The prototypes scaled in their slope coordinates by the shares found, within bounds."""
-    likest = prototypes[int(np.argmax(share))]
+    """The effect whose coordinates u are the sum of the prototypes', each times its share, within bounds."""
+    likeliest = prototypes[int(np.argmax(share))]
     values: dict[str, float] = {}
     for name, quantity in effect.quantities().items():
         if name in effect.shapes:
@@ -192,9 +203,8 @@ def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: Float
         step = np.sign(total) * abs(total) ** (1.0 / quantity.slope_power)
         values[name] = absent + float(step)
         if quantity.upper is not None:
-            values[name] = min(values[name], absent + 0.9 * (quantity.upper - absent))
+            values[name] = min(values[name], absent + INSIDE_BOUND * (quantity.upper - absent))
         if quantity.lower is not None:
-            values[name] = max(
-                values[name], absent + 0.9 * (quantity.lower - absent) if quantity.lower < absent else quantity.lower
-            )
-    return likest.having(**values)
+            lowest = absent + INSIDE_BOUND * (quantity.lower - absent) if quantity.lower < absent else quantity.lower
+            values[name] = max(values[name], lowest)
+    return likeliest.having(**values)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.board import BOARD_BLOCKS
 from lab.diagnose.measurements.converter import code_block
 from lab.diagnose.measurements.darks import DARK_BLOCKS
@@ -58,9 +58,9 @@ FREE_BESIDE = {"fill_factor": ", but contrast may be that of any aperture"}
 _NEAR_FULL = 0.985
 
 
-def evidence_of(
+def measurement_model(
     recordings: RecordingSet, side: Side, fit: FitResult | None = None, baseline: CameraFile | None = None
-) -> tuple[Evidence | None, tuple[Skipped, ...]]:
+) -> tuple[MeasurementModel | None, tuple[Skipped, ...]]:
     """One side's measurements against its baseline, and what couldn't be looked at; None where nothing could.
 
     `baseline`: a camera with its effects in place of the maker's word and the fit.
@@ -87,18 +87,18 @@ def evidence_of(
     always = baseline.effects if baseline is not None else ()
     if not blocks:
         return None, tuple(skipped)
-    evidence = Evidence(tuple(blocks), study.camera, always)
+    model = MeasurementModel(tuple(blocks), study.camera, always)
     if study.stated.fill_factor is None and baseline is None:
-        evidence = replace(evidence, unstated=_any_aperture(evidence))
-    return evidence, tuple(skipped)
+        model = replace(model, unstated_jacobian=_any_aperture(model))
+    return model, tuple(skipped)
 
 
-def _any_aperture(evidence: Evidence) -> dict[str, FloatArray]:
+def _any_aperture(model: MeasurementModel) -> dict[str, FloatArray]:
     """Slopes that span what an aperture of any side does beside that of the whole pixel: its principal directions over even sides."""
-    camera, sides = evidence.camera, np.linspace(LEAST_SIDE, 1.0, APERTURES, endpoint=False)
+    camera, sides = model.camera, np.linspace(LEAST_SIDE, 1.0, APERTURES, endpoint=False)
     lowest = PixelAperture.quantities()["side_change_um"].lower or -np.inf
     effects = [PixelAperture(side_change_um=max(lowest, (s - 1.0) * camera.pixel_pitch_um)) for s in sides]
-    changes = np.array([evidence.mean((e,)) for e in effects]) - evidence.mean()
+    changes = np.array([model.mean((e,)) for e in effects]) - model.mean()
     _, size, direction = np.linalg.svd(changes / np.sqrt(APERTURES), full_matrices=False)
     return {f"aperture:{k}": size[k] * direction[k] for k in range(APERTURE_DIRECTIONS) if size[k] > 0.0}
 

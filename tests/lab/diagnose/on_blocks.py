@@ -9,8 +9,10 @@ import numpy as np
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.inference.evidence import Evidence, chi2
+from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
@@ -35,24 +37,24 @@ def study(recordings: RecordingSet) -> Study:
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
-def evidence(recordings: RecordingSet, *makers: Callable[[Study], Block]) -> Evidence:
+def measured_model(recordings: RecordingSet, *makers: Callable[[Study], Block]) -> MeasurementModel:
     looked_at = study(recordings)
-    return Evidence(tuple(make(looked_at) for make in makers), looked_at.camera)
+    return MeasurementModel(tuple(make(looked_at) for make in makers), looked_at.camera)
 
 
 def verdict(recordings: RecordingSet, *makers: Callable[[Study], Block]) -> Verdict:
-    return decide(evidence(recordings, *makers), np.random.default_rng(0))
+    return decide(measured_model(recordings, *makers), np.random.default_rng(0), DecisionPolicy())
 
 
 def names(found: Verdict) -> list[str]:
     return [c.effect.name for c in found.named]
 
 
-def sigmas(found: Evidence) -> float:
+def sigmas(found: MeasurementModel) -> float:
     """How far chi2 of all numbers under the baseline lies from their count, in its standard deviations."""
-    model = found.gaussian()
+    gaussian = found.gaussian()
     n = len(found.value)
-    return (chi2(found.value - model.mean, model.covariance) - n) / float(np.sqrt(2.0 * n))
+    return (chi2(found.value - gaussian.mean, gaussian.covariance) - n) / float(np.sqrt(2.0 * n))
 
 
 def rendered(seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0, repeats: int = 3) -> RecordingSet:

@@ -14,8 +14,9 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
-from lab.diagnose.measurements.blocks import evidence_of
+from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.summaries import Study
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Plan
@@ -66,9 +67,9 @@ def _only(*kinds: str) -> Change:
     ids=["narrowband", "chart", "chart and edges", "f-number", "pitch", "fill factor"],
 )
 def test_what_nobody_says_is_no_mismatch(change: Change) -> None:
-    evidence, _ = evidence_of(_changed(change), "left", None)
-    assert evidence is not None
-    found = decide(evidence, np.random.default_rng(1))
+    model, _ = measurement_model(_changed(change), "left", None)
+    assert model is not None
+    found = decide(model, np.random.default_rng(1), DecisionPolicy())
     assert (found.before, found.named, found.abstained) == ((), (), ())
 
 
@@ -81,10 +82,10 @@ def test_edges_in_light_of_which_nothing_is_said_are_not_out_of_focus() -> None:
             capture.pop("light_radiance", None)
             capture.pop("dark_radiance", None)
 
-    evidence, _ = evidence_of(_changed(unlit, seed=72), "left", None)
-    assert evidence is not None
-    assert evidence.camera.cfa == "MONO"
-    found = decide(evidence, np.random.default_rng(1))
+    model, _ = measurement_model(_changed(unlit, seed=72), "left", None)
+    assert model is not None
+    assert model.camera.cfa == "MONO"
+    found = decide(model, np.random.default_rng(1), DecisionPolicy())
     assert (found.before, found.named, found.abstained) == ((), (), ())
 
 
@@ -108,10 +109,10 @@ def test_codes_that_were_shifted_are_no_faulty_converter() -> None:
             bit_depth=16, black_level_dn=16 * camera["black_level_dn"], white_level_dn=16 * camera["white_level_dn"]
         )
 
-    evidence, skipped = evidence_of(_changed(shifted, 4), "left", None)
+    model, skipped = measurement_model(_changed(shifted, 4), "left", None)
     assert any("every code is a multiple of 16, as of a converter of 4 bits less" in s.reason for s in skipped)
-    assert evidence is not None
-    assert not decide(evidence, np.random.default_rng(1)).before
+    assert model is not None
+    assert not decide(model, np.random.default_rng(1), DecisionPolicy()).before
 
 
 def test_codes_too_coarse_for_the_noise_are_no_mismatch() -> None:
@@ -123,10 +124,10 @@ def test_codes_too_coarse_for_the_noise_are_no_mismatch() -> None:
         if camera["conversion_gain_dn_per_e"] is not None:
             camera["conversion_gain_dn_per_e"] /= 16
 
-    evidence, _ = evidence_of(_changed(coarse, -4), "left", None)
-    assert evidence is not None
-    assert {"slanted_edge", "screen", "noise"} <= {b.measurement for b in evidence.blocks}
-    found = decide(evidence, np.random.default_rng(1))
+    model, _ = measurement_model(_changed(coarse, -4), "left", None)
+    assert model is not None
+    assert {"slanted_edge", "screen", "noise"} <= {b.measurement for b in model.blocks}
+    found = decide(model, np.random.default_rng(1), DecisionPolicy())
     assert (found.before, found.named, found.abstained) == ((), (), ())
 
 

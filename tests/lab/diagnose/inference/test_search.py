@@ -8,11 +8,14 @@ from typing import Annotated, ClassVar
 import numpy as np
 import pytest
 
-from lab.diagnose.inference.decide import Candidate, _either_sign
-from lab.diagnose.inference.evidence import Evidence, Within
+from lab.diagnose.inference.decide import _with_either_sign
+from lab.diagnose.inference.gaussian import BlockCovariance
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import Search
+from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.policy import DecisionPolicy
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect, Stage
 from sim.parameters import Quantity
@@ -55,7 +58,6 @@ class _Bend(_Curve):
 
 class _Wave(_Curve):
     name: ClassVar[str] = "wave"
-    rivals: ClassVar[frozenset[str]] = frozenset({"ripple"})
 
     def shape(self, x: FloatArray) -> FloatArray:
         return np.sin(6.0 * np.pi * x)
@@ -63,7 +65,6 @@ class _Wave(_Curve):
 
 class _Ripple(_Curve):
     name: ClassVar[str] = "ripple"
-    rivals: ClassVar[frozenset[str]] = frozenset({"wave"})
 
     def shape(self, x: FloatArray) -> FloatArray:
         return np.asarray(np.sin(6.0 * np.pi * x) + 0.4 * np.sin(14.0 * np.pi * x))
@@ -90,7 +91,7 @@ def _camera() -> CameraModel:
     )  # fmt: skip
 
 
-def _evidence(truth: Sequence[Effect], rng: np.random.Generator) -> Evidence:
+def _model(truth: Sequence[Effect], rng: np.random.Generator) -> MeasurementModel:
     camera = _camera()
 
     def line(acting: Sequence[Effect]) -> FloatArray:
@@ -101,18 +102,18 @@ def _evidence(truth: Sequence[Effect], rng: np.random.Generator) -> Evidence:
         covariance=NOISE**2 * np.eye(X.size), labels=tuple(Label(float(x), "all", "", (f"c{i}",), False) for i, x in enumerate(X)),
         hooks=frozenset({"offset_dn"}), predict=lambda acting: Prediction(line(acting), {}), scale=np.ones(X.size),
     )  # fmt: skip
-    return Evidence((block,), camera)
+    return MeasurementModel((block,), camera)
 
 
 def _best(truth: Sequence[Effect], seed: int) -> set[str]:
-    return set(Search(_evidence(truth, np.random.default_rng(seed)), KINDS, THRESHOLD).best().names)
+    return set(Search(_model(truth, np.random.default_rng(seed)), KINDS, THRESHOLD).best().names)
 
 
 def test_a_pair_is_found_that_a_third_effect_hides() -> None:
     """x - x^2 is within 3 % of an arch: the arch alone has the highest score, and only the pair is right to the noise."""
     truth = (_Up(size_dn=1.2), _Bend(size_dn=-1.2))
-    evidence = _evidence(truth, np.random.default_rng(1))
-    found = signatures(evidence, evidence.camera, (), KINDS)
+    model = _model(truth, np.random.default_rng(1))
+    found = signatures(model, model.camera, (), KINDS)
     assert found.scores()[0].effect is _Arch
     pair = found.pairs(1)[0]
     assert {type(e) for e in pair.starts} == {_Up, _Bend}
@@ -154,16 +155,16 @@ def test_an_uncertainty_holds_both_signs_where_only_the_square_acts() -> None:
     """Distances 0 and 2 v from the value told, as likely: sqrt(2) v. A sign that the numbers tell stays as it is known."""
     for kind, widened in ((_Squared, True), (_Lopsided, False)):
         truth = kind(size_dn=0.5)
-        evidence = _evidence((truth,), np.random.default_rng(6))
+        model = _model((truth,), np.random.default_rng(6))
         candidate = Candidate(truth, {"size_dn": 0.01}, 1.0, (), 50.0)
-        std = _either_sign(evidence, candidate, (truth,)).std["size_dn"]
+        std = _with_either_sign(model, candidate, (truth,), DecisionPolicy()).std["size_dn"]
         assert std == pytest.approx(np.hypot(0.01, np.sqrt(2.0) * 0.5) if widened else 0.01)
 
 
 def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> None:
     covariance = np.array([[1.0, 1.2], [1.2, 1.0]]) * 4.0
-    lower = Within(covariance).lower
+    lower = BlockCovariance(covariance).lower
     assert np.linalg.eigvalsh(lower @ lower.T)[0] > 0.0
     np.testing.assert_allclose((lower @ lower.T)[0, 1], 4.4, rtol=1e-3)  # what eigenvalues of 2.2 and 0 leave
     positive = np.array([[1.0, 0.5], [0.5, 1.0]])
-    np.testing.assert_allclose(Within(positive).lower @ Within(positive).lower.T, positive)
+    np.testing.assert_allclose(BlockCovariance(positive).lower @ BlockCovariance(positive).lower.T, positive)

@@ -7,10 +7,11 @@ import pytest
 
 from lab.challenge.recordings import recordings_of, recordings_of_pair
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.board import board_block, calibration_of
 from lab.diagnose.measurements.stereo import scene_gain_block, time_block
 from lab.diagnose.measurements.summaries import Study
+from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.fit.geometry.pinhole import distortion_of, matrix_of
 from lab.formats.recording_set import RecordingSet
@@ -33,7 +34,7 @@ def study_of(recordings: RecordingSet, side: Side = "left") -> Study:
 def judged(recordings: RecordingSet, known: Geometry | None) -> Verdict:
     study = study_of(recordings)
     study.camera = study.camera.model_copy(update={"geometry": known})
-    return decide(Evidence((board_block(study),), study.camera), np.random.default_rng(3))
+    return decide(MeasurementModel((board_block(study),), study.camera), np.random.default_rng(3), DecisionPolicy())
 
 
 def calibrated() -> Geometry:
@@ -68,7 +69,9 @@ def test_a_gain_that_only_scenes_show_is_named(gain: float) -> None:
     left = ConcealedCamera(51, cfa="RGGB", rows=192, cols=256, pair_middle_mm=5.0)
     right = ConcealedCamera(52, laws, cfa="RGGB", rows=192, cols=256, side="right", offset_mm=10.0, pair_middle_mm=5.0)
     study = study_of(recordings_of_pair(left, right, plan), "right")
-    verdict = decide(Evidence((scene_gain_block(study),), study.camera), np.random.default_rng(3))
+    verdict = decide(
+        MeasurementModel((scene_gain_block(study),), study.camera), np.random.default_rng(3), DecisionPolicy()
+    )
     assert [c.effect.name for c in verdict.named] == (["stereo_gain_mismatch"] if gain else [])
     if gain:
         found = verdict.named[0]

@@ -9,12 +9,13 @@ import pytest
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import decide
-from lab.diagnose.inference.evidence import Evidence
-from lab.diagnose.inference.locate import look
+from lab.diagnose.inference.locate import mismatches
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.converter import code_block
 from lab.diagnose.measurements.neighbours import variance_block
 from lab.diagnose.measurements.summaries import Study
 from lab.diagnose.measurements.uniform import linearity_block
+from lab.diagnose.policy import DecisionPolicy
 from lab.predict.camera_model import camera_model, mean_dn
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
@@ -35,8 +36,8 @@ def test_even_converters_show_nothing(seed: int) -> None:
     block = code_block(study)
     chi2 = float(block.value @ np.linalg.solve(block.covariance, block.value)) / len(block.value)
     assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
-    evidence = Evidence((block,), study.camera)
-    assert not look(evidence, evidence.gaussian())[0].significant
+    model = MeasurementModel((block,), study.camera)
+    assert not mismatches(model, model.gaussian(), DecisionPolicy())
 
 
 def test_steps_are_measured_where_they_stand() -> None:
@@ -58,7 +59,7 @@ def test_wrong_bits_are_named(variant: int) -> None:
     law = AdcNonlinearityLaw(4.0, variant, 2)
     study = _study(772302, (law,))
     blocks = (linearity_block(study), variance_block(study), code_block(study))
-    verdict = decide(Evidence(blocks, study.camera), np.random.default_rng(0))
+    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
     assert [c.effect.name for c in verdict.named] == ["adc_nonlinearity"]
     found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std["error_dn"]
     assert std is not None
@@ -68,8 +69,8 @@ def test_wrong_bits_are_named(variant: int) -> None:
 @pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)
 def test_other_combs_are_located_and_not_named(law: Law) -> None:
     study = _study(772021, (law,))
-    evidence = Evidence((code_block(study),), study.camera)
-    verdict = decide(evidence, np.random.default_rng(0))
+    model = MeasurementModel((code_block(study),), study.camera)
+    verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
     assert verdict.before[0].block.measurement == "code_density"
     assert not verdict.named
 

@@ -11,11 +11,13 @@ from scipy import stats
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.inference.evidence import Evidence, chi2
+from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import darks
-from lab.diagnose.measurements.blocks import evidence_of
+from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.darks import DARK_BLOCKS
 from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
@@ -80,7 +82,7 @@ def _blocks(recordings: RecordingSet) -> tuple[Study, list[Block], dict[str, str
 
 def _verdict(recordings: RecordingSet) -> Verdict:
     study, blocks, _ = _blocks(recordings)
-    return decide(Evidence(tuple(blocks), study.camera), np.random.default_rng(0))
+    return decide(MeasurementModel(tuple(blocks), study.camera), np.random.default_rng(0), DecisionPolicy())
 
 
 def _names(verdict: Verdict) -> list[str]:
@@ -177,11 +179,11 @@ def test_healthy_darks_agree_with_their_covariance() -> None:
     for recordings in sets:
         study, blocks, _ = _blocks(recordings)
         for block in blocks:
-            evidence = Evidence((block,), study.camera)
-            model, seen = evidence.seen_gaussian(), evidence.seen
+            model = MeasurementModel((block,), study.camera)
+            gaussian, seen = model.seen_gaussian(), model.seen
             if not seen.any():
                 continue
-            value = chi2(evidence.seen_value - model.mean, model.covariance)
+            value = chi2(model.seen_value - gaussian.mean, gaussian.covariance)
             rare = min(rare, float(stats.chi2.sf(value, int(seen.sum()))))
     assert rare > 1.0 / 30_000.0
 
@@ -290,7 +292,7 @@ def test_a_frame_that_was_not_taken_anew_is_left_out_and_told() -> None:
     study = Study(stale, "left", camera_model(stale, "left"))
     assert [name for name, _ in study.stale] == ["d5"]
     assert "d5" not in {c.id for c in study.recordings.captures("dark")}
-    _, skipped = evidence_of(stale, "left")
+    _, skipped = measurement_model(stale, "left")
     lines = [s.reason for s in skipped if "bit for bit" in s.reason]
     assert len(lines) == 1
     assert "d4" in lines[0]

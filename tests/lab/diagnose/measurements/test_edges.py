@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.inference.evidence import chi2
+from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.edges import ASIDE, REAL_AT, _Edges, _interpolation, _spread, edge_block
 from lab.diagnose.measurements.summaries import Block, Study
 from lab.formats.recording_set import Manifest, RecordingSet

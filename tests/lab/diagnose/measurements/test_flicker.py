@@ -11,14 +11,14 @@ from lab.diagnose.measurements.uniform import linearity_block
 from lab.errors import NotDetermined
 from mocks.former.laws import LightFlickerLaw, PeriodicBandingLaw, RowNoiseLaw
 from sim.effects.light_flicker import LightFlicker
-from tests.lab.diagnose.on_blocks import evidence, former, names, rendered, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import former, measured_model, names, rendered, sigmas, study, verdict
 
 LOOKED_AT = (flicker_block, linearity_block, shading_block)
 
 
 def test_rows_of_healthy_frames_are_noise() -> None:
     """chi2 of about 60 numbers: its mean over 4 cameras within 3 / sqrt(4) of its standard deviation, and 0.3 for what is free."""
-    found = [sigmas(evidence(former(s, cfa=c), flicker_block)) for s in (1, 2) for c in ("MONO", "RGGB")]
+    found = [sigmas(measured_model(former(s, cfa=c), flicker_block)) for s in (1, 2) for c in ("MONO", "RGGB")]
     assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.3
     assert max(found) < 4.0
 
@@ -54,4 +54,4 @@ def test_noise_of_rows_is_no_flicker() -> None:
 
 def test_what_says_nothing_of_rows_is_refused() -> None:
     with pytest.raises(NotDetermined, match="repeated"):
-        evidence(former(1, kinds=("dark",)), flicker_block)
+        measured_model(former(1, kinds=("dark",)), flicker_block)

@@ -9,10 +9,11 @@ import pytest
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.neighbours import PAIRS, correlations, held_out_flats, neighbour_block, variance_block
 from lab.diagnose.measurements.summaries import Block, Study
 from lab.diagnose.measurements.uniform import linearity_block
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
@@ -78,7 +79,7 @@ def _blocks(study: Study) -> tuple[Block, ...]:
 
 
 def _verdict(study: Study) -> Verdict:
-    return decide(Evidence(_blocks(study), study.camera), np.random.default_rng(0))
+    return decide(MeasurementModel(_blocks(study), study.camera), np.random.default_rng(0), DecisionPolicy())
 
 
 def test_correlations_of_a_filter_are_its_autocorrelation() -> None:

@@ -9,12 +9,13 @@ import pytest
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import decide
-from lab.diagnose.inference.evidence import Evidence
-from lab.diagnose.inference.locate import look
+from lab.diagnose.inference.locate import mismatches
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import pattern
 from lab.diagnose.measurements.pattern import green_block, line_block
 from lab.diagnose.measurements.summaries import Block, Study
 from lab.diagnose.measurements.uniform import narrowband_block
+from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
@@ -76,7 +77,7 @@ def test_the_seen_image_comes_first_whichever_frames_were_read_first(monkeypatch
 def test_unlike_greens_are_named_and_measured() -> None:
     """Concealed: 1 %, of either sign the same ratio of all levels and wavelengths."""
     study = _study(771014, (GreenImbalanceLaw(1.0),))
-    verdict = decide(Evidence((green_block(study),), study.camera), np.random.default_rng(0))
+    verdict = decide(MeasurementModel((green_block(study),), study.camera), np.random.default_rng(0), DecisionPolicy())
     assert [c.effect.name for c in verdict.named] == ["green_imbalance"]
     assert verdict.named[0].effect.model_dump()["imbalance_percent"] == pytest.approx(1.0, abs=0.15)
 
@@ -85,7 +86,7 @@ def test_crosstalk_along_rows_is_no_green_imbalance() -> None:
     """Half as much again along rows: greens differ by wavelength, as their neighbours do; 0.5 % and 0.75 % are 0.625 % and +-20 %."""
     study = _study(771015, (CrosstalkLaw(0.5, 2),))
     blocks = (green_block(study), narrowband_block(study))
-    verdict = decide(Evidence(blocks, study.camera), np.random.default_rng(0))
+    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
     assert [c.effect.name for c in verdict.named] == ["crosstalk"]
     found = verdict.named[0].effect.model_dump()
     assert found["share_percent"] == pytest.approx(0.625, rel=0.1)
@@ -95,17 +96,17 @@ def test_crosstalk_along_rows_is_no_green_imbalance() -> None:
 def test_a_tap_gain_is_a_step_in_the_middle_and_has_no_name() -> None:
     study = _study(771016, (TapGainLaw(1.0),))
     block = line_block(study)
-    evidence = Evidence((block,), study.camera)
-    assert look(evidence, evidence.gaussian())[0].significant
+    model = MeasurementModel((block,), study.camera)
+    assert mismatches(model, model.gaussian(), DecisionPolicy())
     steps = {label.condition: v for label, v in zip(block.labels, block.value, strict=True) if not label.held_out}
     # 1 % within 3 sigma of 0.8 % PRNU over 8 columns of 96 pixels a side, with a slope fitted: 0.2 %
     assert steps["column 64"] == pytest.approx(0.01, abs=0.003)
-    verdict = decide(evidence, np.random.default_rng(0))
+    verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
     assert not verdict.named
-    assert verdict.unknown
+    assert verdict.discrepancies
 
 
 def test_white_columns_are_no_steps() -> None:
     """Columns' fixed offsets are the columns' own scatter, by which steps are judged."""
-    evidence = Evidence((line_block(study := _study(771017, (ColumnNoiseLaw(1.0, 0),))),), study.camera)
-    assert not look(evidence, evidence.gaussian())[0].significant
+    model = MeasurementModel((line_block(study := _study(771017, (ColumnNoiseLaw(1.0, 0),))),), study.camera)
+    assert not mismatches(model, model.gaussian(), DecisionPolicy())

@@ -11,7 +11,7 @@ import pytest
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.patches import screen_block
 from lab.diagnose.measurements.screens import (
     SCREEN_BLOCKS,
@@ -22,6 +22,7 @@ from lab.diagnose.measurements.screens import (
     turned_block,
 )
 from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
@@ -42,9 +43,9 @@ def study_of(recordings: RecordingSet) -> Study:
     return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
 
 
-def evidence(recordings: RecordingSet, make: Callable[[Study], Block]) -> Evidence:
+def measured_model(recordings: RecordingSet, make: Callable[[Study], Block]) -> MeasurementModel:
     study = study_of(recordings)
-    return Evidence((make(study),), study.camera)
+    return MeasurementModel((make(study),), study.camera)
 
 
 def verdict_of(recordings: RecordingSet) -> Verdict:
@@ -55,7 +56,7 @@ def verdict_of(recordings: RecordingSet) -> Verdict:
             blocks.append(make(study))
         except NotDetermined:
             continue
-    return decide(Evidence(tuple(blocks), study.camera), np.random.default_rng(3))
+    return decide(MeasurementModel(tuple(blocks), study.camera), np.random.default_rng(3), DecisionPolicy())
 
 
 @pytest.mark.parametrize(("seed", "cfa"), [(62, "MONO"), (63, "RGGB")])
@@ -64,11 +65,11 @@ def test_a_healthy_camera_keeps_the_contrast_that_the_model_says(seed: int, cfa:
     assert not verdict.named
     assert not verdict.abstained
     assert not verdict.before
-    block = verdict.evidence.blocks[0]
-    model = verdict.evidence.gaussian()
-    at = verdict.evidence.slices[0]
-    residual = (verdict.evidence.value - model.mean)[at]
-    chi2 = float(residual @ np.linalg.solve(model.covariance[at, at], residual))
+    block = verdict.model.blocks[0]
+    gaussian = verdict.model.gaussian()
+    at = verdict.model.slices[0]
+    residual = (verdict.model.value - gaussian.mean)[at]
+    chi2 = float(residual @ np.linalg.solve(gaussian.covariance[at, at], residual))
     # floors make it less than n; above it the noise's covariance would be too small: 4 sigma of a chi2 of n numbers
     assert chi2 < len(block.value) + 4 * np.sqrt(2 * len(block.value))
 
@@ -91,15 +92,15 @@ def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
 
 def test_a_screen_that_fills_the_frame_lights_dark_squares_from_beyond() -> None:
     """The former's screen goes on beyond the frame; what that is uncertain by is half of all that an endless screen would add."""
-    found = evidence(recorded(), screen_block)
-    model = found.gaussian()
-    away = (found.value - model.mean) / np.sqrt(np.diag(model.of(0)))
+    found = measured_model(recorded(), screen_block)
+    gaussian = found.gaussian()
+    away = (found.value - gaussian.mean) / np.sqrt(np.diag(gaussian.block_covariance(0)))
     assert np.all(np.abs(away) < 1.5)
 
 
 def test_a_copy_of_the_image_falls_into_the_dark_squares() -> None:
     """Of light of mean m in the plane, turned about its middle, 1 % of what lies there: between nothing and the brightest."""
-    block = evidence(recorded(), screen_block).blocks[0]
+    block = measured_model(recorded(), screen_block).blocks[0]
     more = block.predict((Ghost(share_percent=1.0),)).mean - block.predict(()).mean
     assert np.all(more > 0.0)
     assert np.all(more < 0.011 * block.scale)
@@ -110,7 +111,7 @@ def test_a_steep_gamma_over_wide_rims_is_predicted() -> None:
     what rims lack to 5 %."""
     study = study_of(recorded(concealed.ScreenGammaLaw(4.0, 1, 5)))
     effect = ScreenGamma(exponent=5.0, rim_px=0.4)
-    contrasts = Evidence((contrast_block(study),), study.camera)
+    contrasts = MeasurementModel((contrast_block(study),), study.camera)
     n, covariance = len(contrasts.value), contrasts.gaussian().covariance
     for effects, low, high in (((), 5.0, 1e9), ((effect,), 0.0, 1.0)):
         residual = contrasts.value - contrasts.mean(effects)
@@ -123,12 +124,12 @@ def test_a_steep_gamma_over_wide_rims_is_predicted() -> None:
 def test_defocus_changes_the_contrast_as_predicted() -> None:
     """12 um: far out of the noise, and with the effect within it, levels and the screen's own blur free."""
     study = study_of(recorded(concealed.DefocusLaw(12.0, 1)))
-    evidence = Evidence((contrast_block(study),), study.camera)
+    model = MeasurementModel((contrast_block(study),), study.camera)
     for effects, low, high in (((), 5.0, 1e9), ((Defocus(defocus_um=12.0),), 0.0, 1.0)):
-        model = evidence.gaussian(effects)
-        residual = evidence.value - model.mean
+        gaussian = model.gaussian(effects)
+        residual = model.value - gaussian.mean
         n = len(residual)
-        chi2 = float(residual @ np.linalg.solve(model.covariance, residual))
+        chi2 = float(residual @ np.linalg.solve(gaussian.covariance, residual))
         assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
 
 

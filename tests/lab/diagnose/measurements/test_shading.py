@@ -16,14 +16,14 @@ from lab.diagnose.measurements.shading import (
 from lab.diagnose.measurements.uniform import linearity_block
 from mocks.former import Law
 from mocks.former.laws import DustShadowLaw, NonUniformIlluminationLaw, TapGainLaw, VignettingDecentreLaw, VignettingLaw
-from tests.lab.diagnose.on_blocks import evidence, former, names, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import former, measured_model, names, sigmas, study, verdict
 
 LOOKED_AT = (shading_block, linearity_block)
 
 
 def test_healthy_cells_scatter_as_they_should() -> None:
     """4 cameras: the mean of chi2's departures within 3 / sqrt(4) of its standard deviations, and 0.5 for the free axis and level."""
-    found = [sigmas(evidence(former(s, cfa=c), shading_block)) for s in (1, 2) for c in ("MONO", "BGGR")]
+    found = [sigmas(measured_model(former(s, cfa=c), shading_block)) for s in (1, 2) for c in ("MONO", "BGGR")]
     assert abs(np.mean(found)) < 3.0 / np.sqrt(4) + 0.5
     assert max(found) < 4.0
 

@@ -31,7 +31,7 @@ from mocks.former.laws import (
 )
 from sim.effects.second_order_light import SecondOrderLight
 from sim.spectrum import Spectrum
-from tests.lab.diagnose.on_blocks import UNIFORM, evidence, former, names, rendered, sigmas, study, verdict
+from tests.lab.diagnose.on_blocks import UNIFORM, former, measured_model, names, rendered, sigmas, study, verdict
 
 LEVELS: list[tuple[Law, bool]] = [
     (law, shuttle)
@@ -96,7 +96,7 @@ def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
 def test_healthy_levels_scatter_as_they_should() -> None:
     """4 cameras: no more than noise; less, as a few numbers in ten are free."""
     for seed, cfa in ((1, "MONO"), (2, "RGGB"), (3, "GBRG"), (4, "MONO")):
-        found = evidence(former(seed, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
+        found = measured_model(former(seed, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
         assert -6.0 < sigmas(found) < 3.0
 
 

@@ -34,4 +34,4 @@ def test_a_glare_has_its_name_whatever_its_reach(variant: int) -> None:
     found = verdict(recordings, edge_block, chart_block, screen_block)
     assert names(found) == ["veiling_glare"]
     # of what a lens spreads a halo's share is told apart only where there is one
-    assert (found.named[0].effect.halo(found.evidence.camera)[0] > 0.0) == (variant == 1)
+    assert (found.named[0].effect.halo(found.model.camera)[0] > 0.0) == (variant == 1)

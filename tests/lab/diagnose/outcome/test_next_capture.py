@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from lab.diagnose.inference.decide import Candidate, Verdict
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.decide import Verdict
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.summaries import Block, Label, Prediction
-from lab.diagnose.outcome.next_capture import Hypothesis, _designs, next_sentence, proposals
+from lab.diagnose.outcome.candidate_captures import Hypothesis, designs
+from lab.diagnose.outcome.next_capture import next_sentence, proposals
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import default_camera
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import NextCapture
@@ -33,7 +36,7 @@ SET = RecordingSet(
 FREQUENCY = np.linspace(0.04, 0.9, 16)
 
 
-def _evidence(acting: Sequence[Effect] = ()) -> Evidence:
+def _model(acting: Sequence[Effect] = ()) -> MeasurementModel:
     """A contrast along rows, of one wavelength: too little to tell blurs apart."""
 
     def predict(effects: Sequence[Effect]) -> Prediction:
@@ -48,13 +51,13 @@ def _evidence(acting: Sequence[Effect] = ()) -> Evidence:
         labels=tuple(Label(float(f), "G", "5 deg", ("edge-1",), False) for f in FREQUENCY), hooks=frozenset({"transfer"}),
         predict=predict, scale=np.ones(16),
     )  # fmt: skip
-    return Evidence((block,), CAMERA)
+    return MeasurementModel((block,), CAMERA)
 
 
 def _undecided(one: Effect, *others: tuple[str, float]) -> Verdict:
     share = 1.0 - sum(p for _, p in others)
     candidate = Candidate(one, {}, share, others, 30.0)
-    return Verdict(_evidence((one,)), 12.0, 60.0, (), (candidate,), (), (), ())
+    return Verdict(_model((one,)), 12.0, 60.0, (), (candidate,), (), (), ())
 
 
 def _best(*hypotheses: Effect) -> str:
@@ -65,8 +68,8 @@ def _best(*hypotheses: Effect) -> str:
         apart = predict(held[0]) - predict(held[1])  # type: ignore[operator]
         return float(apart @ np.linalg.solve(covariance, apart))
 
-    designs = list(_designs(SET, "left", _evidence()))
-    return max(designs, key=lambda d: distance(d.predict, d.covariance)).words
+    found = list(designs(SET, "left", _model()))
+    return max(found, key=lambda d: distance(d.predict, d.covariance)).words
 
 
 def test_the_design_follows_what_the_rivals_differ_in() -> None:
@@ -89,7 +92,7 @@ def test_distance_is_what_decides() -> None:
     first, second = (
         Hypothesis("a", (InfraredCutFilter(cut_wavelength_nm=nm, width_nm=4.0),), CAMERA) for nm in (650.0, 650.02)
     )
-    design = next(d for d in _designs(SET, "left", _evidence()) if d.words == "narrowband light at 650 nm")
+    design = next(d for d in designs(SET, "left", _model()) if d.words == "narrowband light at 650 nm")
     a, b = design.predict(first), design.predict(second)
     lower = np.linalg.cholesky(design.covariance)
     apart = np.linalg.solve(lower, a - b)
@@ -102,7 +105,7 @@ def test_distance_is_what_decides() -> None:
 
 def test_proposals_are_sorted_and_name_their_nearest_rivals() -> None:
     verdict = _undecided(effect("optical_low_pass_filter")(displacement_x_um=1.0), ("defocus", 0.3), ("unknown", 0.1))
-    found = [p.capture for p in proposals(SET, "left", verdict)]
+    found = [p.capture for p in proposals(SET, "left", verdict, DecisionPolicy())]
     assert {c.rivals for c in found} == {("optical_low_pass_filter", "defocus")}
     assert "edges" in found[0].capture  # one spreads along two axes, the other all around
     assert found[0].distance > 2.0
@@ -111,8 +114,8 @@ def test_proposals_are_sorted_and_name_their_nearest_rivals() -> None:
 
 
 def test_nothing_undecided_needs_no_capture() -> None:
-    assert proposals(SET, "left", _undecided(Nonlinearity(), ("unknown", 0.02))) == ()
-    assert next_sentence((), unsettled=False) is None
+    assert proposals(SET, "left", _undecided(Nonlinearity(), ("unknown", 0.02)), DecisionPolicy()) == ()
+    assert next_sentence((), False, DecisionPolicy()) is None
 
 
 @pytest.mark.parametrize(
@@ -127,7 +130,7 @@ def test_the_sentence_says_what_can_be_hoped(distance: float, words: str) -> Non
         distance=distance,
         told_apart=told,
     )
-    sentence = next_sentence((capture,), unsettled=False)
+    sentence = next_sentence((capture,), False, DecisionPolicy())
     assert sentence is not None
     assert words in sentence
     assert f"{np.sqrt(2 * distance):.1f} standard deviations" in sentence

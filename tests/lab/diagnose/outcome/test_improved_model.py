@@ -11,10 +11,12 @@ import pytest
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose import Diagnosis, examine
-from lab.diagnose.inference.evidence import Evidence, chi2
-from lab.diagnose.inference.unknown import discrepancy
+from lab.diagnose.inference.discrepancy import likeliest_discrepancy
+from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.summaries import Block, Label, Prediction
-from lab.diagnose.outcome.improved import improved_model
+from lab.diagnose.outcome.improved_model import improved_model
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.simulate import SimulateOptions, simulate
@@ -104,24 +106,24 @@ def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
     the model with it explains the numbers."""
     ripple = 0.1 * np.sin(9.0 * FREQUENCY)
     block, content = _edges(ripple)
-    evidence = Evidence((block,), content.camera)
-    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
-    improved, corrections = improved_model(SET, "left", None, content, evidence, (), (gap,))
+    model = MeasurementModel((block,), content.camera)
+    gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
+    improved, corrections = improved_model(SET, "left", None, content, model, (), (gap,))
     assert [(c.measurement, c.kind) for c in corrections] == [("slanted_edge", "transfer")]
     (one,) = improved.effects
     assert isinstance(one, NamelessCorrection)
     x = FREQUENCY / content.camera.pixel_pitch_um
     follows = np.real(one.transfer(x, 0 * x, 550.0, content.camera)) - 1.0 - ripple
     assert np.abs(follows[FREQUENCY < 0.6]).max() < 3 * NOISE / np.sqrt(2) / np.exp(-1.2)
-    mended = Evidence((replace(block, predict=lambda acting: block.predict((one, *acting))),), content.camera)
+    mended = MeasurementModel((replace(block, predict=lambda acting: block.predict((one, *acting))),), content.camera)
     assert chi2(mended.value - mended.mean(), block.covariance) < 46 + 3 * np.sqrt(92)
 
 
 def test_what_the_model_has_no_place_for_is_said() -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
-    evidence = Evidence((replace(block, measurement="patches_of_light", places="patches"),), content.camera)
-    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
-    improved, corrections = improved_model(SET, "left", None, content, evidence, (), (gap,))
+    model = MeasurementModel((replace(block, measurement="patches_of_light", places="patches"),), content.camera)
+    gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
+    improved, corrections = improved_model(SET, "left", None, content, model, (), (gap,))
     assert not improved.effects
     assert corrections[0].kind is None
     assert (
@@ -137,7 +139,7 @@ def test_what_the_model_has_no_place_for_is_said() -> None:
 def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str, hook: str, along: str) -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
     other = replace(block, axis=axis, unit=unit, hooks=frozenset({hook}), conditions="")
-    evidence = Evidence((other,), content.camera)
-    gap = discrepancy(evidence, evidence.seen_gaussian(), 0)
-    improved, _ = improved_model(SET, "left", None, content, evidence, (), (gap,))
+    model = MeasurementModel((other,), content.camera)
+    gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
+    improved, _ = improved_model(SET, "left", None, content, model, (), (gap,))
     assert [e.along for e in improved.effects if isinstance(e, NamelessCorrection)] == [along]

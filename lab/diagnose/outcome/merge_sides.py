@@ -1,4 +1,4 @@
-"""The diagnosis of all sides in one: verdict, named effects, held-out captures, sentences."""
+"""The findings of all sides as one result: verdict, named effects, held-out chi2, and sentences."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from lab.diagnose.inference.decide import FALSE_ALARM_RATE
-from lab.diagnose.outcome.next_capture import SMALLEST_RIVAL, next_sentence
-from lab.diagnose.side import Named, SideFindings
+from lab.diagnose.outcome.next_capture import next_sentence
+from lab.diagnose.policy import DecisionPolicy
+from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.formats.results import (
     DiagnosisResult,
     HeldOut,
@@ -25,10 +25,10 @@ from sim.effects.library import effects as library
 Word = Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
 
 
-def merged(source: str, found: Sequence[SideFindings]) -> DiagnosisResult:
-    """One result of what all sides show. An effect that several sides show is one entry, with its mean parameters."""
+def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -> DiagnosisResult:
+    """One result of all sides. An effect that several sides show is one entry, with its weighted mean parameters."""
     mismatches = tuple(m for f in found for m in f.mismatches)
-    effects = tuple(_named(found))
+    effects = tuple(_named(found, policy))
     unexplained = tuple(u for f in found for u in f.unexplained)
     verdict: Word = "unexplained"
     if not effects and not unexplained and not mismatches:
@@ -44,24 +44,25 @@ def merged(source: str, found: Sequence[SideFindings]) -> DiagnosisResult:
         effects=effects,
         unexplained=unexplained,
         held_out=held_out,
-        next_capture=next_sentence(offered, bool(unexplained)),
+        next_capture=next_sentence(offered, bool(unexplained), policy),
         next_captures=offered,
         places=tuple(p for f in found for p in f.places),
         measurements=tuple(m for f in found for m in f.measurements),
         visibility=tuple(v for f in found for v in f.visibility),
         pictures=tuple(p for f in found for p in f.pictures),
         threshold=max((f.threshold for f in found if f.threshold is not None), default=None),
-        false_alarm_rate=FALSE_ALARM_RATE if any(f.is_judged for f in found) else None,
+        false_alarm_rate=policy.false_alarm_rate if any(f.is_judged for f in found) else None,
         curves=tuple(c for f in found for c in f.curves),
-        skipped=tuple(
+        skipped=tuple(  # parts of one measurement give the same reason
             dict.fromkeys(s for f in found for s in f.skipped)
-        ),  # parts of one measurement give the same reason
-        summary=tuple(_summary(verdict, mismatches, effects, unexplained, held_out)),
+        ),
+        summary=tuple(_summary(verdict, mismatches, effects, unexplained, held_out, policy)),
+        policy=policy.told(),
     )
 
 
-def _named(found: Sequence[SideFindings]) -> list[NamedEffect]:
-    by_name: dict[str, list[tuple[Side, Named]]] = {}
+def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedEffect]:
+    by_name: dict[str, list[tuple[Side, NamedCandidate]]] = {}
     for findings in found:
         for one in findings.named:
             by_name.setdefault(one.candidate.effect.name, []).append((findings.side, one))
@@ -72,7 +73,7 @@ def _named(found: Sequence[SideFindings]) -> list[NamedEffect]:
         rivals: dict[str, float] = {}
         for c in candidates:
             for rival, probability in c.rivals:
-                if probability >= SMALLEST_RIVAL:
+                if probability >= policy.least_rival_probability:
                     rivals[rival] = max(rivals.get(rival, 0.0), probability)
         parameters = {}
         for field, quantity in kind.quantities().items():
@@ -109,7 +110,7 @@ def _number(parameter: ParameterValue) -> str:
 
 
 def _mean(values: list[tuple[float, float | None]]) -> tuple[float, float | None]:
-    """Weighted by the variances where all are known."""
+    """Mean of (value, standard deviation), weighted by 1 / variance; the first value where a standard deviation isn't known."""
     known = [(v, s) for v, s in values if s]
     if len(known) != len(values) or len(values) == 1:
         return values[0]
@@ -118,7 +119,7 @@ def _mean(values: list[tuple[float, float | None]]) -> tuple[float, float | None
 
 
 def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
-    """Of the sides to whose model something was added; of all where nothing was."""
+    """Sum over the sides on which something was found; over all, where nothing was."""
     anything = any(f.named or f.unexplained for f in found)
     parts = [f.held_out for f in found if f.held_out is not None and (f.named or f.unexplained or not anything)]
     if not parts:
@@ -137,11 +138,13 @@ def _summary(
     effects: Sequence[NamedEffect],
     unexplained: Sequence[Unexplained],
     held_out: HeldOut | None,
+    policy: DecisionPolicy,
 ) -> list[str]:
+    """The diagnosis in sentences."""
     lines = []
     if verdict == "no_mismatch":
         lines.append(
-            f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * FALSE_ALARM_RATE:.0f} %."
+            f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * policy.false_alarm_rate:.0f} %."
         )
     lines += [
         f"{m.measurement.replace('_', ' ')} of the {m.side} camera departs from the baseline: {m.where} ({m.significance_sigma:.1f} sigma)."

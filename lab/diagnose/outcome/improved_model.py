@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from lab.diagnose.inference.evidence import Evidence
-from lab.diagnose.inference.unknown import Discrepancy
+from lab.diagnose.inference.discrepancy import Discrepancy
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import freed_curve
 from lab.diagnose.measurements.summaries import Block
 from lab.formats.camera_file import CameraFile
@@ -22,7 +22,7 @@ from sim.effects.nameless_correction import NamelessCorrection
 from sim.spectrum import FloatArray, Spectrum
 
 Applied = Literal["transfer", "sensitivity", "illumination", "response", "noise"]
-#: Stages that a smooth factor can act on: of a measurement of which axis, that which hook can change.
+#: Stages on which a smooth factor can act: the stage, the axis of the measurement, and the hook that can change it.
 PLACES: tuple[tuple[Applied, str, str], ...] = (
     ("transfer", "spatial_frequency", "transfer"),
     ("sensitivity", "wavelength", "transmittance"),
@@ -30,15 +30,15 @@ PLACES: tuple[tuple[Applied, str, str], ...] = (
     ("noise", "level", "noise_e2"),
     ("response", "level", "response"),
 )
-#: Of a transfer function: below it there is too little contrast to say by what share it is off.
+#: Share of the largest signal below which the discrepancy's relative size isn't known.
 LEAST_CONTRAST = 0.05
-#: Corrections stay within these factors: a process knows nothing of a quantity that mustn't fall to nothing.
+#: Limits of the factors: a Gaussian process doesn't know that a quantity is positive.
 LOWEST, HIGHEST = 0.05, 3.0
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What stands in the improved model for one unexplained mismatch, in words; `kind` None: nothing does."""
+    """What stands in the improved model for one unexplained mismatch, in words; `kind` is None where nothing does."""
 
     measurement: str
     kind: Applied | None
@@ -50,38 +50,41 @@ def improved_model(
     side: Side,
     fit: FitResult | None,
     baseline: CameraFile | None,
-    evidence: Evidence,
+    model: MeasurementModel,
     effects: Sequence[Effect],
-    unknown: Sequence[Discrepancy],
+    discrepancies: Sequence[Discrepancy],
 ) -> tuple[CameraFile, tuple[Correction, ...]]:
-    """The baseline with the named effects, the maker's curves within their freedom where the recordings put them, and, for what has no
-    name, corrections where the model has a place for them. Noise and levels are the fit's where there is one."""
+    """The baseline with the named effects, with the maker's sensitivity curves at the posterior mean of their nuisance parameters, and with
+    a correction for each discrepancy that a stage of the model can hold. Noise and levels are the fit's where there is one.
+
+    Returns the camera and one `Correction` for each discrepancy.
+    """
     always = baseline.effects if baseline is not None else ()
     taken = baseline.camera if baseline is not None else None
     camera = taken or camera_model(recordings, side, fit.cameras.get(side) if fit else None, maker_curves=True)
     if fit is None and baseline is None:
-        camera = evidence.camera
-    # what is measured is electrons times gain: of another gain, the curves take up the difference
-    applied, processes = _applied(evidence, unknown)
-    quantities = evidence.quantities(effects, processes)
-    discrepant = evidence.discrepant(effects, processes)
-    share = evidence.camera.conversion_gain_dn_per_e / camera.conversion_gain_dn_per_e
+        camera = model.camera
+    applied, kernels = _applied(model, discrepancies)
+    estimates = model.nuisance_estimates(effects, kernels)
+    discrepancy = model.discrepancy_mean(effects, kernels)
+    # electrons times gain are measured: where the fit has another gain, the curves take up the difference
+    share = model.camera.conversion_gain_dn_per_e / camera.conversion_gain_dn_per_e
     curves = {
         channel: _scaled(freed, share if freed is not curve else 1.0)
         for channel, curve in camera.quantum_efficiency.items()
-        for freed in (freed_curve(curve, channel, quantities),)
+        for freed in (freed_curve(curve, channel, estimates),)
     }
     corrections: list[Correction] = []
     acting: list[Effect] = [*always, *effects]
-    for gap, (kind, why) in zip(unknown, applied, strict=True):
-        block = evidence.blocks[gap.index]
+    for one, (kind, why) in zip(discrepancies, applied, strict=True):
+        block = model.blocks[one.index]
         name = block.measurement.replace("_", " ")
         if kind is None:
             said = f"{name}: no correction in the improved model; {why}"
             corrections.append(Correction(block.measurement, None, said))
             continue
-        at = evidence.slices[gap.index]
-        x, factor, each = _factor(block, discrepant[at], evidence.levelled(effects)[at])
+        at = model.slices[one.index]
+        x, factor, each = _factor(block, discrepancy[at], model.fitted_mean(effects)[at])
         if kind == "sensitivity":
             for channel, (wavelength_nm, by) in each.items():
                 if channel in curves:
@@ -89,31 +92,31 @@ def improved_model(
             said = f"{name}: in the sensitivity curves, by wavelength and channel"
         else:
             acting.append(_correction(kind, block, x, factor, camera))
-            alike = gap.kinship == "shared"
-            said = f"{name}: a factor on the {kind}" + ("" if alike else f"; the mean of what goes {gap.kinship}")
+            is_shared = one.grouping == "shared"
+            said = f"{name}: a factor on the {kind}" + ("" if is_shared else f"; the mean of what goes {one.grouping}")
         corrections.append(Correction(block.measurement, kind, said))
     improved = camera.model_copy(update={"quantum_efficiency": curves})
     return CameraFile(f"{recordings.manifest.name} {side}".strip(), improved, tuple(acting)), tuple(corrections)
 
 
 def _applied(
-    evidence: Evidence, unknown: Sequence[Discrepancy]
+    model: MeasurementModel, discrepancies: Sequence[Discrepancy]
 ) -> tuple[list[tuple[Applied | None, str]], dict[int, FloatArray]]:
-    """What each discrepancy is applied as, or why it isn't, and the covariances of those that are, by their block."""
-    processes: dict[int, FloatArray] = {}
+    """The stage that each discrepancy is applied to, or None and why; and the kernels of those that are, by block."""
+    kernels: dict[int, FloatArray] = {}
     found: list[tuple[Applied | None, str]] = []
-    for gap in unknown:
-        kind = _place_for(evidence.blocks[gap.index])
-        if gap.gain <= 0:
-            found.append((None, "no smooth process describes it"))
+    for one in discrepancies:
+        kind = _place_for(model.blocks[one.index])
+        if one.log_odds <= 0:
+            found.append((None, "no smooth discrepancy describes it"))
         elif kind is None:
             found.append((None, "the model has no place for one there"))
         elif any(kind == other for other, _ in found):
             found.append((None, "another correction acts there already"))
         else:
             found.append((kind, ""))
-            processes[gap.index] = gap.kernel
-    return found, processes
+            kernels[one.index] = one.kernel
+    return found, kernels
 
 
 def _place_for(block: Block) -> Applied | None:
@@ -126,9 +129,8 @@ def _place_for(block: Block) -> Applied | None:
 def _factor(
     block: Block, mean: FloatArray, predicted: FloatArray
 ) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, FloatArray]]]:
-    """x and the factor on the prediction there, the mean over channels and conditions; and the same channel by channel. `mean`: of
-    the process, given the seen numbers."""
-    # of the signal that the factor acts on: its scale where that is one, else the prediction
+    """x and the factor on the prediction there, averaged over channels and conditions; and the same by channel. `mean`: the posterior
+    mean of the discrepancy (m,). The factor is relative to the block's scale where that varies, else to the prediction."""
     whole = block.scale if np.ptp(block.scale) > 0 else predicted
     usable = whole > LEAST_CONTRAST * float(np.max(whole))
     x = np.array([label.x for label in block.labels])
@@ -147,7 +149,7 @@ def _factor(
 def _correction(
     kind: Applied, block: Block, x: FloatArray, factor: FloatArray, camera: CameraModel
 ) -> NamelessCorrection:
-    """The factor on its stage, its places in the unit that the stage has."""
+    """The factor on its stage, in that stage's unit."""
     gain = camera.conversion_gain_dn_per_e
     if kind == "transfer":
         from_zero = x > 0.0  # where a transfer function is 1

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.patches import PATCH_COLOUR_STD, PATCH_STD, _patches
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
@@ -30,12 +30,12 @@ ROWS, COLS = 48, 64
 
 
 def residual_pictures(
-    recordings: RecordingSet, side: Side, evidence: Evidence, improved: CameraFile
+    recordings: RecordingSet, side: Side, model: MeasurementModel, improved: CameraFile
 ) -> Iterator[ResidualPicture]:
     """One of each kind that there is and that tells what stood before the camera; the baseline has the effects that it always had."""
     replay = Replay(recordings, side, improved.camera)
-    held_out = set(evidence.captures(True))
-    stages = evidence.always, tuple(improved.effects)  # the same where nothing was found
+    held_out = set(model.captures(True))
+    stages = model.always, tuple(improved.effects)  # the same where nothing was found
     for kind in KINDS:
         captures = [c for c in replay.captures if c.kind == kind]
         if not captures:

@@ -9,11 +9,14 @@ import pytest
 from scipy import stats
 
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.inference.decide import Candidate, Verdict
-from lab.diagnose.inference.evidence import Evidence
+from lab.diagnose.inference.decide import Verdict
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.summaries import Block, Label, Prediction
-from lab.diagnose.outcome.looked_at import detectable, measurement_fits, places, visibility
-from lab.diagnose.outcome.pictures import residual_pictures
+from lab.diagnose.outcome.detectability import detectability, detectable
+from lab.diagnose.outcome.goodness_of_fit import measurement_fits, places
+from lab.diagnose.outcome.residual_pictures import residual_pictures
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile, default_camera
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Plan
@@ -51,7 +54,7 @@ def _verdict(named: tuple[Effect, ...] = ()) -> Verdict:
         scale=np.ones(len(labels)), conditions="orientation",
     )  # fmt: skip
     candidates = tuple(Candidate(e, {}, 1.0, (), 100.0) for e in named)
-    return Verdict(Evidence((block,), CAMERA), 12.0, 60.0, (), candidates, (), (), ())
+    return Verdict(MeasurementModel((block,), CAMERA), 12.0, 60.0, (), candidates, (), (), ())
 
 
 def test_detectable_is_seen_at_its_rate() -> None:
@@ -64,10 +67,10 @@ def test_detectable_is_seen_at_its_rate() -> None:
 def test_the_smallest_size_that_is_seen_has_that_non_centrality() -> None:
     """The change by the effect at that size, whitened: lambda to 5 %, as blurs bend a little beyond the slope at zero."""
     verdict = _verdict()
-    found = {item.effect: item for item in visibility("left", verdict)}
+    found = {item.effect: item for item in detectability("left", verdict, DecisionPolicy())}
     size = found["defocus"].smallest["defocus_um"]
-    evidence = verdict.evidence
-    change = (evidence.mean((Defocus(defocus_um=size),)) - evidence.mean())[evidence.seen] / NOISE
+    model = verdict.model
+    change = (model.mean((Defocus(defocus_um=size),)) - model.mean())[model.seen] / NOISE
     assert float(change @ change) == pytest.approx(detectable(12.0), rel=0.05)
     assert 0.9 < found["defocus"].cosine <= 1.0  # all blurs are alike in so few numbers
     assert found["defocus"].told_apart == pytest.approx(
@@ -77,15 +80,15 @@ def test_the_smallest_size_that_is_seen_has_that_non_centrality() -> None:
 
 def test_measurements_fit_with_the_truth_and_not_without() -> None:
     (fit,) = measurement_fits("left", _verdict((TRUTH,)))
-    evidence = _verdict().evidence
+    model = _verdict().model
     assert (fit.n, fit.held_out_n) == (36, 36)
-    assert fit.held_out_before == pytest.approx(evidence.held_out()[0])
-    assert fit.held_out_after == pytest.approx(evidence.held_out((TRUTH,))[0])
+    assert fit.held_out_before == pytest.approx(model.held_out()[0])
+    assert fit.held_out_after == pytest.approx(model.held_out((TRUTH,))[0])
     assert fit.chi2_after < stats.chi2.ppf(0.999, 36) < fit.chi2_before
 
 
 def test_every_place_is_told_before_and_after() -> None:
-    found = list(places("left", _verdict((TRUTH,))))
+    found = list(places("left", _verdict((TRUTH,)), DecisionPolicy()))
     assert {p.axis for p in found} == {"spatial_frequency", "orientation"}
     assert max(p.sigma_before for p in found) > 5.0
     assert max(p.sigma_after for p in found) < 3.0
@@ -102,7 +105,7 @@ def test_pictures_show_what_the_model_lacks_and_noise_once_it_has_it() -> None:
                 "prnu_percent": camera.prnu_percent, "dark_current_e_per_s": camera.dark_e_per_s, "full_well_e": camera.full_well_e}
     )  # fmt: skip
     known = CameraFile("known", model, (OpticalLowPassFilter(displacement_x_um=1.8, displacement_y_um=1.8),))
-    found = {p.kind: p for p in residual_pictures(recordings, "left", _verdict().evidence, known)}
+    found = {p.kind: p for p in residual_pictures(recordings, "left", _verdict().model, known)}
     assert set(found) == {"flat", "slanted_edge"}
 
     def rms(table: tuple[tuple[float, ...], ...]) -> float:

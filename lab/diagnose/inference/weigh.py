@@ -1,0 +1,177 @@
+"""Weigh one member of a set of effects: its probability against rivals in its place, an unknown cause, and misstated metadata."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lab.diagnose.inference.discrepancy import likeliest_discrepancy
+from lab.diagnose.inference.gaussian import Gaussian
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.refit import Fit, log_likelihood
+from lab.diagnose.inference.score import signatures
+from lab.diagnose.inference.search import Search
+from lab.diagnose.policy import DecisionPolicy
+from sim.effects.base import Effect
+from sim.effects.library import effects as library
+from sim.effects.other_f_number import OtherFNumber
+
+#: Name of the hypothesis that no effect of the library is the cause.
+UNKNOWN = "unknown"
+#: Ratios to the stated f-number from which its fit starts.
+F_NUMBER_RATIOS = (0.75, 1.35)
+#: Rivals below this probability aren't kept.
+LEAST_KEPT_PROBABILITY = 1e-4
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that may be named, with the probabilities of its name and of what else may be meant.
+
+    `log_odds`: log posterior of its set over that of the set without it.
+    `explained_share`: of the excess chi2 in the measurements that it acts on.
+    `is_closed`: what is left there is within noise and the form tolerances of the named laws.
+    `remark`: metadata that would explain the recordings as well, in words.
+    """
+
+    effect: Effect
+    std: dict[str, float | None]
+    probability: float
+    rivals: tuple[tuple[str, float], ...]
+    log_odds: float
+    explained_share: float = 1.0
+    is_closed: bool = True
+    remark: str = ""
+
+    @property
+    def unknown_probability(self) -> float:
+        """That the cause isn't in the library."""
+        return dict(self.rivals).get(UNKNOWN, 0.0)
+
+
+def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
+    """One member of a fitted set as a candidate; and the set with a rival in its place, where that is likelier.
+
+    Hypotheses, each with its log posterior:
+
+    - the member, and every effect whose score is near its own in its place. Where both act, a model discrepancy is allowed beside either,
+      so that neither is preferred for what both leave;
+    - unknown: discrepancies in place of the member, with the other members as they are or refitted, or misstated metadata.
+    """
+    model, policy, effect = search.model, search.policy, fit.effects[index]
+    rest = (*fit.effects[:index], *fit.effects[index + 1 :])
+    without, affected = search.without(fit, index), model.affected_blocks(effect)
+    log_odds = fit.log_posterior - without.log_posterior
+    misstated, remark = _misstated_metadata(search, fit, index)
+    if misstated > fit.log_posterior + policy.sure_misstated_log_odds:
+        return Candidate(effect, fit.std[index], 0.0, ((UNKNOWN, 1.0),), log_odds, remark=remark), None
+
+    def with_discrepancies(gaussian: Gaussian, blocks: Sequence[int]) -> float:
+        return sum(likeliest_discrepancy(model, gaussian, i, policy).log_odds for i in blocks)
+
+    fits = {effect.name: fit} | _rival_fits(search, fit, index, without)
+    weights = {}
+    for name, tried in fits.items():
+        weights[name] = tried.log_posterior
+        if tried.log_posterior > fit.log_posterior - policy.hopeless_log_odds:
+            common = [i for i in affected if model.blocks[i].touched_by(library()[name])]
+            weights[name] += with_discrepancies(model.seen_gaussian(tried.effects), common)
+    log_prior = fit.log_posterior - fit.log_likelihood
+    as_they_are = log_likelihood(model, rest) + log_prior + with_discrepancies(model.seen_gaussian(rest), affected)
+    refitted = without.log_posterior + with_discrepancies(model.seen_gaussian(without.effects), affected)
+    weights[UNKNOWN] = max(as_they_are, refitted, misstated)
+
+    top = max(weights.values())
+    odds = {name: float(np.exp(w - top)) for name, w in weights.items()}
+    total = sum(odds.values())
+    rivals = [(n, o / total) for n, o in odds.items() if n != effect.name and o / total > LEAST_KEPT_PROBABILITY]
+    share, is_closed = explained(model, fit, without, affected, policy)
+    first = max((n for n in odds if n != UNKNOWN), key=lambda n: odds[n])
+    better = fits[first] if odds[first] > policy.replacing_odds * odds[effect.name] else None
+    candidate = Candidate(
+        effect,
+        fit.std[index],
+        odds[effect.name] / total,
+        tuple(sorted(rivals, key=lambda r: -r[1])),
+        log_odds,
+        share,
+        is_closed,
+        remark if misstated >= top else "",
+    )
+    return candidate, better
+
+
+def _rival_fits(search: Search, fit: Fit, index: int, without: Fit) -> dict[str, Fit]:
+    """The set with each likely effect in the place of a member: fitted roughly, and to convergence where it isn't far behind."""
+    model, policy, name = search.model, search.policy, fit.effects[index].name
+    log_odds = fit.log_posterior - without.log_posterior
+    others = [e for e in search.candidates if e.name not in fit.names]
+    scores = signatures(model, model.camera, without.effects, others, without.jacobian).scores()
+
+    def is_likely(rival: str, score: float) -> bool:
+        is_rival = rival in search.rivals[name]
+        return score > (policy.near_rival_score_factor if is_rival else policy.rival_score_factor) * log_odds
+
+    found = {}
+    for score in [s for s in scores if is_likely(s.effect.name, s.value)][: policy.screened_effects]:
+        start = (*fit.effects[:index], score.start, *fit.effects[index + 1 :])
+        rough = search.fitted(start, beside=fit)
+        behind = min(
+            policy.rough_fit_share * log_odds,
+            policy.rough_fit_log_odds + policy.rough_fit_steps * rough.promised_gain,
+        )
+        is_near = rough.log_posterior > fit.log_posterior - policy.hopeless_log_odds - behind
+        found[score.effect.name] = search.fitted(start, converged=True) if is_near else rough
+    return found
+
+
+def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, str]:
+    """Log posterior, less prior odds, of the set with another f-number or pitch than stated in the place of an effect that blurs; and that
+    in words. -inf for effects that don't blur, and where the fitted ratio is below `misstated_ratio`."""
+    model, policy, effect = search.model, search.policy, fit.effects[index]
+    if type(effect).transfer is Effect.transfer:
+        return -np.inf, ""
+    rest = (*fit.effects[:index], *fit.effects[index + 1 :])
+    starts = [(*rest, OtherFNumber(ratio=ratio)) for ratio in F_NUMBER_RATIOS]
+    tried = search.fitted(max(starts, key=lambda s: log_likelihood(model, s)), beside=fit)
+    if tried.log_posterior < fit.log_posterior - policy.hopeless_log_odds:
+        return -np.inf, ""
+    tried = search.fitted(tried.effects, converged=True)
+    ratio = next(e.ratio for e in tried.effects if isinstance(e, OtherFNumber))
+    if abs(np.log(ratio)) <= np.log(policy.misstated_ratio):
+        return -np.inf, ""
+    stated, pitch = model.camera.lens.f_number, model.camera.pixel_pitch_um
+    return (
+        tried.log_posterior - policy.misstated_log_odds,
+        (
+            f"as if the lens worked at f/{stated * ratio:.3g} in place of f/{stated:.3g}, "
+            f"or the pixels' pitch were {pitch / ratio:.3g} um in place of {pitch:.3g}"
+        ),
+    )
+
+
+def explained(
+    model: MeasurementModel, fit: Fit, without: Fit, affected: Sequence[int], policy: DecisionPolicy
+) -> tuple[float, bool]:
+    """Share of the excess chi2 that an effect explains in the blocks it acts on; and whether what is left there is closed.
+
+    share = (chi2 without - chi2 with) / (chi2 without - n), by the baseline's covariance, so that an effect's own form tolerance explains
+    nothing; 1 where chi2 with it is within `noise_sigma` of n. Closed: chi2 by the covariance with form tolerances is within
+    `tolerance_sigma` of n; the standard deviation of chi2 is sqrt(2 n).
+    """
+    if not affected:
+        return 1.0, True
+    where = np.any([model.mask(i) for i in affected], axis=0) & model.seen
+    n = int(where.sum())
+    sigma = np.sqrt(2.0 * n)
+    left = model.gaussian(fit.effects, where).chi2(model.value[where]) / (1.0 + policy.covariance_slack) ** 2
+    is_closed = left - n < policy.tolerance_sigma * sigma
+    gaussian = model.gaussian((), where)
+    after, before = (
+        float(np.sum(np.square(gaussian.whiten((model.value - model.mean(f.effects))[where])))) for f in (fit, without)
+    )
+    if after - n < policy.noise_sigma * sigma:
+        return 1.0, is_closed
+    return max(before - after, 0.0) / max(before - n, 1e-9), is_closed

@@ -1,0 +1,255 @@
+"""Captures that a station or a person could take next, each with the forward model's prediction of it and its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from lab.capture.sequences.calibration import Calibration
+from lab.capture.sequences.dark import DarkSequence
+from lab.capture.sequences.flat import FlatSequence
+from lab.capture.sequences.narrowband import NarrowbandSequence
+from lab.capture.sequences.targets import EdgeSequence
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
+from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, LAMP_FLOOR, NARROWBAND_FLOOR
+from lab.formats.recording_set import RecordingSet
+from lab.predict.camera_model import Field, collected_electrons, mean_dn
+from sim.camera import CameraModel, Side
+from sim.effects.base import Effect
+from sim.forward import electron_rate, optical_transfer
+from sim.spectrum import FloatArray, Spectrum
+
+#: Size of a capture that is assumed: pixels of a channel, repeats, and the brightest channel's electrons over the full well.
+PIXELS, REPEATS, FILLED = 2e4, 4, 0.6
+#: Standard deviations that don't average out: of a variance, relative, beside its noise; of a transfer function, where no edge tells.
+VARIANCE_STD, EDGE_STD = 0.003, 0.004
+#: Prior standard deviation of a level that is a nuisance parameter, relative: so wide that it says nothing.
+FREE_STD = 10.0
+#: Length of a session (s), over which drifts show.
+SESSION_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A rival with the effects that act beside it, and the camera with its nuisance parameters at their posterior means."""
+
+    name: str
+    effects: tuple[Effect, ...]
+    camera: CameraModel
+
+
+@dataclass(frozen=True)
+class Design:
+    """A capture that could be taken: the prediction of a hypothesis (n,), its covariance (n, n), and the sequence that takes it (None: a
+    station can't by itself)."""
+
+    words: str
+    predict: Callable[[Hypothesis], FloatArray]
+    covariance: FloatArray
+    plan: Calibration | None = None
+
+
+def designs(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[Design]:
+    """All captures that are considered."""
+    camera = model.camera
+    lamp = _lamp(recordings, side)
+    yield from _narrowband(camera)
+    yield from _edges(camera, model, lamp)
+    yield from _ladders(camera, lamp)
+    yield from _steady(camera, lamp)
+    yield from _darks(camera)
+    yield from _again(model)
+
+
+def _lamp(recordings: RecordingSet, side: Side) -> Spectrum:
+    """The light of the flats or the chart, else of equal energy."""
+    for kind in ("flat", "chart"):
+        for capture in recordings.captures(kind, side):
+            path = getattr(capture, "radiance", None)
+            if path is not None:
+                return recordings.spectrum(path)
+    return Spectrum.of((380.0, 780.0), (0.01, 0.01))
+
+
+def _exposed(camera: CameraModel, light: Spectrum, kind: str = "flat") -> float:
+    """Exposure (s) that fills the brightest channel's wells to `FILLED`."""
+    brightest = max(electron_rate(camera, c, light, (), kind) for c in camera.channels)
+    return FILLED * camera.full_well_e / brightest if brightest > 0 else 0.0
+
+
+def _means(h: Hypothesis, light: Spectrum, kind: str, exposure_s: float, elapsed_s: float = 0.0) -> dict[str, float]:
+    """Mean electrons of uniform light by channel, after the read-out."""
+    rates = {c: electron_rate(h.camera, c, light, h.effects, kind) for c in h.camera.channels}
+    collected = collected_electrons(
+        h.camera, rates, exposure_s, h.effects, field=Field.of(h.camera).under(h.camera, h.effects), elapsed_s=elapsed_s
+    )
+    gain = h.camera.conversion_gain_dn_per_e
+    return {c: value / gain for c, value in mean_dn(h.camera, collected, h.effects).items()}
+
+
+def _narrowband(camera: CameraModel) -> Iterator[Design]:
+    """Light of one wavelength, every 5 nm."""
+    for centre in np.arange(400.0, 721.0, 5.0):
+        light = Spectrum.of((centre - 10.0, centre, centre + 10.0), (0.0, 1e-3, 0.0))
+        exposure = _exposed(camera, light, "narrowband")
+        if exposure <= 0:
+            continue
+
+        def predict(h: Hypothesis, light: Spectrum = light, exposure: float = exposure) -> FloatArray:
+            return np.array(list(_means(h, light, "narrowband", exposure).values()))
+
+        signal = predict(Hypothesis("", (), camera))
+        noise = (signal + camera.read_noise_e**2) / (PIXELS * REPEATS)
+        loose = np.square(signal) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
+        around = {"from_nm": float(centre - 5.0), "to_nm": float(centre + 5.0), "step_nm": 2.5}
+        yield Design(
+            f"narrowband light at {centre:g} nm",
+            predict,
+            np.diag(noise + loose + (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2),
+            Calibration(narrowband=NarrowbandSequence.model_validate(around)),
+        )
+
+
+def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iterator[Design]:
+    """Slanted edges: at four orientations, in the lamp's and in narrowband light, at the lens's and at twice its f-number."""
+    frequency = np.arange(1, 17) * 0.05
+    block = next((b for b in model.blocks if b.measurement == "slanted_edge"), None)
+    std = np.full(frequency.shape, EDGE_STD)
+    if block is not None:  # of the best edge there was, frequency by frequency
+        x, variance = np.array([label.x for label in block.labels]), np.diag(block.covariance)
+        places = np.unique(x)
+        std = np.interp(frequency, places, [float(np.sqrt(variance[x == place].min())) for place in places])
+    angles = np.deg2rad([5.0, 50.0, 95.0, 140.0])
+    fx, fy = np.outer(np.cos(angles), frequency), np.outer(np.sin(angles), frequency)
+    lights = {"the lamp's light": lamp} | {
+        f"light of {nm:g} nm": Spectrum.of((nm - 10.0, nm, nm + 10.0), (0.0, 1e-3, 0.0)) for nm in (450.0, 550.0, 650.0)
+    }
+    for stops, at in ((1.0, ""), (2.0, " at twice the f-number")):
+        for name, light in lights.items():
+            sighted = [c for c in camera.channels if electron_rate(camera, c, light) > 0]
+
+            def predict(
+                h: Hypothesis, stops: float = stops, light: Spectrum = light, channels: list[str] = sighted
+            ) -> FloatArray:
+                lens = h.camera.lens.model_copy(update={"f_number": stops * h.camera.lens.f_number})
+                stopped = h.camera.model_copy(update={"lens": lens})
+                return np.concatenate(
+                    [np.real(optical_transfer(stopped, c, light, fx, fy, h.effects)).ravel() for c in channels]
+                )
+
+            n = len(sighted) * fx.size
+            plain = stops == 1.0 and light is lamp
+            plan = Calibration(edge=EdgeSequence(frames=2 * REPEATS)) if plain else None
+            if n:
+                words = f"slanted edges at 5, 50, 95 and 140 degrees in {name}{at}"
+                yield Design(words, predict, np.diag(np.square(np.tile(std, n // len(std)))), plan)
+
+
+def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
+    """Flats at many levels: by the exposure, or by the light at one exposure. Mean and variance; their scales are free."""
+    shares = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92]) / FILLED
+    full = _exposed(camera, lamp)
+    if full <= 0:
+        return
+    dimmed = [Spectrum.of(*(lamp.arrays[0], share * lamp.arrays[1])) for share in shares]
+    ladders = {
+        "flats at ten exposures, from 1 to 92 % of the full well": [(lamp, share * full) for share in shares],
+        "flats at one exposure and ten levels of the light, from 1 to 92 % of the full well": [
+            (d, full) for d in dimmed
+        ],
+    }
+    for words, steps in ladders.items():
+
+        def predict(h: Hypothesis, steps: list[tuple[Spectrum, float]] = steps) -> FloatArray:
+            levels = [list(_means(h, light, "flat", seconds).values()) for light, seconds in steps]
+            mean = np.array(levels).T.ravel()
+            variance = mean + h.camera.read_noise_e**2
+            for effect in h.effects:
+                variance = effect.noise_e2(mean, variance, h.camera)
+            return np.concatenate([mean, variance])
+
+        mean, variance = np.split(predict(Hypothesis("", (), camera)), 2)
+        std = np.concatenate(
+            [
+                np.hypot(np.sqrt(variance / (PIXELS * REPEATS)), 2.0 * LAMP_FLOOR * mean),
+                np.hypot(np.sqrt(2.0 / (PIXELS * (REPEATS - 1))), VARIANCE_STD) * variance,
+            ]
+        )
+        covariance = np.diag(np.square(std))
+        zero = np.zeros_like(mean)
+        free = [np.concatenate([zero, mean]), np.concatenate([zero, np.ones_like(mean)])]  # gain and read noise
+        free += [np.concatenate([np.ones_like(mean), zero])]  # black level
+        for channel in np.split(np.arange(len(mean)), len(camera.channels)):  # the light
+            rate = np.zeros(2 * len(mean))
+            rate[channel] = mean[channel]
+            free.append(rate)
+        covariance += FREE_STD**2 * sum(np.outer(column, column) for column in free)
+        by_exposure = all(light is lamp for light, _ in steps)
+        sequence = FlatSequence(levels=tuple((FILLED * shares).round(3).tolist()), frames=2 * REPEATS)
+        yield Design(words, predict, covariance, Calibration(flat=sequence) if by_exposure else None)
+
+
+def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
+    """The same flat again and again: the lamp's level is free, what becomes of it isn't."""
+    full = _exposed(camera, lamp)
+    times = np.linspace(0.0, SESSION_S, 13)
+    if full <= 0:
+        return
+
+    def predict(h: Hypothesis) -> FloatArray:
+        return np.array([list(_means(h, lamp, "flat", full, float(t)).values()) for t in times]).T.ravel()
+
+    mean = predict(Hypothesis("", (), camera))
+    noise = (mean + camera.read_noise_e**2) / (PIXELS * REPEATS)
+    levels = np.kron(np.eye(len(camera.channels)), np.ones((len(times), len(times)))) * np.outer(mean, mean)
+    yield Design(
+        "the same flat every five minutes for an hour",
+        predict,
+        np.diag(noise + np.square(2.0 * LAMP_FLOOR * mean)) + FREE_STD**2 * levels,
+    )
+
+
+def _darks(camera: CameraModel) -> Iterator[Design]:
+    """Dark frames by exposure, by time and by temperature; black level and dark current are free."""
+    gain, reference = camera.conversion_gain_dn_per_e, camera.dark_current_reference_c
+    times = np.linspace(0.0, SESSION_S, 13)
+    ladders = {
+        "dark frames every five minutes for an hour": [(0.01, t, reference) for t in times],
+        "dark frames with the sensor 10 and 20 degrees warmer": [
+            (s, 0.0, reference + c) for c in (0, 10, 20) for s in (0.01, 1.0, 5.0)
+        ],
+        "dark frames from 1 ms to 20 s": [(s, 0.0, reference) for s in np.geomspace(0.001, 20.0, 10)],
+    }
+    for words, steps in ladders.items():
+
+        def predict(h: Hypothesis, steps: list[tuple[float, float, float]] = steps) -> FloatArray:
+            found = []
+            for seconds, elapsed, temperature in steps:
+                dark: FloatArray | float = h.camera.dark_current_e_per_s
+                shift = 0.0
+                for effect in h.effects:
+                    dark = effect.dark_current(dark, temperature, h.camera)
+                    shift += effect.offset_dn(elapsed, temperature, h.camera)
+                found.append(float(np.mean(dark)) * seconds * gain + shift)
+            return np.array(found)
+
+        seconds = np.array([s for s, _, _ in steps])
+        covariance = np.eye(len(steps)) * (2 * BLACK_FLOOR_DN) ** 2
+        covariance += FREE_STD**2 * (np.ones_like(covariance) + np.outer(seconds, seconds))
+        exposures = "from 1 ms" in words
+        plan = Calibration(dark=DarkSequence(exposures_s=tuple(seconds.round(4).tolist()), frames=REPEATS))
+        yield Design(words, predict, covariance, plan if exposures else None)
+
+
+def _again(model: MeasurementModel) -> Iterator[Design]:
+    """Every measurement once more, as it was."""
+    for block, at in zip(model.blocks, model.slices, strict=True):
+
+        def predict(h: Hypothesis, at: slice = at) -> FloatArray:
+            return model.fitted_mean(tuple(e for e in h.effects if e not in model.always))[at]
+
+        name = block.measurement.replace("_", " ")
+        yield Design(f"the captures of {name} again, with as many repeats", predict, block.covariance)

@@ -1,0 +1,449 @@
+"""The decision policy: every number by which a diagnosis decides, with its meaning, its unit and where its value comes from.
+
+Odds are natural logarithms throughout ("log odds"): 2.3 is ten to one, 4.6 is a hundred to one. A score is the gain in chi2 that an
+effect's signature promises: twice its log odds.
+
+Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge, and `calibench challenge score` checks them
+together: healthy cases for false alarms, concealed effects for names and rivals, siblings outside the library for false names.
+docs/reference/decision-policy.md is generated from this module by docs/write_tables.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, get_args, get_type_hints
+
+from lab.formats.results import PolicyRule
+from sim.parameters import Frozen
+
+TUNED = "tuned; checked by `calibench challenge score`"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Declaration of one field: its group, its unit ("1": a share, a ratio or a count), its meaning, and where its value comes from."""
+
+    group: str
+    unit: str
+    meaning: str
+    basis: str
+
+
+class DecisionPolicy(Frozen):
+    """All rules of decision. An instance is passed to `lab.diagnose.examine` and stored in its result."""
+
+    # --- significance ----------------------------------------------------------------------------------------------------
+    false_alarm_rate: Annotated[
+        float,
+        Rule(
+            "significance",
+            "1",
+            "share of healthy cameras whose best score exceeds the threshold",
+            "chosen; checked by `calibench challenge score` on healthy cases, and per camera by `calibench diagnose --bootstrap`",
+        ),
+    ] = 0.01
+    threshold_draws: Annotated[
+        int,
+        Rule(
+            "significance",
+            "1",
+            "draws of noise behind the threshold",
+            "4 of 400 draws lie above the 99 % quantile, so that its rate is known to 50 % and the threshold to 2 ln 1.5 = 0.8 of about 15",
+        ),
+    ] = 400
+    slice_false_alarm_rate: Annotated[
+        float,
+        Rule(
+            "significance",
+            "1",
+            "probability, corrected for the number of slices, below which a slice is a mismatch",
+            "half of `false_alarm_rate`: slices add at most half as many false alarms as scores",
+        ),
+    ] = 0.005
+    covariance_slack: Annotated[
+        float,
+        Rule(
+            "significance", "1", "relative error of stated standard deviations; chi2 is divided by (1 + slack)^2", TUNED
+        ),
+    ] = 0.15
+    lone_score_margin: Annotated[
+        float,
+        Rule(
+            "significance",
+            "score",
+            "excess of the best score over the threshold that is a mismatch where neither a slice nor a refit shows one",
+            TUNED,
+        ),
+    ] = 10.0
+
+    # --- cost of a model -------------------------------------------------------------------------------------------------
+    parameter_log_odds: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "log odds",
+            "gain in log-likelihood that a fitted parameter has to earn",
+            "BIC, 0.5 ln n: 2.5 for n = 150 independent numbers, 2.9 for 300",
+        ),
+    ] = 2.5
+    dispensable_log_odds: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "log odds",
+            "gain that a parameter declared dispensable has to earn besides",
+            "about half of a usual threshold (15 to 18 in chi2), as a further effect has to",
+        ),
+    ] = 8.0
+    discrepancy_log_odds: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "log odds",
+            "gain that a model discrepancy has to earn",
+            "logarithm of the number of kernels that differ: 20 amplitudes x 3 lengths x 4 groupings = 240 are tried, of which neighbouring amplitudes are nearly alike: about 150",
+        ),
+    ] = 5.0
+    added_threshold_factor: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "threshold",
+            "gain that an effect has to earn where a stronger one acts on the same measurement",
+            TUNED,
+        ),
+    ] = 1.5
+    exchange_log_odds: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "log odds",
+            "gain from which on leaving out or exchanging a member counts as better",
+            "what refits of the same set from different starts differ by",
+        ),
+    ] = 0.5
+    misstated_log_odds: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "log odds",
+            "prior odds that the model lacks an effect, against a misstated f-number or pitch",
+            TUNED,
+        ),
+    ] = 10.0
+    misstated_ratio: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "1",
+            "factor from which on a fitted f-number or pitch counts as another one than stated",
+            "f-numbers are marked in thirds of a stop, a factor of 1.12",
+        ),
+    ] = 1.1
+    sure_misstated_log_odds: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "log odds",
+            "gain of a misstated f-number or pitch from which on rivals aren't weighed",
+            "a probability of exp(-30) changes no decision",
+        ),
+    ] = 30.0
+
+    # --- name ------------------------------------------------------------------------------------------------------------
+    most_unknown_probability: Annotated[
+        float, Rule("name", "1", "probability of an unknown cause above which no name is given", TUNED)
+    ] = 0.4
+    least_probability: Annotated[
+        float, Rule("name", "1", "least probability of a name that explains at least `exact_share`", TUNED)
+    ] = 0.35
+    least_probability_inexact: Annotated[
+        float,
+        Rule(
+            "name", "1", "least probability of a name that explains less than `exact_share`", "odds of 4 to 1, chosen"
+        ),
+    ] = 0.8
+    exact_share: Annotated[
+        float, Rule("name", "1", "share of the excess chi2 from which on a name explains it nearly all", TUNED)
+    ] = 0.95
+    least_explained_share: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "least share of the excess chi2, in the measurements that an effect acts on, that its name explains",
+            TUNED,
+        ),
+    ] = 0.8
+    least_explained_share_open: Annotated[
+        float, Rule("name", "1", "the same where what is left exceeds noise and form tolerances", TUNED)
+    ] = 0.98
+    noise_sigma: Annotated[
+        float,
+        Rule(
+            "name",
+            "standard deviations",
+            "excess of chi2 over its expectation up to which what is left counts as noise",
+            "one-sided 99.9 % of a normal distribution",
+        ),
+    ] = 3.0
+    tolerance_sigma: Annotated[
+        float,
+        Rule(
+            "name",
+            "standard deviations",
+            "the same where form tolerances are in the covariance",
+            "wider than `noise_sigma`, as the correlation kernel of a law's error is assumed; " + TUNED,
+        ),
+    ] = 5.0
+    replacing_odds: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "ratio of probabilities from which on a rival takes a name's place",
+            "less is what refits of the same set differ by",
+        ),
+    ] = 1.1
+    companion_share: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "share of a stronger effect's size below which an effect beside it counts as that one's law's error",
+            TUNED,
+        ),
+    ] = 0.03
+    least_companion_share: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "the same of the gain of any effect on common measurements",
+            "(1 %)^2: the smallest form tolerance, squared",
+        ),
+    ] = 0.0001
+    remainder_log_odds: Annotated[
+        float, Rule("name", "log odds", "gain of a discrepancy that never speaks against a name", "odds of 20 to 1")
+    ] = 3.0
+    remainder_share: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "gain of a discrepancy in the same frames, over the name's gain, above which both count as one unknown cause",
+            TUNED,
+        ),
+    ] = 0.1
+    own_remainder_share: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "the same in the measurement that shows the name most",
+            "as `least_explained_share_open`: 2 % may be left",
+        ),
+    ] = 0.02
+    sure_remainder_log_odds: Annotated[
+        float,
+        Rule(
+            "name",
+            "log odds",
+            "gain of a discrepancy from which on `own_remainder_share` holds for it in any of the same frames",
+            TUNED,
+        ),
+    ] = 1000.0
+    equal_sign_log_odds: Annotated[
+        float,
+        Rule(
+            "name",
+            "log odds",
+            "difference within which both signs of a parameter count as equally likely",
+            "a likelihood ratio of two standard deviations: 2^2 / 2",
+        ),
+    ] = 2.0
+
+    # --- budget of the search --------------------------------------------------------------------------------------------
+    most_effects: Annotated[
+        int, Rule("budget of the search", "1", "effects in one set", "chosen: twice what the proof's compounds have")
+    ] = 4
+    screened_effects: Annotated[int, Rule("budget of the search", "1", "candidates refitted for one set", TUNED)] = 8
+    screened_pairs: Annotated[int, Rule("budget of the search", "1", "pairs refitted at the start", TUNED)] = 4
+    beam_width: Annotated[
+        int, Rule("budget of the search", "1", "sets of one size from which the search goes on", TUNED)
+    ] = 2
+    beam_log_odds: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "log odds",
+            "distance from the best set within which the search goes on from a set",
+            TUNED,
+        ),
+    ] = 25.0
+    least_score_share: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "1",
+            "share of the best score below which a candidate isn't refitted",
+            "its refit would have to gain ten times what its signature promises",
+        ),
+    ] = 0.1
+    rival_score_factor: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "score / log odds",
+            "score, over a name's gain, from which on any effect is fitted in its place (2: promises as much)",
+            TUNED,
+        ),
+    ] = 1.2
+    near_rival_score_factor: Annotated[
+        float, Rule("budget of the search", "score / log odds", "the same of rivals", TUNED)
+    ] = 0.6
+    rival_cosine: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "1",
+            "cosine of two whitened signatures from which on two effects are rivals",
+            "at a non-centrality of 25 (detected in 93 % of cases) rivals are told apart in less than 95 %: "
+            "Phi(0.5 sqrt(25 (1 - 0.75^2))) = 0.951",
+        ),
+    ] = 0.75
+    certain_probability: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "1",
+            "probability from which on a name isn't weighed again when another member changes",
+            "`false_alarm_rate` for wrong names",
+        ),
+    ] = 0.99
+    refit_again_log_odds: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "log odds",
+            "gain of a member below which the others are fitted once more without it, from where they stand",
+            TUNED,
+        ),
+    ] = 100.0
+    hopeless_log_odds: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "log odds",
+            "distance of a rival that no discrepancy beside it makes up for",
+            "a probability of exp(-30) changes no decision",
+        ),
+    ] = 30.0
+    rough_fit_share: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "1",
+            "share of a name's gain that a rival may lie behind after a rough fit and still be fitted to convergence",
+            TUNED,
+        ),
+    ] = 0.05
+    rough_fit_log_odds: Annotated[
+        float, Rule("budget of the search", "log odds", "upper limit of that distance, beside `rough_fit_steps`", TUNED)
+    ] = 100.0
+    rough_fit_steps: Annotated[
+        float,
+        Rule(
+            "budget of the search",
+            "1",
+            "what is added to that limit, in gains that the rival's next Newton step promises",
+            TUNED,
+        ),
+    ] = 10.0
+
+    # --- model discrepancy -----------------------------------------------------------------------------------------------
+    left_out_parts: Annotated[
+        int,
+        Rule(
+            "model discrepancy",
+            "1",
+            "parts of a measurement's captures that are left out in turn",
+            "chosen: 6-fold cross-validation",
+        ),
+    ] = 6
+    equal_discrepancy_log_odds: Annotated[
+        float,
+        Rule(
+            "model discrepancy",
+            "log odds",
+            "difference within which cross-validation decides between kernels where repeats are held out",
+            "twice `discrepancy_log_odds`",
+        ),
+    ] = 10.0
+    repeat_distance: Annotated[
+        float,
+        Rule(
+            "model discrepancy",
+            "correlation lengths",
+            "distance within which two numbers of one channel and condition are repeats",
+            "a squared exponential's correlation is 0.995 there",
+        ),
+    ] = 0.1
+
+    # --- report ----------------------------------------------------------------------------------------------------------
+    shown_chi2: Annotated[
+        float,
+        Rule(
+            "report",
+            "1",
+            "chi2 of an effect's change from which on a measurement is said to show it",
+            "five standard deviations",
+        ),
+    ] = 25.0
+    shown_share: Annotated[float, Rule("report", "1", "its least share of the strongest measurement's", "chosen")] = (
+        0.02
+    )
+    detection_probability: Annotated[
+        float, Rule("report", "1", "probability at which the smallest detectable size is stated", "chosen")
+    ] = 0.9
+    least_rival_probability: Annotated[
+        float,
+        Rule(
+            "report",
+            "1",
+            "least probability of a rival that is listed",
+            "half of `false_alarm_rate`; rival sets' coverage: `calibench challenge score`",
+        ),
+    ] = 0.005
+    next_capture_share: Annotated[
+        float,
+        Rule(
+            "report", "1", "probability that the rivals which a next capture is to tell apart hold together", "chosen"
+        ),
+    ] = 0.9
+    next_capture_rivals: Annotated[
+        int, Rule("report", "1", "how many these are at most", "chosen: each is refitted")
+    ] = 4
+    next_capture_distance: Annotated[
+        float,
+        Rule(
+            "report",
+            "1",
+            "D = 1/2 |m_k - m_l|^2 from which on a capture is worth taking",
+            "decides rightly with probability Phi(sqrt(D / 2)) = 0.84",
+        ),
+    ] = 2.0
+    next_captures_listed: Annotated[int, Rule("report", "1", "captures that are listed", "chosen")] = 5
+
+    @classmethod
+    def rules(cls) -> dict[str, Rule]:
+        """The declaration of every field, in order."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {name: next(m for m in get_args(hints[name]) if isinstance(m, Rule)) for name in cls.model_fields}
+
+    def told(self) -> tuple[PolicyRule, ...]:
+        """Every field with its value, as a result states it."""
+        return tuple(
+            PolicyRule(name=name, group=rule.group, value=getattr(self, name), unit=rule.unit, meaning=rule.meaning)
+            for name, rule in self.rules().items()
+        )
