@@ -482,12 +482,12 @@ class _Ties:
 
     def _may_settle(self, proposal: Proposal) -> bool:
         """Whether a station can take the capture, it is worth taking, and the tie isn't given up."""
-        from lab.diagnose.outcome.next_capture import WORTH_TAKING
+        from lab.diagnose.policy import DecisionPolicy
 
         capture = proposal.capture
         return (
             proposal.plan is not None
-            and capture.distance >= WORTH_TAKING
+            and capture.distance >= DecisionPolicy().next_capture_distance
             and (capture.side, capture.capture) not in self._taken
             and self._open.get((capture.side, frozenset(capture.rivals)), 1.0) >= GIVE_UP_PROBABILITY
         )
