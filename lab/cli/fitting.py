@@ -58,7 +58,7 @@ def _fit(recordings: RecordingSet) -> FitResult:
 
 def _write_maps(recordings: RecordingSet, folder: Path) -> None:
     """Maps of every side's pixels; a side without darks is said."""
-    from lab.fit.pixels import pixel_maps
+    from lab.fit.noise.pixel_maps import pixel_maps
     from lab.report.maps import write_maps
 
     for side in recordings.sides:

@@ -1,4 +1,6 @@
-"""Fits: from recordings to a camera's parameters with their uncertainties. `fit_recording_set` runs all that there are."""
+"""Fits: from recordings to a camera's parameters with their uncertainties. `fit_recording_set` runs all that there
+are.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,7 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
     """
     from lab.fit.geometry.recordings import fit_geometry
     from lab.fit.mtf.recordings import fit_mtf
-    from lab.fit.noise import fit_noise
+    from lab.fit.noise.recordings import fit_noise
     from lab.fit.psf.recordings import fit_psf_field
     from lab.fit.spectral import fit_spectral
     from lab.fit.stereo import fit_stereo

@@ -1,9 +1,10 @@
 """Two calibrations of one rig: what changed beyond its uncertainty.
 
-Every number that a fit states with a standard uncertainty is compared, found by its name: `x` beside `x_std`. Numbers of curves and
-kernels share one row, of the point at which they differ most, with the number of points allowed for (Sidak). Cameras' geometry
-is also compared by what it does: both project the same points, the rigid motion that the two calibrations imply between each other
-taken out first (`lab.fit.geometry.projection_errors`), since parameters that differ by much may project alike, and the other way round.
+Every number that a fit states with a standard uncertainty is compared, found by its name: `x` beside `x_std`. Numbers
+of curves and kernels share one row, of the point at which they differ most, with the number of points allowed for
+(Sidak). Cameras' geometry is also compared by what it does: both project the same points, the rigid motion that the
+two calibrations imply between each other taken out first (`lab.fit.geometry.projection_errors`), since parameters that
+differ by much may project alike, and the other way round.
 """
 
 from __future__ import annotations
@@ -58,8 +59,10 @@ class _Numbers:
 
 
 def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RATE) -> ComparisonResult:
-    """What differs between two fits of one rig, number by number. `false_alarm_rate` is the chance of any `changed` between two
-    calibrations of an unchanged rig; numbers are taken as independent, which they are not: the true rate is lower."""
+    """What differs between two fits of one rig, number by number. `false_alarm_rate` is the chance of any `changed`
+    between two calibrations of an unchanged rig; numbers are taken as independent, which they are not: the true rate
+    is lower.
+    """
     skipped: list[Skipped] = []
     rows: list[Change] = []
     projections: list[ProjectionChange] = []
@@ -116,7 +119,9 @@ def _sidak_whole(p_value: float, number: int) -> float:
 
 
 def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
-    """Every fitted number under `model`, by name. A model in a list is named by what in it is text: capture, channel, board."""
+    """Every fitted number under `model`, by name. A model in a list is named by what in it is text: capture, channel,
+    board.
+    """
     if isinstance(model, POINTS):
         return
     inflation = _model_error(model) if isinstance(model, GeometryFit) else 1.0

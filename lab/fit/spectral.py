@@ -1,14 +1,14 @@
 """Spectral sensitivity from narrowband light: C = S L solved for S, with its uncertainty.
 
-The light's measured spectrum is in L, so the bandwidth of the source is taken out instead of smeared in (which is what division
-of C by the light's power does). The problem is ill-posed below the bandwidth: the second difference of S has a normal prior
-(Tikhonov), whose strength is what makes the signals most probable (evidence, with the line left free integrated out), and which
-is wider where the curve bends and is high: its local scale is the geometric mean of curvature and height found in a first pass,
-smoothed, plus a floor that the evidence chooses. S >= 0.
+The light's measured spectrum is in L, so the bandwidth of the source is taken out instead of smeared in (which is what
+division of C by the light's power does). The problem is ill-posed below the bandwidth: the second difference of S has
+a normal prior (Tikhonov), whose strength is what makes the signals most probable (evidence, with the line left free
+integrated out), and which is wider where the curve bends and is high: its local scale is the geometric mean of
+curvature and height found in a first pass, smoothed, plus a floor that the evidence chooses. S >= 0.
 
-Signals have the noise of the pixels and 0.3 % of the radiometer's repeatability (independent from spectrum to spectrum). What all
-signals share (conversion gain, PRNU of the region) is a scale, added to the bands at the end. The radiometer's absolute
-calibration is taken as right.
+Signals have the noise of the pixels and 0.3 % of the radiometer's repeatability (independent from spectrum to
+spectrum). What all signals share (conversion gain, PRNU of the region) is a scale, added to the bands at the end. The
+radiometer's absolute calibration is taken as right.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, optimize, special
 
 from lab.errors import NotDetermined
-from lab.fit.lines import DarkLine, dark_line
+from lab.fit.weighted_lines import DarkLine, dark_line
 from lab.formats.recording_set import Capture, Flat, Narrowband, RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
 from sim.camera import Side
@@ -53,9 +53,10 @@ DETERMINED_SHARE = 0.25  # of the curve's maximum: a standard uncertainty above 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """A sensitivity on the wavelengths of the lights, `std` one standard uncertainty, `coverage_factor` what to multiply it by
-    for a band of about 95 %, and the covariance (before the positivity, which only takes away). `gain` (m, n): by how much the
-    curve moves with each signal; what several channels' signals share is propagated by it."""
+    """A sensitivity on the wavelengths of the lights, `std` one standard uncertainty, `coverage_factor` what to
+    multiply it by for a band of about 95 %, and the covariance (before the positivity, which only takes away). `gain`
+    (m, n): by how much the curve moves with each signal; what several channels' signals share is propagated by it.
+    """
 
     sensitivity: FloatArray
     std: FloatArray
@@ -65,7 +66,9 @@ class Sensitivity:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(m,): where the lights say something of the curve: its standard uncertainty is below a quarter of its maximum."""
+        """(m,): where the lights say something of the curve: its standard uncertainty is below a quarter of its
+        maximum.
+        """
         return self.std < DETERMINED_SHARE * max(float(self.sensitivity.max()), 1e-300)
 
 
@@ -74,10 +77,10 @@ def estimate_sensitivity(
 ) -> Sensitivity:
     """Sensitivity S(w) from signals C_i = integral L_i(w) S(w) dw + noise.
 
-    `wavelength_nm` (m,), ascending; `lights` (n, m), photons (or power) per nm; `signal`, `signal_std` (n,). S is in signal per
-    photon (or energy), on `wavelength_nm`; integrals are trapezoids. Where no light shines, `std` is large and `determined` False.
-    Raises ValueError where shapes don't fit, values aren't finite, a light is negative by more than noise, a standard deviation
-    isn't above 0, or there are fewer than 3 lights that differ.
+    `wavelength_nm` (m,), ascending; `lights` (n, m), photons (or power) per nm; `signal`, `signal_std` (n,). S is in
+    signal per photon (or energy), on `wavelength_nm`; integrals are trapezoids. Where no light shines, `std` is large
+    and `determined` False. Raises ValueError where shapes don't fit, values aren't finite, a light is negative by more
+    than noise, a standard deviation isn't above 0, or there are fewer than 3 lights that differ.
     """
     wave, light, value, std = (np.asarray(a, float) for a in (wavelength_nm, lights, signal, signal_std))
     _check(wave, light, value, std)
@@ -112,8 +115,9 @@ def _check(wave: FloatArray, light: FloatArray, value: FloatArray, std: FloatArr
 
 
 def _different(light: FloatArray) -> int:
-    """How many spectra of (n, wavelengths) differ by more than the radiometer's repeatability: the number of singular values of
-    the normalised lights above it. One light taken twice, or at two levels, counts once."""
+    """How many spectra of (n, wavelengths) differ by more than the radiometer's repeatability: the number of singular
+    values of the normalised lights above it. One light taken twice, or at two levels, counts once.
+    """
     unit = light / np.linalg.norm(light, axis=1, keepdims=True)
     return int(np.sum(np.linalg.svd(unit, compute_uv=False) > np.sqrt(2.0) * RADIOMETER_RELATIVE_STD))
 
@@ -140,7 +144,9 @@ def _solve(
     bounds: _Bounds | None = None,
     fine_share: float = 0.0,
 ) -> Sensitivity:
-    """Solution of value = operator S + noise in two passes: alike roughness everywhere, then local, with fine structure."""
+    """Solution of value = operator S + noise in two passes: alike roughness everywhere, then local, with fine
+    structure.
+    """
     mean, covariance = _tikhonov(wave, operator, value, std, [np.ones_like(wave)])
     distance = (wave[:, None] - wave) / LOCAL_WIDTH_NM
     average = np.exp(-0.5 * distance**2)
@@ -167,7 +173,9 @@ def _solve(
 
 
 def _roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) -> FloatArray | None:
-    """Where a curve is rough, maximum 1: the geometric mean of its bend and its height, both smoothed. None for a line."""
+    """Where a curve is rough, maximum 1: the geometric mean of its bend and its height, both smoothed. None for a
+    line.
+    """
     if wave.size < 5:
         return None
     bend = np.sqrt(average @ np.gradient(np.gradient(curve, wave), wave) ** 2)
@@ -177,13 +185,17 @@ def _roughness(wave: FloatArray, curve: FloatArray, average: FloatArray) -> Floa
 
 
 def _smooth_root(wave: FloatArray, roughness: FloatArray) -> FloatArray:
-    """(m, m): columns span curves whose second difference is white with standard deviation `roughness`, but for the line."""
+    """(m, m): columns span curves whose second difference is white with standard deviation `roughness`, but for the
+    line.
+    """
     return np.clip(wave[:, None] - wave, 0.0, None) * (np.sqrt(np.gradient(wave)) * roughness)
 
 
 def _rough_root(wave: FloatArray, roughness: FloatArray, fine_share: float) -> FloatArray:
-    """(m, m) like `_smooth_root`, with fine structure beside it: what bends within FINE_LENGTH_NM, exponentially correlated, as
-    high as `fine_share` of what the bend amounts to over 10 nm. Lights hardly tell it; the bands have to hold it."""
+    """(m, m) like `_smooth_root`, with fine structure beside it: what bends within FINE_LENGTH_NM, exponentially
+    correlated, as high as `fine_share` of what the bend amounts to over 10 nm. Lights hardly tell it; the bands have
+    to hold it.
+    """
     smooth = _smooth_root(wave, roughness)
     if fine_share == 0.0:
         return smooth
@@ -200,8 +212,9 @@ def _line(wave: FloatArray) -> FloatArray:
 def _evidence(
     root: FloatArray, line: FloatArray, operator: FloatArray, value: FloatArray, std: FloatArray
 ) -> tuple[float, float]:
-    """Negative log evidence of S = line a + strength root u (u standard normal, a free and integrated out) at the strength
-    that maximises it, and that strength."""
+    """Negative log evidence of S = line a + strength root u (u standard normal, a free and integrated out) at the
+    strength that maximises it, and that strength.
+    """
     z, h, f = value / std, operator @ line / std[:, None], operator @ root / std[:, None]
     rest = linalg.qr(h)[0][:, line.shape[1] :]
     eigenvalue, vector = np.linalg.eigh((rest.T @ f) @ (rest.T @ f).T)
@@ -229,8 +242,9 @@ def _tikhonov(
     shapes: Sequence[FloatArray],
     fine_share: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Posterior mean and covariance of S under a second-difference prior and free line; of the prior's `shapes` (roughness
-    against wavelength) that with the highest evidence, at its best strength."""
+    """Posterior mean and covariance of S under a second-difference prior and free line; of the prior's `shapes`
+    (roughness against wavelength) that with the highest evidence, at its best strength.
+    """
     line = _line(wave)
     roots = [_rough_root(wave, shape, fine_share) for shape in shapes]
     roots = [root - line @ np.linalg.lstsq(line, root, rcond=None)[0] for root in roots]  # the line is free anyway
@@ -299,8 +313,8 @@ class _Signals:
 def _with_maker(wave: FloatArray, signals: Sequence[_Signals], maker: Sequence[FloatArray]) -> list[Sensitivity]:
     """All channels at once, with the maker's curves as prior: S_c = M_c (1 + a + b_c) + d_c.
 
-    `a` is common to the channels (filters in the lens, scale of the radiometer), `b_c` the channel's own (a line of 2 %), both
-    smooth by their second difference; `d_c` is small and local. The three strengths are found by evidence.
+    `a` is common to the channels (filters in the lens, scale of the radiometer), `b_c` the channel's own (a line of 2
+    %), both smooth by their second difference; `d_c` is small and local. The three strengths are found by evidence.
     """
     count, size = len(signals), wave.size
     offsets = np.cumsum([0, *(s.value.size for s in signals)])
@@ -376,11 +390,11 @@ def _with_maker(wave: FloatArray, signals: Sequence[_Signals], maker: Sequence[F
 def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> SpectralFit:
     """Absolute quantum efficiency of every channel from the narrowband captures, electrons a photon at the pixel.
 
-    Irradiance on axis: pi T L / (1 + 4 N^2); the stated lens transmittance and fill factor are divided out, and the region's mean
-    cos^4. Signals are means over the central quarter of rows and columns. Saturated captures are left out; where a channel has
-    no other light, the maker's curves (times a smooth factor that the channels share, and a smooth few per cent of its own) and
-    the flats with a stated radiance fill in, or without these smoothness alone. Raises NotDetermined where the scale or the
-    light is missing.
+    Irradiance on axis: pi T L / (1 + 4 N^2); the stated lens transmittance and fill factor are divided out, and the
+    region's mean cos^4. Signals are means over the central quarter of rows and columns. Saturated captures are left
+    out; where a channel has no other light, the maker's curves (times a smooth factor that the channels share, and a
+    smooth few per cent of its own) and the flats with a stated radiance fill in, or without these smoothness alone.
+    Raises NotDetermined where the scale or the light is missing.
     """
     return _Recording(recordings, side, noise).fit()
 
@@ -515,7 +529,9 @@ class _Recording:
         return self.gain * 10.0 ** ((gain_db or 0.0) / 20.0)
 
     def _rate(self, capture: Capture, channel: str, values: FloatArray) -> tuple[float, float, bool, float]:
-        """Electrons per second, their standard uncertainty, whether the capture saturates, and its share of saturation."""
+        """Electrons per second, their standard uncertainty, whether the capture saturates, and its share of
+        saturation.
+        """
         gain = self._dn_per_e(capture.gain_db)
         dark, dark_std = self._dark(capture.gain_db or 0.0, channel, capture.exposure_s)
         signal = float(values.mean()) - dark
@@ -693,8 +709,9 @@ class _Recording:
         return self._result(solved, signals)
 
     def _span(self) -> tuple[float, float]:
-        """First and last wavelength that the lights can speak of: narrowband by the centroids of their measured spectra (their
-        names may be some nm off), broadband wholly."""
+        """First and last wavelength that the lights can speak of: narrowband by the centroids of their measured
+        spectra (their names may be some nm off), broadband wholly.
+        """
         if any(isinstance(capture, Flat) for capture in self.narrowband):
             return float(self.wave[0]), float(self.wave[-1])
         paths = {self._path(capture) for capture in self.narrowband}
@@ -766,7 +783,9 @@ class _Recording:
     def _departures(
         self, out: FloatArray, channels: Sequence[str], value: FloatArray, joint: FloatArray
     ) -> tuple[float | None, tuple[MakerDeparture, ...]]:
-        """The maker's curves beside the fitted ones. None where the maker states none, or where the fit leans on them."""
+        """The maker's curves beside the fitted ones. None where the maker states none, or where the fit leans on
+        them.
+        """
         maker = self._maker()
         if maker is None or self.leans_on_maker:
             return None, ()
@@ -790,8 +809,9 @@ def _runs(wave: FloatArray, where: NDArray[np.bool_]) -> tuple[tuple[float, floa
 def _joint(
     wave: FloatArray, out: FloatArray, solved: dict[str, Sensitivity], signals: dict[str, _Signals]
 ) -> FloatArray:
-    """Covariance of all channels' curves at `out`, channel after channel. Channels share the radiometer's error of each light:
-    Cov(S_c, S_d) = G_c diag(r^2 C_c C_d) G_d'."""
+    """Covariance of all channels' curves at `out`, channel after channel. Channels share the radiometer's error of
+    each light: Cov(S_c, S_d) = G_c diag(r^2 C_c C_d) G_d'.
+    """
     at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
     blocks = []
     for c, one in solved.items():
@@ -817,11 +837,11 @@ def compare_curves(
 ) -> tuple[float, tuple[MakerDeparture, ...]]:
     """Where fitted curves part from stated ones, but for one factor that all channels share.
 
-    `value`, `stated` (channels x wavelengths,), channel after channel; `covariance` of `value` without what is common to all. The
-    factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that part don't move it. Every
-    band of neighbouring wavelengths of every channel is tested by its mean difference; the significance (normal, two-sided) is
-    allowed for the number of bands. Bands are taken by significance, each apart from those before it, down to the level that
-    curves which are as stated exceed in at most 1 % of fits.
+    `value`, `stated` (channels x wavelengths,), channel after channel; `covariance` of `value` without what is common
+    to all. The factor is the median of value / stated where `stated` is above a fifth of its maximum: bands that part
+    don't move it. Every band of neighbouring wavelengths of every channel is tested by its mean difference; the
+    significance (normal, two-sided) is allowed for the number of bands. Bands are taken by significance, each apart
+    from those before it, down to the level that curves which are as stated exceed in at most 1 % of fits.
     """
     high = stated > 0.2 * stated.max()
     scale = float(np.median(value[high] / stated[high]))

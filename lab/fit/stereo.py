@@ -1,11 +1,14 @@
-"""Extrinsics of a stereo pair: x_right = rotation x_left + translation_mm, from poses of a board that both cameras saw.
+"""Extrinsics of a stereo pair: x_right = rotation x_left + translation_mm, from poses of a board that both cameras
+saw.
 
-One least-squares problem over everything that both cameras saw: the rig's rotation and translation, both cameras' intrinsics, the
-boards' warp and the pose of the board in every capture (`lab.fit.geometry.bundle_adjustment`). Solving for the rig alone, with the intrinsics held
-where each camera's own views put them, would push their errors into the rig and leave them out of its uncertainty.
+One least-squares problem over everything that both cameras saw: the rig's rotation and translation, both cameras'
+intrinsics, the boards' warp and the pose of the board in every capture (`lab.fit.geometry.bundle_adjustment`). Solving
+for the rig alone, with the intrinsics held where each camera's own views put them, would push their errors into the
+rig and leave them out of its uncertainty.
 
-From the joint covariance follows what a depth is worth. A point P in the left camera's frame is seen at q(theta, P), (4,) px in
-both frames. With A = dq/dP and B = dq/dtheta, the triangulated point moves by dP = -(A^T A)^-1 A^T (B dtheta - dq).
+From the joint covariance follows what a depth is worth. A point P in the left camera's frame is seen at q(theta, P),
+(4,) px in both frames. With A = dq/dP and B = dq/dtheta, the triangulated point moves by dP = -(A^T A)^-1 A^T (B
+dtheta - dq).
 """
 
 from __future__ import annotations
@@ -72,9 +75,10 @@ def fit_stereo(
 ) -> StereoFit:
     """Rotation and translation between the cameras from the `charuco` captures of equal `pose`, with uncertainties.
 
-    `rms_px` is over all corners of both cameras, of the corner's distance from its prediction. Used are the corners that the single
-    cameras' fits rest on; a pair whose rms is more than 3 times the pairs' median is left out. `depths_mm`: where the depth's
-    uncertainty is mapped. Raises `NotDetermined` below 2 pairs, or where no rig explains them.
+    `rms_px` is over all corners of both cameras, of the corner's distance from its prediction. Used are the corners
+    that the single cameras' fits rest on; a pair whose rms is more than 3 times the pairs' median is left out.
+    `depths_mm`: where the depth's uncertainty is mapped. Raises `NotDetermined` below 2 pairs, or where no rig
+    explains them.
     """
     shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
     return fit_pairs(paired_views(recordings, left, right), left, right, shapes, depths_mm)
@@ -118,7 +122,9 @@ def fit_pairs(
 
 
 def paired_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[Pair]:
-    """Views of both cameras with the same `pose`, the first of each where a pose was repeated, in the left one's order."""
+    """Views of both cameras with the same `pose`, the first of each where a pose was repeated, in the left one's
+    order.
+    """
     of_left, of_right = _views_by_pose(recordings, "left", left), _views_by_pose(recordings, "right", right)
     return [Pair(view, of_right[pose]) for pose, view in of_left.items() if pose in of_right]
 
@@ -147,8 +153,9 @@ def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
 
 
 def solve_rig(pairs: Sequence[Pair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int]) -> Solution:
-    """Joint least squares of the rig, both cameras' intrinsics, the boards' warps and their poses, from where the single cameras'
-    fits ended. Sights stand pair by pair, left then right."""
+    """Joint least squares of the rig, both cameras' intrinsics, the boards' warps and their poses, from where the
+    single cameras' fits ended. Sights stand pair by pair, left then right.
+    """
     cameras = np.array([intrinsics_of_fit(left), intrinsics_of_fit(right)])
     keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
     observations, poses, turns, shifts = [], [], [], []
@@ -213,8 +220,9 @@ def _result(
 
 
 def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Array]:
-    """Slopes of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by the shared parameters
-    (n, 4, parameters)."""
+    """Slopes of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by the shared
+    parameters (n, 4, parameters).
+    """
     state, free = solution.state, solution.free
     shared = np.zeros((len(points), 4, len(solution.names)))
     by_point = np.empty((len(points), 4, 3))
@@ -232,8 +240,9 @@ def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Ar
 
 
 def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[Array, Array]:
-    """Standard uncertainty (n,) of the triangulated depth of `points`, mm: by the calibration, and with corners in both pictures
-    that scatter by `corner_px_std` a coordinate, too."""
+    """Standard uncertainty (n,) of the triangulated depth of `points`, mm: by the calibration, and with corners in
+    both pictures that scatter by `corner_px_std` a coordinate, too.
+    """
     by_point, shared = triangulation_jacobian(solution, points)
     inverse = np.linalg.pinv(by_point)[:, 2, :]  # (n, 4): the row of the depth
     by_parameter = -np.einsum("nk,nkp->np", inverse, shared)
@@ -302,8 +311,10 @@ def rectification(state: State, pairs: Sequence[Pair], shape: tuple[int, int]) -
 
 
 def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, tuple[Array, Array]]:
-    """OpenCV's maps (x, y), each of `shape` (rows, cols) float32, for `cv2.remap` of each side's frames into the rectified pair, in
-    which a point stands in the same row of both. Raises `NotDetermined` where the fit has no rectification."""
+    """OpenCV's maps (x, y), each of `shape` (rows, cols) float32, for `cv2.remap` of each side's frames into the
+    rectified pair, in which a point stands in the same row of both. Raises `NotDetermined` where the fit has no
+    rectification.
+    """
     if stereo.rectification is None or stereo.camera_matrix_left is None or stereo.camera_matrix_right is None:
         raise NotDetermined("rectification", "the stereo fit has none: fit again cameras of equal size")
     own = stereo.rectification

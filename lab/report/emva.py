@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.errors import NotDetermined
-from lab.fit.pixels import pixel_maps
+from lab.fit.noise.pixel_maps import pixel_maps
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelNoise, Emva1288, FitResult, NoiseFit, PixelDefects
 from lab.report.emva_plot import EmvaPlot

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from lab.fit.pixels import taken
+from lab.fit.noise.dark_pixels import stack_of
 from lab.formats.recording_set import Dark, Flat, RecordingSet
 from lab.formats.results import Emva1288, Emva1288Points
 from lab.report.charts import AFTER, BEFORE, Trace, axis, layout
@@ -73,11 +73,11 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
         return None
 
     def mean(captures: list[Dark] | list[Flat]) -> tuple[FloatArray, float]:
-        stack = taken(recordings, captures)
+        stack = stack_of(recordings, captures)
         camera = recordings.camera(side)
         left = 0.0
-        if stack.scatter is not None:
-            left = float(planes(stack.scatter, camera.cfa)[plane].mean(dtype=float)) / (stack.count - 1) / stack.count
+        if stack.squares is not None:
+            left = float(planes(stack.squares, camera.cfa)[plane].mean(dtype=float)) / (stack.count - 1) / stack.count
         return np.array(planes(stack.image(), camera.cfa)[plane], float), left
 
     dark, dark_left = mean(darks)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError
-from lab.fit.pixels import PixelMaps
+from lab.fit.noise.pixel_maps import PixelMaps
 from lab.formats.raw_file import replacing
 from lab.report.pictures import map_picture, png
 

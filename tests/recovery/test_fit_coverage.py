@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.fit.levels import Level, level_statistics
-from lab.fit.noise import noise_fit
+from lab.fit.noise.level_statistics import MeasuredLevel, level_statistics
+from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.spectral import estimate_sensitivity
 from lab.formats.recording_set import Camera
 from lab.formats.results import NoiseFit
@@ -51,7 +51,7 @@ def levels(
     exposures: np.ndarray,
     repeats: int,
     rate: float,
-) -> list[Level]:
+) -> list[MeasuredLevel]:
     """Levels of light `rate` (e/s; 0: dark) in the planes R, G, B at 0.7, 1, 0.5 of it."""
     share = np.ones((camera.rows, camera.cols))
     if camera.cfa != "MONO":
@@ -64,7 +64,9 @@ def levels(
             for _ in range(repeats)
         )
         statistics = level_statistics(frames, camera.cfa, camera.white_level_dn)
-        found.append(Level(float(exposure), float(exposure if rate else 0.0), "lamp" if rate else "dark", statistics))
+        found.append(
+            MeasuredLevel(float(exposure), float(exposure if rate else 0.0), "lamp" if rate else "dark", statistics)
+        )
     return found
 
 
@@ -113,11 +115,13 @@ def test_gain_of_full_size_frames(case: str) -> None:
     errors, scores = [], []
     for _ in range(draws):
         darks = [
-            Level(t, 0.0, "dark", level_statistics([frame(0.0) for _ in range(2)], "MONO", 4095))
+            MeasuredLevel(t, 0.0, "dark", level_statistics([frame(0.0) for _ in range(2)], "MONO", 4095))
             for t in (0.02, 0.5, 1.0)
         ]
         flats = [
-            Level(float(t), float(t), "lamp", level_statistics([frame(full * t) for _ in range(2)], "MONO", 4095))
+            MeasuredLevel(
+                float(t), float(t), "lamp", level_statistics([frame(full * t) for _ in range(2)], "MONO", 4095)
+            )
             for t in np.linspace(0.02, 1.0, 50)
         ]
         fit = noise_fit(darks, flats, stated)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lab.fit.levels import Level, Stack
-from lab.fit.lines import linearity
-from lab.fit.noise import noise_fit
-from lab.fit.pixels import DarkPixels
+from lab.fit.noise.dark_pixels import DarkPixels
+from lab.fit.noise.level_statistics import MeasuredLevel, Stack
+from lab.fit.noise.noise_fit import noise_fit
+from lab.fit.weighted_lines import linearity
 from lab.formats.recording_set import Camera
 from lab.formats.results import NoiseFit
 from sim.sensor.mosaic import planes
@@ -86,13 +86,13 @@ class Drawn:
 
     def level(
         self, exposure_s: float, light_s: float, repeats: int, dark: float, temperature_c: float | None = None
-    ) -> tuple[Level, Stack]:
+    ) -> tuple[MeasuredLevel, Stack]:
         stack = Stack(self.truth.cfa, 4095, None)
         for _ in range(repeats):
             stack.add(self.frame(light_s, exposure_s, dark))
         photons = self.truth.rate * light_s / self.truth.efficiency
         lamp = ("", True, 550.0) if light_s else "dark"
-        return Level(exposure_s, photons, lamp, stack.statistics(), temperature_c), stack
+        return MeasuredLevel(exposure_s, photons, lamp, stack.statistics(), temperature_c), stack
 
     def fit(self, temperatures: tuple[float, ...] = ()) -> NoiseFit:
         truth = self.truth

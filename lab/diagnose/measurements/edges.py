@@ -36,12 +36,12 @@ from lab.diagnose.measurements.summaries import (
 )
 from lab.diagnose.measurements.veils import halos, wide_contrast
 from lab.errors import NotDetermined
-from lab.fit.levels import rounding_waves_dn
 from lab.fit.mtf.edge_profile import ROUGHNESS_SHARE
 from lab.fit.mtf.edges_in_frame import find_edges
 from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.samples import Region
 from lab.fit.mtf.transfer_function import EdgeGeometry, EdgeMtf
+from lab.fit.rounding import rounding_waves_dn
 from lab.formats.recording_set import SlantedEdge
 from sim.effects.base import Effect
 from sim.forward import common_wavelengths, electron_rate, transfer_at, wavelength_shares

@@ -25,7 +25,7 @@ from lab.diagnose.measurements.summaries import (
     overrides,
 )
 from lab.errors import NotDetermined
-from lab.fit.levels import variance_rounding_std
+from lab.fit.rounding import variance_rounding_std
 from lab.predict.camera_model import NOISE_NODES
 from sim.camera import Cfa
 from sim.effects.base import Effect

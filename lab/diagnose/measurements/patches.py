@@ -25,7 +25,7 @@ from lab.diagnose.measurements.summaries import (
 )
 from lab.diagnose.measurements.veils import Surroundings, even_share, halo_light, harmonics, wide_contrast
 from lab.errors import NotDetermined
-from lab.fit.levels import rounding_std_dn
+from lab.fit.rounding import rounding_std_dn
 from lab.formats.recording_set import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
 from lab.predict.camera_model import Field, mixed_charge
 from sim.camera import CameraModel

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from lab.errors import NotDetermined
-from lab.fit.levels import unrounded
+from lab.fit.rounding import unrounded
 from lab.formats.recording_set import Camera, Capture, RecordingSet
 from lab.predict.camera_model import Field
 from sim.camera import CameraModel, Side

@@ -26,7 +26,7 @@ from lab.diagnose.measurements.summaries import (
     repeated_levels,
 )
 from lab.errors import NotDetermined
-from lab.fit.levels import rounding_std_dn
+from lab.fit.rounding import rounding_std_dn
 from lab.formats.recording_set import Narrowband
 from lab.predict.camera_model import collected_electrons, mean_dn
 from sim.forward import electron_rate

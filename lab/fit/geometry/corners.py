@@ -1,4 +1,6 @@
-"""Corners of a checkerboard in a picture: the product of two blurred straight edges, fitted to hundredths of a pixel."""
+"""Corners of a checkerboard in a picture: the product of two blurred straight edges, fitted to hundredths of a
+pixel.
+"""
 
 from __future__ import annotations
 

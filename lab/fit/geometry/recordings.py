@@ -114,7 +114,9 @@ def projection_maps(calibration: Calibration) -> tuple[ProjectionUncertainty, ..
 
 
 def board_warps(views: Sequence[BoardView], warps_mm: Array, covariance: Array) -> tuple[BoardWarp, ...]:
-    """The warps (boards, 3), mm, as results, with their joint `covariance`; None where the views don't determine them."""
+    """The warps (boards, 3), mm, as results, with their joint `covariance`; None where the views don't determine
+    them.
+    """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(-1, 3)
     found = []
     for number, view in enumerate(first_view_of_boards(views)):

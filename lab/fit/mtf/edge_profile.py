@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import NotDetermined
-from lab.fit.levels import rounding_std_dn, rounding_waves_dn, unrounded
 from lab.fit.mtf.edge_curve import EdgeCurve, angle_from_vertical_deg
 from lab.fit.mtf.edge_finding import angle_std_deg
 from lab.fit.mtf.line_spread_prior import KNOT_SPACING_PX, LOG_LIKELIHOOD_RANGE, LineSpreadPriors, posterior
 from lab.fit.mtf.samples import Plane, Samples, illumination_gradients, levelled
 from lab.fit.mtf.spline import SortedSamples, Spline
 from lab.fit.mtf.transfer_function import EdgeGeometry, EdgeMtf, edge_result
+from lab.fit.rounding import rounding_std_dn, rounding_waves_dn, unrounded
 
 Array = NDArray[np.floating[Any]]
 

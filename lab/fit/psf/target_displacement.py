@@ -18,7 +18,9 @@ LEAST_LOG_BAYES_FACTOR = 3.0  # for a displacement against none
 
 
 def displaced(picture: Array, field: Array) -> Array:
-    """`picture` (rows, cols) read at the place of each pixel plus `field` (2, rows, cols), px, by splines of order 5."""
+    """`picture` (rows, cols) read at the place of each pixel plus `field` (2, rows, cols), px, by splines of order
+    5.
+    """
     rows, cols = np.indices(picture.shape, dtype=float)
     return np.asarray(ndimage.map_coordinates(picture, [rows + field[0], cols + field[1]], order=5, mode="nearest"))
 

@@ -1,12 +1,12 @@
-"""EMVA 1288's figures against their definitions, written out here a second time, and where they are refused."""
+"""EMVA 1288's emva1288_figures against their definitions, written out here a second time, and where they are refused."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from lab.fit.emva1288 import Recorded, figures
-from lab.fit.levels import Level, SpatialVariance, level_statistics
+from lab.fit.noise.emva1288 import EmvaInput, emva1288_figures
+from lab.fit.noise.level_statistics import MeasuredLevel, SpatialVariance, level_statistics
 
 GAIN, BLACK, READ, FULL, EFFICIENCY, DARK = 0.4, 60.0, 6.0, 6000.0, 0.5, 40.0
 SHAPE = (60, 80)
@@ -18,24 +18,24 @@ def frame(rng: np.random.Generator, light: float, exposure_s: float, pattern: np
     return np.clip(np.rint(BLACK + GAIN * (charge + READ * rng.standard_normal(SHAPE))), 0, 4095).astype(np.uint16)
 
 
-def recorded(seed: int = 1, repeats: int = 2) -> tuple[Recorded, dict[str, dict[float, np.ndarray]]]:
+def recorded(seed: int = 1, repeats: int = 2) -> tuple[EmvaInput, dict[str, dict[float, np.ndarray]]]:
     rng = np.random.default_rng(seed)
     pattern = 0.01 * rng.standard_normal(SHAPE)
     frames: dict[str, dict[float, np.ndarray]] = {"dark": {}, "flat": {}}
-    levels: dict[str, list[Level]] = {"dark": [], "flat": []}
+    levels: dict[str, list[MeasuredLevel]] = {"dark": [], "flat": []}
     for light in LIGHTS:
         for kind in ("dark", "flat"):
             own = np.stack([frame(rng, light if kind == "flat" else 0.0, light, pattern) for _ in range(repeats)])
             frames[kind][light] = own.astype(float)
             photons = FULL * light / EFFICIENCY if kind == "flat" else 0.0
-            levels[kind].append(Level(light, photons, kind, level_statistics(own, "MONO", 4095)))
-    given = Recorded("Y", tuple(levels["dark"]), tuple(levels["flat"]), True, 550.0, 3000.0)
+            levels[kind].append(MeasuredLevel(light, photons, kind, level_statistics(own, "MONO", 4095)))
+    given = EmvaInput("Y", tuple(levels["dark"]), tuple(levels["flat"]), True, 550.0, 3000.0)
     return given, frames
 
 
 def test_figures_are_those_of_the_definitions() -> None:
     given, frames = recorded()
-    found = figures(given)
+    found = emva1288_figures(given)
     assert not isinstance(found, str)
 
     def pair(kind: str, light: float) -> tuple[float, float]:
@@ -75,7 +75,7 @@ def test_figures_are_those_of_the_definitions() -> None:
 
 def test_truth_is_recovered() -> None:
     given, _ = recorded(2)
-    found = figures(given)
+    found = emva1288_figures(given)
     assert not isinstance(found, str)
     truths = {
         "system_gain_dn_per_e": GAIN,
@@ -110,13 +110,13 @@ def test_rows_columns_and_pixels_are_told_apart() -> None:
 
 def test_what_the_recordings_lack_is_said() -> None:
     given, _ = recorded(4)
-    without = figures(Recorded("Y", (), given.flats, True, None, 3000.0))
+    without = emva1288_figures(EmvaInput("Y", (), given.flats, True, None, 3000.0))
     assert isinstance(without, str)
     assert "darks" in without
-    few = figures(Recorded("Y", given.darks, given.flats[:2], True, None, 3000.0))
+    few = emva1288_figures(EmvaInput("Y", given.darks, given.flats[:2], True, None, 3000.0))
     assert isinstance(few, str)
     assert "three" in few
-    below = figures(Recorded("Y", given.darks[:1], given.flats[:12], False, None, 3000.0))
+    below = emva1288_figures(EmvaInput("Y", given.darks[:1], given.flats[:12], False, None, 3000.0))
     assert not isinstance(below, str)
     assert below.saturation_capacity_e is None
     assert below.dynamic_range is None
@@ -129,9 +129,9 @@ def test_what_the_recordings_lack_is_said() -> None:
 def test_rounding_hides_the_dark_noise() -> None:
     rng = np.random.default_rng(5)
     still = [np.rint(20.0 + 0.2 * rng.standard_normal(SHAPE)).astype(np.uint16) for _ in range(2)]
-    dark = Level(0.01, 0.0, "dark", level_statistics(still, "MONO", 255))
+    dark = MeasuredLevel(0.01, 0.0, "dark", level_statistics(still, "MONO", 255))
     flats = [
-        Level(
+        MeasuredLevel(
             float(t),
             float(t),
             "lamp",
@@ -141,7 +141,7 @@ def test_rounding_hides_the_dark_noise() -> None:
         )
         for t in np.linspace(0.1, 1.0, 10)
     ]
-    found = figures(Recorded("Y", (dark,), tuple(flats), False, None, 235.0))
+    found = emva1288_figures(EmvaInput("Y", (dark,), tuple(flats), False, None, 235.0))
     assert not isinstance(found, str)
     assert found.temporal_dark_noise_e is None
     assert found.temporal_dark_noise_limit_e == pytest.approx(0.40 / found.system_gain_dn_per_e)

@@ -13,7 +13,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult, GeometryFit, NoiseFit, StereoFit
 
 STEPS = {
-    "noise": "lab.fit.noise.fit_noise",
+    "noise": "lab.fit.noise.recordings.fit_noise",
     "spectral": "lab.fit.spectral.fit_spectral",
     "mtf": "lab.fit.mtf.recordings.fit_mtf",
     "psf": "lab.fit.psf.recordings.fit_psf_field",

@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.levels import Level, defective_pixels, level_statistics, shading
-from lab.fit.lines import dark_line, linearity
-from lab.fit.noise import fit_noise, fit_transfer, noise_fit, temperature_law
+from lab.fit.noise.defective_pixels import defective_pixels
+from lab.fit.noise.level_statistics import MeasuredLevel, level_statistics
+from lab.fit.noise.noise_fit import noise_fit
+from lab.fit.noise.photon_transfer import fit_transfer
+from lab.fit.noise.recordings import fit_noise
+from lab.fit.noise.shading import shading
+from lab.fit.noise.temperature_law import temperature_law
+from lab.fit.weighted_lines import dark_line, linearity
 from lab.formats.importers.emva1288 import read_emva1288
 from lab.formats.recording_set import Camera, Manifest, RecordingSet, read
 from lab.formats.results import NoiseFit
@@ -73,7 +78,7 @@ def levels(
     dark: bool = False,
     drift: float = 0.0,
     pattern: tuple[np.ndarray, np.ndarray],
-) -> list[Level]:
+) -> list[MeasuredLevel]:
     found = []
     for exposure in exposures:
         frames = (
@@ -83,7 +88,7 @@ def levels(
             for _ in range(repeats)
         )
         found.append(
-            Level(
+            MeasuredLevel(
                 float(exposure),
                 0.0 if dark else float(exposure),
                 "dark" if dark else "lamp",
@@ -338,7 +343,7 @@ def test_quantum_efficiency_of_a_mono_camera() -> None:
     pattern = sensor.pattern(rng)
     darks = levels(sensor, rng, np.array([0.001, 1.0]), 3, dark=True, pattern=pattern)
     flats = [
-        Level(level.exposure_s, sensor.full * level.light / 0.6, ("", True, 550.0), level.plane)
+        MeasuredLevel(level.exposure_s, sensor.full * level.light / 0.6, ("", True, 550.0), level.plane)
         for level in levels(sensor, rng, np.linspace(0.05, 0.95, 10), 2, pattern=pattern)
     ]
     fit = noise_fit(darks, flats, sensor.camera())

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.levels import Stack
-from lab.fit.pixels import DarkPixels, PixelMaps, pixel_maps, read_noise_distribution
+from lab.fit.noise.dark_pixels import DarkPixels, read_noise_distribution
+from lab.fit.noise.level_statistics import Stack
+from lab.fit.noise.pixel_maps import PixelMaps, pixel_maps
 from lab.formats.importers.images import read_image
 from lab.formats.recording_set import Camera, Manifest, RecordingSet
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lab.errors import NotDetermined
-from lab.fit.noise import fit_noise
+from lab.fit.noise.recordings import fit_noise
 from lab.fit.spectral import MIN_LIGHTS, compare_curves, estimate_sensitivity, fit_spectral
 from lab.formats.recording_set import Camera, Manifest, RecordingSet, read
 from lab.formats.results import NoiseFit, SpectralFit

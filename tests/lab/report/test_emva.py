@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from lab.fit.noise import fit_noise
+from lab.fit.noise.recordings import fit_noise
 from lab.formats.recording_set import Camera, Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
 from lab.report import render_report

@@ -16,7 +16,7 @@ from lab.diagnose.measurements.uniform import (
     linearity_block,
     narrowband_block,
 )
-from lab.fit.levels import rounding_std_dn
+from lab.fit.rounding import rounding_std_dn
 from mocks.former import Law
 from mocks.former.laws import (
     AbsorptionBandLaw,

@@ -1,4 +1,4 @@
-"""Lines through measured points, weighted: dark means against exposure, EMVA 1288's linearity."""
+"""Weighted least squares, and the straight lines that use it: dark means against exposure, linearity of EMVA 1288."""
 
 from __future__ import annotations
 
@@ -12,29 +12,34 @@ from sim.spectrum import FloatArray
 
 @dataclass(frozen=True)
 class DarkLine:
-    """Mean of a dark frame against exposure: black + rate t (DN, DN/s), with covariance; `rate` None with one exposure."""
+    """Mean of a dark frame against exposure t: black + rate t (DN, DN/s), with covariance (2, 2); `rate` is None with
+    one exposure.
+    """
 
     black: float
     rate: float | None
     covariance: FloatArray
 
     def at(self, exposure_s: float) -> float:
+        """Dark mean at an exposure, DN."""
         return self.black + (self.rate or 0.0) * exposure_s
 
 
 def dark_line(exposure_s: FloatArray, mean: FloatArray, std: FloatArray) -> DarkLine:
-    """Weighted straight line through dark means; its covariance is scaled up where the means scatter beyond `std`."""
+    """Weighted line through dark means `mean` +- `std` (n,); the covariance is scaled by `chi2_factor`."""
     if np.ptp(exposure_s) <= 1e-6 * np.max(exposure_s, initial=1e-12):
         weight = 1.0 / std**2
         value = float(np.sum(weight * mean) / np.sum(weight))
         return DarkLine(value, None, np.array([[1.0 / np.sum(weight), 0.0], [0.0, 0.0]]))
     basis = np.stack([np.ones_like(exposure_s), exposure_s], axis=1)
     solution, covariance, chi2 = least_squares(basis, mean, std)
-    return DarkLine(float(solution[0]), float(solution[1]), covariance * inflation(chi2, len(mean) - 2))
+    return DarkLine(float(solution[0]), float(solution[1]), covariance * chi2_factor(chi2, len(mean) - 2))
 
 
 def least_squares(basis: FloatArray, values: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Weighted least squares: solution, covariance, chi2."""
+    """Weighted least squares of basis (n, p) solution = values (n,) +- std (n,): solution (p,), covariance (p, p),
+    chi2.
+    """
     scale = np.linalg.norm(basis / std[:, None], axis=0)
     design = basis / std[:, None] / scale
     solution, *_ = np.linalg.lstsq(design, values / std, rcond=None)
@@ -42,8 +47,10 @@ def least_squares(basis: FloatArray, values: FloatArray, std: FloatArray) -> tup
     return solution / scale, covariance, float(np.sum((values / std - design @ solution) ** 2))
 
 
-def inflation(chi2: float, freedom: int, p: float = 0.01) -> float:
-    """Factor on a covariance: chi2 per degree of freedom where chance explains it with less than `p`, else 1."""
+def chi2_factor(chi2: float, freedom: int, p: float = 0.01) -> float:
+    """Factor on a covariance (Birge ratio squared): chi2 per degree of freedom where its probability by chance is
+    below `p`, else 1.
+    """
     if freedom < 1 or special.chdtrc(freedom, chi2) > p:
         return 1.0
     return max(1.0, chi2 / freedom)
@@ -51,7 +58,10 @@ def inflation(chi2: float, freedom: int, p: float = 0.01) -> float:
 
 @dataclass(frozen=True)
 class Linearity:
-    """EMVA's linearity line: offset + slope light, deviations in percent of the line, and their mean modulus."""
+    """The linearity line of EMVA 1288: offset + slope light.
+
+    `deviation_percent` (n,): deviations from the line, relative to it. `error_percent`: their mean modulus.
+    """
 
     offset: float
     slope: float
@@ -62,10 +72,12 @@ class Linearity:
 
 
 def linearity(light: FloatArray, signal: FloatArray, signal_std: FloatArray) -> Linearity:
-    """The line through (light, signal) that minimises the relative deviations, and the linearity error: the mean modulus of
-    the relative deviations in percent (EMVA 1288 release 4.0). All points are used: give those within 5..95 % of saturation.
+    """The line through (light, signal), each (n,), of least relative deviations, and the linearity error (EMVA 1288
+    release 4.0).
 
-    The uncertainty holds the points' noise and, since a modulus of noise isn't zero, what that adds on average.
+    The error is the mean modulus of the relative deviations in percent. All points are used: give those within 5..95 %
+    of saturation. The uncertainty holds the noise of the points `signal_std`, and what that noise adds to a modulus on
+    average.
     """
     basis = np.stack([np.ones_like(light), light], axis=1)
     solution, covariance, chi2 = least_squares(basis, signal, signal)
@@ -75,11 +87,11 @@ def linearity(light: FloatArray, signal: FloatArray, signal_std: FloatArray) -> 
     error = np.abs(deviation)
     z = error / np.maximum(std, 1e-12)
     folded = std * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z**2) + error * (1.0 - 2.0 * special.ndtr(-z))
-    scatter = chi2 / max(len(light) - 2, 1)
+    reduced_chi2 = chi2 / max(len(light) - 2, 1)
     return Linearity(
         float(solution[0]),
         float(solution[1]),
-        float(np.sqrt(covariance[1, 1] * scatter)),
+        float(np.sqrt(covariance[1, 1] * reduced_chi2)),
         deviation,
         float(error.mean()),
         float(np.hypot(np.sqrt(np.sum(std**2)) / len(std), np.mean(folded - error))),
@@ -87,8 +99,11 @@ def linearity(light: FloatArray, signal: FloatArray, signal_std: FloatArray) -> 
 
 
 def root(square: float, square_std: float) -> tuple[float, float]:
-    """Square root of a variance that noise may have made negative, with a standard uncertainty of which twice reaches the roots of
-    the variance's own two standard uncertainties: far from 0 that is std / (2 value), near 0 it takes 0 in."""
+    """Square root of a variance that noise may have made negative, with its standard deviation.
+
+    Far from 0 the standard deviation is square_std / (2 root). Near 0 it covers 0: twice it reaches the roots of
+    square +- 2 square_std.
+    """
     above = max(square, 0.0)
     value = float(np.sqrt(above))
     upper, lower = np.sqrt(above + 2.0 * square_std), np.sqrt(max(above - 2.0 * square_std, 0.0))

@@ -1,9 +1,9 @@
 """EMVA Standard 1288, release 4.0 (linear model): the quantities by their definitions, of one plane of the mosaic.
 
-The letter of the standard: unweighted lines, every pixel counted, no shading taken out, one figure by one formula. Beside it
-stands the physical fit of `lab.fit.noise`, which is less biased where a camera isn't linear. Two things are added to the letter:
-standard uncertainties (of the recordings' noise and of how far these rows, columns and pixels stand for the camera), and
-temporal variances over any number of repeats, of which the standard's pair of images is the smallest.
+The letter of the standard: unweighted lines, every pixel counted, no shading subtracted, one figure by one formula.
+The physical fit of `photon_transfer` is less biased where a camera isn't linear. Two things are added to the letter:
+standard deviations (by the noise of the recordings, and by these rows, columns and pixels as a sample of the camera),
+and temporal variances over any number of repeats, of which the pair of images of the standard is the smallest.
 """
 
 from __future__ import annotations
@@ -14,27 +14,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.fit.levels import QUANTISATION_DN2, BoolArray, Level, PlaneStatistics, SpatialVariance
-from lab.fit.lines import DarkLine, dark_line, inflation, linearity, root
+from lab.fit.noise.frame_sums import BoolArray
+from lab.fit.noise.level_statistics import MeasuredLevel, PlaneStatistics, SpatialVariance
+from lab.fit.rounding import QUANTISATION_DN2
+from lab.fit.weighted_lines import DarkLine, chi2_factor, dark_line, linearity, root
 from lab.formats.results import Emva1288, Emva1288Points
 from sim.spectrum import FloatArray
 
 HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise
-HIDDEN_DN = 0.40  # and the limit that is stated then
+HIDDEN_DN = 0.40  # the limit that is stated then
 LINE_LIMIT = 0.7  # of saturation: range of responsivity and system gain
 LINEARITY_RANGE = (0.05, 0.95)  # of saturation
-SPATIAL_IMAGES = 16  # fewer leave the rows' and columns' parts to the temporal noise; the standard asks for more
+SPATIAL_IMAGES = 16  # with fewer, the row and column parts contain temporal noise; the standard asks for more
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """What `figures` works on: the darks of one temperature, the flats of one lamp in ascending light (two or more of each), what
-    `light` counts, the signal (DN above dark) that is taken for saturation where the flats don't reach it, and what is known of the
-    errors: `variance_error` (relative, of a temporal variance, beyond sampling) and `lamp_error` (relative, of a mean)."""
+class EmvaInput:
+    """What `emva1288_figures` needs.
+
+    `darks`: of one temperature; `flats`: of one lamp in ascending light, two or more of each. `in_photons`: `light`
+    counts photons per pixel. `saturation_dn`: signal above dark taken for saturation where the flats don't reach it.
+    `variance_error`, `lamp_error`: relative errors of a temporal variance beyond sampling, and of a mean.
+    """
 
     plane: str
-    darks: tuple[Level, ...]
-    flats: tuple[Level, ...]
+    darks: tuple[MeasuredLevel, ...]
+    flats: tuple[MeasuredLevel, ...]
     in_photons: bool
     wavelength_nm: float | None
     saturation_dn: float
@@ -43,22 +48,22 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class _Value:
-    """A number with its standard uncertainty."""
+class Measured:
+    """A number with its standard deviation."""
 
     value: float
     std: float
 
-    def over(self, other: _Value) -> _Value:
+    def over(self, other: Measured) -> Measured:
         """Quotient of independent numbers."""
         quotient = self.value / other.value
-        return _Value(quotient, math.hypot(self.std / other.value, quotient * other.std / other.value))
+        return Measured(quotient, math.hypot(self.std / other.value, quotient * other.std / other.value))
 
 
-class _Points:
-    """Means and variances less dark, by level."""
+class EmvaLevels:
+    """Means and variances by level, and the same less dark, (levels,) each."""
 
-    def __init__(self, given: Recorded) -> None:
+    def __init__(self, given: EmvaInput) -> None:
         self.given = given
         self.flats = [level for level in given.flats if level.repeats > 1]
         own = [level.plane[given.plane] for level in self.flats]
@@ -78,7 +83,7 @@ class _Points:
         self.variance_std = np.hypot(
             np.array([plane.temporal_variance_std for plane in own]), given.variance_error * self.variance
         )
-        # The dark at the level's exposure where it was taken, else by the line through all darks.
+        # The dark of the same exposure where there is one, else the line through all darks
         self.source = [self._taken(level.exposure_s) for level in self.flats]
         self.below_mean = self._below(self.dark_mean, self.mean_line)
         self.below_variance = self._below(self.dark_variance, self.variance_line)
@@ -94,25 +99,29 @@ class _Points:
         nearest = int(np.argmin(np.abs(self.dark_exposure - exposure_s)))
         return nearest if abs(self.dark_exposure[nearest] - exposure_s) <= 1e-6 * exposure_s else None
 
-    def _below(self, taken: FloatArray, line: DarkLine | None) -> FloatArray:
-        """Of the dark at each level's exposure; where none was taken, of the line, or (None) the smallest of all."""
+    def _below(self, stack_of: FloatArray, line: DarkLine | None) -> FloatArray:
+        """Dark value at the exposure of each level; where none was taken, that of the line, or (None) the smallest of
+        all.
+        """
         return np.array(
             [
-                taken[source]
+                stack_of[source]
                 if source is not None
-                else (line.at(float(exposure)) if line is not None else float(taken.min()))
+                else (line.at(float(exposure)) if line is not None else float(stack_of.min()))
                 for source, exposure in zip(self.source, self.exposure, strict=True)
             ]
         )
 
-    def gain(self, used: BoolArray) -> _Value:
-        """Slope through the origin of the variance against the signal; `used`: flags."""
+    def gain(self, used: BoolArray) -> Measured:
+        """System gain K: slope through the origin of the variance against the signal, over the levels `used`
+        (levels,).
+        """
         x = np.where(used, self.signal, 0.0)
         norm = float(np.sum(x * x))
         excess = self.variance - self.below_variance
         value = float(np.sum(x * excess)) / norm
         square = float(np.sum((x * self.variance_std) ** 2))
-        # A dark that stands below several levels errs in all of them alike.
+        # The error of a dark is common to all levels that it is subtracted from
         for number, std in enumerate(self.dark_variance_std):
             square += (float(np.sum(x[[source == number for source in self.source]])) * std) ** 2
         on_line = x[[source is None for source in self.source]]
@@ -121,12 +130,11 @@ class _Points:
             t = self.exposure[[source is None for source in self.source]]
             gradient = np.array([on_line.sum(), float(np.sum(on_line * t))])
             square += float(gradient @ lines @ gradient)
-        return _Value(value, math.sqrt(square) / norm)
+        return Measured(value, math.sqrt(square) / norm)
 
 
 def mean_std(planes: Sequence[PlaneStatistics]) -> FloatArray:
-    """Standard uncertainties of means over a plane: temporal noise, rounding where it isn't dithered, and the scatter of
-    repeats where that is larger."""
+    """Standard deviations of means of a plane: temporal noise and rounding, increased where repeats differ by more."""
     noise, excess, freedom = [], 0.0, 0
     for plane in planes:
         variance = plane.temporal_variance if np.isfinite(plane.temporal_variance) else QUANTISATION_DN2
@@ -135,19 +143,19 @@ def mean_std(planes: Sequence[PlaneStatistics]) -> FloatArray:
             frames = np.array(plane.frame_means)
             excess += float(np.sum((frames - frames.mean()) ** 2)) / noise[-1] ** 2
             freedom += plane.repeats - 1
-    widened = np.array(noise) * math.sqrt(inflation(excess, freedom))
+    widened = np.array(noise) * math.sqrt(chi2_factor(excess, freedom))
     repeats = np.sqrt([plane.repeats for plane in planes])
     return np.hypot(widened / repeats, [plane.mean_rounding_std for plane in planes])
 
 
-Found = dict[str, _Value]
+Figures = dict[str, Measured]
 
 
-def figures(given: Recorded) -> Emva1288 | str:
-    """The figures of one plane, or why there are none."""
+def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
+    """The figures of one plane, or the reason why there are none."""
     if not any(level.repeats > 1 for level in given.darks):
         return "no repeated darks: EMVA 1288 compares bright with dark pairs; capture two darks at each of the flats' exposures"
-    at = _Points(given)
+    at = EmvaLevels(given)
     remarks: list[str] = []
     saturation, top = _saturation(at, given, remarks)
     used = at.signal <= LINE_LIMIT * saturation
@@ -166,7 +174,7 @@ def figures(given: Recorded) -> Emva1288 | str:
         remarks.append(
             f"{missing} of {at.signal.size} levels have no dark of their exposure: a line through the darks stands for it"
         )
-    found: Found = {}
+    found: Figures = {}
     if given.in_photons:
         found |= _responsivity(at, used, gain)
     dark, limit_e = _dark_noise(at, gain, remarks)
@@ -177,10 +185,10 @@ def figures(given: Recorded) -> Emva1288 | str:
     found |= _dark_current(at, gain, remarks)
     stacks = _stacks(given, at, saturation, remarks)
     found |= _spatial(given.plane, stacks, gain)
-    numbers = {name: value.value for name, value in found.items()}
-    numbers |= {f"{name}_std": value.std for name, value in found.items()}
+    values_of = {name: value.value for name, value in found.items()}
+    values_of |= {f"{name}_std": value.std for name, value in found.items()}
     return Emva1288(
-        **numbers,
+        **values_of,
         system_gain_dn_per_e=gain.value,
         system_gain_dn_per_e_std=gain.std,
         temporal_dark_noise_limit_e=limit_e,
@@ -190,9 +198,11 @@ def figures(given: Recorded) -> Emva1288 | str:
     )
 
 
-def _saturation(at: _Points, given: Recorded, remarks: list[str]) -> tuple[float, int | None]:
-    """Signal at the level with the largest variance (from the brightest down, the first maximum that two darker levels confirm),
-    and which one that is; None where the flats don't get beyond it."""
+def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[float, int | None]:
+    """Signal at the level of the largest variance, and its index; None where the flats don't exceed it.
+
+    The search goes from the brightest level down to the first maximum that two darker levels confirm.
+    """
     best, index = -np.inf, 0
     for number in range(at.variance.size - 1, -1, -1):
         if at.variance[number] >= best:
@@ -209,23 +219,23 @@ def _saturation(at: _Points, given: Recorded, remarks: list[str]) -> tuple[float
     return given.saturation_dn, None
 
 
-def _responsivity(at: _Points, used: BoolArray, gain: _Value) -> Found:
+def _responsivity(at: EmvaLevels, used: BoolArray, gain: Measured) -> Figures:
     light = np.where(used, at.light, 0.0)
     norm = float(np.sum(light * light))
     if norm <= 0:
         return {}
     std = math.sqrt(float(np.sum((light * at.signal_std) ** 2))) / norm
-    responsivity = _Value(float(np.sum(light * at.signal)) / norm, std)
+    responsivity = Measured(float(np.sum(light * at.signal)) / norm, std)
     return {"responsivity_dn_per_photon": responsivity, "quantum_efficiency": responsivity.over(gain)}
 
 
-def _dark_noise(at: _Points, gain: _Value, remarks: list[str]) -> tuple[Found, float | None]:
-    """Temporal dark noise at zero exposure, and the limit (e) that stands for it where rounding hides it."""
+def _dark_noise(at: EmvaLevels, gain: Measured, remarks: list[str]) -> tuple[Figures, float | None]:
+    """Temporal dark noise at zero exposure, and the limit (e) that is stated where rounding hides it."""
     if np.unique(at.dark_exposure).size >= 3:
-        square = _Value(at.variance_line.black, math.sqrt(float(at.variance_line.covariance[0, 0])))
+        square = Measured(at.variance_line.black, math.sqrt(float(at.variance_line.covariance[0, 0])))
     else:
         shortest = int(np.argmin(at.dark_exposure))
-        square = _Value(float(at.dark_variance[shortest]), float(at.dark_variance_std[shortest]))
+        square = Measured(float(at.dark_variance[shortest]), float(at.dark_variance_std[shortest]))
     if square.value < HIDDEN_DN2:
         limit_e = HIDDEN_DN / gain.value
         remarks.append(
@@ -236,38 +246,40 @@ def _dark_noise(at: _Points, gain: _Value, remarks: list[str]) -> tuple[Found, f
     noise_dn = math.sqrt(square.value)
     noise_e = math.sqrt(square.value - QUANTISATION_DN2)
     return {
-        "temporal_dark_noise_dn": _Value(noise_dn, square.std / (2.0 * noise_dn)),
-        "temporal_dark_noise_e": _Value(noise_e, square.std / (2.0 * noise_e)).over(gain),
+        "temporal_dark_noise_dn": Measured(noise_dn, square.std / (2.0 * noise_dn)),
+        "temporal_dark_noise_e": Measured(noise_e, square.std / (2.0 * noise_e)).over(gain),
     }, None
 
 
-def _sensitivity(at: _Points, top: int | None, gain: _Value, found: Found) -> Found:
-    """Threshold, saturation capacity, largest SNR and dynamic range; in photons where the quantum efficiency is known."""
-    given: Found = {}
+def _sensitivity(at: EmvaLevels, top: int | None, gain: Measured, found: Figures) -> Figures:
+    """Threshold, saturation capacity, largest SNR and dynamic range; in photons where the quantum efficiency is
+    known.
+    """
+    given: Figures = {}
     responsivity = found.get("responsivity_dn_per_photon")
     efficiency = found.get("quantum_efficiency")
     dark = found.get("temporal_dark_noise_dn")
     if dark is not None:
         dark_e = dark.over(gain)
         inner = math.sqrt(dark_e.value**2 + 0.25)
-        given["sensitivity_threshold_e"] = _Value(inner + 0.5, dark_e.value * dark_e.std / inner)
+        given["sensitivity_threshold_e"] = Measured(inner + 0.5, dark_e.value * dark_e.std / inner)
         if responsivity is not None:
-            # (sqrt(sigma^2 + K^2 / 4) + K / 2) / R: nearly free of K.
+            # (sqrt(sigma^2 + K^2 / 4) + K / 2) / R hardly depends on K
             photons = (inner + 0.5) * gain.value / responsivity.value
             parts = (
                 dark_e.value / inner * dark.std / responsivity.value,
                 (0.5 + 0.25 / inner) * gain.std / responsivity.value,
                 photons * responsivity.std / responsivity.value,
             )
-            given["sensitivity_threshold_photons"] = _Value(photons, math.hypot(*parts))
+            given["sensitivity_threshold_photons"] = Measured(photons, math.hypot(*parts))
     if top is None:
         return given
-    # The largest variance lies somewhere between this level's neighbours.
+    # The largest variance lies between the neighbours of this level
     step = float(np.abs(np.diff(at.signal[max(top - 1, 0) : top + 2])).mean()) / math.sqrt(12.0)
-    signal = _Value(float(at.signal[top]), step)
+    signal = Measured(float(at.signal[top]), step)
     if efficiency is not None:
-        light = _Value(float(at.light[top]), float(at.light[top]) * step / signal.value)
-        full = _Value(
+        light = Measured(float(at.light[top]), float(at.light[top]) * step / signal.value)
+        full = Measured(
             light.value * efficiency.value,
             math.hypot(light.std * efficiency.value, light.value * efficiency.std),
         )
@@ -278,13 +290,13 @@ def _sensitivity(at: _Points, top: int | None, gain: _Value, found: Found) -> Fo
         full = signal.over(gain)
         if dark is not None:
             threshold_dn = math.sqrt(dark.value**2 + gain.value**2 / 4.0) + gain.value / 2.0
-            given["dynamic_range"] = signal.over(_Value(threshold_dn, math.hypot(dark.std, gain.std)))
+            given["dynamic_range"] = signal.over(Measured(threshold_dn, math.hypot(dark.std, gain.std)))
     given["saturation_capacity_e"] = full
-    given["snr_max"] = _Value(math.sqrt(full.value), full.std / (2.0 * math.sqrt(full.value)))
+    given["snr_max"] = Measured(math.sqrt(full.value), full.std / (2.0 * math.sqrt(full.value)))
     return given
 
 
-def _linearity(at: _Points, saturation: float, remarks: list[str]) -> tuple[Found, FloatArray]:
+def _linearity(at: EmvaLevels, saturation: float, remarks: list[str]) -> tuple[Figures, FloatArray]:
     """LE, and each level's deviation from the line (percent; NaN outside its range)."""
     deviation = np.full(at.signal.size, np.nan)
     low, high = LINEARITY_RANGE
@@ -294,22 +306,22 @@ def _linearity(at: _Points, saturation: float, remarks: list[str]) -> tuple[Foun
         return {}, deviation
     line = linearity(at.light[chosen], at.signal[chosen], at.signal_std[chosen])
     deviation[chosen] = line.deviation_percent
-    return {"linearity_error_percent": _Value(line.error_percent, line.error_percent_std)}, deviation
+    return {"linearity_error_percent": Measured(line.error_percent, line.error_percent_std)}, deviation
 
 
-def _dark_current(at: _Points, gain: _Value, remarks: list[str]) -> Found:
+def _dark_current(at: EmvaLevels, gain: Measured, remarks: list[str]) -> Figures:
     """From the mean and from the variance, against exposure (three exposures or more)."""
     if np.unique(at.dark_exposure).size < 3:
         remarks.append("darks of fewer than three exposures: no dark current")
         return {}
-    found: Found = {}
+    found: Figures = {}
     mean, variance = at.mean_line, at.variance_line
     if mean.rate is not None:
-        rate = _Value(mean.rate, math.sqrt(float(mean.covariance[1, 1])))
+        rate = Measured(mean.rate, math.sqrt(float(mean.covariance[1, 1])))
         found["dark_current_from_mean_e_per_s"] = rate.over(gain)
     if variance.rate is not None and float(at.dark_variance.min()) >= HIDDEN_DN2:
-        rate = _Value(variance.rate, math.sqrt(float(variance.covariance[1, 1])))
-        square = _Value(gain.value**2, 2.0 * gain.value * gain.std)
+        rate = Measured(variance.rate, math.sqrt(float(variance.covariance[1, 1])))
+        square = Measured(gain.value**2, 2.0 * gain.value * gain.std)
         found["dark_current_from_variance_e_per_s"] = rate.over(square)
     return found
 
@@ -318,11 +330,11 @@ def _dark_current(at: _Points, gain: _Value, remarks: list[str]) -> Found:
 class _Stacks:
     """The dark and the bright stack of the spatial figures; None: there isn't one."""
 
-    dark: Level | None
-    bright: Level | None
+    dark: MeasuredLevel | None
+    bright: MeasuredLevel | None
 
 
-def _stacks(given: Recorded, at: _Points, saturation: float, remarks: list[str]) -> _Stacks:
+def _stacks(given: EmvaInput, at: EmvaLevels, saturation: float, remarks: list[str]) -> _Stacks:
     """The level of most images near half of saturation, and the dark of most images nearest to its exposure."""
 
     def half(number: int) -> tuple[int, float]:
@@ -347,51 +359,51 @@ def _stacks(given: Recorded, at: _Points, saturation: float, remarks: list[str])
     return _Stacks(dark, bright)
 
 
-def _spatial(plane: str, stacks: _Stacks, gain: _Value) -> Found:
-    found: Found = {}
+def _spatial(plane: str, stacks: _Stacks, gain: Measured) -> Figures:
+    found: Figures = {}
     dark = stacks.dark.plane[plane].every_pixel if stacks.dark is not None else None
     if dark is None:
         return found
     for name, square in _parts(dark).items():
-        found[f"dsnu{name}_e"] = _Value(*root(square.value, square.std)).over(gain)
+        found[f"dsnu{name}_e"] = Measured(*root(square.value, square.std)).over(gain)
     bright = stacks.bright.plane[plane].every_pixel if stacks.bright is not None else None
     if bright is None or stacks.bright is None or stacks.dark is None:
         return found
     signal = stacks.bright.plane[plane].mean_of_all - stacks.dark.plane[plane].mean_of_all
     below = _parts(dark)
     for name, square in _parts(bright).items():
-        # Both stacks hold the same dark pattern: its uncertainty as a draw goes, that of its measurement stays.
-        root_dn = _Value(*root(square.value - below[name].value, math.hypot(square.std, below[name].std)))
-        found[f"prnu{name}_percent"] = _Value(100.0 * root_dn.value / signal, 100.0 * root_dn.std / signal)
+        # Both stacks contain the same dark pattern: only the uncertainty of its measurement counts
+        root_dn = Measured(*root(square.value - below[name].value, math.hypot(square.std, below[name].std)))
+        found[f"prnu{name}_percent"] = Measured(100.0 * root_dn.value / signal, 100.0 * root_dn.std / signal)
     return found
 
 
-def _parts(split: SpatialVariance) -> dict[str, _Value]:
+def _parts(split: SpatialVariance) -> dict[str, Measured]:
     return {
-        "": _Value(split.total, split.total_std),
-        "_row": _Value(split.rows, split.rows_std),
-        "_column": _Value(split.columns, split.columns_std),
-        "_pixel": _Value(split.pixels, split.pixels_std),
+        "": Measured(split.total, split.total_std),
+        "_row": Measured(split.rows, split.rows_std),
+        "_column": Measured(split.columns, split.columns_std),
+        "_pixel": Measured(split.pixels, split.pixels_std),
     }
 
 
-def _plotted(at: _Points, given: Recorded, deviation: FloatArray, stacks: _Stacks) -> Emva1288Points:
-    def numbers(values: FloatArray) -> tuple[float, ...]:
+def _plotted(at: EmvaLevels, given: EmvaInput, deviation: FloatArray, stacks: _Stacks) -> Emva1288Points:
+    def values_of(values: FloatArray) -> tuple[float, ...]:
         return tuple(float(value) for value in values)
 
     dark, bright = stacks.dark, stacks.bright
     return Emva1288Points(
         light_unit="photons" if given.in_photons else "s",
-        light=numbers(at.light),
-        exposure_s=numbers(at.exposure),
-        mean_dn=numbers(at.mean),
-        variance_dn2=numbers(at.variance),
-        dark_mean_dn=numbers(at.below_mean),
-        dark_variance_dn2=numbers(at.below_variance),
+        light=values_of(at.light),
+        exposure_s=values_of(at.exposure),
+        mean_dn=values_of(at.mean),
+        variance_dn2=values_of(at.variance),
+        dark_mean_dn=values_of(at.below_mean),
+        dark_variance_dn2=values_of(at.below_variance),
         linearity_deviation_percent=tuple(None if np.isnan(value) else float(value) for value in deviation),
-        dark_exposure_s=numbers(at.dark_exposure),
-        dark_exposure_mean_dn=numbers(at.dark_mean),
-        dark_exposure_variance_dn2=numbers(at.dark_variance),
+        dark_exposure_s=values_of(at.dark_exposure),
+        dark_exposure_mean_dn=values_of(at.dark_mean),
+        dark_exposure_variance_dn2=values_of(at.dark_variance),
         stack_dark_exposure_s=dark.exposure_s if dark is not None else None,
         stack_dark_images=dark.repeats if dark is not None else None,
         stack_light=bright.light if bright is not None else None,

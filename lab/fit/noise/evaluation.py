@@ -1,0 +1,147 @@
+"""The state of a noise fit once its photon transfer is solved: what all figures rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lab.errors import NotDetermined
+from lab.fit.noise.dark_signal import DarkSignal, dark_lines, refuse_light_darks
+from lab.fit.noise.lamp_drift import LampDrift, lamp_drift
+from lab.fit.noise.level_statistics import MeasuredLevel
+from lab.fit.noise.photon_transfer import TransferFit, fit_transfer
+from lab.fit.noise.recorded_levels import RecordedLevels, Remarks
+from lab.fit.noise.saturation import CLIPPED_LIMIT, Saturation, saturation_of
+from lab.formats.recording_set import Camera
+
+MIN_LEVELS = 3
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One photon transfer and what it rests on; `points` are its (level, plane), in the order of `transfer.used`."""
+
+    levels: RecordedLevels
+    dark: DarkSignal
+    saturation: Saturation
+    transfer: TransferFit
+    points: list[tuple[MeasuredLevel, str]]
+    remarks: Remarks
+
+    @cached_property
+    def plane_index(self) -> dict[str, int]:
+        """Index of each plane in `transfer.floor`."""
+        present = {name for _, name in self.points}
+        return {name: index for index, name in enumerate(name for name in self.levels.names if name in present)}
+
+    @cached_property
+    def drift(self) -> LampDrift:
+        """Drift of the lamp between repeats."""
+        return lamp_drift(self.levels, self.dark, self.saturation)
+
+
+def evaluate(
+    darks: Sequence[MeasuredLevel],
+    flats: Sequence[MeasuredLevel],
+    camera: Camera,
+    gain_db: float,
+    defects: int,
+    names: tuple[str, ...],
+) -> Evaluation:
+    """Solve the photon transfer of the planes `names`. Raises `NotDetermined` where the levels don't determine it."""
+    remarks = Remarks()
+    recorded = RecordedLevels.of(darks, flats, camera, gain_db, defects, names, remarks)
+    dark = DarkSignal(recorded.darks, dark_lines(recorded, remarks))
+    refuse_light_darks(recorded, dark)
+    saturation = saturation_of(recorded, dark)
+    transfer, points = transfer_of(recorded, dark, saturation, recorded.darks)
+    evaluation = Evaluation(recorded, dark, saturation, transfer, points, remarks)
+    _remark_on_transfer(evaluation)
+    return evaluation
+
+
+def transfer_of(
+    recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation, darks: Sequence[MeasuredLevel]
+) -> tuple[TransferFit, list[tuple[MeasuredLevel, str]]]:
+    """Photon transfer of `darks` and the unsaturated flats with repeats, and its points (level, plane).
+
+    Raises `NotDetermined` where fewer than three unsaturated flat levels have repeats, or where the variance doesn't
+    grow with the signal.
+    """
+    points: list[tuple[MeasuredLevel, str]] = []
+    x, v, s, plane, light = [], [], [], [], []
+    for level in (*darks, *recorded.flats):
+        bright = level.lamp != "dark"
+        for index, name in enumerate(recorded.names):
+            own = level.plane[name]
+            if own.repeats < 2 or own.temporal_variance <= 0:
+                continue
+            if bright and (saturation.clipped[name][recorded.flats.index(level)] or own.zero_share > CLIPPED_LIMIT):
+                continue
+            points.append((level, name))
+            x.append(own.mean - dark.lines[name].black)
+            v.append(own.temporal_variance)
+            s.append(own.temporal_variance_std)
+            plane.append(index)
+            light.append(bright)
+    bright_levels = {level.light for level, _ in points if level.lamp != "dark"}
+    if len(bright_levels) < MIN_LEVELS:
+        repeated = sum(level.repeats > 1 for level in recorded.flats)
+        alike = [
+            level
+            for level in recorded.flats
+            if level.repeats > 1 and all(level.plane[name].temporal_variance == 0 for name in recorded.names)
+        ]
+        if len(alike) == repeated > 0:
+            raise NotDetermined(
+                "noise",
+                f"the repeats of all {repeated} flat levels are alike, pixel by pixel: give frames that were captured one by one, not "
+                "copies, or raise the gain until noise shows",
+            )
+        raise NotDetermined(
+            "noise",
+            f"{len(bright_levels)} unsaturated flat levels with repeats (of {len(recorded.flats)} levels, {repeated} with repeats), "
+            f"{MIN_LEVELS} needed: capture two frames or more at each of several exposures below saturation",
+        )
+    # Planes without points (all flats clip, no darks) have no floor
+    present = sorted(set(plane))
+    compact = np.searchsorted(present, plane)
+    transfer = fit_transfer(
+        np.array(x), np.array(v), np.array(s), compact, np.array(light), max(saturation.signal_dn.values())
+    )
+    if transfer.gain <= 0 or transfer.gain < 3.0 * transfer.gain_std:
+        raise NotDetermined(
+            "noise",
+            "the temporal variance doesn't grow with the signal: capture repeats of flats that are steady and unprocessed",
+        )
+    return transfer, points
+
+
+def _remark_on_transfer(e: Evaluation) -> None:
+    """Report an error of the model, a straight line taken for the gain, and a significant curvature."""
+    t = e.transfer
+    if t.model_error > 0:
+        e.remarks.add(
+            f"the variances of the flats depart from their curve by {100 * t.model_error:.2g} % (rms) beyond what sampling explains "
+            "(an uneven converter does that): it is in the uncertainties"
+        )
+    if t.by_line:
+        e.remarks.add(
+            f"the bend of the variances ({100 * t.relative_curvature:+.1f} +- {100 * t.relative_curvature_std:.1f} % at saturation) isn't "
+            "significant against that: the conversion gain is EMVA's straight line to 70 % of saturation; at zero signal "
+            f"the curve has {t.curve_gain:.4g} +- {t.curve_gain_std:.2g} DN/e"
+        )
+    elif abs(t.relative_curvature) > 4.0 * t.relative_curvature_std:
+        e.remarks.add(
+            f"the variance bends by {100 * t.relative_curvature:+.1f} +- {100 * t.relative_curvature_std:.1f} % of its line at saturation "
+            "(nonlinear response or brighter-fatter); the conversion gain is that at zero signal"
+        )
+
+
+def in_electrons(e: Evaluation, value: float, std: float) -> tuple[float, float]:
+    """A `value` in DN with its standard deviation in electrons, with that of the gain."""
+    gain = e.transfer.gain
+    return value / gain, float(np.hypot(std / gain, value * e.transfer.gain_std / gain**2))

@@ -1,0 +1,216 @@
+"""The noise fit of one camera: all figures, by channel too, with the points of its plots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+
+from lab.errors import NotDetermined
+from lab.fit.noise.dark_current import dark_current, dark_current_from_variance, dark_current_temperature
+from lab.fit.noise.dark_pixels import DarkPixels, read_noise_distribution
+from lab.fit.noise.emva1288 import EmvaInput, emva1288_figures
+from lab.fit.noise.evaluation import Evaluation, evaluate
+from lab.fit.noise.fixed_pattern import dsnu, prnu, remark_on_shading
+from lab.fit.noise.level_statistics import MeasuredLevel
+from lab.fit.noise.read_noise import black_level, read_noise
+from lab.fit.noise.response import full_well, linearity_by_plane, main_lamp_levels, quantum_efficiency, remark_on_lamp
+from lab.fit.noise.variance_curvature import variance_curvature_figures
+from lab.formats.recording_set import Camera
+from lab.formats.results import ChannelNoise, Emva1288, NoiseFit, PhotonTransfer
+
+
+def noise_fit(
+    darks: Sequence[MeasuredLevel],
+    flats: Sequence[MeasuredLevel],
+    camera: Camera,
+    gain_db: float = 0.0,
+    defects: int = 0,
+    pixels: DarkPixels | None = None,
+) -> NoiseFit:
+    """The noise fit on the statistics of levels; the method: `lab.fit.noise`.
+
+    `defects`: number of pixels that were left out of all levels; `pixels`: single pixels in the darks. Raises
+    `NotDetermined` where fewer than three unsaturated flat levels have repeats.
+    """
+    if pixels is not None and pixels.bad is not None:
+        defects = int(np.count_nonzero(pixels.bad))
+    return _result(evaluate(darks, flats, camera, gain_db, defects, tuple(flats[0].plane)), pixels)
+
+
+def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
+    """All figures. The order of the steps is that of the remarks."""
+    t = e.transfer
+    scale = 10.0 ** (-e.levels.gain_db / 20.0)
+    remark_on_lamp(e)
+    remark_on_levels(e)
+    remark_on_shading(e)
+    principal = principal_figures(e)
+    qe, qe_std, qe_at = quantum_efficiency(e)
+    from_variance, from_variance_std = dark_current_from_variance(e)
+    dark = pixels is not None and e.levels.darks
+    return NoiseFit(
+        **principal,
+        quantum_efficiency=qe,
+        quantum_efficiency_std=qe_std,
+        quantum_efficiency_wavelength_nm=qe_at,
+        conversion_gain_at_zero_dn_per_e=t.curve_gain * scale,
+        conversion_gain_at_zero_dn_per_e_std=t.curve_gain_std * scale,
+        variance_model_error_percent=100.0 * t.model_error,
+        **variance_curvature_figures(e),
+        dark_current_from_variance_e_per_s=from_variance,
+        dark_current_from_variance_e_per_s_std=from_variance_std,
+        dark_current_temperature=dark_current_temperature(e),
+        read_noise_distribution=read_noise_distribution(pixels, t.gain) if dark and pixels is not None else None,
+        defects=pixels.defects(t.gain) if dark and pixels is not None else None,
+        channels=channel_figures(e, principal),
+        emva1288=emva1288_by_plane(e),
+        photon_transfer=photon_transfer_points(e, linearity_by_plane(e)[1]),
+        remarks=tuple(e.remarks.sentences),
+    )
+
+
+def principal_figures(e: Evaluation) -> dict[str, float | None]:
+    """The figures that stand for the sensor and for each channel, with their standard deviations."""
+    scale = 10.0 ** (-e.levels.gain_db / 20.0)
+    errors = list(linearity_by_plane(e)[0].values())
+    # Planes see the same lamp: where it drifts, their errors are fully correlated
+    together = 1.0 if e.drift.relative > 0 else float(np.sqrt(max(len(errors), 1)))
+    found: dict[str, tuple[float | None, float | None]] = {
+        "conversion_gain_dn_per_e": (e.transfer.gain * scale, e.transfer.gain_std * scale),
+        "read_noise_e": read_noise(e),
+        "black_level_dn": black_level(e),
+        "dark_current_e_per_s": dark_current(e),
+        "dsnu_e": dsnu(e),
+        "prnu_percent": prnu(e),
+        "full_well_e": full_well(e),
+        "linearity_error_percent": (
+            float(np.mean([e.error_percent for e in errors])) if errors else None,
+            float(np.mean([e.error_percent_std for e in errors])) / together if errors else None,
+        ),
+    }
+    values = {name: value for name, (value, _) in found.items()}
+    return values | {f"{name}_std": std for name, (_, std) in found.items()}
+
+
+def channel_figures(e: Evaluation, principal: dict[str, float | None]) -> dict[str, ChannelNoise]:
+    """Figures of each colour by itself; a channel that its levels don't determine is left out and reported."""
+    found: dict[str, ChannelNoise] = {}
+    for channel in dict.fromkeys(name[0] for name in e.levels.names):
+        own = tuple(name for name in e.levels.names if name[0] == channel)
+        try:
+            part = (
+                principal
+                if own == e.levels.names
+                else principal_figures(
+                    evaluate(e.levels.all_darks, e.levels.flats, e.levels.camera, e.levels.gain_db, 0, own)
+                )
+            )
+        except NotDetermined as refused:
+            e.remarks.add(f"channel {channel} alone: {refused.reason}")
+            continue
+        found[channel] = ChannelNoise(**part)
+    return found
+
+
+def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
+    """Figures by the letter of EMVA 1288, by plane; what a plane lacks is reported."""
+    found: dict[str, Emva1288] = {}
+    main = sorted(main_lamp_levels(e), key=lambda level: level.light)
+    lamp = main[0].lamp
+    photons = isinstance(lamp, tuple) and len(lamp) == 3 and bool(lamp[1])
+    for name in e.levels.names:
+        given = EmvaInput(
+            plane=name,
+            darks=tuple(e.levels.darks),
+            flats=tuple(level for level in main if level.light > 0),
+            in_photons=photons,
+            wavelength_nm=lamp[2] if photons and isinstance(lamp, tuple) else None,
+            saturation_dn=e.saturation.signal_dn[name],
+            variance_error=e.transfer.model_error,
+            lamp_error=e.drift.relative,
+        )
+        own = emva1288_figures(given)
+        if isinstance(own, str):
+            e.remarks.add(f"no EMVA 1288 figures: {own}")
+        else:
+            found[name] = own
+    return found
+
+
+def photon_transfer_points(e: Evaluation, deviation: dict[tuple[int, str], float]) -> PhotonTransfer:
+    """Points of the plot: flats by channel, means over the planes of the channel."""
+    used = {(id(level), name): bool(flag) for (level, name), flag in zip(e.points, e.transfer.used, strict=True)}
+    rows: list[tuple[str, float, float, float, float, float, bool, float | None]] = []
+    channels = dict.fromkeys(name[0] for name in e.levels.names)
+    for level in e.levels.flats:
+        for channel in channels:
+            own = [name for name in e.levels.names if name[0] == channel and level.repeats > 1]
+            if not own:
+                continue
+            planes = [level.plane[name] for name in own]
+            signal = [p.mean - e.dark.mean_dn(n, level.exposure_s) for p, n in zip(planes, own, strict=True)]
+            index = [e.plane_index.get(n) for n in own]
+            floor = [0.0 if i is None else float(e.transfer.floor[i]) for i in index]
+            dark = [
+                f + e.transfer.gain * (e.dark.mean_dn(n, level.exposure_s) - e.dark.lines[n].black)
+                for f, n in zip(floor, own, strict=True)
+            ]
+            variance = [p.temporal_variance - d for p, d in zip(planes, dark, strict=True)]
+            shares = [deviation[id(level), n] for n in own if (id(level), n) in deviation]
+            rows.append(
+                (
+                    channel,
+                    level.exposure_s,
+                    float(np.mean(signal)),
+                    float(np.sqrt(np.sum([p.mean_std**2 for p in planes])) / len(own)),
+                    float(np.mean(variance)),
+                    float(np.sqrt(np.sum([p.temporal_variance_std**2 for p in planes])) / len(own)),
+                    all(used.get((id(level), n), False) for n in own),
+                    float(np.mean(shares)) if shares else None,
+                )
+            )
+    return PhotonTransfer(
+        **dict(zip(PhotonTransfer.model_fields, (tuple(column) for column in zip(*rows, strict=True)), strict=True))
+    )
+
+
+def remark_on_levels(e: Evaluation) -> None:
+    """Report saturated and single flats, defects, gain, and planes that differ."""
+    clipped = sum(any(flags) for flags in zip(*e.saturation.clipped.values(), strict=True))
+    if clipped:
+        e.remarks.add(f"{clipped} of {len(e.levels.flats)} flat levels saturate in a channel: left out there")
+    single = sum(level.repeats < 2 for level in e.levels.flats)
+    if single:
+        e.remarks.add(f"{single} of {len(e.levels.flats)} flat levels have no repeat: only their means are used")
+    if e.levels.defects:
+        e.remarks.add(f"{e.levels.defects} hot or dead pixels stand out of the longest darks: left out of everything")
+    if e.levels.gain_db:
+        e.remarks.add(f"recorded at a gain of {e.levels.gain_db:g} dB: the conversion gain is given for 0 dB")
+    remark_on_planes(e)
+
+
+def remark_on_planes(e: Evaluation) -> None:
+    """Report planes that differ in conversion gain, as read-out channels of their own do."""
+    values, weights = [], []
+    for name in e.levels.names:
+        own = [
+            (level.plane[name], level)
+            for (level, plane), used in zip(e.points, e.transfer.used, strict=True)
+            if plane == name and used and level.lamp != "dark"
+        ]
+        if not own or e.transfer.by_line:
+            continue
+        signal = np.array([p.mean - e.dark.lines[name].black for p, _ in own])
+        excess = np.array([p.temporal_variance for p, _ in own]) - e.transfer.floor[e.plane_index[name]]
+        excess -= e.transfer.curvature * signal**2
+        weight = (signal / np.hypot([p.temporal_variance_std for p, _ in own], e.transfer.model_error * excess)) ** 2
+        values.append(float(np.sum(weight * excess / signal) / weight.sum()))
+        weights.append(float(weight.sum()))
+    if len(values) < 2:
+        return
+    mean = np.average(values, weights=weights)
+    if special.chdtrc(len(values) - 1, float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2))) < 1e-4:
+        listed = ", ".join(f"{name} {value:.4g}" for name, value in zip(e.levels.names, values, strict=False))
+        e.remarks.add(f"the planes differ in conversion gain ({listed} DN/e): the one given is their mean")

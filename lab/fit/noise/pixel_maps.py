@@ -1,0 +1,126 @@
+"""Maps of single pixels: offset, dark current, relative gain, and which pixels are defective."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from lab.errors import NotDetermined
+from lab.fit.noise.dark_pixels import stack_of
+from lab.fit.noise.defective_pixels import defective_pixels
+from lab.fit.noise.frame_sums import BoolArray
+from lab.fit.noise.level_statistics import Stack
+from lab.fit.noise.shading import shading
+from lab.fit.rounding import QUANTISATION_DN2
+from lab.formats.recording_set import Dark, Flat, RecordingSet
+from sim.camera import Cfa, Side
+from sim.sensor.mosaic import planes
+from sim.spectrum import FloatArray
+
+LOW, HIGH = 0.1, 0.9  # of saturation: flats that determine the gains of pixels
+
+
+@dataclass(frozen=True, eq=False)
+class PixelMaps:
+    """Maps (rows, cols) of one camera, each with `_std`, the standard deviation of a pixel.
+
+    `offset_dn`: mean in the dark at no exposure. `dark_dn_per_s`: dark current, None with darks of one exposure.
+    `gain`: response over that of the neighbourhood in its plane, without shading; None without flats. `defective`:
+    mask.
+    """
+
+    offset_dn: FloatArray
+    offset_dn_std: FloatArray
+    dark_dn_per_s: FloatArray | None
+    dark_dn_per_s_std: FloatArray | None
+    gain: FloatArray | None
+    gain_std: FloatArray | None
+    defective: BoolArray
+
+
+def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
+    """Maps of offset, dark current and relative gain of the pixels of `side`.
+
+    Offset and dark current: a weighted line through the dark means of each pixel against exposure. Gain: the weighted
+    mean over the flats between 10 and 90 % of saturation. Raises `NotDetermined` without darks.
+    """
+    camera = recordings.camera(side)
+    darks = sorted(_levels(recordings.captures("dark", side)), key=lambda group: -group[0].exposure_s)
+    if not darks:
+        raise NotDetermined("noise", "no darks: capture two or more at each of two exposures for maps of single pixels")
+    offset, dark, defective = _dark_maps(recordings, darks, camera.cfa)
+    white = camera.saturation_dn - float(np.median(offset[0]))
+    total, square, weight = np.zeros(offset[0].shape), 0.0, 0.0
+    for group in _levels(recordings.captures("flat", side)):
+        stack = stack_of(recordings, group, defective)
+        image = stack.image()
+        signal = image - offset[0] - (dark[0] * group[0].exposure_s if dark is not None else 0.0)
+        share = float(np.median(signal)) / white
+        if not LOW <= share <= HIGH or float(np.percentile(image, 99.9)) >= camera.saturation_dn:
+            continue
+        for plane in planes(signal, camera.cfa).values():
+            np.divide(plane, shading(plane), out=plane)
+        level = share * stack.count  # weight of shot noise
+        total += level * signal
+        square += (level * _pixel_std(stack) / share / white) ** 2
+        weight += level
+    return PixelMaps(
+        offset_dn=offset[0],
+        offset_dn_std=offset[1],
+        dark_dn_per_s=dark[0] if dark is not None else None,
+        dark_dn_per_s_std=dark[1] if dark is not None else None,
+        gain=total / weight if weight > 0 else None,
+        gain_std=np.full(total.shape, np.sqrt(square) / weight) if weight > 0 else None,
+        defective=defective,
+    )
+
+
+C = TypeVar("C", Dark, Flat)
+Map = tuple[FloatArray, FloatArray]  # values and standard deviations
+
+
+def _levels(captures: list[C]) -> list[list[C]]:
+    """Repeats: captures of the same exposure, light, gain and temperature (to a degree)."""
+    groups: dict[Hashable, list[C]] = {}
+    for capture in captures:
+        light = (capture.photons_per_pixel, capture.radiance) if isinstance(capture, Flat) else None
+        temperature_c = None if capture.temperature_c is None else round(capture.temperature_c)
+        groups.setdefault((capture.exposure_s, capture.gain_db, temperature_c, light), []).append(capture)
+    return list(groups.values())
+
+
+def _pixel_std(stack: Stack) -> float:
+    """Standard deviation of the mean of a pixel over the repeats of a stack, DN; that of rounding with one image."""
+    if stack.squares is None:
+        return float(np.sqrt(QUANTISATION_DN2))
+    variance = float(np.mean(stack.squares)) / (stack.count - 1)
+    return float(np.sqrt(max(variance, QUANTISATION_DN2) / stack.count))
+
+
+def _dark_maps(recordings: RecordingSet, darks: list[list[Dark]], cfa: Cfa) -> tuple[Map, Map | None, BoolArray]:
+    """Offset, dark current (with two exposures) and the mask of pixels that stand out of the longest dark."""
+    exposure, weight, means = [], [], []
+    for group in darks:
+        stack = stack_of(recordings, group)
+        exposure.append(group[0].exposure_s)
+        weight.append(_pixel_std(stack) ** -2)
+        means.append(stack.image())
+    defective = defective_pixels(means[0], cfa)
+    t, w = np.array(exposure), np.array(weight)
+    middle = float(np.sum(w * t) / w.sum())
+    mean = sum(one * share for one, share in zip(means, w / w.sum(), strict=True))
+    shape = means[0].shape
+    norm = float(np.sum(w * (t - middle) ** 2))
+    if norm <= 1e-12 * w.sum() * max(middle, 1e-12) ** 2:
+        return (np.asarray(mean, float), np.full(shape, w.sum() ** -0.5)), None, defective
+    slope = sum(one * share for one, share in zip(means, w * (t - middle) / norm, strict=True))
+    offset = np.asarray(mean - slope * middle, float)
+    offset_std = float(np.sqrt(1.0 / w.sum() + middle**2 / norm))
+    return (
+        (offset, np.full(shape, offset_std)),
+        (np.asarray(slope, float), np.full(shape, norm**-0.5)),
+        defective,
+    )

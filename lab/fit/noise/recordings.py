@@ -1,0 +1,111 @@
+"""The noise fit of a recording set: darks and flats of one camera, grouped into levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from lab.errors import NotDetermined
+from lab.fit.noise.dark_pixels import DarkPixels, stack_of
+from lab.fit.noise.defective_pixels import defective_pixels
+from lab.fit.noise.level_statistics import MeasuredLevel
+from lab.fit.noise.noise_fit import noise_fit
+from lab.fit.noise.recorded_levels import rounded_c
+from lab.formats.recording_set import Camera, Capture, Dark, Flat, RecordingSet
+from lab.formats.results import NoiseFit
+from sim.camera import Side
+from sim.spectrum import Spectrum
+
+MIN_SIZE_PX = 16
+SAME_LAMP = 0.02  # relative difference below which two radiances are one lamp, measured twice
+C = TypeVar("C", bound=Capture)
+
+
+def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
+    """Photon transfer of one camera from its darks and flats (two repeats or more per level).
+
+    Flats and darks of the most frequent `gain_db` are used; the conversion gain is given for 0 dB. Every frame is read
+    once, and no more than one level is held in memory. Raises `NotDetermined` where the flats don't determine the
+    conversion gain. The method: `lab.fit.noise`.
+    """
+    camera = recordings.camera(side)
+    flats = recordings.captures("flat", side)
+    if not flats:
+        raise NotDetermined("noise", "no flats: capture two or more at each of several exposures up to saturation")
+    if min(camera.rows, camera.cols) < MIN_SIZE_PX:
+        raise NotDetermined(
+            "noise",
+            f"{camera.rows} x {camera.cols} px are too few for a variance: give frames of {MIN_SIZE_PX} x {MIN_SIZE_PX} or more",
+        )
+    gains = [flat.gain_db or 0.0 for flat in flats]
+    gain_db = max(sorted(set(gains)), key=gains.count)
+    flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
+    darks = [dark for dark in recordings.captures("dark", side) if (dark.gain_db or 0.0) == gain_db]
+    dark_levels, pixels = _dark_levels(recordings, darks, camera)
+    lamps = _lamps_of(recordings, flats)
+    flat_levels = [
+        MeasuredLevel(
+            group[0].exposure_s,
+            _light(group[0]),
+            lamps[group[0].id],
+            stack_of(recordings, group, pixels.bad).statistics(),
+            group[0].temperature_c,
+        )
+        for group in _grouped(flats, lambda flat: (flat.exposure_s, _light(flat), lamps[flat.id]))
+    ]
+    return noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
+
+
+def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C]]:
+    groups: dict[Hashable, list[C]] = {}
+    for capture in captures:
+        groups.setdefault(key(capture), []).append(capture)
+    return list(groups.values())
+
+
+def _light(flat: Flat) -> float:
+    """Photons per pixel where they are stated, else the exposure."""
+    return flat.photons_per_pixel if flat.photons_per_pixel is not None else flat.exposure_s
+
+
+def _lamps_of(recordings: RecordingSet, flats: Sequence[Flat]) -> dict[str, Hashable]:
+    """The light of each flat, by its id. A lamp that is measured before every pass over the levels is one lamp."""
+    seen: list[tuple[str, Spectrum]] = []
+    names: dict[str | None, str | None] = {None: None}
+    for path in dict.fromkeys(flat.radiance for flat in flats):
+        if path is None:
+            continue
+        spectrum = recordings.spectrum(path)
+        wavelength_nm = np.array(spectrum.wavelength_nm)
+        value = np.array(spectrum.value)
+        for name, other in seen:
+            if np.abs(value - other.at(wavelength_nm)).sum() <= SAME_LAMP * np.abs(value).sum():
+                names[path] = name
+                break
+        else:
+            seen.append((path, spectrum))
+            names[path] = path
+    return {flat.id: (names[flat.radiance], flat.photons_per_pixel is not None, flat.wavelength_nm) for flat in flats}
+
+
+def _dark_levels(
+    recordings: RecordingSet, darks: Sequence[Dark], camera: Camera
+) -> tuple[list[MeasuredLevel], DarkPixels]:
+    """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
+    pixels = DarkPixels(camera.cfa)
+    levels = []
+    groups = _grouped(darks, lambda dark: (dark.exposure_s, rounded_c(dark.temperature_c)))
+    for group in sorted(groups, key=lambda group: -group[0].exposure_s):
+        stack = stack_of(recordings, group, pixels.bad)
+        if pixels.longest is None and stack.mean is not None:
+            bad = defective_pixels(stack.mean, camera.cfa)
+            if bad.any():
+                pixels.bad = bad
+                stack = stack_of(recordings, group, bad)
+        pixels.take(stack, group[0].exposure_s)
+        levels.append(
+            MeasuredLevel(group[0].exposure_s, 0.0, "dark", stack.statistics(), rounded_c(group[0].temperature_c))
+        )
+    return levels, pixels

@@ -1,0 +1,136 @@
+"""The response to light: linearity, full well, quantum efficiency, drift of the lamp between levels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lab.fit.noise.evaluation import Evaluation, in_electrons
+from lab.fit.noise.level_statistics import MeasuredLevel
+from lab.fit.noise.photon_transfer import LINE_LIMIT
+from lab.fit.rounding import QUANTISATION_DN2
+from lab.fit.weighted_lines import Linearity, least_squares, linearity
+from sim.spectrum import FloatArray
+
+LINEARITY_RANGE = (0.05, 0.95)  # of saturation: range of the linearity line of EMVA 1288
+
+
+def linearity_by_plane(e: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[int, str], float]]:
+    """Linearity by plane, and the deviation, %, of every (id of level, plane) that has one."""
+    found: dict[str, Linearity] = {}
+    deviation: dict[tuple[int, str], float] = {}
+    for name in e.levels.names:
+        chosen = levels_in_range(e, name, *LINEARITY_RANGE)
+        if len({level.light for level in chosen}) < 4:
+            continue
+        light, signal, std = response_to_light(e, name, chosen)
+        found[name] = linearity(light, signal, std)
+        for level, percent in zip(chosen, found[name].deviation_percent, strict=True):
+            deviation[id(level), name] = float(percent)
+    if not found:
+        e.remarks.add(
+            "fewer than four levels of one lamp between 5 and 95 % of saturation: the linearity error isn't determined"
+        )
+    return found, deviation
+
+
+def main_lamp_levels(e: Evaluation) -> list[MeasuredLevel]:
+    """Flats of the lamp with most levels."""
+    lamps = [level.lamp for level in e.levels.flats]
+    lamp = max(dict.fromkeys(lamps), key=lamps.count)
+    return [level for level in e.levels.flats if level.lamp == lamp]
+
+
+def levels_in_range(e: Evaluation, name: str, low: float, high: float) -> list[MeasuredLevel]:
+    """Unsaturated flats of the main lamp with a signal of `low` to `high` of saturation."""
+    clipped = dict(zip(map(id, e.levels.flats), e.saturation.clipped[name], strict=True))
+    return [
+        level
+        for level in main_lamp_levels(e)
+        if not clipped[id(level)]
+        and low
+        <= (level.plane[name].mean - e.dark.lines[name].at(level.exposure_s)) / e.saturation.signal_dn[name]
+        <= high
+    ]
+
+
+def response_to_light(
+    e: Evaluation, name: str, levels: Sequence[MeasuredLevel]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Light, signal (DN above dark) and its standard deviation, (levels,) each: by noise, and by the drift of the lamp
+    between repeats.
+    """
+    signal = np.array([level.plane[name].mean - e.dark.mean_dn(name, level.exposure_s) for level in levels])
+    noise = np.array([level.plane[name].mean_std for level in levels])
+    shot = e.transfer.gain * np.maximum(signal, 0.0) + QUANTISATION_DN2
+    noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
+    return np.array([level.light for level in levels]), signal, np.hypot(noise, e.drift.relative * signal)
+
+
+def full_well(e: Evaluation) -> tuple[float | None, float | None]:
+    """Saturation, e, and its standard deviation; None where no flat saturates."""
+    seen = [(value, name) for name, value in e.saturation.seen_dn.items() if value is not None]
+    if not seen:
+        highest = max(
+            level.plane[name].mean - e.dark.lines[name].black for level in e.levels.flats for name in e.levels.names
+        ) / (e.levels.white_dn - e.dark.lines[None].black)
+        e.remarks.add(
+            f"no flat saturates (the brightest reaches {100 * highest:.0f} % of the range): the full well isn't determined; expose longer"
+        )
+        return None, None
+    value, name = max(seen)
+    limit = e.levels.white_dn - e.dark.lines[name].black
+    if value >= limit - 0.5:
+        e.remarks.add(
+            f"saturation is the converter's limit ({e.levels.white_dn:g} DN): full_well_e is the signal there, and the pixel may hold more"
+        )
+    # The saturated value is rounded to whole DN
+    return in_electrons(e, value, np.sqrt(QUANTISATION_DN2))
+
+
+def quantum_efficiency(e: Evaluation) -> tuple[float | None, float | None, float | None]:
+    """Quantum efficiency of a MONO camera, its standard deviation and wavelength (nm), by EMVA 1288: responsivity over
+    K.
+
+    The responsivity is the slope of the signal against photons, to 70 % of saturation. None without a stated number of
+    photons.
+    """
+    levels = main_lamp_levels(e)
+    lamp = levels[0].lamp
+    if e.levels.camera.cfa != "MONO" or not (isinstance(lamp, tuple) and lamp[1]):
+        return None, None, None
+    chosen = levels_in_range(e, "Y", 0.0, LINE_LIMIT)
+    chosen = [level for level in chosen if level.light > 0]
+    if len({level.light for level in chosen}) < 3:
+        return None, None, None
+    line = linearity(*response_to_light(e, "Y", chosen))
+    value, std = in_electrons(e, line.slope, line.slope_std)
+    return value, std, lamp[2]
+
+
+def remark_on_lamp(e: Evaluation) -> None:
+    """Report a drift of the lamp between repeats, or else between levels."""
+    drift = e.drift
+    if drift.relative > 0:
+        e.remarks.add(
+            f"the lamp drifted: the means of repeated flat frames differ by {drift.std_dn:.2g} DN (rms) where noise explains "
+            f"{drift.noise_dn:.2g} DN ({100 * drift.relative:.2g} % of the signal)"
+        )
+        return
+    # Drift between levels: the residual of a cubic through the means, all planes together
+    rests, noises = [], []
+    for name in e.levels.names:
+        levels = levels_in_range(e, name, *LINEARITY_RANGE)
+        if len({level.light for level in levels}) < 7:
+            continue
+        light, signal, std = response_to_light(e, name, levels)
+        basis = np.polynomial.legendre.legvander(2.0 * (light - light.min()) / np.ptp(light) - 1.0, 3)
+        solution, _, _ = least_squares(basis, signal, std)
+        rests.append(np.sqrt(np.sum((signal - basis @ solution) ** 2) / (len(levels) - 4)))
+        noises.append(np.sqrt(np.mean(std**2)))
+    if rests and np.mean(rests) > 4.0 * np.mean(noises):
+        e.remarks.add(
+            f"the lamp drifted between levels: their means depart by {np.mean(rests):.2g} DN (rms) from a smooth response where noise "
+            f"explains {np.mean(noises):.2g} DN"
+        )
