@@ -7,7 +7,7 @@ STAMP := $(VENV)/.ready
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: setup run test serve bench proof slow lint clean
+.PHONY: setup run test serve bench proof proof-live slow lint clean
 
 setup: $(STAMP)
 
@@ -36,6 +36,12 @@ proof: $(STAMP)
 	test -s $(PROOF).seed || $(BIN)/python -c "import random; print($(if $(SEED),$(SEED),random.SystemRandom().randrange(10**6, 2**32)))" > $(PROOF).seed
 	test -f $(PROOF).score.json || $(BIN)/calibench challenge make --proof --out $(PROOF) --cases $(CASES) --seed "$$(cat $(PROOF).seed)"
 	$(BIN)/calibench challenge score $(PROOF) --truths $(PROOF).truths.json --json $(PROOF).score.json --page docs/proof.md
+
+# The live proof: benches that conceal each effect, a session over the wire of each, and the diagnosis. Goes on where it stopped;
+# ARGS="--only CASE" runs one.
+LIVE ?= calibench-data/proof-live
+proof-live: $(STAMP)
+	$(BIN)/python -m lab.challenge.live --out $(LIVE) --page docs/proof.md $(ARGS)
 
 # The tests that the everyday suite leaves out: recovery and coverage over many draws.
 slow: $(STAMP)

@@ -83,7 +83,7 @@ def write_page(found: ChallengeScore, page: Path) -> None:
         f"Seed {found.seed}, {found.cases} cases, {found.size} frames; SHA-256 over all seals `{found.seals_sha256}`.\n\n"
         f"{table(found)}\n\n![What was said of what was concealed]({picture.name})"
     )
-    text = _placed(text, found.purpose, section)
+    text = placed(text, found.purpose, section)
     row = f"| {found.purpose} | {found.seed} | {found.cases} | {found.size} | `{found.seals_sha256[:16]}` |"
     if row not in text:
         begin = text.find("<!-- seeds:end -->")
@@ -96,7 +96,8 @@ def write_page(found: ChallengeScore, page: Path) -> None:
     page.write_text(text, encoding="utf-8")
 
 
-def _placed(text: str, name: str, section: str) -> str:
+def placed(text: str, name: str, section: str) -> str:
+    """A page's text with a section between its marks, or added at the end."""
     begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     if begin not in text:
         return f"{text.rstrip()}\n\n## Results, {name}\n\n{begin}\n{section}\n{end}\n"

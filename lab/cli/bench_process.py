@@ -18,16 +18,16 @@ BENCH_START_S, BENCH_END_S = 60.0, 10.0
 
 
 @contextlib.contextmanager
-def mock_bench(conceal: Sequence[str]) -> Iterator[Path]:
+def mock_bench(conceal: Sequence[str], options: Sequence[str] = ()) -> Iterator[Path]:
     """Start `calibench bench` and give its station file; the bench ends with the block, or with this process.
 
-    `conceal`: what the bench's option of that name takes, one item an effect. Raises InputError with the bench's own line where
+    `conceal`: what the bench's option of that name takes, one item an effect; `options`: others of its options. Raises InputError with the bench's own line where
     it refuses an option, DeviceError where it doesn't start.
     """
     with tempfile.TemporaryDirectory(prefix="calibench-bench-") as folder:
         file = Path(folder) / "station.toml"
         command = [sys.executable, "-m", "lab.cli", "bench", "--station", str(file), "--with-parent"]
-        command += [f"--conceal={item}" for item in conceal]
+        command += [*(f"--conceal={item}" for item in conceal), *options]
         # A session of its own: Ctrl-C ends this process alone, and the bench serves until the shutter is closed.
         bench = subprocess.Popen(
             command,

@@ -1,0 +1,327 @@
+"""The live proof: benches that conceal one thing each, a whole session over the wire, and what the diagnosis makes of it.
+
+`python -m lab.challenge.live --out DIR`. Every case starts `calibench bench` as an OS process, captures a quick session from its
+station file, fits and diagnoses it, and leaves DIR/results/CASE.json; a case whose result is there is not run again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from lab.challenge.truth import load, store
+from lab.cli.bench_process import mock_bench
+from lab.errors import InputError
+from lab.formats.results import DiagnosisResult
+from sim.camera import Side
+from sim.parameters import Frozen
+
+Outcome = Literal["named", "among rivals", "not named", "wrong name", "healthy", "failed"]
+
+#: A typical size of every effect that the bench can show, on the left camera or on the rig.
+SIZES: dict[str, str] = {
+    "adc_nonlinearity": "left:error_dn=4",
+    "ambient_light": "both:rate_e_per_s=400,red_over_blue=3",
+    "amplifier_glow": "left:glow_e_per_s=60,reach_mm=0.5",
+    "astigmatism": "left:defocus_x_um=22",
+    "axial_chromatic_aberration": "left:slope_um=15",
+    "black_level_drift": "left:drift_dn_per_min=1",
+    "blooming": "left:share_percent=20",
+    "brighter_fatter": "left:loss_percent=10,shared_percent=10",
+    "charge_diffusion": "left:length_um=1.2",
+    "column_noise": "left:offset_e=2",
+    "coma": "left:w131_x_um=0.25",
+    "cover_glass": "left:thickness_mm=15",
+    "crosstalk": "left:share_percent=2",
+    "dark_current_temperature": "left:doublings_per_c=0.12",
+    "decentre": "left:shift_x_um=3",
+    "defocus": "left:defocus_um=22",
+    "distortion": "left:corner_percent=1.5",
+    "exposure_offset": "left:offset_us=25",
+    "field_curvature": "left:curvature_um=25",
+    "ghost": "left:share_percent=2",
+    "green_imbalance": "left:imbalance_percent=2",
+    "hot_pixels": "left:excess_e_per_s=1500,share_ppm=500",
+    "image_lag": "left:lag_percent=2",
+    "infrared_cut_filter": "left:cut_wavelength_nm=655,width_nm=4",
+    "inter_pixel_capacitance": "left:share_percent=2",
+    "lateral_chromatic_aberration": "left:slope_um=2.5",
+    "light_flicker": "both:modulation_percent=8,frequency_hz=100,line_time_us=20",
+    "nameless_correction": "left:strength=1",
+    "non_uniform_illumination": "both:gradient_x_percent=4",
+    "nonlinearity": "left:quadratic_percent=3",
+    "on_chip_sharpening": "left:strength=0.3",
+    "on_chip_smoothing": "left:strength=0.3",
+    "optical_low_pass_filter": "left:displacement_x_um=2,displacement_y_um=2",
+    "other_f_number": "left:ratio=1.4",
+    "pixel_aperture": "left:side_change_um=-0.7",
+    "radiometer_nonlinearity": "both:exponent_percent=4",
+    "random_telegraph_noise": "left:amplitude_e=40,share_percent=0.5",
+    "row_noise": "left:noise_e=3",
+    "screen_gamma": "both:exponent=1.8",
+    "screen_pixel_structure": "both:amplitude_percent=20",
+    "source_bandwidth": "both:width_nm=6",
+    "source_drift": "both:drift_percent_per_min=1",
+    "spherical_aberration": "left:w040_um=0.15",
+    "stereo_gain_mismatch": "both:gain_percent=5",
+    "stray_light": "both:share_percent=0.6",
+    "veiling_glare": "left:share_percent=3",
+    "vibration_blur": "both:amplitude_x_um=1.5",
+    "vignetting": "left:corner_loss_percent=6",
+    "vignetting_decentre": "left:fall_off_percent=12,centre_x=0.3",
+    "wavelength_offset": "both:offset_nm=2",
+}
+
+PAIRS = (
+    ("optical_low_pass_filter", "infrared_cut_filter"),
+    ("nonlinearity", "vignetting"),
+    ("wavelength_offset", "defocus"),
+    ("row_noise", "hot_pixels"),
+    ("veiling_glare", "crosstalk"),
+    ("source_drift", "coma"),
+    ("image_lag", "green_imbalance"),
+    ("brighter_fatter", "infrared_cut_filter"),
+    ("stray_light", "amplifier_glow"),
+    ("lateral_chromatic_aberration", "column_noise"),
+)
+
+HEALTHY_SEEDS = (11, 12, 13, 14, 15, 16)
+
+#: Small enough that a quick session leaves rivals, which `--resolve` is to tell apart.
+RESOLVED = (
+    "left:charge_diffusion:length_um=0.9",
+    "left:pixel_aperture:side_change_um=-0.4",
+    "left:defocus:defocus_um=14",
+)
+
+#: By how much the sensors get warmer (C) where the effect needs that.
+WARM_UP_C = {"dark_current_temperature": 6.0}
+
+#: Effects that a diagnosis doesn't look for: it is right with no name, or with the name of what does the same.
+NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
+    "cover_glass": frozenset({"spherical_aberration"}),
+    "nameless_correction": frozenset(),
+    "other_f_number": frozenset(),
+}
+
+#: Effects that one session can't show: its own boards give the distortion, so that only an earlier calibration tells that it changed.
+NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre"})
+
+
+class LiveCase(Frozen):
+    """One bench: what it conceals (`--conceal`), its seed, and whether `run --resolve` is asked for."""
+
+    name: str
+    concealed: tuple[str, ...] = ()
+    seed: int = 1
+    warm_up_c: float = 0.0
+    resolve: bool = False
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of what is concealed."""
+        return tuple(spec.split(":")[1] for spec in self.concealed)
+
+
+class FoundParameter(Frozen):
+    """A parameter that was concealed and named: truth against what was found, with its standard deviation."""
+
+    effect: str
+    parameter: str
+    unit: str
+    truth: float
+    value: float
+    std: float | None
+
+
+class LiveRun(Frozen):
+    """What came of a case. `named`: effects with their sides; `first_named`, `first_rivals`: what was said before `--resolve` took
+    its `captures`."""
+
+    case: LiveCase
+    outcome: Outcome
+    verdict: str = ""
+    named: dict[str, tuple[Side, ...]] = {}
+    rivals: dict[str, tuple[str, ...]] = {}
+    parameters: tuple[FoundParameter, ...] = ()
+    chi2_before: float | None = None
+    chi2_after: float | None = None
+    n: int | None = None
+    first_named: tuple[str, ...] = ()
+    first_rivals: tuple[str, ...] = ()
+    captures: tuple[str, ...] = ()
+    wall_s: float = 0.0
+    error: str | None = None
+
+
+def _spec(effect: str) -> str:
+    side, values = SIZES[effect].split(":")
+    return f"{side}:{effect}:{values}"
+
+
+def _of(name: str, *effects: str) -> LiveCase:
+    warm = max((WARM_UP_C.get(effect, 0.0) for effect in effects), default=0.0)
+    return LiveCase(name=name, concealed=tuple(_spec(effect) for effect in effects), warm_up_c=warm)
+
+
+def every_case() -> dict[str, LiveCase]:
+    """Name -> case: singles, pairs, healthy cameras, and benches to resolve."""
+    cases = [_of(effect, effect) for effect in SIZES]
+    cases += [_of("+".join(pair), *pair) for pair in PAIRS]
+    cases += [LiveCase(name=f"healthy-{seed}", seed=seed) for seed in HEALTHY_SEEDS]
+    cases += [LiveCase(name=f"resolve-{spec.split(':')[1]}", concealed=(spec,), resolve=True) for spec in RESOLVED]
+    return {case.name: case for case in cases}
+
+
+def drawn(seed: int, count: int = 3) -> tuple[LiveCase, ...]:
+    """Some single effects at random, for a day's tests."""
+    single = [case for name, case in every_case().items() if name in SIZES and name not in NOT_IN_ONE_SESSION]
+    return tuple(random.Random(seed).sample(single, count))
+
+
+def run_case(case: LiveCase, folder: Path) -> LiveRun:
+    """Run one case; its session lies in `folder` until it is diagnosed."""
+    began_s = time.monotonic()
+    options = ["--seed", str(case.seed), "--warm-up", str(case.warm_up_c), *([] if case.concealed else ["--healthy"])]
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        with mock_bench(case.concealed, options) as station:
+            ends = ["--quick", "--station", str(station), "--out", str(folder), "--name", case.name]
+            _command("run" if case.resolve else "capture", *ends, *(["--resolve"] if case.resolve else []))
+        sessions = sorted((folder / "sessions").iterdir())
+        file = folder / "diagnose.json" if not case.resolve else sessions[0] / "diagnose.json"
+        if not case.resolve:
+            _command("diagnose", sessions[0].name, "--json", str(file), data=folder)
+        found = DiagnosisResult.model_validate_json(file.read_text(encoding="utf-8"))
+    except (subprocess.CalledProcessError, InputError) as error:
+        said = str(getattr(error, "stderr", "") or error).strip().splitlines() or [""]
+        return LiveRun(case=case, outcome="failed", error=said[-1], wall_s=time.monotonic() - began_s)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return judged(case, found).model_copy(update={"wall_s": time.monotonic() - began_s})
+
+
+def _command(*arguments: str, data: Path | None = None) -> None:
+    environment = dict(os.environ) | ({} if data is None else {"CALIBENCH_DATA": str(data)})
+    command = [sys.executable, "-m", "lab.cli", *arguments]
+    subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+
+
+def judged(case: LiveCase, found: DiagnosisResult) -> LiveRun:
+    """A diagnosis against what was concealed."""
+    named = {effect.name: effect.sides for effect in found.effects}
+    rivals = {effect.name: tuple(rival.name for rival in effect.rivals) for effect in found.effects}
+    parameters = []
+    wanted: dict[str, frozenset[Side]] = {}
+    for spec in case.concealed:
+        side, name, text = spec.split(":")
+        wanted[name] = frozenset({"left", "right"} if side == "both" else {side})  # type: ignore[arg-type]
+        for effect in found.effects:
+            values = dict(part.split("=") for part in text.split(",")) if effect.name == name else {}
+            for parameter, value in effect.parameters.items():
+                if parameter in values:
+                    parameters.append(
+                        FoundParameter(
+                            effect=name,
+                            parameter=parameter,
+                            unit=value.unit,
+                            truth=float(values[parameter]),
+                            value=value.value,
+                            std=value.std,
+                        )
+                    )
+    held = found.held_out
+    before = found.resolutions[0].effects_before if found.resolutions else ()
+    return LiveRun(
+        case=case,
+        outcome=_outcome(case, named, rivals, wanted, found.verdict),
+        verdict=found.verdict,
+        named=named,
+        rivals=rivals,
+        parameters=tuple(parameters),
+        chi2_before=None if held is None else held.chi2_before,
+        chi2_after=None if held is None else held.chi2_after,
+        n=None if held is None else held.n,
+        first_named=tuple(effect.name for effect in before),
+        first_rivals=tuple(rival.name for effect in before for rival in effect.rivals),
+        captures=tuple(resolution.capture for resolution in found.resolutions),
+    )
+
+
+def _outcome(
+    case: LiveCase,
+    named: dict[str, tuple[Side, ...]],
+    rivals: dict[str, tuple[str, ...]],
+    wanted: dict[str, frozenset[Side]],
+    verdict: str,
+) -> Outcome:
+    if not wanted:
+        return "healthy" if not named and verdict == "no_mismatch" else "wrong name" if named else "not named"
+    allowed: frozenset[str] = frozenset().union(*(NOT_LOOKED_FOR.get(name, frozenset({name})) for name in wanted))
+    strange = [name for name, sides in named.items() if name not in allowed or not _reaches(name, sides, wanted)]
+    missing = [name for name in wanted if name not in NOT_LOOKED_FOR and name not in named]
+    if strange:
+        told = {rival for name in strange for rival in rivals[name]}
+        return "among rivals" if missing and told.issuperset(missing) else "wrong name"
+    return "not named" if missing else "named"
+
+
+def _reaches(name: str, sides: tuple[Side, ...], wanted: dict[str, frozenset[Side]]) -> bool:
+    """Whether an effect was named on sides that have it alone."""
+    return name not in wanted or set(sides) <= wanted[name]
+
+
+def run_all(cases: dict[str, LiveCase], out: Path) -> dict[str, LiveRun]:
+    """Results by case: those in OUT/results, and the others as they are run, in order."""
+    runs = {}
+    for name, case in cases.items():
+        file = out / "results" / f"{name}.json"
+        if file.exists():
+            kept = load(LiveRun, file)
+            if kept.case == case and kept.outcome != "failed":
+                runs[name] = kept
+                continue
+        runs[name] = run_case(case, out / "session" / name)
+        store(runs[name], file)
+        print(f"{name}: {runs[name].outcome}, {runs[name].wall_s:.0f} s", flush=True)
+    return runs
+
+
+def main(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="where results are kept")],
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="CASE", help="this case; may be repeated (without: all)")
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option("--page", metavar="FILE.md", help="write a table and a picture into this page")
+    ] = None,
+    cases: Annotated[bool, typer.Option("--cases", help="list the cases as JSON, and end")] = False,
+) -> None:
+    """Conceal every effect on the mock bench, capture, diagnose, and say what was found. Goes on where it stopped."""
+    from lab.challenge.live_page import write_page
+
+    every = every_case()
+    if cases:
+        print(json.dumps({name: case.concealed for name, case in every.items()}, indent=1))
+        return
+    unknown = sorted(set(only or ()) - set(every))
+    if unknown:
+        raise InputError(f"--only {unknown[0]}: no such case; there are {', '.join(every)}")
+    runs = run_all({name: case for name, case in every.items() if not only or name in only}, out)
+    if page is not None:
+        write_page(runs, page)
+    right = sum(run.outcome in ("named", "healthy") for run in runs.values())
+    print(f"{right} of {len(runs)} right; results in {out / 'results'}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,123 @@
+"""The live proof's own parts, and three of its cases that nobody chose: drawn from the commit and the day, over the wire."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from lab.challenge.live import (
+    HEALTHY_SEEDS,
+    PAIRS,
+    SIZES,
+    LiveCase,
+    LiveRun,
+    drawn,
+    every_case,
+    judged,
+    run_all,
+    run_case,
+)
+from lab.challenge.live_page import drawing, table, write_page
+from lab.challenge.truth import store
+from lab.formats.results import DiagnosisResult, NamedEffect, ParameterValue, Rival
+from mocks.conceal import NOT_SHOWN, parse
+from sim.camera import Side
+from sim.effects.library import effects as library
+
+
+def day_seed() -> int:
+    """Another one every commit and every day; `CALIBENCH_SEED` repeats one."""
+    if "CALIBENCH_SEED" in os.environ:
+        return int(os.environ["CALIBENCH_SEED"])
+    there = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+    )
+    return (int((there.stdout.strip() or "0")[:12], 16) + int(datetime.now(UTC).strftime("%Y%m%d"))) % 10**9
+
+
+def result(verdict: str, *effects: tuple[str, tuple[Side, ...], dict[str, float], tuple[str, ...]]) -> DiagnosisResult:
+    named = [
+        NamedEffect(
+            name=name,
+            probability=0.9,
+            sides=sides,
+            parameters={key: ParameterValue(value=value, std=0.1, unit="um") for key, value in values.items()},
+            rivals=tuple(Rival(name=rival, probability=0.1) for rival in rivals),
+            statement="",
+        )
+        for name, sides, values, rivals in effects
+    ]
+    return DiagnosisResult(source="test", verdict=verdict, effects=tuple(named))  # type: ignore[arg-type]
+
+
+def test_every_effect_that_the_bench_shows_has_a_case() -> None:
+    assert set(SIZES) == set(library()) - set(NOT_SHOWN)
+    assert len(PAIRS) == 10
+    assert len(HEALTHY_SEEDS) == 6
+    assert len(set(every_case())) == len(SIZES) + 10 + 6 + 3
+
+
+@pytest.mark.parametrize("case", every_case().values(), ids=lambda case: case.name)
+def test_the_bench_takes_every_case(case: LiveCase) -> None:
+    concealed = parse(case.concealed)
+    assert {effect.name for effects in concealed.values() for effect in effects} == set(case.effects)
+
+
+@pytest.mark.parametrize(
+    ("found", "outcome"),
+    [
+        (result("explained", ("defocus", ("left",), {"defocus_um": 21.0}, ())), "named"),
+        (result("no_mismatch"), "not named"),
+        (result("explained", ("coma", ("left",), {}, ())), "wrong name"),
+        (result("explained", ("coma", ("left",), {}, ("defocus",))), "among rivals"),
+        (result("explained", ("defocus", ("left", "right"), {}, ())), "wrong name"),
+        (result("explained", ("defocus", ("left",), {}, ()), ("coma", ("right",), {}, ())), "wrong name"),
+    ],
+)
+def test_a_diagnosis_is_judged(found: DiagnosisResult, outcome: str) -> None:
+    run = judged(every_case()["defocus"], found)
+    assert run.outcome == outcome
+    assert [p.truth for p in run.parameters] == ([22.0] if found.effects and found.effects[0].parameters else [])
+
+
+def test_a_healthy_camera_is_right_without_a_name() -> None:
+    case = every_case()["healthy-11"]
+    assert judged(case, result("no_mismatch")).outcome == "healthy"
+    assert judged(case, result("unexplained")).outcome == "not named"
+    assert judged(case, result("explained", ("coma", ("left",), {}, ()))).outcome == "wrong name"
+
+
+def test_results_that_are_there_are_not_run_again(tmp_path: Path) -> None:
+    case = every_case()["defocus"]
+    kept = judged(case, result("explained", ("defocus", ("left",), {"defocus_um": 21.0}, ())))
+    store(kept, tmp_path / "results" / "defocus.json")
+    runs = run_all({"defocus": case}, tmp_path)
+    assert runs == {"defocus": kept}
+    write_page(runs, tmp_path / "page.md")
+    write_page(runs, tmp_path / "page.md")
+    text = (tmp_path / "page.md").read_text()
+    assert text.count("| defocus defocus_um=22 | named | defocus (left) |") == 1
+    assert "defocus_um 21 ± 0.1 um, 22" in table(runs)
+    assert drawing(runs).count("<circle") == 1
+    assert (tmp_path / "page-live.svg").is_file()
+
+
+def test_a_bench_that_refuses_is_a_failed_case(tmp_path: Path) -> None:
+    run = run_case(LiveCase(name="none", concealed=("left:frobnication:x=1",)), tmp_path / "none")
+    assert run.outcome == "failed"
+    assert "no effect named" in (run.error or "")
+
+
+@pytest.mark.timeout(2400)
+def test_three_of_the_day_are_named(tmp_path: Path) -> None:
+    """Of typical sizes: no name but the concealed one's, and no more than one of the three left without it."""
+    seed = day_seed()
+    runs: list[LiveRun] = [run_case(case, tmp_path / case.name) for case in drawn(seed)]
+    told = {run.case.name: (run.outcome, run.named, run.error) for run in runs}
+    print(f"CALIBENCH_SEED={seed}: {told}")
+    assert not [run for run in runs if run.outcome in ("wrong name", "failed")], (seed, told)
+    assert sum(run.outcome == "named" for run in runs) >= 2, (seed, told)
