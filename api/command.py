@@ -28,7 +28,8 @@ _ANY = ("0.0.0.0", "::", "")  # addresses of this computer that are nobody's nam
 
 
 def _store(folder: Path | None) -> Store:
-    from lab.capture.store import Settings, Store
+    from lab.capture.settings import Settings
+    from lab.capture.store import Store
 
     return Store.open(Settings() if folder is None else Settings(data=folder))
 

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable
 import anyio
 
 from api.errors import Conflict
-from lab.capture.sequences.calibration import Calibration, full_calibration
+from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
@@ -130,16 +130,16 @@ class LiveSessions:
         live = self._live.get(session_id)
         return live if live is not None and not live.ended else None
 
-    def start(self, station: Station, calibration: Calibration, name: str, notes: str) -> str:
+    def start(self, station: Station, plan: CapturePlan, name: str, notes: str) -> str:
         """Register a session and run it; its id. Raises Conflict if one runs on an instrument of the station, InputError if
-        the station lacks what the calibration needs."""
+        the station lacks what the plan needs."""
         with self._lock:
             self._check_free(station)
             live = LiveSession(station)
             capture = CaptureSession.start(
                 self._store,
                 station,
-                calibration,
+                plan,
                 name=name,
                 notes=notes,
                 on_progress=live.tell,
@@ -182,8 +182,8 @@ class LiveSessions:
             session_id = request.session
             try:
                 if not session_id:
-                    calibration = request.calibration or full_calibration(station, request.quick)
-                    session_id = self.start(station, calibration, request.name, request.notes)
+                    plan = request.plan or full_plan(station, request.quick)
+                    session_id = self.start(station, plan, request.name, request.notes)
                 elif self.find(session_id) is None and self._store.session(session_id).state != "finished":
                     self.resume(session_id, station)
             except Conflict as error:

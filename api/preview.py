@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 from sim.sensor.mosaic import planes
 
 #: sRGB's curve is near enough a power of this.
 GAMMA = 2.2
 
 
-def preview_png(frame: NDArray[np.uint16], camera: Camera, width_px: int, stretch: bool = False) -> bytes:
+def preview_png(frame: NDArray[np.uint16], camera: DataSheet, width_px: int, stretch: bool = False) -> bytes:
     """PNG of `frame` (rows, cols), at most `width_px` wide. Black is the data sheet's black level, white its white level, or
     with `stretch` the frame's own 99.9th percentile, so that dark frames show what is in them. No white balance."""
     black = camera.black_level_dn or 0.0

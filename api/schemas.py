@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from api.keys import Permission
+from lab.capture.records import Run
 from lab.capture.session import Progress
-from lab.capture.store import Run
+from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from sim.camera import Side
 
 #: Databases that forget the time zone give back UTC.
 Utc = Annotated[datetime, AfterValidator(lambda at: at if at.tzinfo else at.replace(tzinfo=UTC))]
-SequenceName = Literal["dark", "flat", "narrowband", "chart", "edge", "screen", "stereo"]
+
+
+def _one_of(what: str, known: Collection[str]) -> AfterValidator:
+    """Accepts the names that are in `known` when a request comes."""
+
+    def check(name: str) -> str:
+        if name not in known:
+            raise ValueError(f"{name!r} is no {what}; choose from {', '.join(known)}")
+        return name
+
+    return AfterValidator(check)
+
+
+SequenceName = Annotated[str, _one_of("sequence", SEQUENCES), Field(json_schema_extra={"enum": list(SEQUENCES)})]
+CaptureKind = Annotated[
+    str, _one_of("kind of capture", CAPTURES.models), Field(json_schema_extra={"enum": list(CAPTURES.names)})
+]
 SessionState = Literal[
     "created",
     "connecting",

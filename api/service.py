@@ -14,9 +14,10 @@ from api.keys import Permission
 from api.live import LiveSessions
 from api.security import Demand, Gate
 from api.upload import Inbox
+from lab.capture.records import SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
-from lab.capture.store import SessionInfo, Store
+from lab.capture.store import Store
 from lab.errors import InputError
 from lab.jobs import JobInfo, JobRunner
 from lab.pipeline import ReportFile

@@ -15,10 +15,10 @@ import numpy as np
 import mocks.bench
 import mocks.conceal
 import mocks.truth
-from lab.capture.sequences.calibration import full_calibration
-from lab.capture.sequences.steps import FindExposure, FixedExposure, RelativeExposure, Step
+from lab.capture.plan import full_plan
 from lab.capture.station import Station
-from lab.formats.recording_set import AnyCapture, Manifest
+from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, RelativeExposure, Step
+from lab.formats.recording_set import Manifest
 from sim.camera import Geometry, Side
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import Spectrum
@@ -64,7 +64,7 @@ class Session:
         self.folder = folder
         self.bench = bench()
         self.found: dict[tuple[str, Side], float] = {}
-        self.captures: list[AnyCapture] = []
+        self.captures: list[Capture] = []
         for name in ("frames", "spectra", "targets"):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
@@ -76,7 +76,7 @@ class Session:
             | {"cameras": {side: address | {"datasheet": sheet} for side, sheet in sheets.items()}}
             | {"targets": self.bench.station_targets()}
         )
-        calibration = full_calibration(station)
+        calibration = full_plan(station)
         self.patterns = calibration.patterns(station)
         for path, cells in self.patterns.items():
             np.save(self.folder / path, cells)

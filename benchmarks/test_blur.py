@@ -19,6 +19,8 @@ from scipy.signal import fftconvolve
 
 from benchmarks.peers.iso12233 import iso12233_mtf
 from benchmarks.peers.mosleh import mosleh_kernel
+from lab.capture_kinds.bernoulli import BernoulliCapture
+from lab.capture_kinds.screen import ScreenState
 from lab.fit.mtf import edge_mtf
 from lab.fit.psf import estimate_kernel
 from lab.fit.psf.levelled_captures import ScreenPictures
@@ -26,7 +28,6 @@ from lab.fit.psf.normal_equations import normal_equations
 from lab.fit.psf.photograph import photographed_kernel
 from lab.fit.psf.screen_kernel import measure_kernels
 from lab.fit.psf.target_displacement import displaced
-from lab.formats.recording_set import Bernoulli, Screen
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, expected_electrons, kernel
 from sim.optics.imaging import MeasuredPsf
@@ -279,9 +280,9 @@ def simulated_camera() -> tuple[np.ndarray, np.ndarray]:
         frames[name] = np.mean([sample_from(electrons * rate, camera, rng, pixels) for _ in range(4)], axis=0)
     contrast = frames["white"] - frames["black"]
     contrast[contrast < 0.2 * np.quantile(contrast, 0.98)] = np.nan
-    first = Bernoulli(
+    first = BernoulliCapture(
         id="noise", kind="bernoulli", side="left", frame="noise.npy", exposure_s=1.0,
-        screen=Screen(pose="p", cell_camera_px=3.8), target="noise.npy",
+        screen=ScreenState(pose="p", cell_camera_px=3.8), target="noise.npy",
     )  # fmt: skip
     levelled = [(frames[name] - frames["black"]) / contrast for name in ("board", "noise")]
     found = measure_kernels(ScreenPictures(first, *levelled, board, pattern), "MONO", 9)["Y"].kernel

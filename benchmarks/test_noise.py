@@ -18,7 +18,7 @@ import pytest
 from lab.fit.noise.photon_transfer import fit_transfer
 from lab.fit.noise.recordings import fit_noise
 from lab.formats.importers.emva1288 import read_emva1288
-from lab.formats.recording_set import Camera, Manifest, RecordingSet
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import NoiseFit
 
 ROOT = Path(__file__).parents[1]
@@ -83,7 +83,7 @@ class Bench:
                         capture |= {"photons_per_pixel": FULL * float(light) / EFFICIENCY, "wavelength_nm": 550.0}
                     captures.append(capture)
                     frames[name] = self.frame(float(light) if kind == "flat" else 0.0, exposure)
-        camera = Camera(rows=ROWS, cols=COLS, cfa="MONO", bit_depth=12)
+        camera = DataSheet(rows=ROWS, cols=COLS, cfa="MONO", bit_depth=12)
         return RecordingSet(Manifest(cameras={"left": camera}, captures=tuple(captures)), frames)
 
 

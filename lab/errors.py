@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 
+def one_line(error: Exception) -> str:
+    """An exception's text on one line; its class where it has no text."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 class InputError(Exception):
     """The input can't be used (exit code 2). The message is one line: what, where, remedy."""
 

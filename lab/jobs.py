@@ -18,7 +18,10 @@ from typing import Any, cast
 import sqlalchemy as sa
 from pydantic import ConfigDict
 
-from lab.capture.store import JobRow, JobState, Lock, Store, now
+from lab.capture.durable_files import Lock
+from lab.capture.records import JobState, now
+from lab.capture.store import Store
+from lab.capture.tables import JobRow
 from lab.errors import Cancelled, DeviceError, InputError, NotDetermined
 from lab.pipeline import (
     STEPS,

@@ -26,7 +26,7 @@ from sim.camera import Side
 from sim.parameters import Frozen
 
 if TYPE_CHECKING:
-    from lab.capture.sequences.calibration import Calibration
+    from lab.capture.plan import CapturePlan
     from lab.capture.session import Progress as CaptureProgress
     from lab.capture.station import Drivers, Station
     from lab.capture.store import Store
@@ -67,12 +67,12 @@ GIVE_UP_PROBABILITY = 1e-3
 class CaptureRequest:
     """A session to capture: what is left of the session `session`, or a new one where that is empty.
 
-    calibration : the sequences of a new session; None: all that the station has the instruments and targets for
-    quick : fewer exposures and repeats, where `calibration` is None
+    plan : the sequences of a new session; None: all that the station has the instruments and targets for
+    quick : fewer exposures and repeats, where `plan` is None
     """
 
     session: str = ""
-    calibration: Calibration | None = None
+    plan: CapturePlan | None = None
     quick: bool = False
     name: str = ""
     notes: str = ""
@@ -227,7 +227,7 @@ def capture_here(
         session = CaptureSession.start(
             store,
             station,
-            request.calibration,
+            request.plan,
             quick=request.quick,
             name=request.name,
             notes=request.notes,
@@ -419,7 +419,7 @@ class _Pipeline:
             capture = proposal.capture
             self._say("resolve", f"{capture.capture}, to tell {' from '.join(capture.rivals)}")
             name = f"{self.recordings.manifest.name} resolve".strip()
-            session = self._captured("resolve", CaptureRequest(calibration=proposal.plan, name=name))
+            session = self._captured("resolve", CaptureRequest(plan=proposal.plan, name=name))
             ties.taken(capture)
             resolutions.append(
                 Resolution(

@@ -9,10 +9,10 @@ from sse_starlette.sse import EventSourceResponse
 from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
 from api.keys import Permission
-from api.routes.sessions import calibration_of
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
+from lab.capture.plan import full_plan
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.jobs import JobInfo
 from lab.pipeline import ReportFile
@@ -71,7 +71,7 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     session, which can be followed, paused and aborted as any other. 409 while another runs on the same instruments. The key's
     scope has to be `admin`, for this captures and computes."""
     station = service.station(start.station)
-    session_id = service.live.start(station, calibration_of(station, start), start.name, start.notes)
+    session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
     job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
     return _accepted(service, job_id, response)
 

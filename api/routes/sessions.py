@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import anyio
 from fastapi import APIRouter, HTTPException, Query, Request, Response
@@ -15,14 +15,13 @@ from api.errors import answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
 from api.preview import preview_png
-from api.schemas import Capture, SequenceName, Session, SessionDetail, SessionResume, SessionStart, Station
+from api.schemas import Capture, CaptureKind, Session, SessionDetail, SessionResume, SessionStart, Station
 from api.service import OPERATE, READ, Here, RegistryId, Service, SessionId
-from lab.capture.sequences.calibration import Calibration, full_calibration
+from lab.capture.durable_files import npy_bytes
+from lab.capture.plan import full_plan
+from lab.capture.records import CaptureInfo, SessionInfo
 from lab.capture.session import Progress
-from lab.capture.station import Station as LabStation
-from lab.capture.store import CaptureInfo, SessionInfo, npy_bytes
 from lab.errors import InputError
-from lab.formats.recording_set import Kind
 from sim.camera import Side
 
 router = APIRouter()
@@ -40,7 +39,6 @@ def _station(service: Service, name: str) -> Station:
         station = service.station(name)
     except InputError as error:
         return Station(name=name, title=name, problem=str(error))
-    possible = full_calibration(station)
     return Station(
         name=name,
         title=station.name or name,
@@ -49,7 +47,7 @@ def _station(service: Service, name: str) -> Station:
             family: entry.driver for family in _INSTRUMENTS if (entry := getattr(station, family)) is not None
         },
         targets=tuple(station.targets),
-        sequences=tuple(one for one in get_args(SequenceName) if getattr(possible, one) is not None),
+        sequences=full_plan(station).names,
         busy_with=service.live.busy(station),
     )
 
@@ -81,20 +79,6 @@ def _session(service: Service, session_id: str) -> Session:
     return Session(**_fields(service, service.session(session_id)))
 
 
-def calibration_of(station: LabStation, start: SessionStart) -> Calibration:
-    """The sequences that are asked for. Raises InputError where the station lacks what one of them needs."""
-    everything = full_calibration(station, start.quick)
-    if start.sequences is None:
-        return everything
-    missing = [name for name in start.sequences if getattr(everything, name) is None]
-    if missing:
-        raise InputError(
-            f"sequences: the station lacks instruments or targets for {', '.join(missing)}; "
-            "leave it out or add them to the station file"
-        )
-    return Calibration(**{name: getattr(everything, name) for name in start.sequences})
-
-
 @router.get("/sessions", tags=["sessions"], dependencies=[READ], responses=answers(401))
 def list_sessions(service: Here) -> list[Session]:
     """All sessions, the newest first."""
@@ -111,7 +95,7 @@ def list_sessions(service: Here) -> list[Session]:
 def start_session(service: Here, start: SessionStart, response: Response) -> Session:
     """Start a session; it runs on its own, follow its events. 409 while another runs on the same instruments."""
     station = service.station(start.station)
-    session_id = service.live.start(station, calibration_of(station, start), start.name, start.notes)
+    session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
     return _session(service, session_id)
 
@@ -233,7 +217,7 @@ def _known_capture(service: Service, session_id: str, capture_id: int) -> Captur
 def list_captures(
     service: Here,
     session_id: SessionId,
-    kind: Annotated[Kind | None, Query(description="only of this kind")] = None,
+    kind: Annotated[CaptureKind | None, Query(description="only of this kind")] = None,
     side: Annotated[Side | None, Query(description="only of this camera")] = None,
     offset: Annotated[int, Query(ge=0)] = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,

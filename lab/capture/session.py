@@ -29,11 +29,14 @@ from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, T
 
 from drivers.errors import InstrumentError
 from drivers.instrument import Identity
-from lab.capture.devices import Instruments, Taken, in_thread, take
-from lab.capture.sequences.calibration import Calibration, full_calibration
-from lab.capture.sequences.steps import Step
+from lab.capture.blocking_calls import in_thread
+from lab.capture.instruments import Instruments
+from lab.capture.plan import CapturePlan, full_plan
+from lab.capture.records import JournalEntry, Run, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
-from lab.capture.store import JournalEntry, Run, SessionInfo, Store, now
+from lab.capture.store import Store
+from lab.capture.take_step import Taken, take
+from lab.capture_kinds.base import Step
 from lab.errors import DeviceError, InputError
 from sim.parameters import Frozen
 
@@ -139,7 +142,7 @@ class CaptureSession:
         cls,
         store: Store,
         station: Station,
-        calibration: Calibration | None = None,
+        plan: CapturePlan | None = None,
         *,
         quick: bool = False,
         name: str = "",
@@ -149,16 +152,16 @@ class CaptureSession:
     ) -> CaptureSession:
         """Register a new session, by default of everything that the station can do; `run` it then.
 
-        Raises InputError if the station lacks what the calibration needs.
+        Raises InputError if the station lacks what the plan needs.
         """
-        chosen = calibration or full_calibration(station, quick)
+        chosen = plan or full_plan(station, quick)
         steps = chosen.steps(station)
         if not steps:
             raise InputError("station: nothing to capture with; add instruments and targets to the station file")
         session_id = store.create_session(
             station,
             steps,
-            calibration=chosen.model_dump(mode="json", exclude_none=True),
+            plan=chosen.document(),
             patterns=chosen.patterns(station),
             name=name,
             notes=notes,

@@ -1,7 +1,7 @@
-"""The station: which instruments stand where, what the makers say of the cameras, and which targets are at hand.
+"""The station: the instruments and their addresses, the cameras' data sheets, and the targets at hand.
 
-A station file is TOML; `calibench bench --station FILE` writes one for the mock bench. Everything here is the lab's own
-knowledge: addresses, data sheets, nominal layouts. Nothing in it is measured, and nothing in it is believed.
+A station file is TOML; `calibench bench --station FILE` writes one for the mock bench. It holds what the lab knows
+beforehand: addresses, data sheets, nominal layouts. Nothing in it is measured. The kinds of target are in `lab.capture_kinds`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Any, TypeVar, cast, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -22,8 +22,10 @@ from drivers.monochromator.base import Monochromator
 from drivers.registry import driver
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
+from lab.capture_kinds.base import AnyTarget, CaptureLimits, Target, TargetT
 from lab.errors import DeviceError, InputError
-from lab.formats.recording_set import Camera, parse_spectrum
+from lab.formats.recording_set import DataSheet
+from lab.formats.spectrum_csv import parse_spectrum
 from sim.camera import Side
 from sim.parameters import Frozen
 from sim.spectrum import Spectrum
@@ -46,13 +48,13 @@ class Address(BaseModel):
 
 
 class StationCamera(Address):
-    """One camera: how to reach it, and the maker's word on it.
+    """One camera: its address and its data sheet.
 
-    `datasheet` has the recording set's keys; its `quantum_efficiency`, inline curves (or paths of CSV files beside the
-    station file), is taken out into `quantum_efficiency` here.
+    `datasheet` has the recording set's keys. Its `quantum_efficiency`, inline curves or paths of CSV files beside the station
+    file, is moved to `quantum_efficiency` here.
     """
 
-    datasheet: Camera
+    datasheet: DataSheet
     quantum_efficiency: dict[str, Spectrum] = {}
 
     @model_validator(mode="before")
@@ -71,95 +73,8 @@ class StationCamera(Address):
         return self
 
 
-class Cap(Frozen):
-    """No light reaches the cameras."""
-
-    kind: Literal["cap"]
-
-
-class Sphere(Frozen):
-    """The port of the integrating sphere: uniform diffuse light from the monochromator."""
-
-    kind: Literal["sphere"]
-
-
-class ChartLayout(Frozen):
-    corners: tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
-
-
-class ReflectanceChart(Frozen):
-    kind: Literal["colorchecker"]
-    chart: str = "ColorChecker24"
-    left: ChartLayout | None = None
-    right: ChartLayout | None = None
-
-
-class EdgeRegion(Frozen):
-    """Where one edge lies in a frame, nominally."""
-
-    name: str
-    region: tuple[int, int, int, int]
-    angle_deg: float
-    field_mm: tuple[float, float]
-
-
-class EdgeLayout(Frozen):
-    regions: tuple[EdgeRegion, ...]
-
-
-class KnifeEdge(Frozen):
-    """A knife edge before the sphere."""
-
-    kind: Literal["slanted_edge"]
-    angle_deg: float
-    left: EdgeLayout | None = None
-    right: EdgeLayout | None = None
-
-
-class ScreenLayout(Frozen):
-    camera_px_per_screen_px: float = Field(gt=0)
-    visible: tuple[int, int, int, int]  # in screen px: what surely lies inside the frame
-
-
-class ScreenTarget(Frozen):
-    """The screen that the display driver draws on."""
-
-    kind: Literal["screen"]
-    rows: int = Field(gt=0)
-    cols: int = Field(gt=0)
-    pixel_mm: float = Field(gt=0)
-    left: ScreenLayout | None = None
-    right: ScreenLayout | None = None
-
-
-class CharucoBoard(Frozen):
-    """One pose of a ChArUco board."""
-
-    kind: Literal["charuco"]
-    dictionary: str
-    squares: tuple[int, int]
-    square_mm: float = Field(gt=0)
-    marker_mm: float = Field(gt=0)
-    pose: str
-
-
-Target = Annotated[
-    Cap | Sphere | ReflectanceChart | KnifeEdge | ScreenTarget | CharucoBoard, Field(discriminator="kind")
-]
-TargetT = TypeVar("TargetT", Cap, Sphere, ReflectanceChart, KnifeEdge, ScreenTarget, CharucoBoard)
-
-
-class Limits(Frozen):
-    """What the sequences keep to."""
-
-    exposure_min_s: float = Field(default=20e-6, gt=0)
-    exposure_max_s: float = Field(default=10.0, gt=0)
-    gain_db: float = 0.0
-    slit_um: float | None = Field(default=None, gt=0)  # None: as the instrument stands
-
-
 class Station(Frozen):
-    """What is where. `cameras` has a left one at least; an instrument that isn't there is None."""
+    """The content of a station file. `cameras` has a left one at least. None: the station has no such instrument."""
 
     name: str = ""
     monochromator: Address | None = None
@@ -167,8 +82,8 @@ class Station(Frozen):
     display: Address | None = None
     stage: Address | None = None
     cameras: dict[Side, StationCamera] = Field(min_length=1)
-    targets: dict[str, Target] = {}
-    limits: Limits = Limits()
+    targets: dict[str, AnyTarget] = {}
+    limits: CaptureLimits = CaptureLimits()
 
     @property
     def sides(self) -> tuple[Side, ...]:
@@ -179,14 +94,16 @@ class Station(Frozen):
         """Targets of one kind by name, in the station file's order."""
         return {name: target for name, target in self.targets.items() if isinstance(target, kind)}
 
-    def one(self, kind: type[TargetT]) -> str:
+    def one(self, kind: type[Target]) -> str:
         """Name of the first target of one kind. Raises InputError if the station has none."""
         for name in self.having(kind):
             return name
-        wanted = kind.model_fields["kind"].annotation
-        raise InputError(
-            f"station: no target of kind {wanted.__args__[0]!r}; add one under [targets] of the station file"  # type: ignore[union-attr]
-        )
+        wanted = get_args(kind.model_fields["kind"].annotation)[0]
+        raise InputError(f"station: no target of kind {wanted!r}; add one under [targets] of the station file")
+
+    def lacks(self, *families: str) -> tuple[str, ...]:
+        """Those of the instrument families that the station hasn't."""
+        return tuple(family for family in families if getattr(self, family) is None)
 
 
 def _with_curves(tables: Any, folder: Path) -> Any:

@@ -7,332 +7,51 @@
                      documents.jsonl  bluesky's documents
                      session.nxs      the whole session, packed when it closes (NeXus layout, gzip and shuffle)
 
-A file is written under a temporary name, flushed to the disk and renamed; only then one transaction links everything that a
-step took and marks the step done. So a file without a link may be left after a crash (it is swept away when the session
-resumes), and a link without its file never. A frame's SHA-256 is checked whenever it is read.
+A file is written under a temporary name, flushed to the disk and renamed. Then one transaction links all files of a step and
+marks the step done. A crash may leave a file without a link, which is removed when the session resumes; it never leaves a
+link without its file. A frame's SHA-256 is checked whenever it is read.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
-import io
-import json
 import os
 import secrets
 import shutil
-import time
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import h5py
 import numpy as np
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from numpy.typing import NDArray
-from pydantic import ConfigDict, TypeAdapter
-from pydantic_settings import BaseSettings, SettingsConfigDict
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
+from sqlalchemy.orm import Session, sessionmaker
 
-from lab.capture.sequences.steps import Step
-from lab.capture.station import Station
-from lab.errors import InputError
-from lab.formats.recording_set import (
-    AnyCapture,
-    Camera,
-    Manifest,
-    RecordingSet,
-    format_spectrum,
-    manifest_json,
-    parse_spectrum,
+from lab.capture.durable_files import Lock, npy_bytes, write_durably
+from lab.capture.nexus import write_nexus
+from lab.capture.records import (
+    CaptureInfo,
+    JournalEntry,
+    ResultInfo,
+    Role,
+    Run,
+    SessionInfo,
+    SessionState,
+    StoredFile,
+    now,
 )
+from lab.capture.session_files import PACK, SessionFiles, StoredPlace
+from lab.capture.settings import Settings
+from lab.capture.station import Station
+from lab.capture.tables import CaptureRow, FileRow, KeyRow, ResultRow, SessionRow, StepRow, open_engine, upgrade
+from lab.capture_kinds.base import CAPTURES, Capture, Step
+from lab.errors import InputError
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
+from lab.formats.spectrum_csv import format_spectrum
 from sim.camera import Side
-from sim.parameters import Frozen
 from sim.spectrum import Spectrum
-
-SessionState = Literal["created", "running", "paused", "interrupted", "failed", "finished"]
-JobState = Literal["queued", "running", "done", "failed", "cancelled"]
-Role = Literal["frame", "spectrum", "target"]
-_CAPTURE: TypeAdapter[AnyCapture] = TypeAdapter(AnyCapture)
-PACK = "session.nxs"
-_GZIP_LEVEL = 1  # of frames that are mostly noise, level 6 saves 2 % more and takes three times as long
-_PACKERS = 2
-
-
-class Settings(BaseSettings):
-    """Where data are kept and where work is done; from the environment, `CALIBENCH_DATA` and so on."""
-
-    model_config = SettingsConfigDict(env_prefix="CALIBENCH_")
-
-    data: Path = Path("calibench-data")
-    database_url: str | None = None  # None: SQLite in the data folder
-    scheduler: str | None = None  # address of a Dask scheduler; None: in this process
-
-    @property
-    def url(self) -> str:
-        """The registry's SQLAlchemy URL."""
-        return self.database_url or f"sqlite:///{(self.data / 'registry.sqlite').resolve()}"
-
-
-# --- the registry's tables ---------------------------------------------------------------------------------------------
-
-
-class Base(DeclarativeBase):
-    """The registry's tables. A change here needs a revision in `lab/capture/migrations/versions`."""
-
-    type_annotation_map = {dict[str, Any]: sa.JSON, list[Any]: sa.JSON, datetime: sa.DateTime(timezone=True)}
-
-
-class SessionRow(Base):
-    __tablename__ = "sessions"
-
-    id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
-    name: Mapped[str] = mapped_column(sa.Text, default="")
-    notes: Mapped[str] = mapped_column(sa.Text, default="")
-    created: Mapped[datetime]
-    closed: Mapped[datetime | None]
-    state: Mapped[str] = mapped_column(sa.String(20))
-    error: Mapped[str | None] = mapped_column(sa.Text)
-    station: Mapped[dict[str, Any]]
-    calibration: Mapped[dict[str, Any]]
-    cameras: Mapped[dict[str, Any]]
-    runs: Mapped[list[Any]]
-    packed: Mapped[bool] = mapped_column(default=False)
-
-
-class StepRow(Base):
-    """The journal: a step is done when `finished` is set."""
-
-    __tablename__ = "steps"
-    __table_args__ = (sa.UniqueConstraint("session_id", "step_id"),)
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    session_id: Mapped[str] = mapped_column(sa.ForeignKey("sessions.id", ondelete="CASCADE"), index=True)
-    position: Mapped[int]
-    step_id: Mapped[str] = mapped_column(sa.String(120))
-    spec: Mapped[dict[str, Any]]
-    started: Mapped[datetime | None]
-    finished: Mapped[datetime | None]
-    result: Mapped[dict[str, Any] | None]
-
-
-class FileRow(Base):
-    """A file of a session, immutable. `pack_index`: where a frame lies in the packed session."""
-
-    __tablename__ = "files"
-    __table_args__ = (sa.UniqueConstraint("session_id", "path"),)
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    session_id: Mapped[str] = mapped_column(sa.ForeignKey("sessions.id", ondelete="CASCADE"), index=True)
-    role: Mapped[str] = mapped_column(sa.String(20))
-    path: Mapped[str] = mapped_column(sa.String(300))
-    sha256: Mapped[str] = mapped_column(sa.String(64))
-    bytes: Mapped[int]
-    side: Mapped[str | None] = mapped_column(sa.String(10))
-    pack_index: Mapped[int | None]
-
-
-class CaptureRow(Base):
-    __tablename__ = "captures"
-    __table_args__ = (sa.UniqueConstraint("session_id", "name"),)
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    session_id: Mapped[str] = mapped_column(sa.ForeignKey("sessions.id", ondelete="CASCADE"), index=True)
-    step: Mapped[int] = mapped_column(sa.ForeignKey("steps.id", ondelete="CASCADE"))
-    file: Mapped[int] = mapped_column(sa.ForeignKey("files.id", ondelete="CASCADE"))
-    name: Mapped[str] = mapped_column(sa.String(160))
-    kind: Mapped[str] = mapped_column(sa.String(20))
-    side: Mapped[str] = mapped_column(sa.String(10))
-    document: Mapped[dict[str, Any]]
-
-
-class JobRow(Base):
-    __tablename__ = "jobs"
-
-    id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
-    kind: Mapped[str] = mapped_column(sa.String(20))
-    source: Mapped[str] = mapped_column(sa.Text)
-    state: Mapped[str] = mapped_column(sa.String(20), index=True)
-    progress: Mapped[float] = mapped_column(default=0.0)
-    message: Mapped[str] = mapped_column(sa.Text, default="")
-    error: Mapped[str | None] = mapped_column(sa.Text)
-    cancel_requested: Mapped[bool] = mapped_column(default=False)
-    runner: Mapped[str] = mapped_column(sa.String(40))
-    created: Mapped[datetime]
-    started: Mapped[datetime | None]
-    finished: Mapped[datetime | None]
-
-
-class ResultRow(Base):
-    __tablename__ = "results"
-
-    id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
-    job_id: Mapped[str | None] = mapped_column(sa.ForeignKey("jobs.id", ondelete="SET NULL"), index=True)
-    source: Mapped[str] = mapped_column(sa.Text, index=True)
-    kind: Mapped[str] = mapped_column(sa.String(20))
-    created: Mapped[datetime]
-    document: Mapped[dict[str, Any]]
-
-
-class KeyRow(Base):
-    """An API key: only its hash (see `api.security`)."""
-
-    __tablename__ = "api_keys"
-
-    name: Mapped[str] = mapped_column(sa.String(100), primary_key=True)
-    scope: Mapped[str] = mapped_column(sa.String(20))
-    sha256: Mapped[str] = mapped_column(sa.String(64), unique=True)
-    created: Mapped[datetime]
-
-
-# --- what the store tells ----------------------------------------------------------------------------------------------
-
-
-class _Row(Frozen):
-    model_config = ConfigDict(frozen=True, extra="forbid", from_attributes=True)
-
-
-class SessionInfo(_Row):
-    """A session as the registry has it."""
-
-    id: str
-    name: str
-    notes: str
-    created: datetime
-    closed: datetime | None
-    state: SessionState
-    error: str | None
-    packed: bool
-    steps: int
-    steps_done: int
-
-
-class CaptureInfo(_Row):
-    """A capture as the registry has it; `document` is its entry in a manifest."""
-
-    id: int
-    session_id: str
-    name: str
-    kind: str
-    side: str
-    document: dict[str, Any]
-
-
-class ResultInfo(_Row):
-    """A stored result; `document` as `spec/results.md` has it."""
-
-    id: str
-    job_id: str | None
-    source: str
-    kind: str
-    created: datetime
-    document: dict[str, Any]
-
-
-class Run(Frozen):
-    """Provenance of one run of a session: when, with which instruments and which versions."""
-
-    started: datetime
-    instruments: dict[str, dict[str, str]]
-    versions: dict[str, str]
-
-
-@dataclass(frozen=True)
-class StoredFile:
-    """A file that is on the disk and not linked yet."""
-
-    role: Role
-    path: str
-    sha256: str
-    bytes: int
-    side: Side | None = None
-
-
-@dataclass(frozen=True)
-class JournalEntry:
-    """A step of the journal with what came of it; `finished` None: still to do."""
-
-    step: Step
-    finished: datetime | None
-    result: dict[str, Any]
-
-
-def now() -> datetime:
-    """The time, UTC."""
-    return datetime.now(UTC)
-
-
-def npy_bytes(array: NDArray[Any]) -> bytes:
-    """An array as the bytes of its .npy file."""
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
-
-
-def write_durably(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all, and see it onto the disk: temporary name, fsync, rename, fsync of the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.rename(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
-class Lock:
-    """Held by one process at a time, and let go of by the system when that process ends, however it ends."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._file: int | None = None
-
-    def acquire(self, patience_s: float = 0.2) -> bool:
-        """Whether the lock is ours now; tries for `patience_s`, for a mere look at a lock holds it for a moment."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
-        until = time.monotonic() + patience_s
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() >= until:
-                    os.close(file)
-                    return False
-                time.sleep(0.01)
-            else:
-                self._file = file
-                return True
-
-    def release(self) -> None:
-        """Let go; doing it twice is fine."""
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
-
-    def is_held(self) -> bool:
-        """Whether anyone holds it, us included."""
-        if self._file is not None:
-            return True
-        if not self.path.exists():
-            return False
-        if taken := self.acquire(patience_s=0.0):
-            self.release()
-        return not taken
 
 
 class Store:
@@ -350,10 +69,10 @@ class Store:
             raise InputError(
                 f"{self.root}: can't be made ({error.strerror}); set CALIBENCH_DATA to a folder of yours"
             ) from error
-        self._engine = _engine(self.settings.url)
+        self._engine = open_engine(self.settings.url)
         self._read = sessionmaker(self._engine, expire_on_commit=False)
         self._write = sessionmaker(self._engine.execution_options(writes=True), expire_on_commit=False)
-        self._upgrade()
+        upgrade(self._engine, self.root)
 
     @classmethod
     def open(cls, settings: Settings | None = None) -> Store:
@@ -364,31 +83,6 @@ class Store:
     def close(self) -> None:
         """Let go of the database."""
         self._engine.dispose()
-
-    def _upgrade(self) -> None:
-        """Bring the registry to the newest revision."""
-        config = Config()
-        config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
-        newest = ScriptDirectory.from_config(config).get_current_head()
-        lock = Lock(self.root / ".migration.lock")
-        if not lock.acquire(patience_s=60.0):
-            raise InputError(
-                f"{self.root}: its registry is being migrated by another process; try again when it is done"
-            )
-        try:
-            with self._engine.execution_options(writes=True).connect() as connection:
-                if MigrationContext.configure(connection).get_current_revision() == newest:
-                    return
-                config.attributes["connection"] = connection
-                command.upgrade(config, "head")
-                connection.commit()
-        except sa.exc.DatabaseError as error:
-            raise InputError(
-                f"{self.settings.url}: isn't a registry ({str(error.orig or error).splitlines()[0]}); "
-                "set CALIBENCH_DATA to another folder"
-            ) from error
-        finally:
-            lock.release()
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Session]:
@@ -417,7 +111,7 @@ class Store:
         station: Station,
         steps: Sequence[Step],
         *,
-        calibration: Mapping[str, Any] | None = None,
+        plan: Mapping[str, Any] | None = None,
         patterns: Mapping[str, NDArray[np.uint8]] | None = None,
         name: str = "",
         notes: str = "",
@@ -447,7 +141,7 @@ class Store:
                     created=created,
                     state="created",
                     station=station.model_dump(mode="json"),
-                    calibration=dict(calibration or {}),
+                    calibration=dict(plan or {}),
                     cameras=cameras,
                     runs=[],
                 )
@@ -547,7 +241,7 @@ class Store:
         started: datetime,
         result: Mapping[str, Any],
         files: Sequence[StoredFile] = (),
-        captures: Sequence[AnyCapture] = (),
+        captures: Sequence[Capture] = (),
     ) -> bool:
         """Link everything a step took and mark it done, in one transaction. False if it was done before: nothing changes."""
         with self.transaction() as db:
@@ -633,7 +327,7 @@ class Store:
     def frame(self, capture_id: int) -> NDArray[np.uint16]:
         """The frame of a capture by its id in the registry."""
         capture = self.capture(capture_id)
-        return self.recording_set(capture.session_id).frame(_CAPTURE.validate_python(capture.document))
+        return self.recording_set(capture.session_id).frame(CAPTURES.parse(capture.document))
 
     def recording_set(self, session_id: str) -> RecordingSet:
         """A session as a recording set: what was taken so far, or all of it."""
@@ -645,16 +339,16 @@ class Store:
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
-                cameras={side: Camera.model_validate(camera) for side, camera in row.cameras.items()},  # type: ignore[misc]
-                captures=tuple(_CAPTURE.validate_python(document) for document in documents),
+                cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},  # type: ignore[misc]
+                captures=tuple(CAPTURES.parse(document) for document in documents),
             )
             files = db.execute(
                 sa.select(FileRow.path, FileRow.sha256, FileRow.side, FileRow.pack_index).where(
                     FileRow.session_id == session_id
                 )
             )
-            where = {path: _Place(sha256, side, index) for path, sha256, side, index in files}
-        return RecordingSet(manifest, source=session_id, store=_SessionFiles(self.folder(session_id), where))
+            where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in files}
+        return RecordingSet(manifest, source=session_id, files=SessionFiles(self.folder(session_id), where))
 
     # --- closing ---------------------------------------------------------------------------------------------------------
 
@@ -677,9 +371,11 @@ class Store:
             frames = [file for file in files if file.role == "frame"]
             partial = pack.with_name(f".{PACK}.partial")
             partial.unlink(missing_ok=True)
-            index = _pack(partial, recordings, info, self.runs(session_id), files, progress)
-            packed = _SessionFiles(
-                folder, {file.path: _Place(file.sha256, file.side, index[file.path]) for file in frames}, pack=partial
+            index = write_nexus(partial, recordings, info, self.runs(session_id), files, progress)
+            packed = SessionFiles(
+                folder,
+                {file.path: StoredPlace(file.sha256, file.side, index[file.path]) for file in frames},
+                pack=partial,
             )
             for file in frames:
                 packed.frame(file.path, recordings.manifest.cameras["left"])
@@ -752,32 +448,6 @@ class Store:
             db.delete(row)
 
 
-# --- the engine --------------------------------------------------------------------------------------------------------
-
-
-def _engine(url: str) -> sa.Engine:
-    try:
-        engine = sa.create_engine(url)
-    except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError, ImportError) as error:
-        raise InputError(f"registry {url!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error
-    if engine.dialect.name != "sqlite":
-        return engine
-
-    @sa.event.listens_for(engine, "connect")
-    def _pragmas(connection: Any, record: Any) -> None:
-        connection.isolation_level = None  # BEGIN is ours, below
-        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=30000"):
-            connection.execute(f"PRAGMA {pragma}").close()
-
-    @sa.event.listens_for(engine, "begin")
-    def _begin(connection: sa.Connection) -> None:
-        # A writer that began by reading would fail, not wait, where another wrote in between.
-        writes = connection.get_execution_options().get("writes")
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
-
-    return engine
-
-
 def _file_row(session_id: str, file: StoredFile) -> FileRow:
     return FileRow(
         session_id=session_id, role=file.role, path=file.path, sha256=file.sha256, bytes=file.bytes, side=file.side
@@ -787,161 +457,3 @@ def _file_row(session_id: str, file: StoredFile) -> FileRow:
 def _aware(at: datetime) -> datetime:
     """SQLite forgets the time zone; ours is always UTC."""
     return at if at.tzinfo is not None else at.replace(tzinfo=UTC)
-
-
-# --- a session's files as a recording set's ----------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Place:
-    sha256: str
-    side: str | None
-    pack_index: int | None
-
-
-class _SessionFiles:
-    """Frames, spectra and targets of a session, packed or not; each checked against the registry's SHA-256.
-
-    Knows paths only, so that it can be sent to another process.
-    """
-
-    def __init__(self, folder: Path, places: Mapping[str, _Place], pack: Path | None = None) -> None:
-        self.folder, self.places = folder, dict(places)
-        self.pack = pack or folder / PACK
-
-    def _place(self, path: str) -> _Place:
-        if path not in self.places:
-            raise InputError("isn't linked in the registry; resume the session, which takes it again")
-        return self.places[path]
-
-    def _bytes(self, path: str) -> bytes:
-        place = self._place(path)
-        try:
-            content = (self.folder / path).read_bytes()
-        except OSError as error:
-            raise InputError(f"can't be read ({error.strerror}); restore it from a backup") from error
-        return _intact(content, place)
-
-    def file(self, path: str) -> Path | None:
-        if path.startswith("lens/"):
-            return self.folder / path
-        return None if self._place(path).pack_index is not None else self.folder / path
-
-    def frame(self, path: str, camera: Camera) -> NDArray[np.uint16]:
-        place = self._place(path)
-        if place.pack_index is None:
-            return np.load(io.BytesIO(self._bytes(path)), allow_pickle=False)
-        try:
-            with h5py.File(self.pack, "r") as file:
-                frame = np.asarray(file[f"entry/instrument/{place.side}/data"][place.pack_index], np.uint16)
-        except (OSError, KeyError, ValueError) as error:
-            raise InputError(f"can't be read from {self.pack} ({error}); restore it from a backup") from error
-        _intact(npy_bytes(frame), place)
-        return frame
-
-    def spectrum(self, path: str) -> Spectrum:
-        return parse_spectrum(self._bytes(path).decode())
-
-    def target(self, path: str) -> NDArray[np.uint8]:
-        return np.load(io.BytesIO(self._bytes(path)), allow_pickle=False)
-
-    def where(self, path: str) -> str:
-        place = self.places.get(path)
-        if place is not None and place.pack_index is not None:
-            return f"{self.pack}:/entry/instrument/{place.side}/data[{place.pack_index}]"
-        return str(self.folder / path)
-
-
-def _intact(content: bytes, place: _Place) -> bytes:
-    found = hashlib.sha256(content).hexdigest()
-    if found != place.sha256:
-        raise InputError(
-            f"damaged: its SHA-256 is {found[:12]}, the registry has {place.sha256[:12]}; restore it from a backup"
-        )
-    return content
-
-
-def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
-    group = parent.create_group(name)
-    group.attrs["NX_class"] = nx_class
-    return group
-
-
-def _chunk(frame: NDArray[np.uint16]) -> bytes:
-    """A frame as HDF5's shuffle and gzip filters would leave it; zlib lets other threads run, HDF5's own filters don't."""
-    shuffled = np.ascontiguousarray(frame.astype("<u2").view(np.uint8).reshape(-1, 2).T)
-    return zlib.compress(shuffled.tobytes(), _GZIP_LEVEL)
-
-
-def _pack(
-    path: Path,
-    recordings: RecordingSet,
-    info: SessionInfo,
-    runs: Sequence[Run],
-    files: Sequence[StoredFile],
-    progress: Callable[[str, float], None] | None,
-) -> dict[str, int]:
-    """Write the NeXus-layout file; the place of every frame in its side's stack is returned.
-
-    `/entry/instrument/SIDE` is an NXdetector whose `data` stacks that side's frames in the order in which they were taken;
-    `/entry/spectra` and `/entry/targets` hold the rest, `/entry/manifest` the manifest as JSON.
-    """
-    first = {capture.frame: capture for capture in reversed(recordings.manifest.captures)}
-    frames = [stored for stored in files if stored.role == "frame"]
-    index: dict[str, int] = {}
-    with h5py.File(path, "w") as file:
-        file.attrs["NX_class"] = "NXroot"
-        file.attrs["default"] = "entry"
-        entry = _group(file, "entry", "NXentry")
-        entry["title"] = info.name or info.id
-        entry["entry_identifier"] = info.id
-        entry["start_time"] = info.created.isoformat()
-        entry["program_name"] = "calibench"
-        entry["manifest"] = manifest_json(recordings.manifest)
-        entry["provenance"] = json.dumps([run.model_dump(mode="json") for run in runs])
-        instrument = _group(entry, "instrument", "NXinstrument")
-        done = 0
-        for side in recordings.sides:
-            camera = recordings.manifest.cameras[side]
-            mine = [stored for stored in frames if stored.side == side]
-            detector = _group(instrument, side, "NXdetector")
-            data = detector.create_dataset(
-                "data",
-                shape=(len(mine), camera.rows, camera.cols),
-                dtype=np.dtype("<u2"),
-                chunks=(1, camera.rows, camera.cols) if mine else None,
-                compression="gzip" if mine else None,
-                compression_opts=_GZIP_LEVEL if mine else None,
-                shuffle=bool(mine),
-            )
-            data.attrs["units"] = "DN"
-            with ThreadPoolExecutor(_PACKERS, thread_name_prefix="pack") as pool:
-                chunks = pool.map(lambda stored: _chunk(recordings.frame(first[stored.path])), mine)
-                for at, (stored, chunk) in enumerate(zip(mine, chunks, strict=True)):
-                    data.id.write_direct_chunk((at, 0, 0), chunk)
-                    index[stored.path] = at
-                    done += 1
-                    if progress:
-                        progress("packing the session", done / len(frames))
-            detector["frame_name"] = [stored.path for stored in mine]
-            detector["count_time"] = [first[stored.path].exposure_s for stored in mine]
-            detector["count_time"].attrs["units"] = "s"
-            detector["bit_depth_readout"] = camera.bit_depth
-            if camera.pixel_pitch_um is not None:
-                for axis in ("x_pixel_size", "y_pixel_size"):
-                    detector[axis] = camera.pixel_pitch_um
-                    detector[axis].attrs["units"] = "um"
-        spectra = _group(entry, "spectra", "NXcollection")
-        targets = _group(entry, "targets", "NXcollection")
-        for stored in files:
-            name = Path(stored.path).stem
-            if stored.role == "spectrum":
-                spectrum = recordings.spectrum(stored.path)
-                group = _group(spectra, name, "NXdata")
-                group.attrs["signal"], group.attrs["axes"] = "value", "wavelength"
-                group["value"] = spectrum.value
-                group["wavelength"] = spectrum.wavelength_nm
-                group["wavelength"].attrs["units"] = "nm"
-            elif stored.role == "target":
-                targets.create_dataset(name, data=recordings.target(stored.path), compression="gzip")
-    return index

@@ -34,7 +34,8 @@ FitFile = Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="a f
 
 def open_store(folder: Path | None = None) -> Store:
     """The data folder: `folder`, else what CALIBENCH_DATA says; made if it isn't there."""
-    from lab.capture.store import Settings, Store
+    from lab.capture.settings import Settings
+    from lab.capture.store import Store
 
     settings = Settings() if folder is None else Settings(data=folder)
     return Store.open(settings)
@@ -42,7 +43,7 @@ def open_store(folder: Path | None = None) -> Store:
 
 def existing_store() -> Store | None:
     """The store of the settings' data folder; None where there is no such folder. Reading never makes one."""
-    from lab.capture.store import Settings
+    from lab.capture.settings import Settings
 
     return open_store() if Settings().data.is_dir() else None
 

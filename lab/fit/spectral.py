@@ -21,9 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, optimize, special
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
 from lab.fit.weighted_lines import DarkLine, dark_line
-from lab.formats.recording_set import Capture, Flat, Narrowband, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
 from sim.camera import Side
 from sim.optics.illumination import irradiance_factor
@@ -406,7 +409,7 @@ class _Recording:
         self.recordings, self.side, self.noise = recordings, side, noise
         self.camera = recordings.camera(side)
         self.remarks: list[str] = []
-        self.narrowband: list[Narrowband | Flat] = [
+        self.narrowband: list[NarrowbandCapture | FlatCapture] = [
             c for c in recordings.captures("narrowband", side) if c.exposure_s > 0
         ]
         if len({self._path(c) for c in self.narrowband}) < MIN_LIGHTS:
@@ -426,7 +429,7 @@ class _Recording:
         self.darks: dict[tuple[float, str], DarkLine] = {}
 
     @staticmethod
-    def _path(capture: Narrowband | Flat) -> str:
+    def _path(capture: NarrowbandCapture | FlatCapture) -> str:
         return cast(str, capture.radiance)
 
     def _conversion_gain(self) -> tuple[float, float]:
@@ -626,7 +629,7 @@ class _Recording:
     def _with_flats(self, signals: dict[str, _Signals]) -> dict[str, _Signals]:
         """The signals and those of the flats whose radiance is known: one for each spectrum."""
         rates: dict[tuple[str, str], list[tuple[float, float]]] = {}
-        used: dict[str, list[Flat]] = {}
+        used: dict[str, list[FlatCapture]] = {}
         for flat in self.recordings.captures("flat", self.side):
             if flat.radiance is not None and flat.exposure_s > 0:
                 used.setdefault(flat.radiance, []).append(flat)
@@ -712,7 +715,7 @@ class _Recording:
         """First and last wavelength that the lights can speak of: narrowband by the centroids of their measured
         spectra (their names may be some nm off), broadband wholly.
         """
-        if any(isinstance(capture, Flat) for capture in self.narrowband):
+        if any(isinstance(capture, FlatCapture) for capture in self.narrowband):
             return float(self.wave[0]), float(self.wave[-1])
         paths = {self._path(capture) for capture in self.narrowband}
         centroids = []

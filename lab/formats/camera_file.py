@@ -31,8 +31,9 @@ from pydantic import BaseModel, ValidationError
 
 from lab.errors import InputError
 from lab.formats.raw_file import replacing
-from lab.formats.recording_set import RecordingSet, parse_spectrum
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit
+from lab.formats.spectrum_csv import parse_spectrum
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Lens, Side
 from sim.effects.base import Effect

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lab.errors import InputError
 from lab.formats.importers.images import decoded
-from lab.formats.recording_set import parse_curve
+from lab.formats.spectrum_csv import parse_curve
 from sim.camera import CameraModel
 from sim.scene import Scene, SpectralImage
 from sim.scene.catalogue import SCENES, Cube, PictureOnScreen, View, scene_by_name

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtri
 
-from lab.formats.recording_set import Camera, RecordingSet
+from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit
 from sim.camera import CameraModel, Geometry, Lens, Side
 from sim.effects.base import Effect
@@ -85,7 +85,7 @@ def camera_model(
     )
 
 
-def assumptions(camera: Camera) -> tuple[Assumed, ...]:
+def assumptions(camera: DataSheet) -> tuple[Assumed, ...]:
     """What `camera_model` has to assume of this camera whatever the fits find."""
     found = []
     if camera.f_number is None:

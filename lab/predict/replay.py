@@ -12,20 +12,20 @@ from functools import cached_property
 
 import numpy as np
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.transfer_function import EdgeMtf
-from lab.formats.recording_set import Capture, Chart, Dark, Flat, Narrowband, RecordingSet, SlantedEdge
+from lab.formats.recording_set import RecordingSet
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
 from sim.forward import Exposure, dark_electrons, expected_electrons, read_out
-from sim.scene.scenes import Darkness, EdgeRegion, KnifeEdge, ReflectanceChart, Scene, UniformField
+from sim.scene.scenes import EdgeRegion, KnifeEdge, Scene
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
-#: The kinds of capture whose scene a manifest tells; screens and boards also need where they stood.
-REPLAYED = (Dark, Flat, Narrowband, Chart, SlantedEdge)
 #: Light of equal energy, for edges in light that nobody measured: (nm), W sr^-1 m^-2 nm^-1.
 _EQUAL = Spectrum.of((380.0, 780.0), (0.01, 0.01))
 
@@ -39,12 +39,11 @@ class Replay:
     @cached_property
     def captures(self) -> tuple[Capture, ...]:
         """Those that can be replayed, in the manifest's order."""
-        return tuple(c for c in self.recordings.captures(side=self.side) if self._tells_its_light(c))
+        return tuple(c for c in self.recordings.captures(side=self.side) if self._tells_its_scene(c))
 
-    def _tells_its_light(self, capture: Capture) -> bool:
-        if isinstance(capture, Flat):
-            return capture.radiance is not None
-        return isinstance(capture, REPLAYED)
+    def _tells_its_scene(self, capture: Capture) -> bool:
+        """Whether the manifest tells the scene, or the recordings do (an edge's place). Screens and boards also need their pose."""
+        return isinstance(capture, SlantedEdgeCapture) or capture.scene(lambda path: _EQUAL) is not None
 
     @cached_property
     def _start(self) -> float | None:
@@ -78,40 +77,36 @@ class Replay:
         return repr(told) if steady else capture.id
 
     def _electrons(self, capture: Capture, effects: Sequence[Effect]) -> tuple[Exposure, FloatArray]:
-        edge = self._edge(capture) if isinstance(capture, SlantedEdge) else None
+        edge = self._edge(capture) if isinstance(capture, SlantedEdgeCapture) else None
         exposure = Exposure(
             self._scene(capture, edge), capture.exposure_s, capture.gain_db or 0.0, capture.temperature_c,
             0.0 if capture.time is None or self._start is None else capture.time.timestamp() - self._start, placed="image",
         )  # fmt: skip
         electrons = expected_electrons(self.camera, exposure, effects)
-        if isinstance(capture, SlantedEdge):
+        if isinstance(capture, SlantedEdgeCapture):
             electrons = self._levelled(capture, exposure, electrons, effects)
         return exposure, electrons
 
     def _scene(self, capture: Capture, edge: EdgeMtf | None) -> Scene:
-        match capture:
-            case Dark():
-                return Darkness()
-            case Flat() | Narrowband() if capture.radiance is not None:
-                return UniformField(self.recordings.spectrum(capture.radiance), capture.kind)
-            case Chart():
-                return ReflectanceChart(capture.corners, self.recordings.spectrum(capture.radiance), capture.chart)
-            case SlantedEdge() if edge is not None:
-                light = self.recordings.spectrum(capture.light_radiance) if capture.light_radiance else _EQUAL
-                dark = Spectrum.of(*(light.arrays[0], 0.0 * light.arrays[1]))
-                return KnifeEdge((_placed(self._region(capture), edge),), dark, light)
-        raise NotDetermined("replay", f"{capture.id} ({capture.kind}) doesn't tell what stood before the camera")
+        if isinstance(capture, SlantedEdgeCapture) and edge is not None:
+            light = self.recordings.spectrum(capture.light_radiance) if capture.light_radiance else _EQUAL
+            dark = Spectrum.of(*(light.arrays[0], 0.0 * light.arrays[1]))
+            return KnifeEdge((_placed(self._region(capture), edge),), dark, light)
+        scene = capture.scene(self.recordings.spectrum)
+        if scene is None:
+            raise NotDetermined("replay", f"{capture.id} ({capture.kind}) doesn't tell what stood before the camera")
+        return scene
 
-    def _edge(self, capture: SlantedEdge) -> EdgeMtf:
+    def _edge(self, capture: SlantedEdgeCapture) -> EdgeMtf:
         """In the channel with most pixels."""
         channel = "G" if "G" in self.camera.channels else self.camera.channels[0]
         return measure_edge(self.recordings, [capture], channel)
 
-    def _region(self, capture: SlantedEdge) -> tuple[int, int, int, int]:
+    def _region(self, capture: SlantedEdgeCapture) -> tuple[int, int, int, int]:
         return capture.region or (0, 0, self.camera.rows, self.camera.cols)
 
     def _levelled(
-        self, capture: SlantedEdge, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
+        self, capture: SlantedEdgeCapture, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
     ) -> FloatArray:
         """Edges' two levels by channel as the recording has them: a straight line from the model's electrons to it, by least squares."""
         dark = np.broadcast_to(np.asarray(dark_electrons(self.camera, exposure, effects), float), electrons.shape)

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from lab.capture_kinds.bernoulli import BernoulliCapture
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.patches import Patch as PatchLevel
 from lab.diagnose.measurements.patches import patch_covariance, patch_levels
@@ -21,7 +23,7 @@ from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.fit.psf.expected_kernel import expected_kernel
 from lab.formats.camera_file import CameraFile
-from lab.formats.recording_set import Bernoulli, RecordingSet, SlantedEdge
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, Check, Curve, FitResult, KernelPair, Patch, Skipped, ValidationResult
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
@@ -168,10 +170,10 @@ def _edges(
     stated = recordings.camera(side)
     if stated.f_number is None or stated.pixel_pitch_um is None:
         raise NotDetermined("mtf", "f-number or pixel pitch isn't stated: no diffraction to predict the edges from")
-    captures = recordings.captures(SlantedEdge, side)
+    captures = recordings.captures(SlantedEdgeCapture, side)
     if not captures:
         raise NotDetermined("mtf", "no slanted-edge captures")
-    settings: dict[object, list[SlantedEdge]] = {}
+    settings: dict[object, list[SlantedEdgeCapture]] = {}
     for found in captures:
         key = (found.region, found.angle_deg, found.exposure_s, found.gain_db, found.light_radiance)
         settings.setdefault(key, []).append(found)
@@ -208,7 +210,7 @@ def _edges(
 
 def _predicted_mtf(
     recordings: RecordingSet,
-    capture: SlantedEdge,
+    capture: SlantedEdgeCapture,
     channel: str,
     measured: EdgeMtf,
     model: CameraModel,
@@ -238,7 +240,7 @@ def _kernels(
 ) -> list[Check]:
     if not fit.psf:
         raise NotDetermined("psf", "no kernel was fitted")
-    screens = {c.id: c.screen for c in recordings.captures(Bernoulli, side)}
+    screens = {c.id: c.screen for c in recordings.captures(BernoulliCapture, side)}
     by_capture: dict[str, list[KernelPair]] = {}
     numbers: dict[str, list[tuple[FloatArray, FloatArray, FloatArray]]] = {}
     for found in fit.psf:

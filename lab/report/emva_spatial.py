@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.fit.noise.dark_pixels import stack_of
-from lab.formats.recording_set import Dark, Flat, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Emva1288, Emva1288Points
 from lab.report.charts import AFTER, BEFORE, Trace, axis, layout
 from lab.report.emva_plot import EmvaPlot, curve, floats, markers
@@ -61,7 +63,7 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
     """The stacks that the spatial figures come from, read again."""
     darks = [c for c in recordings.captures("dark", side) if c.exposure_s == points.stack_dark_exposure_s]
 
-    def light(flat: Flat) -> float:
+    def light(flat: FlatCapture) -> float:
         return flat.photons_per_pixel if flat.photons_per_pixel is not None else flat.exposure_s
 
     flats = [
@@ -72,7 +74,7 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
     if not darks:
         return None
 
-    def mean(captures: list[Dark] | list[Flat]) -> tuple[FloatArray, float]:
+    def mean(captures: list[DarkCapture] | list[FlatCapture]) -> tuple[FloatArray, float]:
         stack = stack_of(recordings, captures)
         camera = recordings.camera(side)
         left = 0.0

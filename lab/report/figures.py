@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
 from sim.camera import Side
 
@@ -64,7 +64,7 @@ def measured(value: float, std: float | None = None, unit: str = "") -> str:
     return number if unit in ("", "1") else f"{number} {SHOWN_UNITS.get(unit, unit)}"
 
 
-def noise_figures(noise: NoiseFit, camera: Camera | None = None) -> Iterator[Figure]:
+def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[Figure]:
     """What the photon transfer gave, beside the maker's word."""
     for field, (name, unit) in NOISE.items():
         value = getattr(noise, field)
@@ -84,7 +84,7 @@ def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, floa
     return (min(found), max(found), len(found)) if found else None
 
 
-def camera_figures(fit: CameraFit, camera: Camera | None = None) -> Iterator[Figure]:
+def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[Figure]:
     """All key figures of one camera."""
     if fit.noise is not None:
         yield from noise_figures(fit.noise, camera)
@@ -139,7 +139,7 @@ def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tu
     )
 
 
-def by_side(fit: FitResult, cameras: dict[Side, Camera]) -> list[tuple[str, dict[Side, Figure]]]:
+def by_side(fit: FitResult, cameras: dict[Side, DataSheet]) -> list[tuple[str, dict[Side, Figure]]]:
     """Rows of the table of key figures, name -> figure of each side; what one side lacks keeps its place in the order."""
     names: list[str] = []
     rows: dict[str, dict[Side, Figure]] = {}

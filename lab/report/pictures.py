@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 from lab.formats.results import Patch
 from sim.sensor.mosaic import planes
 
@@ -95,7 +95,7 @@ def patch_colours(patches: tuple[Patch, ...]) -> dict[str, tuple[str, str]]:
     return {name: (css(measured[name]), css(predicted[name])) for name in measured}
 
 
-def frame_picture(frame: NDArray[np.uint16], camera: Camera, width_px: int = 480) -> str:
+def frame_picture(frame: NDArray[np.uint16], camera: DataSheet, width_px: int = 480) -> str:
     """A frame as a viewer wants it: one pixel per Bayer cell, black subtracted, channels scaled alike to their 99.5 %."""
     split: dict[str, Any] = planes(frame.astype(np.float32) - float(camera.black_level_dn or 0.0), camera.cfa)
     if camera.cfa == "MONO":

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from api.preview import GAMMA, preview_png
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 from sim.sensor.mosaic import phases
 
 
-def camera(cfa: str, rows: int = 40, cols: int = 60) -> Camera:
-    return Camera(rows=rows, cols=cols, cfa=cfa, bit_depth=12, black_level_dn=100, white_level_dn=4000)  # type: ignore[arg-type]
+def camera(cfa: str, rows: int = 40, cols: int = 60) -> DataSheet:
+    return DataSheet(rows=rows, cols=cols, cfa=cfa, bit_depth=12, black_level_dn=100, white_level_dn=4000)  # type: ignore[arg-type]
 
 
 def picture(*args: Any, **options: Any) -> np.ndarray[Any, Any]:

@@ -12,10 +12,11 @@ import sqlalchemy as sa
 from distributed import LocalCluster
 
 import lab.jobs
-from lab.capture.sequences.calibration import Calibration
-from lab.capture.sequences.dark import DarkSequence
+from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession, Progress
-from lab.capture.store import JobRow, Store
+from lab.capture.store import Store
+from lab.capture.tables import JobRow
+from lab.capture_kinds.dark import DarkSequence
 from lab.errors import InputError, NotDetermined
 from lab.jobs import JobInfo, JobRunner
 from lab.pipeline import CaptureRequest, Goal, PipelineProgress, PipelineRequest, Tell, capture_here
@@ -31,7 +32,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 @pytest.fixture
 def session(store: Store) -> str:
-    darks = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.1), frames=2))
+    darks = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
     run = CaptureSession.start(store, fake_bench.station(), darks, connect=fake_bench.Bench().drivers)
     return run.run().id
 
@@ -192,7 +193,7 @@ def test_a_scheduler_that_is_not_there_is_said(store: Store) -> None:
 
 def test_a_job_that_captures_runs_here_and_is_cancelled_in_good_order(store: Store) -> None:
     bench = fake_bench.Bench(delay_s=0.05)
-    darks = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.1), frames=2))
+    darks = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
     waiting = CaptureSession.start(store, fake_bench.station(), darks, connect=bench.drivers).id
 
     def capturer(request: CaptureRequest, tell: Callable[[Progress], None]) -> str:

@@ -13,10 +13,10 @@ import lab.diagnose
 import lab.fit
 import lab.predict.validate
 import lab.report
-from lab.capture.sequences.calibration import Calibration
-from lab.capture.sequences.dark import DarkSequence
+from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.store import Store
+from lab.capture_kinds.dark import DarkSequence
 from lab.diagnose import Diagnosis
 from lab.diagnose.outcome.next_capture import WORTH_TAKING, Proposal
 from lab.errors import Cancelled, InputError
@@ -35,7 +35,7 @@ from lab.pipeline import (
 )
 from tests.lab import fake_bench
 
-DARKS = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.1), frames=2))
+DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 
 
 @pytest.fixture
@@ -162,7 +162,7 @@ def test_the_whole_pipeline_captures_and_leaves_everything_in_the_sessions_folde
     store: Store, steps: list[str]
 ) -> None:
     told: list[PipelineProgress] = []
-    request = PipelineRequest("pipeline", capture=CaptureRequest(calibration=DARKS, name="darks"))
+    request = PipelineRequest("pipeline", capture=CaptureRequest(plan=DARKS, name="darks"))
     found = run_pipeline(request, told.append, store=store, capturer=Bench(store))
     assert steps == ["fit", "validate", "diagnose", "report"]
     assert found.session is not None
@@ -187,7 +187,7 @@ def test_a_cancelled_capture_is_resumed_by_the_next_pipeline(store: Store, steps
     bench = Bench(store)
     with pytest.raises(Cancelled):
         run_pipeline(
-            PipelineRequest("pipeline", capture=CaptureRequest(calibration=DARKS)), cancel, store=store, capturer=bench
+            PipelineRequest("pipeline", capture=CaptureRequest(plan=DARKS)), cancel, store=store, capturer=bench
         )
     assert steps == []
     (session,) = store.sessions()
@@ -285,7 +285,7 @@ def test_resolving_captures_and_diagnoses_until_nothing_can_settle_the_tie(
 
     monkeypatch.setattr(lab.diagnose, "examine", examine)
     bench, remarks = Bench(store), []
-    request = PipelineRequest("pipeline", capture=CaptureRequest(calibration=DARKS, name="one"), resolve=True)
+    request = PipelineRequest("pipeline", capture=CaptureRequest(plan=DARKS, name="one"), resolve=True)
 
     def tell(progress: PipelineProgress) -> None:
         if progress.remark:

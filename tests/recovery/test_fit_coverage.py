@@ -11,7 +11,7 @@ import pytest
 from lab.fit.noise.level_statistics import MeasuredLevel, level_statistics
 from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.spectral import estimate_sensitivity
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 from lab.formats.results import NoiseFit
 from sim.camera import CameraModel, Lens
 from sim.sensor.electrons import FixedPattern, sample_from
@@ -72,7 +72,7 @@ def levels(
 
 def test_photon_transfer_covers() -> None:
     camera = model("RGGB", 64, 96)
-    stated = Camera(rows=64, cols=96, cfa="RGGB", bit_depth=12)
+    stated = DataSheet(rows=64, cols=96, cfa="RGGB", bit_depth=12)
     rng = np.random.default_rng(20)
     fits: list[NoiseFit] = []
     for _ in range(DRAWS):
@@ -102,7 +102,7 @@ def test_gain_of_full_size_frames(case: str) -> None:
     """50 levels of two 640 x 480 frames: 0.1 % rms in all three cases, where a straight line is off by 1.6 and 2.1 %."""
     draws, gain, full = 12, 0.5, 7800.0
     rng = np.random.default_rng(21)
-    stated = Camera(rows=480, cols=640, cfa="MONO", bit_depth=12)
+    stated = DataSheet(rows=480, cols=640, cfa="MONO", bit_depth=12)
 
     def frame(electrons: float) -> np.ndarray:
         loss = 0.02 * electrons / full if case == "brighter_fatter" else 0.0

@@ -16,7 +16,7 @@ from lab.fit.noise.dark_pixels import DarkPixels
 from lab.fit.noise.level_statistics import MeasuredLevel, Stack
 from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.weighted_lines import linearity
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 from lab.formats.results import NoiseFit
 from sim.sensor.mosaic import planes
 
@@ -112,7 +112,7 @@ class Drawn:
             for t in truth.flats
         ]
         rows, cols = truth.shape
-        return noise_fit(darks, flats, Camera(rows=rows, cols=cols, cfa=truth.cfa, bit_depth=12), pixels=pixels)
+        return noise_fit(darks, flats, DataSheet(rows=rows, cols=cols, cfa=truth.cfa, bit_depth=12), pixels=pixels)
 
 
 def quadratic_sum(parts: tuple[float, ...]) -> float:

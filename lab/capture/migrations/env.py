@@ -5,7 +5,8 @@ from __future__ import annotations
 from alembic import context
 from sqlalchemy import create_engine
 
-from lab.capture.store import Base, Settings
+from lab.capture.settings import Settings
+from lab.capture.tables import Base
 
 
 def run() -> None:

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.formats.camera_file import CameraFile
-from lab.formats.recording_set import Flat, Narrowband, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
 from lab.predict.replay import Replay
 from sim.camera import CameraModel, Side
@@ -81,7 +83,7 @@ def _at_recorded_levels(recordings: RecordingSet, side: Side, camera: CameraMode
     replay = Replay(recordings, side, camera)
     ratios = []
     for capture in replay.captures:
-        if isinstance(capture, Flat | Narrowband):
+        if isinstance(capture, FlatCapture | NarrowbandCapture):
             lit = float(recordings.frame(capture).mean()) - camera.black_level_dn
             predicted = float(replay.expected(capture).mean()) - camera.black_level_dn
             if predicted > LEAST_SIGNAL_SHARE * (camera.white_level_dn - camera.black_level_dn):

@@ -16,10 +16,11 @@ from scipy import ndimage, sparse
 from scipy.linalg import block_diag
 from scipy.special import ndtr
 
+from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.neighbours import held_out_flats
 from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, held_out_of
 from lab.errors import NotDetermined
-from lab.formats.recording_set import Flat, Narrowband
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -165,9 +166,9 @@ def _counted(study: Study) -> dict[bool, _Counts]:
     size = int(study.camera.white_level_dn) + 1
     counts = {out: _Counts(np.zeros(size), np.zeros(size), []) for out in (False, True)}
     out = set(study.once(held_out_flats))
-    groups = study.groups(Narrowband, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     out |= set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
-    for kind in (Flat, Narrowband):
+    for kind in (FlatCapture, NarrowbandCapture):
         for capture in study.recordings.captures(kind, study.side):
             if not capture.gain_db:
                 counts[capture.id in out].take(study, capture)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 from scipy.special import betainc, chdtrc, chdtri, digamma, gammaln, ndtr, polygamma, xlogy
 
+from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.summaries import (
     BLACK_FLOOR_DN,
     STATED_BLACK_DN,
@@ -29,7 +30,6 @@ from lab.diagnose.measurements.summaries import (
     held_out_of,
 )
 from lab.errors import NotDetermined
-from lab.formats.recording_set import Dark
 from sim.effects.base import Effect, Lines
 from sim.spectrum import FloatArray
 
@@ -68,11 +68,11 @@ class Condition:
 
     exposure_s: float
     temperature_c: float | None
-    seen: tuple[Dark, ...]
-    held_out: tuple[Dark, ...]
+    seen: tuple[DarkCapture, ...]
+    held_out: tuple[DarkCapture, ...]
 
     @property
-    def captures(self) -> tuple[Dark, ...]:
+    def captures(self) -> tuple[DarkCapture, ...]:
         return (*self.seen, *self.held_out)
 
     @property
@@ -133,12 +133,12 @@ def conditions(study: Study) -> list[Condition]:
 
     Of two repeats both are seen, as noise needs both: then every third condition is held out.
     """
-    captures = study.recordings.captures(Dark, study.side)
+    captures = study.recordings.captures(DarkCapture, study.side)
     if not captures:
         raise NotDetermined("dark", "no dark captures")
     gains = [c.gain_db for c in captures]
     usual = max(dict.fromkeys(gains), key=gains.count)
-    groups: list[list[Dark]] = []
+    groups: list[list[DarkCapture]] = []
     for c in sorted(
         (c for c in captures if c.gain_db == usual),
         key=lambda c: (c.temperature_c is None, c.temperature_c or 0.0),

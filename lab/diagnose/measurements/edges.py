@@ -24,6 +24,7 @@ from scipy import sparse
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.summaries import (
     SPECTRAL_HOOKS,
     Block,
@@ -42,7 +43,6 @@ from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.samples import Region
 from lab.fit.mtf.transfer_function import EdgeGeometry, EdgeMtf
 from lab.fit.rounding import rounding_waves_dn
-from lab.formats.recording_set import SlantedEdge
 from sim.effects.base import Effect
 from sim.forward import common_wavelengths, electron_rate, transfer_at, wavelength_shares
 from sim.optics.illumination import optical_axis_px, relative_illumination
@@ -126,7 +126,7 @@ def edge_block(study: Study) -> Block:
 class _Edge:
     """One edge in one channel, of the repeats that choice may see or of those held out."""
 
-    part: tuple[SlantedEdge, ...]
+    part: tuple[SlantedEdgeCapture, ...]
     channel: str
     measured: EdgeMtf
     held_out: bool
@@ -151,7 +151,7 @@ def _measured(study: Study) -> list[_Edge]:
             "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
         )
     groups = study.groups(
-        SlantedEdge, lambda c: (c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm)
+        SlantedEdgeCapture, lambda c: (c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm)
     )
     if not groups:
         raise NotDetermined("slanted_edge", "no slanted-edge captures")
@@ -182,11 +182,11 @@ def _measured(study: Study) -> list[_Edge]:
     return edges
 
 
-def _found(study: Study, capture: SlantedEdge) -> list[Region]:
+def _found(study: Study, capture: SlantedEdgeCapture) -> list[Region]:
     return [f.region for f in find_edges(study.recordings.frame(capture), study.stated.cfa, study.saturation_dn)]
 
 
-def _direction_deg(study: Study, capture: SlantedEdge, region: Region, angle_deg: float) -> float:
+def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, angle_deg: float) -> float:
     """Of the edge's normal that points to the light."""
     row0, col0, row1, col1 = region
     frame = np.asarray(study.recordings.frame(capture)[row0:row1, col0:col1], float)
@@ -197,7 +197,7 @@ def _direction_deg(study: Study, capture: SlantedEdge, region: Region, angle_deg
 
 
 def _fixed_share(
-    study: Study, group: Sequence[SlantedEdge], frames: int, channel: str, region: Region, measured: EdgeMtf
+    study: Study, group: Sequence[SlantedEdgeCapture], frames: int, channel: str, region: Region, measured: EdgeMtf
 ) -> float:
     """Share of the variance of a mean of `frames` frames that doesn't differ from repeat to repeat (pixels' response)."""
     total = measured.noise_std_light**2

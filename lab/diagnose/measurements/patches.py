@@ -10,6 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.bernoulli import BernoulliCapture
+from lab.capture_kinds.black import BlackCapture
+from lab.capture_kinds.chart import ChartCapture
+from lab.capture_kinds.checkerboard import CheckerboardCapture
+from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.curves import CurveSlopes
 from lab.diagnose.measurements.summaries import (
     CLIPPED_SHARE,
@@ -26,7 +32,7 @@ from lab.diagnose.measurements.summaries import (
 from lab.diagnose.measurements.veils import Surroundings, even_share, halo_light, harmonics, wide_contrast
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
-from lab.formats.recording_set import Bernoulli, Black, Capture, Chart, Checkerboard, RecordingSet, White
+from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import Field, mixed_charge
 from sim.camera import CameraModel
 from sim.effects.base import Effect
@@ -48,7 +54,7 @@ SCREEN_FLOOR = (
 class Patch:
     """One patch in one channel, averaged over a capture's repeats; DN."""
 
-    captures: tuple[Chart, ...]
+    captures: tuple[ChartCapture, ...]
     name: str
     channel: str
     level: float
@@ -129,7 +135,7 @@ def chart_block(study: Study) -> Block:
 
 
 def patch_levels(study: Study) -> list[Patch]:
-    groups = study.groups(Chart, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
+    groups = study.groups(ChartCapture, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
     groups = [g for g in groups if g[0].chart == "ColorChecker24"]
     step = mosaic.step(study.camera.cfa)
     points = []
@@ -210,7 +216,7 @@ def _mixing(study: Study, points: list[Patch], electrons: FloatArray, effects: E
     return factor
 
 
-def _patches(capture: Chart) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
+def _patches(capture: ChartCapture) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
     """Patches' inner halves: name, rows, cols, centre."""
     corners = np.array(capture.corners, float)
     found = []
@@ -235,9 +241,9 @@ def screen_block(study: Study) -> Block:
     """
     recordings, side, camera, noise = study.recordings, study.side, study.camera, study.noise
     by_pose: dict[str, dict[str, list[Any]]] = {}
-    shown: list[White | Black | Checkerboard | Bernoulli] = [
-        *recordings.captures(White, side), *recordings.captures(Black, side),
-        *recordings.captures(Checkerboard, side), *recordings.captures(Bernoulli, side),
+    shown: list[WhiteCapture | BlackCapture | CheckerboardCapture | BernoulliCapture] = [
+        *recordings.captures(WhiteCapture, side), *recordings.captures(BlackCapture, side),
+        *recordings.captures(CheckerboardCapture, side), *recordings.captures(BernoulliCapture, side),
     ]  # fmt: skip
     for capture in shown:
         by_pose.setdefault(capture.screen.pose, {}).setdefault(capture.kind, []).append(capture)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.neighbours import held_out_flats
 from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, Block, Effects, Label, Prediction, Study
 from lab.errors import NotDetermined
-from lab.formats.recording_set import Narrowband
 from sim.effects.base import Effect
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -211,7 +211,7 @@ def _by_level(study: Study, levels: Sequence[Uniform], rows_dn2: float) -> list[
 
 def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
     found = []
-    groups = study.groups(Narrowband, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     for i, group in enumerate(groups):
         for capture in group:
             if study.levels(capture).mean["G"] is None:

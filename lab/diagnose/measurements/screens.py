@@ -24,11 +24,15 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, special
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.bernoulli import BernoulliCapture
+from lab.capture_kinds.black import BlackCapture
+from lab.capture_kinds.checkerboard import CheckerboardCapture
+from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, held_out_of
 from lab.errors import NotDetermined
 from lab.fit.psf.drawn_pattern import area_drawn
 from lab.fit.psf.screen_registration import ScreenWarp, register
-from lab.formats.recording_set import Bernoulli, Black, Capture, Checkerboard, White
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.forward import common_wavelengths, optical_transfer, transfer_at
@@ -118,14 +122,15 @@ def _patterns(study: Study) -> list[list[Pattern]]:
     if not study.diffraction_is_known:
         raise NotDetermined("bernoulli", "f-number or pixel pitch isn't stated: no diffraction to draw patterns with")
     captures: Any = study.recordings.captures
-    groups = study.groups(Bernoulli, lambda c: (c.screen.pose, c.target))
+    groups = study.groups(BernoulliCapture, lambda c: (c.screen.pose, c.target))
     if not groups:
         raise NotDetermined("bernoulli", "no bernoulli captures")
     found, reason = [], ""
     for i, group in enumerate(groups):
         pose = group[0].screen.pose
         whites, blacks, boards = (
-            [c for c in captures(k, study.side) if c.screen.pose == pose] for k in (White, Black, Checkerboard)
+            [c for c in captures(k, study.side) if c.screen.pose == pose]
+            for k in (WhiteCapture, BlackCapture, CheckerboardCapture)
         )
         missing = [n for n, some in (("white", whites), ("black", blacks), ("checkerboard", boards)) if not some]
         if missing:
@@ -841,7 +846,7 @@ class _Line:
 def grid_block(study: Study) -> Block:
     """The strongest line in the spectrum of the lit screen by channel, as a standard normal number: rows' and columns' lines, and
     lines that uniform light shows as well, are the camera's and don't count."""
-    groups = study.groups(White, lambda c: (c.screen.pose, c.exposure_s))
+    groups = study.groups(WhiteCapture, lambda c: (c.screen.pose, c.exposure_s))
     if not groups:
         raise NotDetermined("screen_grid", "no white captures")
     found: list[_Line] = []

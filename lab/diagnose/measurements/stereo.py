@@ -14,6 +14,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.board import views_of
 from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
 from lab.errors import NotDetermined
@@ -21,7 +24,6 @@ from lab.fit.geometry.board_detection import BoardView
 from lab.fit.geometry.bundle_adjustment import board_pose
 from lab.fit.geometry.calibration import Calibration, calibrate_robustly
 from lab.fit.geometry.pinhole import project
-from lab.formats.recording_set import Capture, Flat, White
 from sim.camera import Side
 from sim.optics.illumination import relative_illumination
 from sim.sensor import mosaic
@@ -137,7 +139,7 @@ def _uniform(study: Study, side: Side, dark: _Darks) -> list[_Lamp]:
     recordings = study.recordings
     white = recordings.camera(side).saturation_dn
     gathered: dict[str, dict[str, list[float]]] = {}
-    for capture in recordings.captures(Flat, side):
+    for capture in recordings.captures(FlatCapture, side):
         if capture.gain_db or capture.radiance is None:
             continue
         total = float(recordings.spectrum(capture.radiance).arrays[1].sum())
@@ -210,7 +212,7 @@ def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]
 def _groups(study: Study, side: Side) -> dict[str, list[Any]]:
     """The lit screen's captures at the plain gain, by pose."""
     found: dict[str, list[Any]] = {}
-    for capture in study.recordings.captures(White, side):
+    for capture in study.recordings.captures(WhiteCapture, side):
         if not capture.gain_db:
             found.setdefault(capture.screen.pose, []).append(capture)
     return found

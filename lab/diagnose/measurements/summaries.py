@@ -17,9 +17,10 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from scipy import ndimage
 
+from lab.capture_kinds.base import Capture
 from lab.errors import NotDetermined
 from lab.fit.rounding import unrounded
-from lab.formats.recording_set import Camera, Capture, RecordingSet
+from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.predict.camera_model import Field
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
@@ -128,7 +129,7 @@ class Study:
         self.side, self.camera = side, camera
         #: Pixels from here on say nothing of the light: the converter's highest code, or the full well where that comes first.
         self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)
-        self.stated: Camera = recordings.camera(side)
+        self.stated: DataSheet = recordings.camera(side)
         self.channels = camera.channels
         self._levels: dict[str, Levels] = {}
         self._made: dict[Any, Any] = {}

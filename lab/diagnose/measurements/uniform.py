@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.curves import CurveSlopes
 from lab.diagnose.measurements.neighbours import held_out_flats
 from lab.diagnose.measurements.summaries import (
@@ -27,7 +28,6 @@ from lab.diagnose.measurements.summaries import (
 )
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
-from lab.formats.recording_set import Narrowband
 from lab.predict.camera_model import collected_electrons, mean_dn
 from sim.forward import electron_rate
 from sim.spectrum import FloatArray, Spectrum
@@ -171,8 +171,8 @@ def narrowband_block(study: Study) -> Block:
         raise NotDetermined(
             "narrowband", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"
         )
-    captures = study.recordings.captures(Narrowband, study.side)
-    groups = study.groups(Narrowband, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    captures = study.recordings.captures(NarrowbandCapture, study.side)
+    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     out = set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
     points = []
     for capture in captures:

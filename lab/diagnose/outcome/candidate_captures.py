@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lab.capture.sequences.calibration import Calibration
-from lab.capture.sequences.dark import DarkSequence
-from lab.capture.sequences.flat import FlatSequence
-from lab.capture.sequences.narrowband import NarrowbandSequence
-from lab.capture.sequences.targets import EdgeSequence
+from lab.capture.plan import CapturePlan
+from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.flat import FlatSequence
+from lab.capture_kinds.narrowband import NarrowbandSequence
+from lab.capture_kinds.slanted_edge import EdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
 from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, LAMP_FLOOR, NARROWBAND_FLOOR
@@ -49,7 +49,7 @@ class Design:
     words: str
     predict: Callable[[Hypothesis], FloatArray]
     covariance: FloatArray
-    plan: Calibration | None = None
+    plan: CapturePlan | None = None
 
 
 def designs(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[Design]:
@@ -109,7 +109,7 @@ def _narrowband(camera: CameraModel) -> Iterator[Design]:
             f"narrowband light at {centre:g} nm",
             predict,
             np.diag(noise + loose + (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2),
-            Calibration(narrowband=NarrowbandSequence.model_validate(around)),
+            CapturePlan((NarrowbandSequence.model_validate(around),)),
         )
 
 
@@ -142,7 +142,7 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
 
             n = len(sighted) * fx.size
             plain = stops == 1.0 and light is lamp
-            plan = Calibration(edge=EdgeSequence(frames=2 * REPEATS)) if plain else None
+            plan = CapturePlan((EdgeSequence(frames=2 * REPEATS),)) if plain else None
             if n:
                 words = f"slanted edges at 5, 50, 95 and 140 degrees in {name}{at}"
                 yield Design(words, predict, np.diag(np.square(np.tile(std, n // len(std)))), plan)
@@ -189,7 +189,7 @@ def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
         covariance += FREE_STD**2 * sum(np.outer(column, column) for column in free)
         by_exposure = all(light is lamp for light, _ in steps)
         sequence = FlatSequence(levels=tuple((FILLED * shares).round(3).tolist()), frames=2 * REPEATS)
-        yield Design(words, predict, covariance, Calibration(flat=sequence) if by_exposure else None)
+        yield Design(words, predict, covariance, CapturePlan((sequence,)) if by_exposure else None)
 
 
 def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
@@ -240,7 +240,7 @@ def _darks(camera: CameraModel) -> Iterator[Design]:
         covariance = np.eye(len(steps)) * (2 * BLACK_FLOOR_DN) ** 2
         covariance += FREE_STD**2 * (np.ones_like(covariance) + np.outer(seconds, seconds))
         exposures = "from 1 ms" in words
-        plan = Calibration(dark=DarkSequence(exposures_s=tuple(seconds.round(4).tolist()), frames=REPEATS))
+        plan = CapturePlan((DarkSequence(exposures_s=tuple(seconds.round(4).tolist()), frames=REPEATS),))
         yield Design(words, predict, covariance, plan if exposures else None)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import ndtr
 
-from lab.capture.sequences.calibration import Calibration
+from lab.capture.plan import CapturePlan
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import refit
@@ -50,7 +50,7 @@ class Proposal:
     """A capture, what it would tell, and the sequence that takes it (None: a station can't by itself)."""
 
     capture: NextCapture
-    plan: Calibration | None
+    plan: CapturePlan | None
 
 
 def proposals(recordings: RecordingSet, side: Side, verdict: Verdict, policy: DecisionPolicy) -> tuple[Proposal, ...]:

@@ -12,11 +12,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.chart import ChartCapture
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.patches import PATCH_COLOUR_STD, PATCH_STD, _patches
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
-from lab.formats.recording_set import Capture, Chart, RecordingSet, SlantedEdge
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ResidualPicture
 from lab.predict.replay import Replay
 from sim.camera import CameraModel, Side
@@ -76,7 +79,7 @@ def _residual(recordings: RecordingSet, replay: Replay, capture: Capture, effect
         gain * signal + (gain * camera.read_noise_e) ** 2 + (camera.prnu_percent / 100.0 * signal) ** 2 + 1.0 / 12.0
     )
     region = _region(capture, frame.shape)
-    known = np.hypot(PATCH_STD, PATCH_COLOUR_STD) if isinstance(capture, Chart) else 0.0
+    known = np.hypot(PATCH_STD, PATCH_COLOUR_STD) if isinstance(capture, ChartCapture) else 0.0
     return _cells(
         np.where(judged, frame - offset - predicted, 0.0)[region],
         np.where(judged, variance, 0.0)[region],
@@ -87,18 +90,18 @@ def _residual(recordings: RecordingSet, replay: Replay, capture: Capture, effect
 def _judged(capture: Capture, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Pixels of which the model says anything: of an edge its region, of a chart the patches' inner halves."""
     inside = np.zeros(shape, bool)
-    if isinstance(capture, Chart):
+    if isinstance(capture, ChartCapture):
         for _, rows, cols, *_ in _patches(capture):
             inside[slice(*rows), slice(*cols)] = True
     else:
-        row0, col0, row1, col1 = (isinstance(capture, SlantedEdge) and capture.region) or (0, 0, *shape)
+        row0, col0, row1, col1 = (isinstance(capture, SlantedEdgeCapture) and capture.region) or (0, 0, *shape)
         inside[row0:row1, col0:col1] = True
     return inside
 
 
 def _region(capture: Capture, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Of an edge its middle, pixel by pixel; else the frame."""
-    if not isinstance(capture, SlantedEdge):
+    if not isinstance(capture, SlantedEdgeCapture):
         return slice(None), slice(None)
     row0, col0, row1, col1 = capture.region or (0, 0, *shape)
     row, col = (row0 + row1) // 2, (col0 + col1) // 2

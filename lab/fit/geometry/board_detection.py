@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry.corners import CornerFits, fit_corners
-from lab.formats.recording_set import Charuco, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from sim.camera import Side
 from sim.sensor.mosaic import phases, planes
@@ -43,7 +44,7 @@ class BoardView:
     standard deviation of a coordinate by the noise of the picture, where it is known.
     """
 
-    capture: Charuco
+    capture: CharucoCapture
     index: NDArray[np.int64]
     board_mm: Array
     image_px: Array
@@ -66,7 +67,7 @@ def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
     return picture
 
 
-def find_board(picture: Array, capture: Charuco) -> BoardView:
+def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
     """Corners of the board in a picture (rows, cols) of 0..1. Raises `NotDetermined` where it isn't found, with the
     reason.
     """
@@ -101,7 +102,7 @@ def find_board(picture: Array, capture: Charuco) -> BoardView:
     return BoardView(capture, index, board, fitted, std_px).only(trusted)
 
 
-def _charuco_corners(grey: NDArray[np.uint8], capture: Charuco) -> tuple[NDArray[np.int64], Array]:
+def _charuco_corners(grey: NDArray[np.uint8], capture: CharucoCapture) -> tuple[NDArray[np.int64], Array]:
     """Numbers and places of the inner corners of a ChArUco board, by the detector of OpenCV."""
     code = getattr(cv2.aruco, capture.dictionary, None)
     if not isinstance(code, int) or not capture.dictionary.startswith("DICT_"):
@@ -128,7 +129,7 @@ def _grid_steps(index: NDArray[np.int64], cols: int) -> Array:
     return np.column_stack([index % cols, index // cols]).astype(float)
 
 
-def board_points(capture: Charuco, index: NDArray[np.int64]) -> Array:
+def board_points(capture: CharucoCapture, index: NDArray[np.int64]) -> Array:
     """(x, y, 0), mm, of the inner corners of these numbers; the first square begins at 0."""
     return np.column_stack(
         [(_grid_steps(index, capture.squares[1] - 1) + 1.0) * capture.square_mm, np.zeros(len(index))]

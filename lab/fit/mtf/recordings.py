@@ -8,19 +8,20 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import NotDetermined
 from lab.fit.mtf.edges_in_frame import FoundEdge, find_edges
 from lab.fit.mtf.estimate_mtf import DEFAULT_FREQUENCY_CY_PER_PX, planes_mtf
 from lab.fit.mtf.samples import Region, region_planes
 from lab.fit.mtf.transfer_function import EdgeMtf
-from lab.formats.recording_set import RecordingSet, SlantedEdge
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MtfCurve, NoiseFit
 from sim.camera import Side
 
 
 def measure_edge(
     recordings: RecordingSet,
-    captures: Sequence[SlantedEdge],
+    captures: Sequence[SlantedEdgeCapture],
     channel: str,
     noise: NoiseFit | None = None,
     frequency_cy_per_px: ArrayLike | None = None,
@@ -56,7 +57,7 @@ def measure_edge(
     return planes_mtf(planes, frequency, code=1.0, frames=len(frames))
 
 
-def _edges_of(recordings: RecordingSet, capture: SlantedEdge) -> tuple[FoundEdge, ...]:
+def _edges_of(recordings: RecordingSet, capture: SlantedEdgeCapture) -> tuple[FoundEdge, ...]:
     """Edges of the frame of a capture; see `find_edges`."""
     camera = recordings.camera(capture.side)
     return find_edges(recordings.frame(capture), camera.cfa, camera.saturation_dn)

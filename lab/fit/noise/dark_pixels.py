@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.fit.noise.frame_sums import BoolArray, Float32Array
 from lab.fit.noise.level_statistics import Stack
 from lab.fit.rounding import QUANTISATION_DN2
 from lab.fit.weighted_lines import root
-from lab.formats.recording_set import Dark, Flat, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Defect, PixelDefects, ReadNoiseDistribution
 from sim.camera import Cfa
 from sim.sensor.mosaic import planes
@@ -25,7 +27,7 @@ VISIBLE_DN2 = 0.24  # below: rounding hides the noise
 
 
 def stack_of(
-    recordings: RecordingSet, captures: Sequence[Dark] | Sequence[Flat], bad: BoolArray | None = None
+    recordings: RecordingSet, captures: Sequence[DarkCapture] | Sequence[FlatCapture], bad: BoolArray | None = None
 ) -> Stack:
     """The repeats of one level as a stack; every frame is read once. `bad` (rows, cols): pixels to leave out."""
     camera = recordings.camera(captures[0].side)

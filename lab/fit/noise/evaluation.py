@@ -15,7 +15,7 @@ from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.photon_transfer import TransferFit, fit_transfer
 from lab.fit.noise.recorded_levels import RecordedLevels, Remarks
 from lab.fit.noise.saturation import CLIPPED_LIMIT, Saturation, saturation_of
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 
 MIN_LEVELS = 3
 
@@ -46,7 +46,7 @@ class Evaluation:
 def evaluate(
     darks: Sequence[MeasuredLevel],
     flats: Sequence[MeasuredLevel],
-    camera: Camera,
+    camera: DataSheet,
     gain_db: float,
     defects: int,
     names: tuple[str, ...],

@@ -17,14 +17,14 @@ from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.read_noise import black_level, read_noise
 from lab.fit.noise.response import full_well, linearity_by_plane, main_lamp_levels, quantum_efficiency, remark_on_lamp
 from lab.fit.noise.variance_curvature import variance_curvature_figures
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 from lab.formats.results import ChannelNoise, Emva1288, NoiseFit, PhotonTransfer
 
 
 def noise_fit(
     darks: Sequence[MeasuredLevel],
     flats: Sequence[MeasuredLevel],
-    camera: Camera,
+    camera: DataSheet,
     gain_db: float = 0.0,
     defects: int = 0,
     pixels: DarkPixels | None = None,

@@ -8,6 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.fit.noise.dark_pixels import stack_of
 from lab.fit.noise.defective_pixels import defective_pixels
@@ -15,7 +17,7 @@ from lab.fit.noise.frame_sums import BoolArray
 from lab.fit.noise.level_statistics import Stack
 from lab.fit.noise.shading import shading
 from lab.fit.rounding import QUANTISATION_DN2
-from lab.formats.recording_set import Dark, Flat, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from sim.camera import Cfa, Side
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray
@@ -78,7 +80,7 @@ def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
     )
 
 
-C = TypeVar("C", Dark, Flat)
+C = TypeVar("C", DarkCapture, FlatCapture)
 Map = tuple[FloatArray, FloatArray]  # values and standard deviations
 
 
@@ -86,7 +88,7 @@ def _levels(captures: list[C]) -> list[list[C]]:
     """Repeats: captures of the same exposure, light, gain and temperature (to a degree)."""
     groups: dict[Hashable, list[C]] = {}
     for capture in captures:
-        light = (capture.photons_per_pixel, capture.radiance) if isinstance(capture, Flat) else None
+        light = (capture.photons_per_pixel, capture.radiance) if isinstance(capture, FlatCapture) else None
         temperature_c = None if capture.temperature_c is None else round(capture.temperature_c)
         groups.setdefault((capture.exposure_s, capture.gain_db, temperature_c, light), []).append(capture)
     return list(groups.values())
@@ -100,7 +102,7 @@ def _pixel_std(stack: Stack) -> float:
     return float(np.sqrt(max(variance, QUANTISATION_DN2) / stack.count))
 
 
-def _dark_maps(recordings: RecordingSet, darks: list[list[Dark]], cfa: Cfa) -> tuple[Map, Map | None, BoolArray]:
+def _dark_maps(recordings: RecordingSet, darks: list[list[DarkCapture]], cfa: Cfa) -> tuple[Map, Map | None, BoolArray]:
     """Offset, dark current (with two exposures) and the mask of pixels that stand out of the longest dark."""
     exposure, weight, means = [], [], []
     for group in darks:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from lab.fit.noise.level_statistics import MeasuredLevel
-from lab.formats.recording_set import Camera
+from lab.formats.recording_set import DataSheet
 
 BLACK_CLIPPED_SHARE = 1e-3  # of pixels at 0 in a dark, above which darks are clipped
 
@@ -32,7 +32,7 @@ class RecordedLevels:
     levels.
     """
 
-    camera: Camera
+    camera: DataSheet
     gain_db: float
     defects: int
     names: tuple[str, ...]
@@ -52,7 +52,7 @@ class RecordedLevels:
         cls,
         darks: Sequence[MeasuredLevel],
         flats: Sequence[MeasuredLevel],
-        camera: Camera,
+        camera: DataSheet,
         gain_db: float,
         defects: int,
         names: tuple[str, ...],

@@ -7,13 +7,16 @@ from typing import TypeVar
 
 import numpy as np
 
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.fit.noise.dark_pixels import DarkPixels, stack_of
 from lab.fit.noise.defective_pixels import defective_pixels
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.noise.recorded_levels import rounded_c
-from lab.formats.recording_set import Camera, Capture, Dark, Flat, RecordingSet
+from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from sim.camera import Side
 from sim.spectrum import Spectrum
@@ -65,12 +68,12 @@ def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C
     return list(groups.values())
 
 
-def _light(flat: Flat) -> float:
+def _light(flat: FlatCapture) -> float:
     """Photons per pixel where they are stated, else the exposure."""
     return flat.photons_per_pixel if flat.photons_per_pixel is not None else flat.exposure_s
 
 
-def _lamps_of(recordings: RecordingSet, flats: Sequence[Flat]) -> dict[str, Hashable]:
+def _lamps_of(recordings: RecordingSet, flats: Sequence[FlatCapture]) -> dict[str, Hashable]:
     """The light of each flat, by its id. A lamp that is measured before every pass over the levels is one lamp."""
     seen: list[tuple[str, Spectrum]] = []
     names: dict[str | None, str | None] = {None: None}
@@ -91,7 +94,7 @@ def _lamps_of(recordings: RecordingSet, flats: Sequence[Flat]) -> dict[str, Hash
 
 
 def _dark_levels(
-    recordings: RecordingSet, darks: Sequence[Dark], camera: Camera
+    recordings: RecordingSet, darks: Sequence[DarkCapture], camera: DataSheet
 ) -> tuple[list[MeasuredLevel], DarkPixels]:
     """Statistics of the darks, longest exposure first: it shows the hot pixels, which are left out from there on."""
     pixels = DarkPixels(camera.cfa)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.errors import NotDetermined
-from lab.formats.recording_set import Bernoulli, RecordingSet
+from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 from sim.sensor.mosaic import planes
 
@@ -25,7 +26,7 @@ class ScreenPictures:
     targets (rows, cols) of cells.
     """
 
-    first: Bernoulli
+    first: BernoulliCapture
     checkerboard: Array
     bernoulli: Array
     checkerboard_target: NDArray[np.uint8]

@@ -8,7 +8,7 @@ from lab.errors import NotDetermined
 from lab.fit.psf.levelled_captures import screen_pictures
 from lab.fit.psf.radial_symmetry import radial_symmetry
 from lab.fit.psf.screen_kernel import ScreenKernel, measure_field
-from lab.formats.recording_set import Camera, RecordingSet
+from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import PsfKernel, PsfSymmetry
 from sim.camera import Side
 
@@ -55,7 +55,7 @@ def fit_psf_field(recordings: RecordingSet, side: Side, patches: int = 3) -> Psf
     return PsfFit(tuple(kernels), tuple(parts), symmetry)
 
 
-def _result(camera: Camera, capture: str, found: ScreenKernel) -> PsfKernel:
+def _result(camera: DataSheet, capture: str, found: ScreenKernel) -> PsfKernel:
     """A kernel as it stands in the results."""
     return PsfKernel(
         capture=capture,
@@ -67,7 +67,7 @@ def _result(camera: Camera, capture: str, found: ScreenKernel) -> PsfKernel:
     )
 
 
-def _field_mm(camera: Camera, at_px: tuple[float, float]) -> tuple[float, float] | None:
+def _field_mm(camera: DataSheet, at_px: tuple[float, float]) -> tuple[float, float] | None:
     """Place on the sensor, (row, col) from the middle of the frame, mm; None without a pixel pitch."""
     if camera.pixel_pitch_um is None:
         return None

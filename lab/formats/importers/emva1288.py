@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lab.errors import InputError
-from lab.formats.importers.images import IMAGES, ImageStore, read_camera_file, read_image
+from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
 from lab.formats.recording_set import Manifest, RecordingSet
 
 NS = 1e-9
@@ -204,8 +204,8 @@ def read_emva1288(path: Path) -> RecordingSet:
             "captures": captures,
         }
     )
-    store = ImageStore(file.parent, frames, shift)
-    return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), store=store)
+    files = ImageFiles(file.parent, frames, shift)
+    return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), files=files)
 
 
 def _shape_and_shift(

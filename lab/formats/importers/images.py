@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from lab.errors import InputError
-from lab.formats.recording_set import RAWS, Camera, FolderStore, Frame, load_frame
+from lab.formats.recording_set import RAWS, DataSheet, FolderFiles, Frame, load_frame
 from sim.camera import Side
 
 IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
@@ -76,7 +76,7 @@ def _grey(image: NDArray[Any]) -> Frame:
     return np.ascontiguousarray(image, dtype=np.uint16)
 
 
-class ImageStore(FolderStore):
+class ImageFiles(FolderFiles):
     """A folder whose frames are images: `images` has the file behind each frame's path in the recording set. Values are
     shifted down by `shift` bits. The files are decoded when asked for, and never copied as they are."""
 
@@ -87,14 +87,14 @@ class ImageStore(FolderStore):
     def file(self, path: str) -> Path | None:
         return None if path in self.images else super().file(path)
 
-    def frame(self, path: str, camera: Camera) -> Frame:
+    def frame(self, path: str, camera: DataSheet) -> Frame:
         return np.right_shift(read_image(self.images[path]), self.shift, dtype=np.uint16)
 
     def where(self, path: str) -> str:
         return str(self.images[path]) if path in self.images else super().where(path)
 
 
-def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> dict[Side, Camera]:
+def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> dict[Side, DataSheet]:
     """The cameras that `camera.toml` describes: the keys of a recording set's camera, at the top for a single (left) camera,
     or in the tables `[left]` and `[right]`. Keys that it leaves out come from that side's `defaults`; a missing file is an empty one."""
     written: dict[str, Any] = {}
@@ -112,7 +112,7 @@ def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> 
     cameras = {}
     for side, keys in sides.items():
         try:
-            cameras[side] = Camera.model_validate({**defaults.get(side, {}), **written, **keys})
+            cameras[side] = DataSheet.model_validate({**defaults.get(side, {}), **written, **keys})
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"])

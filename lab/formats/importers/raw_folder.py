@@ -28,16 +28,15 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
+from lab.capture_kinds.base import CAPTURES, Capture
 from lab.errors import InputError
-from lab.formats.importers.images import IMAGES, ImageStore, read_camera_file, read_image
-from lab.formats.recording_set import Camera, FolderStore, RecordingError, RecordingSet, parse_manifest
+from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
+from lab.formats.recording_set import DataSheet, FolderFiles, RecordingError, RecordingSet, parse_manifest
 from sim.camera import Side
 
 INDEX, CAMERA = "index.csv", "camera.toml"
-#: Columns that hold several numbers, and how many in each group (0: a flat list).
-LISTS = {"region": 0, "corners": 2, "field_mm": 0, "squares": 0}
 
 
 def read_raw_folder(path: Path) -> RecordingSet:
@@ -75,7 +74,7 @@ def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: flo
         path,
         list(enumerate(rows, start=1)),
         str(path),
-        lambda measured: {side: Camera.model_validate({"cfa": "MONO"} | keys) for side, keys in measured.items()},
+        lambda measured: {side: DataSheet.model_validate({"cfa": "MONO"} | keys) for side, keys in measured.items()},
     )
     single = [name for names in pairs.values() if len(names) == 1 for name in names.values()]
     if single:
@@ -87,9 +86,9 @@ def _recording_set(
     path: Path,
     rows: list[tuple[int, dict[str, str]]],
     where: str,
-    cameras: Callable[[dict[Side, dict[str, Any]]], dict[Side, Camera]],
+    cameras: Callable[[dict[Side, dict[str, Any]]], dict[Side, DataSheet]],
 ) -> RecordingSet:
-    store = FolderStore(path)
+    folder = FolderFiles(path)
     images: dict[str, Path] = {}
     captures: list[dict[str, Any]] = []
     problems: list[str] = []
@@ -97,7 +96,7 @@ def _recording_set(
     for number, row in rows:
         try:
             capture = _capture(row)
-            found = store.file(capture["frame"])
+            found = folder.file(capture["frame"])
         except InputError as error:
             problems.append(f"{where}: row {number}: {row.get('frame', '')}: {error}")
             continue
@@ -120,7 +119,7 @@ def _recording_set(
         }
     )
     manifest, warnings = parse_manifest(text, where)
-    return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), store=ImageStore(path, images))
+    return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), files=ImageFiles(path, images))
 
 
 def _rows(index: Path) -> Iterator[tuple[int, dict[str, str]]]:
@@ -155,11 +154,13 @@ def _capture(row: dict[str, str]) -> dict[str, Any]:
     """A row as a capture's keys: lists and numbers out of their cells, `screen.x` into `screen`."""
     if "frame" not in row or "kind" not in row:
         raise InputError("the frame or its kind is missing; write both")
+    kind = CAPTURES.models.get(row["kind"])
+    sizes = _list_sizes(kind) if kind is not None else {}
     capture: dict[str, Any] = {}
     for key, cell in row.items():
         value: Any = cell
-        if key in LISTS:
-            value = _list(key, cell)
+        if key in sizes:
+            value = _list(key, cell, sizes[key])
         if key.startswith("screen."):
             capture.setdefault("screen", {})[key.removeprefix("screen.")] = value
         else:
@@ -167,13 +168,22 @@ def _capture(row: dict[str, str]) -> dict[str, Any]:
     return capture
 
 
-def _list(key: str, cell: str) -> list[Any]:
+def _list_sizes(kind: type[Capture]) -> dict[str, int]:
+    """Keys of a kind that hold several numbers, and how many make a group (0: a flat list)."""
+    sizes = {}
+    for key, field in kind.model_fields.items():
+        parts = [part for part in (field.annotation, *get_args(field.annotation)) if get_origin(part) is tuple]
+        if parts:
+            sizes[key] = len(get_args(get_args(parts[0])[0]))
+    return sizes
+
+
+def _list(key: str, cell: str, size: int) -> list[Any]:
     try:
         numbers = [float(word) for word in re.split(r"[\s;]+", cell)]
     except ValueError:
         raise InputError(f"{key}: '{cell}' isn't a list of numbers; write them with spaces between") from None
     whole = [int(number) if number.is_integer() else number for number in numbers]
-    size = LISTS[key]
     return [whole[k : k + size] for k in range(0, len(whole), size)] if size else whole
 
 

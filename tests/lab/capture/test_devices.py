@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from drivers.errors import InstrumentError, NoAnswer
-from lab.capture.devices import Status, in_thread, level_of
-from lab.formats.recording_set import Camera
+from lab.capture.blocking_calls import Status, in_thread
+from lab.capture.devices import level_of
+from lab.formats.recording_set import DataSheet
 
 
 def test_a_level_is_that_of_the_brightest_channel() -> None:
-    sheet = Camera(rows=40, cols=40, cfa="RGGB", bit_depth=12, black_level_dn=95, white_level_dn=4095)
+    sheet = DataSheet(rows=40, cols=40, cfa="RGGB", bit_depth=12, black_level_dn=95, white_level_dn=4095)
     frame = np.full((40, 40), 95, np.uint16)
     frame[1::2, 1::2] = 2095
     assert level_of(frame, sheet) == pytest.approx(0.5)

@@ -18,21 +18,24 @@ import pytest
 
 from drivers.errors import NoAnswer
 from drivers.instrument import Identity
-from lab.capture.sequences.calibration import Calibration, full_calibration
-from lab.capture.sequences.dark import DarkSequence
-from lab.capture.sequences.flat import FlatSequence
-from lab.capture.sequences.narrowband import NarrowbandSequence
+from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.store import Store
+from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.flat import FlatSequence
+from lab.capture_kinds.narrowband import NarrowbandSequence
 from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import inspect
 from tests.lab import fake_bench
 from tests.lab.fake_bench import BLACK, SLOPE, Bench
 
 STATION = fake_bench.station()
-DARKS = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.002, 0.003, 0.004, 0.005), frames=4))
-LIT = Calibration(
-    dark=DarkSequence(exposures_s=(0.001,), frames=1), flat=FlatSequence(levels=(0.2, 0.5, 0.8), frames=2)
+DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.002, 0.003, 0.004, 0.005), frames=4),))
+LIT = CapturePlan(
+    (
+        DarkSequence(exposures_s=(0.001,), frames=1),
+        FlatSequence(levels=(0.2, 0.5, 0.8), frames=2),
+    )
 )
 
 
@@ -44,7 +47,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def begin(
-    store: Store, bench: Bench, calibration: Calibration, on_progress: Callable[[Progress], None] | None = None
+    store: Store, bench: Bench, calibration: CapturePlan, on_progress: Callable[[Progress], None] | None = None
 ) -> CaptureSession:
     return CaptureSession.start(store, STATION, calibration, connect=bench.drivers, on_progress=on_progress)
 
@@ -72,7 +75,7 @@ def assert_whole(store: Store, session: str) -> None:
 def test_a_whole_calibration(store: Store) -> None:
     bench, told = Bench(), []
     session = CaptureSession.start(
-        store, STATION, full_calibration(STATION, quick=True), connect=bench.drivers, on_progress=told.append
+        store, STATION, full_plan(STATION, quick=True), connect=bench.drivers, on_progress=told.append
     )
     info = session.run()
     assert (info.state, info.packed, info.steps_done) == ("finished", True, info.steps)
@@ -120,7 +123,7 @@ def test_exposures_are_found_from_far_off_or_at_a_limit(
     store: Store, slope: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(SLOPE, "left", slope)
-    session = begin(store, Bench(), Calibration(flat=FlatSequence(levels=(0.5,), frames=1)))
+    session = begin(store, Bench(), CapturePlan((FlatSequence(levels=(0.5,), frames=1),)))
     session.run()
     exposure_s = store.journal(session.id)[0].result["exposure_s"]["left"]
     wanted = 0.75 * (4095 - BLACK) / slope
@@ -135,7 +138,7 @@ def test_a_sensor_that_saturates_below_its_data_sheet_is_not_taken_for_well_expo
 ) -> None:
     monkeypatch.setitem(SLOPE, "left", 1e5)
     monkeypatch.setattr(fake_bench, "WHITE", 3490)  # 85 % of the range: neither clearly saturated nor what is wanted
-    session = begin(store, Bench(), Calibration(flat=FlatSequence(levels=(0.5,), frames=1)))
+    session = begin(store, Bench(), CapturePlan((FlatSequence(levels=(0.5,), frames=1),)))
     session.run()
     found = store.journal(session.id)[0].result
     assert found["level"]["left"] == pytest.approx(0.75, abs=0.05)
@@ -145,7 +148,7 @@ def test_a_sensor_that_saturates_below_its_data_sheet_is_not_taken_for_well_expo
 def test_a_wavelength_that_the_radiometer_refuses_is_left_out_with_the_reason(store: Store) -> None:
     bench, told = Bench(), []
     bench.refused_nm = 410.0
-    session = begin(store, bench, Calibration(narrowband=NarrowbandSequence(to_nm=420)), told.append)
+    session = begin(store, bench, CapturePlan((NarrowbandSequence(to_nm=420),)), told.append)
     assert session.run().state == "finished"
     assert {c.wavelength_nm for c in store.recording_set(session.id).captures("narrowband")} == {400.0, 420.0}
     assert {entry.result.get("skipped") is not None for entry in store.journal(session.id)} == {False, True}
@@ -381,7 +384,7 @@ def _spawn(store: Store, session: str, delay_s: float) -> subprocess.Popen[str]:
 
 
 def test_kill_9_loses_nothing_and_repeats_nothing(store: Store) -> None:
-    calibration = Calibration(dark=DarkSequence(exposures_s=tuple(0.001 * n for n in range(1, 26)), frames=4))
+    calibration = CapturePlan((DarkSequence(exposures_s=tuple(0.001 * n for n in range(1, 26)), frames=4),))
     session = store.create_session(STATION, calibration.steps(STATION))
     assert store.session(session).steps == 100
     hashes: dict[str, str] = {}

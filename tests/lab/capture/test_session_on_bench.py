@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.capture.sequences.calibration import Calibration
-from lab.capture.sequences.dark import DarkSequence
-from lab.capture.sequences.flat import FlatSequence
-from lab.capture.sequences.narrowband import NarrowbandSequence
-from lab.capture.sequences.targets import ChartSequence, ScreenSequence
+from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import read_station
 from lab.capture.store import Store
+from lab.capture_kinds.chart import ChartSequence
+from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.flat import FlatSequence
+from lab.capture_kinds.narrowband import NarrowbandSequence
+from lab.capture_kinds.screen import ScreenSequence
 from lab.errors import DeviceError
 from lab.formats.recording_set import inspect
 
@@ -30,12 +31,14 @@ from lab.capture.session import CaptureSession
 from lab.capture.store import Store
 CaptureSession(Store(sys.argv[1]), sys.argv[2], on_progress=lambda p: print(p.done, flush=True)).run()
 """
-FEW = Calibration(
-    dark=DarkSequence(exposures_s=(0.001, 1.0), frames=2),
-    flat=FlatSequence(levels=(0.25, 0.5, 0.75), frames=2),
-    narrowband=NarrowbandSequence(from_nm=500, to_nm=600, step_nm=100, passes=2),
-    chart=ChartSequence(frames=1),
-    screen=ScreenSequence(frames=1),
+FEW = CapturePlan(
+    (
+        DarkSequence(exposures_s=(0.001, 1.0), frames=2),
+        FlatSequence(levels=(0.25, 0.5, 0.75), frames=2),
+        NarrowbandSequence(from_nm=500, to_nm=600, step_nm=100, passes=2),
+        ChartSequence(frames=1),
+        ScreenSequence(frames=1),
+    )
 )
 
 

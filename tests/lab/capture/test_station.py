@@ -4,7 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from lab.capture.station import Cap, CharucoBoard, KnifeEdge, ScreenTarget, Station, drivers_of, read_station
+from lab.capture.station import Station, drivers_of, read_station
+from lab.capture_kinds.charuco import BoardTarget
+from lab.capture_kinds.dark import CapTarget
+from lab.capture_kinds.screen import ScreenTarget
+from lab.capture_kinds.slanted_edge import EdgeTarget
 from lab.errors import DeviceError, InputError
 
 TEXT = """
@@ -56,9 +60,9 @@ def test_everything_is_where_the_file_says(tmp_path: Path) -> None:
     assert station.monochromator is not None
     assert station.monochromator.settings == {"move_timeout_s": 12.0}
     assert station.display is None
-    assert station.one(Cap) == "cap"
-    assert list(station.having(CharucoBoard)) == ["charuco-01"]
-    assert station.having(KnifeEdge)["edge-1"].right is None
+    assert station.one(CapTarget) == "cap"
+    assert list(station.having(BoardTarget)) == ["charuco-01"]
+    assert station.having(EdgeTarget)["edge-1"].right is None
 
 
 def test_curves_are_taken_inline_and_from_files(tmp_path: Path) -> None:

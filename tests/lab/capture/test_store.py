@@ -16,17 +16,22 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
-from lab.capture.sequences.calibration import Calibration
-from lab.capture.sequences.dark import DarkSequence
-from lab.capture.sequences.targets import ScreenSequence
-from lab.capture.store import PACK, Base, Lock, Run, Settings, Store, now, npy_bytes, write_durably
+from lab.capture.durable_files import Lock, npy_bytes, write_durably
+from lab.capture.plan import CapturePlan
+from lab.capture.records import Run, now
+from lab.capture.session_files import PACK
+from lab.capture.settings import Settings
+from lab.capture.store import Store
+from lab.capture.tables import Base
+from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.screen import ScreenSequence
 from lab.errors import InputError
 from lab.formats.recording_set import read, write
 from sim.spectrum import Spectrum
 from tests.lab import fake_bench
 
 STATION = fake_bench.station()
-DARKS = Calibration(dark=DarkSequence(exposures_s=(0.001, 0.1), frames=2))
+DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 
 
 @pytest.fixture
@@ -36,7 +41,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
     opened.close()
 
 
-def started(store: Store, calibration: Calibration = DARKS, **keys: Any) -> str:
+def started(store: Store, calibration: CapturePlan = DARKS, **keys: Any) -> str:
     return store.create_session(STATION, calibration.steps(STATION), patterns=calibration.patterns(STATION), **keys)
 
 
@@ -218,7 +223,12 @@ def test_a_process_that_ends_while_it_is_looked_at_is_believed(store: Store, mon
 
 # --- as a recording set --------------------------------------------------------------------------------------------------
 
-SCREEN = Calibration(dark=DarkSequence(exposures_s=(0.001,), frames=2), screen=ScreenSequence(frames=2))
+SCREEN = CapturePlan(
+    (
+        DarkSequence(exposures_s=(0.001,), frames=2),
+        ScreenSequence(frames=2),
+    )
+)
 
 
 def test_a_session_is_a_recording_set_loose_and_packed(store: Store, tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.fit.geometry.recordings import fit_geometry
-from lab.formats.recording_set import Camera, Charuco, Manifest, RecordingSet
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import GeometryFit
 
 SHAPE = (300, 400)
@@ -54,7 +55,7 @@ POSES = [  # rotation vector; the board's middle, mm, in the left camera's frame
 ]
 
 
-def texture(capture: Charuco, mm_per_texel: float) -> NDArray[np.float64]:
+def texture(capture: CharucoCapture, mm_per_texel: float) -> NDArray[np.float64]:
     """The board, 0 or 1, with its first square's corner at texel corner [0, 0]."""
     rows, cols = capture.squares
     side = round(capture.square_mm / mm_per_texel)
@@ -87,7 +88,7 @@ def fine_rays(matrix: tuple[float, ...], distortion: tuple[float, ...]) -> NDArr
     return undistorted((x.ravel() - matrix[2]) / matrix[0], (y.ravel() - matrix[5]) / matrix[4], distortion)
 
 
-def draw(capture: Charuco, matrix, distortion, rotation, translation, blur_px=0.6) -> NDArray[np.float64]:
+def draw(capture: CharucoCapture, matrix, distortion, rotation, translation, blur_px=0.6) -> NDArray[np.float64]:
     """Share of the light, (rows, cols), 1 outside of the board."""
     mm_per_texel = 0.25
     board = texture(capture, mm_per_texel)
@@ -117,9 +118,9 @@ def seen(dictionary: str, squares: tuple[int, int], side: str, turn: tuple[float
     return draw(capture, matrix, TRUTH.distortion, rotation, translation)
 
 
-def board_captures(side: str, dictionary: str, squares: tuple[int, int], poses: int) -> list[Charuco]:
+def board_captures(side: str, dictionary: str, squares: tuple[int, int], poses: int) -> list[CharucoCapture]:
     return [
-        Charuco(
+        CharucoCapture(
             id=f"charuco-{side}-{k}",
             kind="charuco",
             side=side,
@@ -144,7 +145,7 @@ def make_boards(
     sides: tuple[str, ...] = ("left", "right"),
 ) -> RecordingSet:
     rng = np.random.default_rng(8)
-    camera = Camera(
+    camera = DataSheet(
         rows=SHAPE[0],
         cols=SHAPE[1],
         pixel_pitch_um=3.0,

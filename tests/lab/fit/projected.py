@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.fit.geometry.board_detection import BoardView, board_points
-from lab.formats.recording_set import Charuco
 
 SHAPE = (960, 1280)
 Array = NDArray[np.floating[Any]]
@@ -37,14 +37,16 @@ class Truth:
 TRUTH = Truth()
 
 
-def capture(number: int, side: str = "left", squares: tuple[int, int] = (9, 12), square_mm: float = 25.0) -> Charuco:
-    return Charuco(
+def capture(
+    number: int, side: str = "left", squares: tuple[int, int] = (9, 12), square_mm: float = 25.0
+) -> CharucoCapture:
+    return CharucoCapture(
         id=f"{side}-{number}", kind="charuco", side=side, frame="none.npy", exposure_s=0.01, dictionary="none",
         squares=squares, square_mm=square_mm, pose=f"pose-{number}",
     )  # fmt: skip
 
 
-def bent(board: Array, of: Charuco, warp_mm: tuple[float, ...]) -> Array:
+def bent(board: Array, of: CharucoCapture, warp_mm: tuple[float, ...]) -> Array:
     """The board's corners with z = a (x^2 - 1/3) + b (y^2 - 1/3) + c x y."""
     x = 2 * board[:, 0] / (of.squares[1] * of.square_mm) - 1
     y = 2 * board[:, 1] / (of.squares[0] * of.square_mm) - 1

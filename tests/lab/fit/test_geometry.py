@@ -84,7 +84,7 @@ def test_a_plain_checkerboard_is_a_charuco_without_dictionary(boards, truth):
 def test_a_frame_without_board_is_rejected_and_said_so(boards):
     recordings = boards(poses=5, sides=("left",))
     capture = recordings.captures("charuco", "left")[2]
-    recordings._store.frames[capture.frame] = np.full((300, 400), 700, np.uint16)
+    recordings._files.frames[capture.frame] = np.full((300, 400), 700, np.uint16)
     fit = fit_geometry(recordings, "left")
     assert fit.views == 4
     assert [item.step for item in fit.rejected] == [capture.id]
@@ -93,10 +93,10 @@ def test_a_frame_without_board_is_rejected_and_said_so(boards):
 def test_a_displaced_view_is_left_out(boards):
     recordings = boards(poses=6, sides=("left",))
     capture = recordings.captures("charuco", "left")[3]
-    frame = recordings._store.frames[capture.frame].copy()
+    frame = recordings._files.frames[capture.frame].copy()
     # the lower half of the frame slips by 4 px: a rolling shutter over a moving board
     frame[150:] = np.roll(frame[150:], 4, axis=1)
-    recordings._store.frames[capture.frame] = frame
+    recordings._files.frames[capture.frame] = frame
     fit = fit_geometry(recordings, "left")
     assert fit.views == 5
     assert fit.rejected[0].step == capture.id

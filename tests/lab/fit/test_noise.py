@@ -19,7 +19,7 @@ from lab.fit.noise.shading import shading
 from lab.fit.noise.temperature_law import temperature_law
 from lab.fit.weighted_lines import dark_line, linearity
 from lab.formats.importers.emva1288 import read_emva1288
-from lab.formats.recording_set import Camera, Manifest, RecordingSet, read
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet, read
 from lab.formats.results import NoiseFit
 from sim.sensor.mosaic import planes
 
@@ -65,8 +65,8 @@ class Sensor:
         charge += self.read * rng.standard_normal(self.shape)
         return np.clip(np.rint(self.black + self.gain * charge), 0, self.white).astype(np.uint16)
 
-    def camera(self) -> Camera:
-        return Camera(rows=self.shape[0], cols=self.shape[1], cfa=self.cfa, bit_depth=12)
+    def camera(self) -> DataSheet:
+        return DataSheet(rows=self.shape[0], cols=self.shape[1], cfa=self.cfa, bit_depth=12)
 
 
 def levels(

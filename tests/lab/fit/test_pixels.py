@@ -15,7 +15,7 @@ from lab.fit.noise.dark_pixels import DarkPixels, read_noise_distribution
 from lab.fit.noise.level_statistics import Stack
 from lab.fit.noise.pixel_maps import PixelMaps, pixel_maps
 from lab.formats.importers.images import read_image
-from lab.formats.recording_set import Camera, Manifest, RecordingSet
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "llanos_colorchecker"
 SHAPE = (48, 64)
@@ -30,7 +30,7 @@ def recordings(kinds: dict[str, dict[float, list[np.ndarray]]], bit_depth: int =
                 captures.append({"id": name, "kind": kind, "side": "left", "frame": name, "exposure_s": exposure})
                 frames[name] = frame.astype(np.uint16)
     rows, cols = next(iter(frames.values())).shape
-    camera = Camera(rows=rows, cols=cols, cfa=cfa, bit_depth=bit_depth)
+    camera = DataSheet(rows=rows, cols=cols, cfa=cfa, bit_depth=bit_depth)
     return RecordingSet(Manifest(cameras={"left": camera}, captures=tuple(captures)), frames)
 
 

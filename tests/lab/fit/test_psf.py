@@ -14,6 +14,11 @@ from scipy.signal import fftconvolve
 from scipy.special import j1, ndtr
 
 from benchmarks.peers.mosleh import mosleh_kernel
+from lab.capture_kinds.bernoulli import BernoulliCapture
+from lab.capture_kinds.black import BlackCapture
+from lab.capture_kinds.checkerboard import CheckerboardCapture
+from lab.capture_kinds.screen import ScreenState
+from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
 from lab.fit.psf import estimate_kernel
 from lab.fit.psf.levelled_captures import screen_pictures
@@ -25,7 +30,7 @@ from lab.fit.psf.screen_kernel import ScreenKernel, measure_kernels
 from lab.fit.psf.screen_registration import register, target_corners
 from lab.fit.psf.simplex import on_simplex
 from lab.fit.psf.target_displacement import displacement
-from lab.formats.recording_set import Bernoulli, Black, Camera, Checkerboard, Manifest, RecordingSet, Screen, White
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 
 
 def by_area(light, support, over=8):
@@ -323,7 +328,7 @@ def cells(row, col):
 @functools.cache
 def light_of(kind, seed=77):
     """What the whole mosaic sees of a pattern, each pixel through its own channel's blur."""
-    pattern = {White: np.ones((40, 50)), Black: np.zeros((40, 50)), Checkerboard: BOARD}.get(kind)
+    pattern = {WhiteCapture: np.ones((40, 50)), BlackCapture: np.zeros((40, 50)), CheckerboardCapture: BOARD}.get(kind)
     if pattern is None:
         pattern = PATTERN if seed == 77 else np.random.default_rng(seed).integers(0, 2, (40, 50))
     light = np.zeros(SHAPE)
@@ -352,20 +357,20 @@ def shown(pattern, sigma_px):
 
 def screen_recordings(electrons=9000.0, seed=5, **changed):
     rng = np.random.default_rng(seed)
-    camera = Camera(
+    camera = DataSheet(
         rows=SHAPE[0], cols=SHAPE[1], pixel_pitch_um=3.0, fill_factor=1.0, cfa="GRBG", bit_depth=12, black_level_dn=64.0
     )
     gains = np.tile(np.array([[1.0, 0.6], [0.45, 1.04]]), (SHAPE[0] // 2, SHAPE[1] // 2))
     response = gains * (1 + 0.008 * rng.normal(size=SHAPE))
-    screen = Screen(pose="p0", cell_camera_px=4.0)
+    screen = ScreenState(pose="p0", cell_camera_px=4.0)
     captures, frames = [], {}
-    for kind in (White, Black, Checkerboard, Bernoulli):
+    for kind in (WhiteCapture, BlackCapture, CheckerboardCapture, BernoulliCapture):
         light = light_of(kind, changed.get("pattern_seed", 77))
         for repeat in range(2):
             name = f"{kind.__name__.lower()}-{repeat}"
             mean = electrons * response * (0.01 + 0.99 * light)
             frames[f"frames/{name}.npy"] = np.minimum(64 + np.round(0.4 * rng.poisson(mean)), 4095).astype(np.uint16)
-            target = {} if kind in (White, Black) else {"target": f"targets/{kind.__name__.lower()}.npy"}
+            target = {} if kind in (WhiteCapture, BlackCapture) else {"target": f"targets/{kind.__name__.lower()}.npy"}
             captures.append(
                 kind(
                     id=name,

@@ -11,7 +11,7 @@ import pytest
 from lab.errors import NotDetermined
 from lab.fit.noise.recordings import fit_noise
 from lab.fit.spectral import MIN_LIGHTS, compare_curves, estimate_sensitivity, fit_spectral
-from lab.formats.recording_set import Camera, Manifest, RecordingSet, read
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet, read
 from lab.formats.results import NoiseFit, SpectralFit
 from sim.camera import CameraModel, Lens
 from sim.forward import Exposure, sample
@@ -196,7 +196,7 @@ def model() -> CameraModel:
     )
 
 
-def stated(**changes: object) -> Camera:
+def stated(**changes: object) -> DataSheet:
     m = model()
     known = {
         "rows": m.rows,
@@ -209,10 +209,10 @@ def stated(**changes: object) -> Camera:
         "focal_length_mm": m.lens.focal_length_mm,
         "lens_transmittance": m.lens.transmittance,
     }
-    return Camera(**(known | changes))
+    return DataSheet(**(known | changes))
 
 
-def recordings(exposure_s: float = 0.1, camera: Camera | None = None, step_nm: float = 10.0) -> RecordingSet:
+def recordings(exposure_s: float = 0.1, camera: DataSheet | None = None, step_nm: float = 10.0) -> RecordingSet:
     """Darks and narrowband light, 10 nm wide, of a radiance that a pixel of QE 1 would turn into 8000 e in 0.1 s."""
     rng = np.random.default_rng(4)
     captures, frames, spectra = [], {}, {}

@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.recordings import fit_geometry, geometry_result
 from lab.fit.stereo import Pair, fit_pairs, fit_stereo, rectification_maps
-from lab.formats.recording_set import Camera, Charuco, Manifest, RecordingSet
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 PAIRS = Path(__file__).parents[3].parent / "shared" / "data" / "opencv_stereo"
@@ -113,7 +114,7 @@ def test_public_stereo_pairs():
             path = f"frames/{file.stem}.npy"
             frames[path] = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE).astype(np.uint16)
             captures.append(
-                Charuco(
+                CharucoCapture(
                     id=file.stem,
                     kind="charuco",
                     side=side,
@@ -125,7 +126,7 @@ def test_public_stereo_pairs():
                     pose=file.stem[-2:],
                 )
             )
-    camera = Camera(rows=480, cols=640, pixel_pitch_um=6.0, fill_factor=1.0, cfa="MONO", bit_depth=8)
+    camera = DataSheet(rows=480, cols=640, pixel_pitch_um=6.0, fill_factor=1.0, cfa="MONO", bit_depth=8)
     recordings = RecordingSet(
         Manifest(cameras={"left": camera, "right": camera}, captures=tuple(captures)), frames=frames
     )

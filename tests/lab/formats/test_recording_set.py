@@ -14,9 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from lab.capture_kinds.dark import DarkCapture
+from lab.capture_kinds.flat import FlatCapture
 from lab.errors import InputError
-from lab.formats import recording_set as recording
-from lab.formats.recording_set import Dark, Flat, Manifest, RecordingError, RecordingSet, read, write
+from lab.formats.recording_set import Manifest, RecordingError, RecordingSet, read, write
 from sim.spectrum import Spectrum
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -118,8 +119,8 @@ def test_any_set_survives_writing_and_reading(
 def test_captures_by_kind_class_and_side(small_set: Callable[..., RecordingSet]) -> None:
     recordings = small_set()
     assert [c.id for c in recordings.captures("dark", "left")] == ["dark-000", "dark-006"]
-    assert recordings.captures(Dark, "left") == recordings.captures("dark", "left")
-    assert all(isinstance(c, Flat) for c in recordings.captures("flat"))
+    assert recordings.captures(DarkCapture, "left") == recordings.captures("dark", "left")
+    assert all(isinstance(c, FlatCapture) for c in recordings.captures("flat"))
     assert len(recordings.captures()) == len(recordings.manifest.captures)
     assert recordings.capture("dark-006").side == "left"
     with pytest.raises(InputError, match="no capture 'nope'"):
@@ -132,7 +133,7 @@ def test_frames_are_read_only_and_the_cache_keeps_to_its_size(folder: Path) -> N
     with pytest.raises(ValueError, match="read-only"):
         recordings.frame(first)[0, 0] = 1
     one = recordings.frame(first).nbytes
-    small = RecordingSet(recordings.manifest, store=recordings._store, cache_bytes=one)
+    small = RecordingSet(recordings.manifest, files=recordings._files, cache_bytes=one)
     kept = small.frame(first)
     assert small.frame(first) is kept
     small.frame(second)
@@ -556,7 +557,7 @@ def test_clipped_channel_of_another_kind_is_only_remarked(folder: Path) -> None:
 
 def test_a_refused_set_is_not_written(small_set: Callable[..., RecordingSet], tmp_path: Path) -> None:
     recordings = small_set()
-    recordings._store.spectra.pop("spectra/lamp.csv")
+    recordings._files.spectra.pop("spectra/lamp.csv")
     with pytest.raises(RecordingError, match=r"lamp\.csv"):
         write(recordings, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
@@ -568,7 +569,7 @@ def test_a_failure_while_writing_leaves_nothing(
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(recording, "manifest_json", full)
+    monkeypatch.setattr("lab.formats.recording_set.writing.manifest_json", full)
     with pytest.raises(InputError, match="No space left"):
         write(small_set(), tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lab.capture_kinds.narrowband import NarrowbandCapture
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.measurements.summaries import Study
 from lab.errors import NotDetermined
-from lab.formats.recording_set import Narrowband, RecordingSet, SlantedEdge
+from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
 from lab.predict.replay import Replay
 from mocks.former import ConcealedCamera, Plan
@@ -30,7 +32,7 @@ def replay(recordings: RecordingSet) -> Replay:
 def test_edges_come_out_where_they_were_recorded(replay: Replay, recordings: RecordingSet) -> None:
     """Residuals within the noise (photon noise, PRNU) but for a tenth: an edge that were off by 0.1 px alone would add a third."""
     camera = replay.camera
-    for capture in recordings.captures(SlantedEdge)[:3]:
+    for capture in recordings.captures(SlantedEdgeCapture)[:3]:
         assert capture.region is not None
         row0, col0, row1, col1 = capture.region
         inside = np.s_[row0 + 6 : row1 - 6, col0 + 6 : col1 - 6]
@@ -72,7 +74,7 @@ def test_effects_act_on_replayed_frames(replay: Replay, recordings: RecordingSet
     """A filter's edge at 600 nm takes all light of 650 nm and none of 500 nm: 13 and 20 widths away."""
     cut = effect("infrared_cut_filter")(cut_wavelength_nm=600.0, width_nm=4.0)
     camera = replay.camera
-    for capture in recordings.captures(Narrowband):
+    for capture in recordings.captures(NarrowbandCapture):
         dark = (
             camera.black_level_dn + camera.conversion_gain_dn_per_e * camera.dark_current_e_per_s * capture.exposure_s
         )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lab.fit.noise.recordings import fit_noise
-from lab.formats.recording_set import Camera, Manifest, RecordingSet
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import CameraFit, FitResult
 from lab.report import render_report
 from lab.report.emva import data_sheets
@@ -36,7 +36,7 @@ def recordings(*, photons: bool, cfa: str = "MONO") -> RecordingSet:
                 mean = (6000.0 * light * pattern if kind == "flat" else 0.0) + (30.0 + hot) * light
                 charge = np.minimum(rng.poisson(mean), 6600) + 4.0 * rng.standard_normal(SHAPE)
                 frames[name] = np.clip(np.rint(80.0 + 0.5 * charge), 0, 4095).astype(np.uint16)
-    camera = Camera(rows=SHAPE[0], cols=SHAPE[1], cfa=cfa, bit_depth=12)
+    camera = DataSheet(rows=SHAPE[0], cols=SHAPE[1], cfa=cfa, bit_depth=12)
     return RecordingSet(Manifest(cameras={"left": camera}, captures=tuple(captures)), frames)
 
 

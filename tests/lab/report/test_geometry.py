@@ -11,7 +11,7 @@ import pytest
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.recordings import geometry_result
 from lab.fit.stereo import Pair, fit_pairs
-from lab.formats.recording_set import Camera, Manifest, RecordingSet
+from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import ChannelGeometry, GeometryFit
 from lab.report.geometry import (
     charts_by_side,
@@ -99,7 +99,7 @@ def test_rectified_pair_is_one_picture_of_both(rig):
     pairs, _, stereo = rig
     captures = [capture for pair in pairs for capture in (pair.left.capture, pair.right.capture)]
     captures = [c.model_copy(update={"frame": f"{c.id}.npy"}) for c in captures]
-    camera = Camera(rows=SHAPE[0], cols=SHAPE[1], pixel_pitch_um=3.0, fill_factor=1.0, cfa="MONO", bit_depth=12)
+    camera = DataSheet(rows=SHAPE[0], cols=SHAPE[1], pixel_pitch_um=3.0, fill_factor=1.0, cfa="MONO", bit_depth=12)
     frame = (np.indices(SHAPE).sum(axis=0) % 512).astype(np.uint16)
     recordings = RecordingSet(
         Manifest(cameras={"left": camera, "right": camera}, captures=tuple(captures)),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lab.errors import InputError
-from lab.formats.recording_set import Camera, RecordingSet
+from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit, FitResult, MakerDeparture, Patch, SpectralFit, Unexplained
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.figures import by_side, measured, rotation_vector_mrad
@@ -164,7 +164,7 @@ def test_text_from_outside_stays_text(small_set: Callable[..., RecordingSet], ma
     recordings = small_set()
     evil = '</script><script>alert("x")</script><img src=x onerror=alert(1)>'
     manifest = recordings.manifest.model_copy(update={"name": evil, "notes": evil})
-    recordings = RecordingSet(manifest, store=recordings._store, source=evil, warnings=(evil,))
+    recordings = RecordingSet(manifest, files=recordings._files, source=evil, warnings=(evil,))
     fit, validation, diagnosis = made_up()
     check = validation.checks[0]
     curve = check.curves[0].model_copy(update={"label": evil})
@@ -262,7 +262,7 @@ def test_pictures_have_the_right_way_up_and_the_right_colours() -> None:
 
 
 def test_frame_picture_puts_the_mosaic_channels_where_they_belong() -> None:
-    camera = Camera(rows=4, cols=4, cfa="GBRG", bit_depth=12, black_level_dn=10)
+    camera = DataSheet(rows=4, cols=4, cfa="GBRG", bit_depth=12, black_level_dn=10)
     frame = np.full((4, 4), 10, np.uint16)
     frame[0::2, 1::2] = 1000  # blue of GBRG
     assert tuple(decoded(frame_picture(frame, camera))[0, 0]) == (0, 0, 255)

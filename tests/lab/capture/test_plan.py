@@ -5,14 +5,14 @@ from collections import Counter, defaultdict
 import numpy as np
 import pytest
 
-from lab.capture.sequences.calibration import Calibration, full_calibration
-from lab.capture.sequences.dark import DarkSequence
-from lab.capture.sequences.flat import FlatSequence
-from lab.capture.sequences.narrowband import NarrowbandSequence
-from lab.capture.sequences.steps import FindExposure, RelativeExposure, Setting, Step
-from lab.capture.sequences.targets import ScreenSequence
+from lab.capture.plan import full_plan
+from lab.capture_kinds.base import FindExposure, RelativeExposure, Setting, Step
+from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.flat import FlatSequence
+from lab.capture_kinds.narrowband import NarrowbandCapture, NarrowbandSequence
+from lab.capture_kinds.screen import ScreenSequence
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import InputError
-from lab.formats.recording_set import Narrowband, SlantedEdge
 from tests.lab import fake_bench
 
 STATION = fake_bench.station()
@@ -20,14 +20,14 @@ STATION = fake_bench.station()
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_a_full_calibration_takes_what_the_fits_need(quick: bool) -> None:
-    steps = full_calibration(STATION, quick).steps(STATION)
+    steps = full_plan(STATION, quick).steps(STATION)
     captures = [capture for step in steps for capture in step.captures if capture.side == "left"]
     kinds = Counter(capture.kind for capture in captures)
     assert kinds["dark"] >= 4 * 4
     assert kinds["flat"] >= 8 * 4
-    assert {c.wavelength_nm for c in captures if isinstance(c, Narrowband)} == set(range(400, 721, 10))
+    assert {c.wavelength_nm for c in captures if isinstance(c, NarrowbandCapture)} == set(range(400, 721, 10))
     assert min(kinds[kind] for kind in ("chart", "white", "black", "checkerboard", "bernoulli")) >= 2
-    edges = Counter(capture.frame for capture in captures if isinstance(capture, SlantedEdge))
+    edges = Counter(capture.frame for capture in captures if isinstance(capture, SlantedEdgeCapture))
     assert len(edges) >= 4 * 2  # orientations x repeats
     assert set(edges.values()) == {3}  # regions
     assert kinds["charuco"] == 3
@@ -35,8 +35,8 @@ def test_a_full_calibration_takes_what_the_fits_need(quick: bool) -> None:
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_ids_and_files_are_unique_and_the_same_every_time(quick: bool) -> None:
-    steps = full_calibration(STATION, quick).steps(STATION)
-    assert steps == full_calibration(STATION, quick).steps(STATION)
+    steps = full_plan(STATION, quick).steps(STATION)
+    assert steps == full_plan(STATION, quick).steps(STATION)
     ids = [step.id for step in steps]
     assert len(set(ids)) == len(ids)
     captures = [capture.id for step in steps for capture in step.captures]
@@ -49,13 +49,13 @@ def test_ids_and_files_are_unique_and_the_same_every_time(quick: bool) -> None:
 
 
 def test_both_sides_are_in_every_trigger() -> None:
-    for step in full_calibration(STATION).steps(STATION):
+    for step in full_plan(STATION).steps(STATION):
         assert {capture.side for capture in step.captures} in (set(), {"left", "right"})
 
 
 def test_what_a_step_relies_on_comes_before_it() -> None:
     found, measured = set(), set()
-    for step in full_calibration(STATION).steps(STATION):
+    for step in full_plan(STATION).steps(STATION):
         if isinstance(step.exposure, RelativeExposure):
             assert step.exposure.of in found
         if isinstance(step.exposure, FindExposure):
@@ -81,8 +81,7 @@ def test_ladders_cancel_a_linear_drift() -> None:
 
 
 def test_flats_go_from_near_dark_to_beyond_saturation() -> None:
-    levels = full_calibration(STATION).flat
-    assert levels is not None
+    levels = next(one for one in full_plan(STATION).sequences if isinstance(one, FlatSequence))
     assert min(levels.levels) <= 0.05
     assert max(levels.levels) > 1.0
     factors = {s.exposure.factor for s in levels.steps(STATION) if isinstance(s.exposure, RelativeExposure)}
@@ -120,19 +119,19 @@ def test_a_screen_too_small_to_align_is_refused() -> None:
 @pytest.mark.parametrize("family", ["monochromator", "spectroradiometer", "display"])
 def test_without_an_instrument_the_sequences_that_need_it_are_left_out(family: str) -> None:
     station = fake_bench.station(**{family: None})
-    chosen = full_calibration(station)
-    assert chosen.dark is not None
-    assert (chosen.flat is None) == (family != "display")
-    assert (chosen.screen is None) == (family != "monochromator")
+    chosen = full_plan(station)
+    assert "dark" in chosen.names
+    assert ("flat" in chosen.names) == (family == "display")
+    assert ("screen" in chosen.names) == (family == "monochromator")
     assert chosen.steps(station)
-    wanted = full_calibration(STATION)
+    wanted = full_plan(STATION)
     with pytest.raises(InputError, match=rf"needs a {family}"):
         wanted.steps(station)
 
 
 def test_specs_refuse_unknown_axes() -> None:
     with pytest.raises(ValueError, match="wavelength"):
-        Calibration.model_validate({"dark": {"exposures_s": [1], "frames": 1, "wavelength": 3}})
+        DarkSequence.model_validate({"exposures_s": [1], "frames": 1, "wavelength": 3})
     with pytest.raises(ValueError, match="need an exposure"):
         captures = DarkSequence(exposures_s=(1.0,), frames=1).steps(STATION)[0].captures
         Step(id="x", what="x", setting=Setting(target="cap"), captures=captures)

@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Annotated, ClassVar, Literal, Self
+
 from pydantic import Field
 
-from lab.capture.sequences.steps import (
+from lab.capture_kinds.base import (
+    Capture,
+    Equipment,
     FindExposure,
+    Reading,
     RelativeExposure,
     Sequence,
     Setting,
+    SpectrumPath,
     Step,
-    common,
-    needs,
+    Target,
+    planned_keys,
     spectrum_path,
 )
-from lab.capture.station import Sphere, Station
-from lab.formats.recording_set import Narrowband
+from lab.capture_kinds.flat import SphereTarget
+from sim.scene.scenes import Scene, UniformField
+from sim.spectrum import Spectrum
 
 
 class NarrowbandSequence(Sequence):
-    """From `from_nm` to `to_nm` by `step_nm` and back, `passes` times in all; the light is measured at every visit.
+    """From `from_nm` to `to_nm` by `step_nm` and back, `passes` times in all. The light is measured at every visit.
 
-    Going there and back cancels a linear drift of the lamp. The exposures are found on the first pass and kept.
+    The way there and back cancels a linear drift of the lamp. The exposures are found on the first pass and kept.
     """
+
+    name: ClassVar[str] = "narrowband"
+    instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
+    targets: ClassVar[tuple[type[Target], ...]] = (SphereTarget,)
 
     from_nm: float = Field(default=400.0, gt=0)
     to_nm: float = Field(default=720.0, gt=0)
@@ -30,16 +42,19 @@ class NarrowbandSequence(Sequence):
     passes: int = Field(default=2, ge=1)
     level: float = 0.7
 
+    @classmethod
+    def planned(cls, station: Equipment, quick: bool) -> Self | None:
+        return None if station.lacks(*cls.instruments) else cls()
+
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:
         """The wavelengths in ascending order, both ends included."""
         count = int((self.to_nm - self.from_nm) / self.step_nm + 1e-9) + 1
         return tuple(self.from_nm + n * self.step_nm for n in range(count))
 
-    def steps(self, station: Station) -> tuple[Step, ...]:
-        """See `Sequence.steps`."""
-        needs(station, "narrowband", "monochromator", "spectroradiometer")
-        sphere = station.one(Sphere)
+    def steps(self, station: Equipment) -> tuple[Step, ...]:
+        self.check_instruments(station)
+        sphere = station.one(SphereTarget)
         made: list[Step] = []
         for turn in range(1, self.passes + 1):
             for wavelength_nm in self.wavelengths_nm if turn % 2 else self.wavelengths_nm[::-1]:
@@ -64,12 +79,29 @@ class NarrowbandSequence(Sequence):
                         radiance=path,
                         exposure=RelativeExposure(of=f"{stem}/exposure"),
                         captures=tuple(
-                            Narrowband.model_validate(
-                                common(id, side)
-                                | {"kind": "narrowband", "wavelength_nm": wavelength_nm, "radiance": path}
+                            NarrowbandCapture(
+                                kind="narrowband", wavelength_nm=wavelength_nm, radiance=path, **planned_keys(id, side)
                             )
                             for side in station.sides
                         ),
                     )
                 )
         return tuple(made)
+
+
+class NarrowbandCapture(Capture):
+    """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured."""
+
+    shows: ClassVar[str] = "uniform diffuse light from the monochromator, filling the field"
+    sequence: ClassVar[type[Sequence] | None] = NarrowbandSequence
+
+    kind: Literal["narrowband"]
+    wavelength_nm: float = Field(gt=0)
+    bandwidth_nm: Annotated[float | None, Reading("bandwidth_nm")] = Field(default=None, ge=0)
+    radiance: SpectrumPath
+
+    def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
+        return UniformField(spectrum(self.radiance), self.kind)
+
+
+KIND = NarrowbandCapture

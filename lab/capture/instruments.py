@@ -1,0 +1,117 @@
+"""A station's devices, connected, and how they are brought into a safe state: shutter closed, screen dark, all motion ended."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import InstrumentError
+from drivers.instrument import Identity
+from lab.capture.blocking_calls import STOP_S, in_thread
+from lab.capture.devices import (
+    CamerasDevice,
+    Device,
+    LightDevice,
+    RadiometerDevice,
+    ScreenDevice,
+    ShutterDevice,
+    TargetDevice,
+    WriteFrame,
+    WriteSpectrum,
+)
+from lab.capture.station import Drivers, Station
+from lab.capture_kinds.base import CaptureLimits
+from lab.errors import DeviceError
+
+
+class Instruments:
+    """A station's devices, connected by `connect`. One per run of a session."""
+
+    def __init__(
+        self,
+        station: Station,
+        drivers: Drivers,
+        *,
+        write_frame: WriteFrame,
+        write_spectrum: WriteSpectrum,
+        cells: Callable[[str], NDArray[np.uint8]],
+    ) -> None:
+        self.station, self.drivers = station, drivers
+        sheets = {side: camera.datasheet for side, camera in station.cameras.items()}
+        self.cameras = CamerasDevice(drivers.cameras, sheets, write_frame)
+        self.target = TargetDevice(drivers.stage) if drivers.stage else None
+        self.light = LightDevice(drivers.monochromator) if drivers.monochromator else None
+        self.shutter = ShutterDevice(drivers.monochromator) if drivers.monochromator else None
+        self.screen = ScreenDevice(drivers.display, cells) if drivers.display else None
+        radiometer = drivers.spectroradiometer
+        self.radiometer = RadiometerDevice(radiometer, write_spectrum) if radiometer else None
+
+    @property
+    def limits(self) -> CaptureLimits:
+        """The station's limits."""
+        return self.station.limits
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """All devices that the station has, the cameras last."""
+        every = (self.target, self.light, self.shutter, self.screen, self.radiometer, self.cameras)
+        return tuple(device for device in every if device is not None)
+
+    def connect(self) -> dict[str, Identity]:
+        """Reach every instrument and bring it into its safe state; who they are, by name. Raises DeviceError."""
+        found: dict[str, Identity] = {}
+        for name, driver in self.drivers.all.items():
+            try:
+                driver.connect()
+                driver.stop()
+                found[name] = driver.identity()
+            except InstrumentError as error:
+                raise DeviceError(_named(name, error)) from error
+        for side, camera in self.drivers.cameras.items():
+            sensor, sheet = camera.sensor(), self.station.cameras[side].datasheet
+            if (sensor.rows, sensor.cols) != (sheet.rows, sheet.cols):
+                raise DeviceError(
+                    f"camera {side}: has {sensor.rows} x {sensor.cols} pixels, its data sheet in the station file says "
+                    f"{sheet.rows} x {sheet.cols}; correct rows and cols there, or the camera's region"
+                )
+            if sensor.cfa not in (None, sheet.cfa):
+                raise DeviceError(
+                    f"camera {side}: says its colour filters are {sensor.cfa}, its data sheet in the station file says "
+                    f"{sheet.cfa}; correct cfa there"
+                )
+        return found
+
+    def make_safe(self) -> list[str]:
+        """Close the shutter, darken the screen, stop all motion: every instrument at once, each for `STOP_S` at most.
+
+        What didn't obey is returned, one line each.
+        """
+        stopping = {name: in_thread(driver.stop) for name, driver in self.drivers.all.items()}
+        complaints = []
+        until = time.monotonic() + STOP_S
+        for name, future in stopping.items():
+            try:
+                future.result(max(0.0, until - time.monotonic()))
+            except TimeoutError:
+                complaints.append(f"{name}: didn't stop within {STOP_S:g} s")
+            except Exception as error:
+                complaints.append(_named(name, error))
+        return complaints
+
+    def close(self) -> None:
+        """Let go of all lines. Never raises."""
+        closing = [in_thread(driver.close) for driver in self.drivers.all.values()]
+        until = time.monotonic() + STOP_S
+        for future in closing:
+            try:
+                future.result(max(0.0, until - time.monotonic()))
+            except Exception:
+                continue
+
+
+def _named(name: str, error: Exception) -> str:
+    text = str(error)
+    return text if name.split(maxsplit=1)[0] in text.lower() else f"{name}: {text}"

@@ -1,0 +1,91 @@
+"""What the store tells of sessions, captures, results and files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from pydantic import ConfigDict
+
+from lab.capture_kinds.base import Step
+from sim.camera import Side
+from sim.parameters import Frozen
+
+SessionState = Literal["created", "running", "paused", "interrupted", "failed", "finished"]
+JobState = Literal["queued", "running", "done", "failed", "cancelled"]
+Role = Literal["frame", "spectrum", "target"]
+
+
+class _Record(Frozen):
+    model_config = ConfigDict(frozen=True, extra="forbid", from_attributes=True)
+
+
+class SessionInfo(_Record):
+    """A session as the registry has it."""
+
+    id: str
+    name: str
+    notes: str
+    created: datetime
+    closed: datetime | None
+    state: SessionState
+    error: str | None
+    packed: bool
+    steps: int
+    steps_done: int
+
+
+class CaptureInfo(_Record):
+    """A capture as the registry has it; `document` is its entry in a manifest."""
+
+    id: int
+    session_id: str
+    name: str
+    kind: str
+    side: str
+    document: dict[str, Any]
+
+
+class ResultInfo(_Record):
+    """A stored result; `document` as `spec/results.md` has it."""
+
+    id: str
+    job_id: str | None
+    source: str
+    kind: str
+    created: datetime
+    document: dict[str, Any]
+
+
+class Run(Frozen):
+    """Provenance of one run of a session: when, with which instruments and which versions."""
+
+    started: datetime
+    instruments: dict[str, dict[str, str]]
+    versions: dict[str, str]
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file that is on the disk and not linked yet."""
+
+    role: Role
+    path: str
+    sha256: str
+    bytes: int
+    side: Side | None = None
+
+
+@dataclass(frozen=True)
+class JournalEntry:
+    """A step of the journal with what came of it; `finished` None: still to do."""
+
+    step: Step
+    finished: datetime | None
+    result: dict[str, Any]
+
+
+def now() -> datetime:
+    """The time, UTC."""
+    return datetime.now(UTC)

@@ -1,1 +1,0 @@
-"""What a calibration captures: frozen specifications, one per kind of measurement, and the steps that they come to."""

@@ -1,0 +1,176 @@
+"""The registry's tables, and its database: SQLite in the data folder, or PostgreSQL by URL."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from lab.capture.durable_files import Lock
+from lab.errors import InputError
+
+
+class Base(DeclarativeBase):
+    """The registry's tables. A change here needs a revision in `lab/capture/migrations/versions`."""
+
+    type_annotation_map = {dict[str, Any]: sa.JSON, list[Any]: sa.JSON, datetime: sa.DateTime(timezone=True)}
+
+
+class SessionRow(Base):
+    __tablename__ = "sessions"
+
+    id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
+    name: Mapped[str] = mapped_column(sa.Text, default="")
+    notes: Mapped[str] = mapped_column(sa.Text, default="")
+    created: Mapped[datetime]
+    closed: Mapped[datetime | None]
+    state: Mapped[str] = mapped_column(sa.String(20))
+    error: Mapped[str | None] = mapped_column(sa.Text)
+    station: Mapped[dict[str, Any]]
+    calibration: Mapped[dict[str, Any]]
+    cameras: Mapped[dict[str, Any]]
+    runs: Mapped[list[Any]]
+    packed: Mapped[bool] = mapped_column(default=False)
+
+
+class StepRow(Base):
+    """The journal: a step is done when `finished` is set."""
+
+    __tablename__ = "steps"
+    __table_args__ = (sa.UniqueConstraint("session_id", "step_id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[str] = mapped_column(sa.ForeignKey("sessions.id", ondelete="CASCADE"), index=True)
+    position: Mapped[int]
+    step_id: Mapped[str] = mapped_column(sa.String(120))
+    spec: Mapped[dict[str, Any]]
+    started: Mapped[datetime | None]
+    finished: Mapped[datetime | None]
+    result: Mapped[dict[str, Any] | None]
+
+
+class FileRow(Base):
+    """A file of a session, immutable. `pack_index`: where a frame lies in the packed session."""
+
+    __tablename__ = "files"
+    __table_args__ = (sa.UniqueConstraint("session_id", "path"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[str] = mapped_column(sa.ForeignKey("sessions.id", ondelete="CASCADE"), index=True)
+    role: Mapped[str] = mapped_column(sa.String(20))
+    path: Mapped[str] = mapped_column(sa.String(300))
+    sha256: Mapped[str] = mapped_column(sa.String(64))
+    bytes: Mapped[int]
+    side: Mapped[str | None] = mapped_column(sa.String(10))
+    pack_index: Mapped[int | None]
+
+
+class CaptureRow(Base):
+    __tablename__ = "captures"
+    __table_args__ = (sa.UniqueConstraint("session_id", "name"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    session_id: Mapped[str] = mapped_column(sa.ForeignKey("sessions.id", ondelete="CASCADE"), index=True)
+    step: Mapped[int] = mapped_column(sa.ForeignKey("steps.id", ondelete="CASCADE"))
+    file: Mapped[int] = mapped_column(sa.ForeignKey("files.id", ondelete="CASCADE"))
+    name: Mapped[str] = mapped_column(sa.String(160))
+    kind: Mapped[str] = mapped_column(sa.String(20))
+    side: Mapped[str] = mapped_column(sa.String(10))
+    document: Mapped[dict[str, Any]]
+
+
+class JobRow(Base):
+    __tablename__ = "jobs"
+
+    id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
+    kind: Mapped[str] = mapped_column(sa.String(20))
+    source: Mapped[str] = mapped_column(sa.Text)
+    state: Mapped[str] = mapped_column(sa.String(20), index=True)
+    progress: Mapped[float] = mapped_column(default=0.0)
+    message: Mapped[str] = mapped_column(sa.Text, default="")
+    error: Mapped[str | None] = mapped_column(sa.Text)
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    runner: Mapped[str] = mapped_column(sa.String(40))
+    created: Mapped[datetime]
+    started: Mapped[datetime | None]
+    finished: Mapped[datetime | None]
+
+
+class ResultRow(Base):
+    __tablename__ = "results"
+
+    id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
+    job_id: Mapped[str | None] = mapped_column(sa.ForeignKey("jobs.id", ondelete="SET NULL"), index=True)
+    source: Mapped[str] = mapped_column(sa.Text, index=True)
+    kind: Mapped[str] = mapped_column(sa.String(20))
+    created: Mapped[datetime]
+    document: Mapped[dict[str, Any]]
+
+
+class KeyRow(Base):
+    """An API key: only its hash (see `api.security`)."""
+
+    __tablename__ = "api_keys"
+
+    name: Mapped[str] = mapped_column(sa.String(100), primary_key=True)
+    scope: Mapped[str] = mapped_column(sa.String(20))
+    sha256: Mapped[str] = mapped_column(sa.String(64), unique=True)
+    created: Mapped[datetime]
+
+
+# --- the database ------------------------------------------------------------------------------------------------------
+
+
+def open_engine(url: str) -> sa.Engine:
+    """The database at a URL. Raises InputError where it can't be opened."""
+    try:
+        engine = sa.create_engine(url)
+    except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError, ImportError) as error:
+        raise InputError(f"registry {url!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error
+    if engine.dialect.name != "sqlite":
+        return engine
+
+    @sa.event.listens_for(engine, "connect")
+    def _pragmas(connection: Any, record: Any) -> None:
+        connection.isolation_level = None  # BEGIN is ours, below
+        for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=30000"):
+            connection.execute(f"PRAGMA {pragma}").close()
+
+    @sa.event.listens_for(engine, "begin")
+    def _begin(connection: sa.Connection) -> None:
+        # A writer that began by reading would fail, not wait, where another wrote in between.
+        writes = connection.get_execution_options().get("writes")
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    return engine
+
+
+def upgrade(engine: sa.Engine, folder: Path) -> None:
+    """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry."""
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    newest = ScriptDirectory.from_config(config).get_current_head()
+    lock = Lock(folder / ".migration.lock")
+    if not lock.acquire(patience_s=60.0):
+        raise InputError(f"{folder}: its registry is being migrated by another process; try again when it is done")
+    try:
+        with engine.execution_options(writes=True).connect() as connection:
+            if MigrationContext.configure(connection).get_current_revision() == newest:
+                return
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+            connection.commit()
+    except sa.exc.DatabaseError as error:
+        raise InputError(
+            f"{engine.url}: isn't a registry ({str(error.orig or error).splitlines()[0]}); "
+            "set CALIBENCH_DATA to another folder"
+        ) from error
+    finally:
+        lock.release()

@@ -1,0 +1,203 @@
+"""The plan that takes one step: set the bench, measure the light, find the exposure, expose."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import bluesky.plan_stubs as bps
+import numpy as np
+from bluesky.utils import Msg
+
+from lab.capture.devices import LightSetting, Shot, ShownPattern
+from lab.capture.instruments import Instruments
+from lab.capture.records import StoredFile
+from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
+from lab.errors import DeviceError, InputError
+from sim.camera import Side
+
+T = TypeVar("T")
+Plan = Generator[Msg, Any, T]
+
+#: Levels above SATURATED and below UNLIT, shares of the range, tell only in which direction to search. SATURATED is 10 % below
+#: the data sheet's full well, because a sensor may saturate below its data sheet.
+SATURATED, UNLIT = 0.9, 0.01
+TRIES = 14
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What a step gave: its result for the journal, its files, and its completed captures."""
+
+    result: dict[str, Any]
+    files: tuple[StoredFile, ...] = ()
+    captures: tuple[Capture, ...] = ()
+
+
+def arrange(step: Step, instruments: Instruments) -> Plan[None]:
+    """Set the bench as the step wants it, moving only what stands otherwise. Raises InputError for what isn't there."""
+    setting = step.setting
+    group = "arrange"
+    if setting.target is not None:
+        if instruments.target is None:
+            raise InputError(
+                f"station: step {step.id!r} needs target {setting.target!r} and there is no [stage]; add one (driver 'prompt' asks you)"
+            )
+        if instruments.target.value != setting.target:
+            yield from bps.abs_set(instruments.target, setting.target, group=group)
+    if instruments.light is not None and instruments.shutter is not None:
+        lit = setting.wavelength_nm is not None
+        if not lit and instruments.shutter.value is not False:
+            yield from bps.abs_set(instruments.shutter, False, group=group)
+        if setting.wavelength_nm is not None:
+            light = LightSetting(setting.wavelength_nm, setting.slit_um)
+            if instruments.light.value != light:
+                yield from bps.abs_set(instruments.light, light, group=group)
+    if instruments.screen is not None:
+        pattern = ShownPattern(setting.pattern, setting.cell_px if setting.pattern else 1)
+        if instruments.screen.value != pattern:
+            yield from bps.abs_set(instruments.screen, pattern, group=group)
+    yield from bps.wait(group=group)
+    # Only now: opening the shutter before the grating has arrived would light the target with other wavelengths.
+    if instruments.shutter is not None and setting.wavelength_nm is not None and not instruments.shutter.value:
+        yield from bps.abs_set(instruments.shutter, True, wait=True)
+
+
+def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
+    yield Msg("prepare", instruments.cameras, shot, group="shoot")
+    yield from bps.wait(group="shoot")
+    yield from bps.trigger(instruments.cameras, group="shoot")
+    yield from bps.wait(group="shoot")
+
+
+def find_exposure(
+    wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float]
+) -> Plan[tuple[dict[Side, float], dict[Side, float]]]:
+    """Exposures (s) and the levels they gave, camera by camera, by test frames that aren't kept.
+
+    A frame that is saturated or unlit only says in which direction to go; any other tells the exposure by proportion. A
+    camera that reaches a limit of the station keeps the limit.
+    """
+    limits = instruments.limits
+
+    def bounded(exposure_s: float) -> float:
+        return float(np.clip(exposure_s, limits.exposure_min_s, limits.exposure_max_s))
+
+    exposure_s = {side: bounded(start_s[side]) for side in instruments.cameras.cameras}
+    levels: dict[Side, float] = {}
+    before: tuple[dict[Side, float], dict[Side, float]] | None = None
+    for _ in range(TRIES):
+        yield from _shoot(instruments, Shot(exposure_s, limits.gain_db, {}))
+        levels = dict(instruments.cameras.levels)
+        following = dict(exposure_s)
+        for side, level in levels.items():
+            if abs(level - wanted.level) <= wanted.tolerance and not _stuck(side, before, exposure_s, levels):
+                continue
+            if level >= SATURATED or _stuck(side, before, exposure_s, levels):
+                factor = 0.2
+            elif level < UNLIT:
+                factor = 10.0
+            else:
+                factor = wanted.level / level
+            following[side] = bounded(exposure_s[side] * factor)
+        if following == exposure_s:
+            break
+        before, exposure_s = (exposure_s, levels), following
+    return exposure_s, levels
+
+
+def _stuck(
+    side: Side,
+    before: tuple[dict[Side, float], dict[Side, float]] | None,
+    exposure_s: Mapping[Side, float],
+    levels: Mapping[Side, float],
+) -> bool:
+    """Whether a shorter exposure left a bright frame as bright: it is saturated, wherever the data sheet ends the range."""
+    if before is None or levels[side] < 0.3:
+        return False
+    shortened = exposure_s[side] / before[0][side]
+    return shortened < 0.9 and levels[side] / before[1][side] > np.sqrt(shortened)
+
+
+def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> Plan[Taken]:
+    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id.
+
+    A wavelength whose light the spectroradiometer refuses to measure is left out, with the reason in the result; any other
+    refusal is a DeviceError, for later steps rely on the spectrum.
+    """
+    yield from arrange(step, instruments)
+    files: list[StoredFile] = []
+    result: dict[str, Any] = {}
+    radiometer, cameras = instruments.radiometer, instruments.cameras
+    if step.radiance is not None:
+        if radiometer is None:
+            raise InputError(f"station: step {step.id!r} needs a [spectroradiometer]; add it to the station file")
+        yield Msg("prepare", radiometer, step.radiance, group="radiance")
+        yield from bps.trigger(radiometer, group="radiance")
+        yield from bps.wait(group="radiance")
+        if radiometer.stored is None:
+            reason = radiometer.refused or "spectroradiometer: gave no spectrum"
+            if not step.captures:
+                raise DeviceError(reason)
+            return Taken({"skipped": reason})
+        files.append(radiometer.stored)
+        result["radiance"] = step.radiance
+    captures: tuple[Capture, ...] = ()
+    if isinstance(step.exposure, FindExposure):
+        exposure_s, levels = yield from find_exposure(step.exposure, instruments, _start(instruments, results))
+        result |= {"exposure_s": exposure_s, "level": levels}
+    elif step.exposure is not None:
+        shot = Shot(
+            _exposures(step, instruments, results),
+            instruments.limits.gain_db,
+            {capture.side: capture.frame for capture in step.captures},
+        )
+        yield from _shoot(instruments, shot)
+        files += cameras.stored.values()
+        captures = _completed(step, instruments)
+        result |= {"level": dict(cameras.levels)}
+    yield from bps.create(name=step.sequence)
+    for device in instruments.devices:
+        yield from bps.read(device)
+    yield from bps.save()
+    return Taken(result, tuple(files), captures)
+
+
+def _start(instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:
+    """Where a search for an exposure starts: at what the latest search found, else at 10 ms."""
+    found = [result["exposure_s"] for result in results.values() if "exposure_s" in result]
+    return {side: float(found[-1][side]) if found else 0.01 for side in instruments.cameras.cameras}
+
+
+def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:
+    sides = instruments.cameras.cameras
+    if isinstance(step.exposure, FixedExposure):
+        return dict.fromkeys(sides, step.exposure.exposure_s)
+    assert isinstance(step.exposure, RelativeExposure)
+    limits = instruments.limits
+    base = results[step.exposure.of]["exposure_s"]
+    return {
+        side: float(np.clip(base[side] * step.exposure.factor, limits.exposure_min_s, limits.exposure_max_s))
+        for side in sides
+    }
+
+
+def _completed(step: Step, instruments: Instruments) -> tuple[Capture, ...]:
+    """The step's captures with the keys that the trigger and the instruments tell."""
+    readings = {key: value for device in instruments.devices for key, value in device.readings().items()}
+    completed = []
+    for capture in step.captures:
+        frame = instruments.cameras.frames[capture.side]
+        told: dict[str, Any] = {
+            "exposure_s": frame.exposure_s,
+            "gain_db": frame.gain_db,
+            "temperature_c": frame.temperature_c,
+            "time": frame.time,
+        }
+        for key, field in type(capture).model_fields.items():
+            for mark in field.metadata:
+                if isinstance(mark, Reading):
+                    told[key] = readings.get(mark.key)
+        completed.append(capture.model_copy(update={key: value for key, value in told.items() if value is not None}))
+    return tuple(completed)

@@ -1,0 +1,332 @@
+"""What the file of a capture kind is written with.
+
+A kind's file declares, as far as the kind needs its own:
+
+- a `Capture`: the kind's entry in a recording set's manifest;
+- a `Target`: what the station file says of the thing that stands before the cameras;
+- a `Sequence`: the steps in which a station takes such captures.
+
+`register` makes them known. Everything else (formats, store, sessions, service, command line, reports) reads `CAPTURES`,
+`TARGETS` and `SEQUENCES` and names no kind, unless an estimator needs that very kind.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from enum import Enum
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from lab.capture_kinds.registry import ByKind
+from lab.errors import InputError
+from sim.camera import Side
+from sim.parameters import Frozen
+from sim.scene.scenes import Scene
+from sim.spectrum import Spectrum
+
+Cells = NDArray[np.uint8]
+
+# --- the manifest's entry ----------------------------------------------------------------------------------------------
+
+
+class Open(BaseModel):
+    """Base of the manifest's objects: immutable. An unknown key is kept, as the format asks."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+    def unknown_keys(self) -> dict[str, Any]:
+        """The keys that the format doesn't know, with their values."""
+        return dict(self.model_extra or {})
+
+
+class Names(Enum):
+    """What the string under a manifest's key names: a capture, a file, or a pose."""
+
+    CAPTURE = "capture"
+    FRAME = "frame"
+    SPECTRUM = "spectrum"
+    TARGET = "target"
+    POSE = "pose"
+
+
+CaptureId = Annotated[str, Names.CAPTURE]
+FramePath = Annotated[str, Names.FRAME]
+SpectrumPath = Annotated[str, Names.SPECTRUM]
+TargetPath = Annotated[str, Names.TARGET]
+PoseName = Annotated[str, Names.POSE]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Marks a capture's key whose value an instrument tells when the frame is taken; `key`: that of `Device.readings`."""
+
+    key: str
+
+
+class Capture(Open):
+    """The keys that every capture has. A kind adds its own, and overrides what differs for it."""
+
+    shows: ClassVar[str]  # what stands before the camera, in words
+    sequence: ClassVar[type[Sequence] | None] = None  # what takes it on a station; None: it only comes from elsewhere
+    shares_frame: ClassVar[bool] = False  # several captures may describe one frame
+    clipping_matters: ClassVar[bool] = True  # a clipped channel is worth a warning
+
+    id: CaptureId
+    kind: str
+    side: Side
+    frame: FramePath
+    exposure_s: float = Field(ge=0)
+    gain_db: float | None = None
+    temperature_c: float | None = None
+    time: datetime | None = None
+
+    @classmethod
+    def unsupported(cls, document: dict[str, Any]) -> str | None:
+        """Why this version skips a capture that is right by the format; None where it is supported."""
+        return None
+
+    def problems(self, rows: int, cols: int) -> Iterator[str]:
+        """What is wrong with the keys of a capture from a camera of `rows` x `cols` pixels: value, limit, remedy."""
+        return iter(())
+
+    def remarks(self) -> Iterator[str]:
+        """What is odd about the keys, and how to mend it. The capture is used nevertheless."""
+        return iter(())
+
+    def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
+        """What the forward model puts before the camera; None where the manifest doesn't tell it.
+
+        `spectrum` gives the spectrum at a path of the manifest.
+        """
+        return None
+
+
+def _mark(annotation: Any) -> Names | None:
+    """The `Names` in a field's annotation, at any depth of unions."""
+    if isinstance(annotation, Names):
+        return annotation
+    return next((mark for part in get_args(annotation) if (mark := _mark(part)) is not None), None)
+
+
+def names_in(item: Open) -> Iterator[tuple[str, Names, str]]:
+    """(dotted key, what it names, value) of every key of a manifest's object that names something."""
+    for key, field in type(item).model_fields.items():
+        value = getattr(item, key)
+        if isinstance(value, Open):
+            yield from ((f"{key}.{inner}", mark, name) for inner, mark, name in names_in(value))
+        elif isinstance(value, str):
+            mark = next((one for one in field.metadata if isinstance(one, Names)), None) or _mark(field.annotation)
+            if mark is not None:
+                yield key, mark, value
+
+
+O = TypeVar("O", bound=Open)  # noqa: E741
+
+
+def in_folder(item: O, folder: str) -> O:
+    """The same object with `folder/` before all that it names."""
+    own = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
+    nested = {key: in_folder(value, folder) for key, value in item if isinstance(value, Open)}
+    return item.model_copy(update=own | nested)
+
+
+CAPTURES: ByKind[Capture] = ByKind("capture")
+AnyCapture = Annotated[Capture, CAPTURES]
+
+# --- the station's targets ---------------------------------------------------------------------------------------------
+
+
+class Target(Frozen):
+    """Something that can be put before the cameras, as `[targets.NAME]` of the station file describes it."""
+
+    kind: str
+
+    @property
+    def instruction(self) -> str:
+        """What an operator does to put it there."""
+        raise NotImplementedError
+
+
+TargetT = TypeVar("TargetT", bound=Target)
+TARGETS: ByKind[Target] = ByKind("target")
+AnyTarget = Annotated[Target, TARGETS]
+
+# --- the sequence of steps ---------------------------------------------------------------------------------------------
+
+
+class CaptureLimits(Frozen):
+    """The exposures, the gain and the slits that sequences keep to."""
+
+    exposure_min_s: float = Field(default=20e-6, gt=0)
+    exposure_max_s: float = Field(default=10.0, gt=0)
+    gain_db: float = 0.0
+    slit_um: float | None = Field(default=None, gt=0)  # None: as the instrument stands
+
+
+class Equipment(Protocol):
+    """What a sequence may ask of a station: cameras, limits, targets, instruments."""
+
+    @property
+    def sides(self) -> tuple[Side, ...]: ...
+    @property
+    def limits(self) -> CaptureLimits: ...
+    def having(self, kind: type[TargetT]) -> dict[str, TargetT]: ...
+    def one(self, kind: type[Target]) -> str: ...
+    def lacks(self, *families: str) -> tuple[str, ...]: ...
+
+
+class Setting(Frozen):
+    """How the bench is set for a step. None: it doesn't matter.
+
+    `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path in
+    the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the pattern.
+    """
+
+    target: str | None
+    wavelength_nm: float | None = None
+    slit_um: float | None = None
+    pattern: str | None = None
+    cell_px: int = 1
+
+
+class FixedExposure(Frozen):
+    """The same exposure (s) for every camera."""
+
+    kind: Literal["fixed"] = "fixed"
+    exposure_s: float = Field(gt=0)
+
+
+class RelativeExposure(Frozen):
+    """`factor` times the exposure that the step `of` found for each camera."""
+
+    kind: Literal["relative"] = "relative"
+    of: str
+    factor: float = Field(default=1.0, gt=0)
+
+
+class FindExposure(Frozen):
+    """A search, camera by camera, for the exposure at which the brightest channel reaches `level`.
+
+    `level` and `tolerance` are shares of the range from the black level to saturation.
+    """
+
+    kind: Literal["find"] = "find"
+    level: float = Field(default=0.75, gt=0.05, lt=0.95)
+    tolerance: float = Field(default=0.05, gt=0)
+
+
+class Step(Frozen):
+    """The unit of the journal: all of it is kept, or none. Its `id` is stable, so that a session can be resumed.
+
+    `radiance`: path at which the step's measurement by the spectroradiometer is kept; None: no measurement. `captures`: what
+    one trigger of all cameras gives, without the keys that the trigger tells (exposure, gain, temperature, time).
+    """
+
+    id: str
+    what: str
+    setting: Setting
+    radiance: str | None = None
+    exposure: FixedExposure | RelativeExposure | FindExposure | None = Field(default=None, discriminator="kind")
+    captures: tuple[AnyCapture, ...] = ()
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.captures and not isinstance(self.exposure, FixedExposure | RelativeExposure):
+            raise ValueError(f"step {self.id}: captures need an exposure, fixed or relative to one that was found")
+        return self
+
+    @property
+    def sequence(self) -> str:
+        """The first part of the id."""
+        return self.id.partition("/")[0]
+
+
+class Sequence(Frozen):
+    """The specification of a measurement. Its fields are the measurement's parameters; its steps follow from them."""
+
+    name: ClassVar[str]
+    instruments: ClassVar[tuple[str, ...]] = ()  # families of the station file that it can't do without
+    targets: ClassVar[tuple[type[Target], ...]] = ()  # kinds of target that it puts before the cameras
+
+    @classmethod
+    @abstractmethod
+    def planned(cls, station: Equipment, quick: bool) -> Self | None:
+        """What a full calibration takes on this station; `quick`: fewer frames. None where the station can't take it."""
+
+    @abstractmethod
+    def steps(self, station: Equipment) -> tuple[Step, ...]:
+        """The steps in the order in which they are taken. Raises InputError if the station lacks what they need."""
+
+    def patterns(self, station: Equipment) -> dict[str, Cells]:
+        """What the screen shows, cells of 0 (dark) and 1 (lit), by path in the session."""
+        return {}
+
+    @classmethod
+    def check_instruments(cls, station: Equipment) -> None:
+        """Raises InputError that names an instrument which the station lacks."""
+        if missing := station.lacks(*cls.instruments):
+            raise InputError(
+                f"station: the sequence {cls.name!r} needs a {' and a '.join(missing)}; "
+                f"add [{missing[0]}] to the station file or leave the sequence out"
+            )
+
+
+SEQUENCES: dict[str, type[Sequence]] = {}
+
+
+def name_of(step_id: str) -> str:
+    """A step's id as the stem of a file's name."""
+    return step_id.replace("/", "-")
+
+
+def frame_path(step_id: str, side: str) -> str:
+    """Path in the session of a step's frame of one side."""
+    return f"frames/{name_of(step_id)}-{side}.npy"
+
+
+def spectrum_path(step_id: str) -> str:
+    """Path in the session of the spectrum that a step measures."""
+    return f"spectra/{name_of(step_id)}.csv"
+
+
+def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
+    """The keys that every capture of a step has before it is taken."""
+    return {"id": f"{name_of(step_id)}-{side}", "side": side, "frame": frame_path(step_id, side), "exposure_s": 0.0}
+
+
+# --- the registry ------------------------------------------------------------------------------------------------------
+
+
+def register(kind: type[Capture]) -> None:
+    """Make a kind of capture known, with its sequence and that sequence's targets.
+
+    Raises ValueError if a name is taken by another class.
+    """
+    CAPTURES.add(kind)
+    if kind.sequence is None:
+        return
+    if SEQUENCES.setdefault(kind.sequence.name, kind.sequence) is not kind.sequence:
+        raise ValueError(f"{kind.__name__}: the sequence name {kind.sequence.name!r} is taken; choose another name")
+    for target in kind.sequence.targets:
+        TARGETS.add(target)
+
+
+@contextmanager
+def registered(kind: type[Capture]) -> Iterator[None]:
+    """Within the block, the kind is known, too."""
+    tables: tuple[dict[str, Any], ...] = (CAPTURES.models, TARGETS.models, SEQUENCES)
+    before = [dict(table) for table in tables]
+    try:
+        register(kind)
+        yield
+    finally:
+        for table, content in zip(tables, before, strict=True):
+            table.clear()
+            table.update(content)

@@ -1,0 +1,132 @@
+"""The ColorChecker in white light: a check of colour and linearity that no fit uses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import Field
+
+from lab.capture_kinds.base import (
+    Capture,
+    Equipment,
+    FindExposure,
+    RelativeExposure,
+    Sequence,
+    Setting,
+    SpectrumPath,
+    Step,
+    Target,
+    planned_keys,
+    spectrum_path,
+)
+from lab.errors import InputError
+from sim.parameters import Frozen
+from sim.scene.scenes import Corners, ReflectanceChart, Scene
+from sim.spectrum import Spectrum
+
+#: The only chart whose reflectances are known.
+KNOWN_CHART = "ColorChecker24"
+
+
+class ChartLayout(Frozen):
+    """Where the patch grid lies in one camera's frame, nominally: [row, col] of dark skin, bluish green, black, white."""
+
+    corners: Corners
+
+
+class ChartTarget(Target):
+    """A reflectance chart."""
+
+    kind: Literal["colorchecker"]
+    chart: str = KNOWN_CHART
+    left: ChartLayout | None = None
+    right: ChartLayout | None = None
+
+    @property
+    def instruction(self) -> str:
+        return f"put the {self.chart} before the cameras, in the lamp's light"
+
+
+class ChartSequence(Sequence):
+    """`frames` of the chart in white light, with the radiance of its white diffuser."""
+
+    name: ClassVar[str] = "chart"
+    instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
+    targets: ClassVar[tuple[type[Target], ...]] = (ChartTarget,)
+
+    frames: int = Field(default=4, ge=1)
+    level: float = 0.75
+
+    @classmethod
+    def planned(cls, station: Equipment, quick: bool) -> Self | None:
+        if station.lacks(*cls.instruments) or not station.having(ChartTarget):
+            return None
+        return cls(frames=2 if quick else 4)
+
+    def steps(self, station: Equipment) -> tuple[Step, ...]:
+        self.check_instruments(station)
+        name = station.one(ChartTarget)
+        target = station.having(ChartTarget)[name]
+        lit = Setting(target=name, wavelength_nm=0.0)
+        light = spectrum_path("colorchecker/exposure")
+        made = [
+            Step(
+                id="colorchecker/exposure",
+                what="ColorChecker: finding the exposure, measuring the light",
+                setting=lit,
+                radiance=light,
+                exposure=FindExposure(level=self.level),
+            )
+        ]
+        for frame in range(1, self.frames + 1):
+            id = f"colorchecker/{frame}"
+            captures = []
+            for side in station.sides:
+                layout = target.left if side == "left" else target.right
+                if layout is None:
+                    raise InputError(
+                        f"station: target {name!r} has no [targets.{name}.{side}] corners; "
+                        "add the four [row, col] of the patch grid as this camera sees it"
+                    )
+                keys = {"kind": "chart", "chart": target.chart, "corners": layout.corners, "radiance": light}
+                captures.append(ChartCapture.model_validate(planned_keys(id, side) | keys))
+            made.append(
+                Step(
+                    id=id,
+                    what=f"ColorChecker, frame {frame} of {self.frames}",
+                    setting=lit,
+                    exposure=RelativeExposure(of=made[0].id),
+                    captures=tuple(captures),
+                )
+            )
+        return tuple(made)
+
+
+class ChartCapture(Capture):
+    """A reflectance chart. `radiance`: of a perfect white diffuser under the same light."""
+
+    shows: ClassVar[str] = "a reflectance chart"
+    sequence: ClassVar[type[Sequence] | None] = ChartSequence
+
+    kind: Literal["chart"]
+    chart: str
+    corners: Corners  # [row, col]: dark skin, bluish green, black, white
+    radiance: SpectrumPath
+
+    @classmethod
+    def unsupported(cls, document: dict[str, Any]) -> str | None:
+        if document.get("chart") in (None, KNOWN_CHART):
+            return None
+        return f"unknown chart {document['chart']!r} is skipped; only {KNOWN_CHART} is known"
+
+    def problems(self, rows: int, cols: int) -> Iterator[str]:
+        for row, col in self.corners:
+            if not (-0.5 <= row <= rows - 0.5 and -0.5 <= col <= cols - 0.5):
+                yield f"corner [{row:g}, {col:g}] is outside the frame of {rows} x {cols}; give [row, col]"
+
+    def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
+        return ReflectanceChart(self.corners, spectrum(self.radiance), self.chart)
+
+
+KIND = ChartCapture

@@ -1,0 +1,114 @@
+"""Poses of a ChArUco board before both cameras: the intrinsics of each camera, and the pose of one to the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar, Literal, Self
+
+from pydantic import Field
+
+from lab.capture_kinds.base import (
+    Capture,
+    Equipment,
+    FindExposure,
+    PoseName,
+    RelativeExposure,
+    Sequence,
+    Setting,
+    Step,
+    Target,
+    planned_keys,
+)
+
+
+class BoardTarget(Target):
+    """One pose of a ChArUco board."""
+
+    kind: Literal["charuco"]
+    dictionary: str
+    squares: tuple[int, int]
+    square_mm: float = Field(gt=0)
+    marker_mm: float = Field(gt=0)
+    pose: str
+
+    @property
+    def instruction(self) -> str:
+        return f"hold the ChArUco board of {self.square_mm:g} mm squares in pose {self.pose}, in view of both cameras"
+
+
+class StereoSequence(Sequence):
+    """`frames` of each pose at hand (the first `poses` of them; None: all), both cameras at once.
+
+    The exposure is found at the first pose and kept for the others: board and light stay the same.
+    """
+
+    name: ClassVar[str] = "stereo"
+    instruments: ClassVar[tuple[str, ...]] = ("monochromator",)
+    targets: ClassVar[tuple[type[Target], ...]] = (BoardTarget,)
+
+    poses: int | None = Field(default=None, ge=1)
+    frames: int = Field(default=1, ge=1)
+    level: float = 0.7
+
+    @classmethod
+    def planned(cls, station: Equipment, quick: bool) -> Self | None:
+        return None if station.lacks(*cls.instruments) or not station.having(BoardTarget) else cls()
+
+    def steps(self, station: Equipment) -> tuple[Step, ...]:
+        self.check_instruments(station)
+        station.one(BoardTarget)
+        made: list[Step] = []
+        for target, board in list(station.having(BoardTarget).items())[: self.poses]:
+            lit = Setting(target=target, wavelength_nm=0.0)
+            if not made:
+                made.append(
+                    Step(
+                        id="stereo/exposure",
+                        what="ChArUco board: finding the exposure",
+                        setting=lit,
+                        exposure=FindExposure(level=self.level),
+                    )
+                )
+            for frame in range(1, self.frames + 1):
+                id = f"stereo/{target}/{frame}"
+                keys = {"kind": "charuco"} | board.model_dump(exclude={"kind"})
+                made.append(
+                    Step(
+                        id=id,
+                        what=f"ChArUco pose {board.pose}, frame {frame} of {self.frames}",
+                        setting=lit,
+                        exposure=RelativeExposure(of="stereo/exposure"),
+                        captures=tuple(
+                            CharucoCapture.model_validate(planned_keys(id, side) | keys) for side in station.sides
+                        ),
+                    )
+                )
+        return tuple(made)
+
+
+class CharucoCapture(Capture):
+    """A ChArUco board. The same `pose` in captures of both sides makes a stereo pair."""
+
+    shows: ClassVar[str] = "a ChArUco board"
+    sequence: ClassVar[type[Sequence] | None] = StereoSequence
+    clipping_matters: ClassVar[bool] = False
+
+    kind: Literal["charuco"]
+    # An imported photograph may not say how long it was exposed; the geometry doesn't need it.
+    exposure_s: float | None = Field(ge=0)  # type: ignore[assignment]
+    dictionary: str  # OpenCV's name, or "none": a plain checkerboard of `squares`, without markers
+    squares: tuple[int, int]  # rows, cols
+    square_mm: float = Field(gt=0)
+    marker_mm: float | None = Field(default=None, gt=0)  # None only where there are no markers
+    pose: PoseName
+
+    def problems(self, rows: int, cols: int) -> Iterator[str]:
+        if self.marker_mm is None and self.dictionary != "none":
+            yield "marker_mm is missing; give the markers' side, or dictionary 'none' for a plain checkerboard"
+        if self.marker_mm is not None and self.marker_mm >= self.square_mm and self.dictionary != "none":
+            yield f"markers of {self.marker_mm:g} mm don't fit squares of {self.square_mm:g} mm; correct one"
+        if min(self.squares) < 2:
+            yield f"squares {list(self.squares)} make no board; give [rows, cols] of squares, 2 at least"
+
+
+KIND = CharucoCapture

@@ -1,0 +1,76 @@
+"""Dark frames: black level, read noise, DSNU, and the dark current from a ladder of exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar, Literal, Self
+
+from pydantic import Field
+
+from lab.capture_kinds.base import Capture, Equipment, FixedExposure, Sequence, Setting, Step, Target, planned_keys
+from sim.scene.scenes import Darkness
+from sim.spectrum import Spectrum
+
+DARK_S = (0.0005, 0.05, 0.5, 2.0, 5.0)
+QUICK_DARK_S = (0.0005, 0.5, 2.0, 5.0)
+
+
+class CapTarget(Target):
+    """No light reaches the cameras."""
+
+    kind: Literal["cap"]
+
+    @property
+    def instruction(self) -> str:
+        return "close every lens with its cap"
+
+
+class DarkSequence(Sequence):
+    """`frames` dark frames at each of `exposures_s`.
+
+    The ladder is taken upwards and downwards in turn, so that a linear drift of the temperature isn't taken for dark current.
+    """
+
+    name: ClassVar[str] = "dark"
+    targets: ClassVar[tuple[type[Target], ...]] = (CapTarget,)
+
+    exposures_s: tuple[float, ...] = Field(min_length=1)
+    frames: int = Field(ge=1)
+
+    @classmethod
+    def planned(cls, station: Equipment, quick: bool) -> Self | None:
+        return cls(exposures_s=QUICK_DARK_S if quick else DARK_S, frames=4)
+
+    def steps(self, station: Equipment) -> tuple[Step, ...]:
+        cap = station.one(CapTarget)
+        made: list[Step] = []
+        for frame in range(1, self.frames + 1):
+            ladder = self.exposures_s if frame % 2 else self.exposures_s[::-1]
+            for exposure_s in ladder:
+                id = f"dark/{exposure_s:g}s/{frame}"
+                made.append(
+                    Step(
+                        id=id,
+                        what=f"dark frame {frame} of {self.frames}, {exposure_s:g} s",
+                        setting=Setting(target=cap),
+                        exposure=FixedExposure(exposure_s=exposure_s),
+                        captures=tuple(DarkCapture(kind="dark", **planned_keys(id, side)) for side in station.sides),
+                    )
+                )
+        return tuple(made)
+
+
+class DarkCapture(Capture):
+    """No light."""
+
+    shows: ClassVar[str] = "nothing: shutter or cap closed"
+    sequence: ClassVar[type[Sequence] | None] = DarkSequence
+    clipping_matters: ClassVar[bool] = False
+
+    kind: Literal["dark"]
+
+    def scene(self, spectrum: Callable[[str], Spectrum]) -> Darkness:
+        return Darkness()
+
+
+KIND = DarkCapture

@@ -1,0 +1,142 @@
+"""Slanted edges (ISO 12233): the modulation transfer function over the field and over orientations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar, Literal, Self
+
+from pydantic import Field
+
+from lab.capture_kinds.base import (
+    Capture,
+    Equipment,
+    FindExposure,
+    RelativeExposure,
+    Sequence,
+    Setting,
+    SpectrumPath,
+    Step,
+    Target,
+    planned_keys,
+    spectrum_path,
+)
+from sim.parameters import Frozen
+
+
+class EdgeLayout(Frozen):
+    """Where one edge lies in a frame, nominally; `field_mm`: [row, col] of its centre from the optical axis, at the sensor."""
+
+    name: str
+    region: tuple[int, int, int, int]
+    angle_deg: float
+    field_mm: tuple[float, float]
+
+
+class EdgeLayouts(Frozen):
+    """The edges in one camera's frame."""
+
+    regions: tuple[EdgeLayout, ...]
+
+
+class EdgeTarget(Target):
+    """A knife edge before the sphere."""
+
+    kind: Literal["slanted_edge"]
+    angle_deg: float
+    left: EdgeLayouts | None = None
+    right: EdgeLayouts | None = None
+
+    @property
+    def instruction(self) -> str:
+        return f"put the knife edge before the sphere, {self.angle_deg:g} degrees from the vertical"
+
+
+class EdgeSequence(Sequence):
+    """`frames` of every knife edge at hand. A frame has an edge in several regions, and one capture for each region."""
+
+    name: ClassVar[str] = "edge"
+    instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
+    targets: ClassVar[tuple[type[Target], ...]] = (EdgeTarget,)
+
+    frames: int = Field(default=4, ge=1)
+    level: float = 0.7
+
+    @classmethod
+    def planned(cls, station: Equipment, quick: bool) -> Self | None:
+        if station.lacks(*cls.instruments) or not station.having(EdgeTarget):
+            return None
+        return cls(frames=2 if quick else 4)
+
+    def steps(self, station: Equipment) -> tuple[Step, ...]:
+        self.check_instruments(station)
+        station.one(EdgeTarget)
+        made: list[Step] = []
+        for name, edge in station.having(EdgeTarget).items():
+            lit = Setting(target=name, wavelength_nm=0.0)
+            find = f"edge/{name}/exposure"
+            light = spectrum_path(find)
+            made.append(
+                Step(
+                    id=find,
+                    what=f"slanted edge {name}: finding the exposure, measuring the light",
+                    setting=lit,
+                    radiance=light,
+                    exposure=FindExposure(level=self.level),
+                )
+            )
+            for frame in range(1, self.frames + 1):
+                id = f"edge/{name}/{frame}"
+                captures = []
+                for side in station.sides:
+                    layout = edge.left if side == "left" else edge.right
+                    for region in () if layout is None else layout.regions:
+                        keys = planned_keys(id, side) | {
+                            "id": f"{name}-{frame}-{region.name}-{side}",
+                            "kind": "slanted_edge",
+                            "region": region.region,
+                            "angle_deg": region.angle_deg,
+                            "light_radiance": light,
+                            "field_mm": region.field_mm,
+                        }
+                        captures.append(SlantedEdgeCapture.model_validate(keys))
+                made.append(
+                    Step(
+                        id=id,
+                        what=f"slanted edge {name} at {edge.angle_deg:g} deg, frame {frame} of {self.frames}",
+                        setting=lit,
+                        exposure=RelativeExposure(of=find),
+                        captures=tuple(captures),
+                    )
+                )
+        return tuple(made)
+
+
+class SlantedEdgeCapture(Capture):
+    """One straight edge in `region` (row0, col0, row1, col1, end excluded); None: the edges are searched for.
+
+    `angle_deg`: from the vertical, nominal; positive turns the edge's top to the right.
+    """
+
+    shows: ClassVar[str] = "one straight edge in `region`"
+    sequence: ClassVar[type[Sequence] | None] = EdgeSequence
+    shares_frame: ClassVar[bool] = True
+
+    kind: Literal["slanted_edge"]
+    region: tuple[int, int, int, int] | None = None
+    angle_deg: float | None = None
+    dark_radiance: SpectrumPath | None = None
+    light_radiance: SpectrumPath | None = None
+    field_mm: tuple[float, float] | None = None  # [row, col] from the optical axis, at the sensor
+
+    def problems(self, rows: int, cols: int) -> Iterator[str]:
+        if self.region is None:
+            return
+        row0, col0, row1, col1 = self.region
+        if not (0 <= row0 < row1 <= rows and 0 <= col0 < col1 <= cols):
+            yield (
+                f"region {list(self.region)} isn't inside the frame of {rows} x {cols}; "
+                "give [row0, col0, row1, col1], end excluded"
+            )
+
+
+KIND = SlantedEdgeCapture

@@ -1,0 +1,33 @@
+"""The recording set: the folder format in which recordings come in from outside and go out again.
+
+`read` looks at everything once, up front, and names all that is wrong with a folder, one line each. `write` puts a folder
+there completely or not at all. The kinds of capture are in `lab.capture_kinds`.
+"""
+
+from lab.formats.recording_set.checks import inspect
+from lab.formats.recording_set.clipping import clipped_share
+from lab.formats.recording_set.files import FolderFiles, RecordingFiles
+from lab.formats.recording_set.frame_files import RAWS, Frame, Target, load_frame
+from lab.formats.recording_set.manifest import DataSheet, Manifest, RecordingError, manifest_json, parse_manifest
+from lab.formats.recording_set.reading import read
+from lab.formats.recording_set.recordings import RecordingSet
+from lab.formats.recording_set.writing import write
+
+__all__ = [
+    "RAWS",
+    "DataSheet",
+    "FolderFiles",
+    "Frame",
+    "Manifest",
+    "RecordingError",
+    "RecordingFiles",
+    "RecordingSet",
+    "Target",
+    "clipped_share",
+    "inspect",
+    "load_frame",
+    "manifest_json",
+    "parse_manifest",
+    "read",
+    "write",
+]

@@ -1,0 +1,173 @@
+"""The look through a whole recording set, up front: every problem and every oddity, one line each."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import suppress
+
+import numpy as np
+
+from lab.capture_kinds.base import Capture, Names, Open, names_in
+from lab.capture_kinds.flat import FlatCapture
+from lab.capture_kinds.narrowband import NarrowbandCapture
+from lab.errors import InputError
+from lab.formats.recording_set.clipping import CLIPPED_LIMIT, FlatLevel, clipped_share, flat_level, saturated_flats
+from lab.formats.recording_set.manifest import DataSheet, Findings
+from lab.formats.recording_set.recordings import RecordingSet
+from sim.camera import Side
+
+#: A narrowband light's centre this far and a quarter of its bandwidth off the wavelength set is remarked on.
+OFF_NAME_NM = 3.0
+
+
+def _unknown_keys(where: str, item: Open) -> Iterator[str]:
+    for key in item.unknown_keys():
+        yield f"{where}: unknown key '{key}' is kept but not used; check its spelling"
+    for name, value in item:
+        if isinstance(value, Open):
+            yield from _unknown_keys(f"{where}, {name}", value)
+
+
+def _camera_problems(camera: DataSheet) -> Iterator[str]:
+    limit = 2**camera.bit_depth - 1
+    if camera.white_level_dn is not None and camera.white_level_dn > limit:
+        yield f"white_level_dn = {camera.white_level_dn:g} is above what {camera.bit_depth} bits hold ({limit}); correct one"
+    if camera.black_level_dn is not None and camera.black_level_dn >= camera.saturation_dn:
+        yield f"black_level_dn = {camera.black_level_dn:g} isn't below the white level {camera.saturation_dn:g}; correct one"
+    for channel in camera.quantum_efficiency or {}:
+        if channel not in camera.channels:
+            yield (
+                f"quantum_efficiency of a channel '{channel}', but a {camera.cfa} sensor has "
+                f"{', '.join(camera.channels)}; rename it"
+            )
+
+
+def _check_frames(recordings: RecordingSet, found: Findings) -> None:
+    """Every frame, loaded once."""
+    flats: dict[Side, list[FlatLevel]] = defaultdict(list)
+    clipped_of: dict[tuple[Side, str], list[str]] = defaultdict(list)
+    for capture in recordings.manifest.captures:
+        camera = recordings.manifest.cameras[capture.side]
+        try:
+            frame = recordings.frame(capture)
+        except InputError as error:
+            found.problems.append(str(error))
+            continue
+        if not capture.clipping_matters:
+            continue
+        clipped = clipped_share(frame, camera)
+        if isinstance(capture, FlatCapture):
+            with suppress(InputError):  # a spectrum that can't be used is named with the spectra
+                flats[capture.side].append(flat_level(recordings, capture, frame, clipped))
+        elif max(clipped.values()) > CLIPPED_LIMIT:
+            clipped_of[capture.side, capture.kind].append(capture.id)
+    for side, levels in flats.items():
+        found.problems += saturated_flats(levels, recordings.manifest.cameras[side])
+    for (side, kind), ids in clipped_of.items():
+        named = ", ".join(ids[:3]) + (f" .. {ids[-1]}" if len(ids) > 3 else "")
+        found.warnings.append(
+            f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped ({named}); "
+            "what a clipped channel saw is not used; expose shorter"
+        )
+
+
+def _check_cameras(recordings: RecordingSet, found: Findings) -> None:
+    for side, camera in recordings.manifest.cameras.items():
+        where = f"{recordings.source}: camera {side}"
+        found.warnings += _unknown_keys(where, camera)
+        found.problems += [f"{where}: {problem}" for problem in _camera_problems(camera)]
+        if camera.lens_file is not None:
+            try:
+                recordings.file(camera.lens_file)
+            except InputError as error:
+                found.problems.append(f"{recordings.where(camera.lens_file)} (lens_file of camera {side}): {error}")
+
+
+def _check_captures(recordings: RecordingSet, found: Findings) -> None:
+    manifest, source = recordings.manifest, recordings.source
+    for id, count in Counter(capture.id for capture in manifest.captures).items():
+        if count > 1:
+            found.problems.append(f"{source}: capture id '{id}' is used {count} times; give every capture its own")
+    framed: dict[str, Capture] = {}
+    for capture in manifest.captures:
+        where = f"{source}: capture {capture.id}"
+        found.warnings += _unknown_keys(where, capture)
+        camera = manifest.cameras[capture.side]
+        found.problems += [f"{where}: {text}" for text in capture.problems(camera.rows, camera.cols)]
+        found.warnings += [f"{where}: {text}" for text in capture.remarks()]
+        first = framed.setdefault(capture.frame, capture)
+        if first is not capture and not capture.shares_frame:
+            found.warnings.append(f"{where}: its frame is that of {first.id} too, so it is no repeat; check the path")
+
+
+def _check_spectra_and_targets(recordings: RecordingSet, found: Findings) -> None:
+    manifest = recordings.manifest
+    efficiencies = {
+        path: f"quantum_efficiency {channel} of camera {side}"
+        for side, camera in manifest.cameras.items()
+        for channel, path in (camera.quantum_efficiency or {}).items()
+    }
+    lights: dict[str, str] = {}
+    targets: dict[str, str] = {}
+    for capture in manifest.captures:
+        for key, what, path in names_in(capture):
+            if what in (Names.SPECTRUM, Names.TARGET):
+                users = lights if what is Names.SPECTRUM else targets
+                users.setdefault(path, f"{key} of capture {capture.id}")
+    for path, user in [*efficiencies.items(), *lights.items()]:
+        where = f"{recordings.where(path)} ({user})"
+        try:
+            lowest, highest = min(value := recordings.spectrum(path).value), max(value)
+        except InputError as error:
+            found.problems.append(f"{where}: {error.__cause__}")
+            continue
+        if user.startswith("quantum_efficiency") and not 0 <= lowest <= highest <= 1:
+            found.problems.append(
+                f"{where}: {lowest:g}..{highest:g} isn't a quantum efficiency of 0..1 electrons a photon; "
+                "divide percent by 100"
+            )
+        elif not user.startswith("quantum_efficiency") and highest <= 0:
+            found.warnings.append(f"{where}: no light at any wavelength; was the shutter open?")
+    found.warnings += _lights_off_their_names(recordings)
+    for path, user in targets.items():
+        try:
+            recordings.target(path)
+        except InputError as error:
+            found.problems.append(f"{recordings.where(path)} ({user}): {error.__cause__}")
+
+
+def _lights_off_their_names(recordings: RecordingSet) -> Iterator[str]:
+    """One line on the narrowband lights whose measured centre, over what exceeds half of the maximum, isn't the wavelength set."""
+    off: dict[str, str] = {}
+    for capture in recordings.manifest.captures:
+        if not isinstance(capture, NarrowbandCapture) or capture.radiance in off:
+            continue
+        try:
+            wavelength, value = recordings.spectrum(capture.radiance).arrays
+        except InputError:  # named with the spectra
+            continue
+        if value.max() > 0:
+            share = value / value.max()
+            above = share > 0.5
+            centre_nm = float(np.average(wavelength[above], weights=share[above]))
+            if abs(centre_nm - capture.wavelength_nm) > OFF_NAME_NM + 0.25 * (capture.bandwidth_nm or 0.0):
+                off[capture.radiance] = f"{capture.wavelength_nm:g} nm: {centre_nm:.1f} nm"
+    if off:
+        yield (
+            f"{recordings.source}: {len(off)} narrowband lights are centred elsewhere than they are set ({'; '.join(off.values())}); "
+            "their measured spectra are used; correct wavelength_nm, or measure again"
+        )
+
+
+def inspect(recordings: RecordingSet) -> tuple[list[str], list[str]]:
+    """(problems, warnings) of a recording set, one line each: everything that `read` refuses and everything it remarks.
+
+    Looks at every frame, spectrum and target once.
+    """
+    found = Findings(warnings=list(_unknown_keys(f"{recordings.source}: manifest", recordings.manifest)))
+    _check_cameras(recordings, found)
+    _check_captures(recordings, found)
+    _check_spectra_and_targets(recordings, found)
+    _check_frames(recordings, found)
+    return found.problems, found.warnings

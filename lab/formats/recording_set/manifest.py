@@ -1,0 +1,167 @@
+"""The manifest's keys, name by name, and its JSON text.
+
+An unknown key is kept and reported; an unknown kind of capture is reported and skipped. Anything else that is wrong is a
+problem, one line each, and all problems are told at once.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from pydantic import Field, ValidationError, field_validator
+
+from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
+from lab.errors import InputError, one_line
+from sim.camera import Cfa, Side
+
+
+class DataSheet(Open):
+    """What the manufacturer says of one camera. The fits test it. None: not known."""
+
+    rows: int = Field(gt=0)
+    cols: int = Field(gt=0)
+    pixel_pitch_um: float | None = Field(default=None, gt=0)
+    fill_factor: float | None = Field(default=None, gt=0, le=1)
+    cfa: Cfa
+    bit_depth: int = Field(ge=1, le=16)
+    black_level_dn: float | None = Field(default=None, ge=0)
+    white_level_dn: float | None = Field(default=None, gt=0)
+    conversion_gain_dn_per_e: float | None = Field(default=None, gt=0)
+    full_well_e: float | None = Field(default=None, gt=0)
+    read_noise_e: float | None = Field(default=None, ge=0)
+    dark_current_e_per_s: float | None = Field(default=None, ge=0)
+    dsnu_e: float | None = Field(default=None, ge=0)
+    prnu_percent: float | None = Field(default=None, ge=0)
+    quantum_efficiency: dict[str, str] | None = None  # channel -> CSV path
+    f_number: float | None = Field(default=None, gt=0)
+    focal_length_mm: float | None = Field(default=None, gt=0)
+    lens_transmittance: float | None = Field(default=None, gt=0, le=1)
+    lens_file: str | None = None
+
+    @field_validator("quantum_efficiency", mode="before")
+    @classmethod
+    def _known_channels(cls, value: Any) -> Any:
+        return {key: path for key, path in value.items() if path is not None} if isinstance(value, dict) else value
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the colour channels, in the order R, G, B; `("Y",)` for a MONO sensor."""
+        return ("Y",) if self.cfa == "MONO" else ("R", "G", "B")
+
+    @property
+    def saturation_dn(self) -> float:
+        """The highest code: `white_level_dn`, or what `bit_depth` allows where that is unknown."""
+        return self.white_level_dn if self.white_level_dn is not None else float(2**self.bit_depth - 1)
+
+
+class Manifest(Open):
+    """The file `manifest.json`."""
+
+    format: Literal["calibench-recording"] = "calibench-recording"
+    version: Literal[1] = 1
+    name: str = ""
+    notes: str = ""
+    cameras: dict[Side, DataSheet]
+    captures: tuple[AnyCapture, ...]
+
+
+class RecordingError(InputError):
+    """All that is wrong with a recording set, one line each: what, where, remedy."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = tuple(problems)
+
+
+@dataclass
+class Findings:
+    """What a look through a recording set finds: problems, for which it is refused, and warnings."""
+
+    problems: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+# --- JSON --------------------------------------------------------------------------------------------------------------
+
+
+def manifest_json(manifest: Manifest) -> str:
+    """A manifest as JSON text: the keys that were given, unknown ones too."""
+    kept = manifest.model_dump(mode="json", exclude_unset=True)
+    head = {key: getattr(manifest, key) for key in ("format", "version", "name", "notes")}
+    return json.dumps(head | kept, indent=1, ensure_ascii=False) + "\n"
+
+
+def _schema_lines(where: str, error: ValidationError) -> Iterator[str]:
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"])
+        if item["type"] == "missing":
+            yield f"{where}: the key '{key}' is missing; add it"
+        else:
+            given = "" if isinstance(item["input"], dict | list) else f" (it is {item['input']!r})"
+            yield f"{where}: {key or 'it'}: {item['msg'][:1].lower()}{item['msg'][1:]}{given}; correct it"
+
+
+def _usable_captures(listed: list[Any], where: str, sides: Container[str], found: Findings) -> list[Capture]:
+    captures: list[Capture] = []
+    for number, item in enumerate(listed):
+        at = f"{where}: captures[{number}]"
+        if not isinstance(item, dict):
+            found.problems.append(f"{at}: isn't an object; write the capture's keys")
+            continue
+        at += f" ({item['id']})" if item.get("id") is not None else ""
+        kind = item.get("kind")
+        if not isinstance(kind, str):
+            found.problems.append(f"{at}: the kind is {kind!r}; write one of {', '.join(CAPTURES.names)}")
+            continue
+        if kind not in CAPTURES.models:
+            found.warnings.append(f"{at}: unknown kind '{kind}' is skipped; the kinds are {', '.join(CAPTURES.names)}")
+            continue
+        if why := CAPTURES.models[kind].unsupported(item):
+            found.warnings.append(f"{at}: {why}")
+            continue
+        try:
+            capture = CAPTURES.parse(item)
+        except ValidationError as error:
+            found.problems += _schema_lines(at, error)
+            continue
+        if capture.side not in sides:
+            found.problems.append(f"{at}: no camera '{capture.side}' in cameras; describe it, or correct the side")
+            continue
+        captures.append(capture)
+    return captures
+
+
+def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
+    """The manifest in JSON `text`, and warnings on what was skipped. RecordingError with one line for each problem."""
+    try:
+        raw = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise RecordingError([f"{where}: isn't JSON ({one_line(error)}); write it again"]) from error
+    if not isinstance(raw, dict):
+        raise RecordingError([f"{where}: isn't a JSON object; write the keys of the recording-set format"])
+    if raw.get("format") != "calibench-recording" or raw.get("version") != 1:
+        given = f"format {raw.get('format')!r} version {raw.get('version')!r}"
+        raise RecordingError([f"{where}: {given}, not 'calibench-recording' 1; give a recording set of that version"])
+    found = Findings()
+    listed, cameras = raw.get("captures"), raw.get("cameras")
+    captures: list[Capture] = []
+    if isinstance(listed, list):
+        # Where the cameras themselves are wrong, that is said once, below.
+        sides = cameras if isinstance(cameras, dict) and cameras else get_args(Side)
+        captures = _usable_captures(listed, where, sides, found)
+        raw["captures"] = ()
+        if not captures and not found.problems:
+            found.problems += [*found.warnings, f"{where}: no capture that can be used; list what was captured"]
+    manifest: Manifest | None = None
+    try:
+        manifest = Manifest.model_validate(raw)
+    except ValidationError as error:
+        found.problems += _schema_lines(where, error)
+    if manifest is not None and not manifest.cameras:
+        found.problems.append(f"{where}: cameras is empty; describe the left camera at least")
+    if found.problems or manifest is None:
+        raise RecordingError(found.problems)
+    return manifest.model_copy(update={"captures": tuple(captures)}), found.warnings

@@ -1,0 +1,187 @@
+"""A recording set in use: the manifest, and its frames, spectra and targets when they are asked for."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Container, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args, overload
+
+from numpy.typing import NDArray
+
+from lab.capture_kinds.base import Capture, in_folder
+from lab.errors import InputError
+from lab.formats.recording_set.files import JoinedFiles, MemoryFiles, OverlaidFiles, RecordingFiles
+from lab.formats.recording_set.frame_files import Frame, Target
+from lab.formats.recording_set.manifest import DataSheet, Manifest
+from sim.camera import Side
+from sim.spectrum import Spectrum
+
+C = TypeVar("C", bound=Capture)
+
+
+class RecordingSet:
+    """A manifest with its frames, spectra and targets. Frames are loaded when asked for, and `cache_bytes` of them are kept.
+
+    It comes from a folder by `read`, or from memory: `frames`, `spectra` and `targets` by the paths in the manifest. It can be
+    shared between threads and sent to another process.
+    """
+
+    def __init__(
+        self,
+        manifest: Manifest,
+        frames: Mapping[str, NDArray[Any]] | None = None,
+        spectra: Mapping[str, Spectrum] | None = None,
+        targets: Mapping[str, NDArray[Any]] | None = None,
+        *,
+        source: str = "memory",
+        warnings: tuple[str, ...] = (),
+        files: RecordingFiles | None = None,
+        cache_bytes: int = 256 << 20,
+    ) -> None:
+        self.manifest = manifest
+        self.source = source
+        self.warnings = warnings
+        self.cache_bytes = cache_bytes
+        self._files: RecordingFiles = files or MemoryFiles(frames or {}, spectra or {}, targets or {})
+        self._cache: OrderedDict[str, Frame] = OrderedDict()
+        self._held = 0
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_cache": OrderedDict(), "_held": 0, "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= state | {"_lock": threading.Lock()}
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """The sides that have a camera, left first."""
+        return tuple(side for side in get_args(Side) if side in self.manifest.cameras)
+
+    def camera(self, side: Side) -> DataSheet:
+        """The data sheet of the camera of `side`. Raises InputError where there is none."""
+        if side not in self.manifest.cameras:
+            raise InputError(f"{self.source}: no camera '{side}', only {', '.join(self.sides)}; ask for one of these")
+        return self.manifest.cameras[side]
+
+    @overload
+    def captures(self, kind: type[C], side: Side | None = None) -> list[C]: ...
+    @overload
+    def captures(self, kind: None = None, side: Side | None = None) -> list[Capture]: ...
+    @overload
+    def captures(self, kind: str, side: Side | None = None) -> list[Any]: ...
+
+    def captures(self, kind: str | type[Capture] | None = None, side: Side | None = None) -> Any:
+        """Captures in the manifest's order, of one kind (its class or its name) and one side, or of all."""
+        return [
+            capture
+            for capture in self.manifest.captures
+            if (side is None or capture.side == side)
+            and (kind is None or (capture.kind == kind if isinstance(kind, str) else isinstance(capture, kind)))
+        ]
+
+    def with_frames(self, frames: Mapping[str, NDArray[Any]]) -> RecordingSet:
+        """The same set with other frames (uint16) at some of its paths."""
+        return RecordingSet(
+            self.manifest,
+            source=self.source,
+            warnings=self.warnings,
+            files=OverlaidFiles(self._files, frames),
+            cache_bytes=self.cache_bytes,
+        )
+
+    def joined(self, later: RecordingSet, folder: str) -> RecordingSet:
+        """This set with the captures of a later one of the same cameras. The later one's ids, paths and poses begin with `folder/`."""
+        captures = (*self.manifest.captures, *(in_folder(capture, folder) for capture in later.manifest.captures))
+        return RecordingSet(
+            self.manifest.model_copy(update={"captures": captures}),
+            source=self.source,
+            warnings=(*self.warnings, *later.warnings),
+            files=JoinedFiles(self._files, later._files, folder),
+            cache_bytes=self.cache_bytes,
+        )
+
+    def without(self, ids: Container[str]) -> RecordingSet:
+        """The same set less the captures of these ids; frames, spectra and targets are shared."""
+        kept = tuple(c for c in self.manifest.captures if c.id not in ids)
+        return RecordingSet(
+            self.manifest.model_copy(update={"captures": kept}),
+            source=self.source,
+            warnings=self.warnings,
+            files=self._files,
+            cache_bytes=self.cache_bytes,
+        )
+
+    def capture(self, id: str) -> Capture:
+        """The capture called `id`; InputError where there is none."""
+        for capture in self.manifest.captures:
+            if capture.id == id:
+                return capture
+        raise InputError(f"{self.source}: no capture '{id}'; the manifest lists {len(self.manifest.captures)} others")
+
+    def frame(self, capture: Capture) -> Frame:
+        """Raw DN of a capture: uint16 (rows, cols), read-only. InputError where the file is not what the manifest says."""
+        with self._lock:
+            if capture.frame in self._cache:
+                self._cache.move_to_end(capture.frame)
+                return self._cache[capture.frame]
+        camera = self.camera(capture.side)
+        try:
+            frame = self._files.frame(capture.frame, camera)
+            if problem := _frame_problem(frame, camera):
+                raise InputError(problem)  # noqa: TRY301
+        except InputError as error:
+            raise InputError(f"{self.where(capture.frame)} (capture {capture.id}): {error}") from error
+        frame.flags.writeable = False
+        with self._lock:
+            if capture.frame not in self._cache and frame.nbytes <= self.cache_bytes:
+                self._cache[capture.frame] = frame
+                self._held += frame.nbytes
+                while self._held > self.cache_bytes:
+                    self._held -= self._cache.popitem(last=False)[1].nbytes
+        return frame
+
+    def let_go(self) -> None:
+        """Free the frames that are kept for being read again."""
+        with self._lock:
+            self._cache.clear()
+            self._held = 0
+
+    def spectrum(self, path: str) -> Spectrum:
+        """The spectrum that the manifest calls `path`."""
+        try:
+            return self._files.spectrum(path)
+        except InputError as error:
+            raise InputError(f"{self.where(path)}: {error}") from error
+
+    def target(self, path: str) -> Target:
+        """What was shown on the screen: uint8 (rows, cols) of 0 and 1."""
+        try:
+            return self._files.target(path)
+        except InputError as error:
+            raise InputError(f"{self.where(path)}: {error}") from error
+
+    def file(self, path: str) -> Path | None:
+        """The file behind a path of the manifest, or None for a set in memory."""
+        return self._files.file(path)
+
+    def where(self, path: str) -> str:
+        """How messages call what the manifest names `path`."""
+        return self._files.where(path)
+
+
+def _frame_problem(frame: Frame, camera: DataSheet) -> str | None:
+    """Why `frame` can't be a frame of `camera`, with the remedy; None where it can."""
+    if frame.shape != (camera.rows, camera.cols):
+        return (
+            f"{frame.shape[0]} x {frame.shape[1]} pixels (rows x cols), but the manifest says "
+            f"{camera.rows} x {camera.cols}; recapture, or correct rows and cols"
+        )
+    highest, limit = int(frame.max()), 2**camera.bit_depth - 1
+    if highest > limit:
+        return f"{highest} DN is above what {camera.bit_depth} bits hold ({limit} DN); correct bit_depth, or save raw DN unscaled"
+    if highest > camera.saturation_dn:
+        return f"{highest} DN is above white_level_dn = {camera.saturation_dn:g} DN; correct white_level_dn, or save raw DN unscaled"
+    return None
