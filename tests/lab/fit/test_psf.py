@@ -367,14 +367,15 @@ def screen_recordings(electrons=9000.0, seed=5, **changed):
     for kind in (WhiteCapture, BlackCapture, CheckerboardCapture, BernoulliCapture):
         light = light_of(kind, changed.get("pattern_seed", 77))
         for repeat in range(2):
-            name = f"{kind.__name__.lower()}-{repeat}"
+            shown = kind.__name__.removesuffix("Capture").lower()
+            name = f"{shown}-{repeat}"
             mean = electrons * response * (0.01 + 0.99 * light)
             frames[f"frames/{name}.npy"] = np.minimum(64 + np.round(0.4 * rng.poisson(mean)), 4095).astype(np.uint16)
-            target = {} if kind in (WhiteCapture, BlackCapture) else {"target": f"targets/{kind.__name__.lower()}.npy"}
+            target = {} if kind in (WhiteCapture, BlackCapture) else {"target": f"targets/{shown}.npy"}
             captures.append(
                 kind(
                     id=name,
-                    kind=kind.__name__.lower(),
+                    kind=shown,
                     side="left",
                     frame=f"frames/{name}.npy",
                     exposure_s=0.01,
