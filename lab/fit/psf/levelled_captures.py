@@ -40,11 +40,9 @@ def screen_pictures(recordings: RecordingSet, side: Side) -> list[ScreenPictures
     """
     shown: dict[str, dict[tuple[str, str], list[Any]]] = {}
     for kind in ("white", "black", "checkerboard", "bernoulli"):
-        for capture in recordings.captures(side=side):
-            if capture.kind == kind:
-                shown.setdefault(capture.screen.pose, {}).setdefault((kind, getattr(capture, "target", "")), []).append(
-                    capture
-                )
+        for capture in recordings.captures(kind, side):
+            key = (kind, getattr(capture, "target", ""))
+            shown.setdefault(capture.screen.pose, {}).setdefault(key, []).append(capture)
     if not any(kind == "bernoulli" for kinds in shown.values() for kind, _ in kinds):
         raise NotDetermined("psf", "no bernoulli captures")
     found, reason = [], ""
