@@ -25,7 +25,7 @@ from lab.fit.geometry.recordings import fit_geometry
 from lab.fit.mtf.recordings import fit_mtf
 from lab.fit.noise.recordings import fit_noise
 from lab.fit.psf.recordings import fit_psf_field
-from lab.fit.spectral import fit_spectral
+from lab.fit.spectral.recordings import fit_spectral
 from lab.formats import recording_set as recording
 
 T = TypeVar("T")

@@ -54,7 +54,7 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
     from lab.fit.mtf.recordings import fit_mtf
     from lab.fit.noise.recordings import fit_noise
     from lab.fit.psf.recordings import fit_psf_field
-    from lab.fit.spectral import fit_spectral
+    from lab.fit.spectral.recordings import fit_spectral
     from lab.fit.stereo import fit_stereo
 
     sides = recordings.sides

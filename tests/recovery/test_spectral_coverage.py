@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from lab.fit.spectral import fit_spectral
+from lab.fit.spectral.recordings import fit_spectral
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import NoiseFit
 from sim.forward import Exposure, sample

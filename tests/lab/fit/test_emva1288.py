@@ -1,4 +1,4 @@
-"""EMVA 1288's emva1288_figures against their definitions, written out here a second time, and where they are refused."""
+"""The figures of EMVA 1288 against their definitions, written out here a second time, and where they are refused."""
 
 from __future__ import annotations
 

@@ -10,7 +10,10 @@ import pytest
 
 from lab.errors import NotDetermined
 from lab.fit.noise.recordings import fit_noise
-from lab.fit.spectral import MIN_LIGHTS, compare_curves, estimate_sensitivity, fit_spectral
+from lab.fit.spectral import estimate_sensitivity
+from lab.fit.spectral.captures import MIN_LIGHTS
+from lab.fit.spectral.maker_departures import compare_curves
+from lab.fit.spectral.recordings import fit_spectral
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet, read
 from lab.formats.results import NoiseFit, SpectralFit
 from sim.camera import CameraModel, Lens
