@@ -24,11 +24,11 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
+    ExaminedPlace,
     FitResult,
     HeldOut,
     MeasurementFit,
     Mismatch,
-    Place,
     ResidualCurve,
     ResidualPicture,
     Skipped,
@@ -68,7 +68,7 @@ class SideFindings:
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
     proposals: tuple[Proposal, ...] = ()
-    places: tuple[Place, ...] = ()
+    places: tuple[ExaminedPlace, ...] = ()
     measurements: tuple[MeasurementFit, ...] = ()
     visibility: tuple[Visibility, ...] = ()
     pictures: tuple[ResidualPicture, ...] = ()

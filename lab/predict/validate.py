@@ -24,7 +24,16 @@ from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.fit.psf.expected_kernel import expected_kernel
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import CameraFit, Check, Curve, FitResult, KernelPair, Patch, Skipped, ValidationResult
+from lab.formats.results import (
+    CameraFit,
+    Check,
+    CurveComparison,
+    FitResult,
+    KernelPair,
+    PatchComparison,
+    Skipped,
+    ValidationResult,
+)
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
@@ -142,7 +151,7 @@ def _chart(
     )
     check = _check("colorchecker", side, captures[0], measured - predicted, covariance, measured)
     patches = tuple(
-        Patch(
+        PatchComparison(
             patch=p.name, channel=p.channel, predicted_dn=float(predicted[i]), predicted_dn_std=float(std[i]),
             measured_dn=float(measured[i]), measured_dn_std=float(noise[i]),
         )
@@ -192,7 +201,7 @@ def _edges(
             blocks.append(measured.covariance + np.diag(np.full(len(predicted), MTF_FLOOR**2)))
             reference.append(np.maximum(predicted, 0.1))
             curves.append(
-                Curve(
+                CurveComparison(
                     label=f"{capture.id}, {measured.angle_deg:.1f} deg", channel=channel, axis="spatial frequency, cy/px",
                     x=tuple(MTF_FREQUENCIES.tolist()), predicted=tuple(predicted.tolist()), measured=tuple(measured.mtf.tolist()),
                     measured_std=tuple(measured.mtf_std.tolist()),

@@ -10,14 +10,7 @@ from typing import Any
 import numpy as np
 
 from lab.formats.recording_set import RecordingSet
-from lab.formats.results import (
-    Check,
-    DiagnosisResult,
-    NoiseFit,
-    Patch,
-    ResidualCurve,
-    SpectralFit,
-)
+from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
 from lab.report.figures import measured
 from sim.camera import Side
 
@@ -361,7 +354,7 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
     }
 
 
-def patch_comparison(patches: Sequence[Patch]) -> Figure:
+def patch_comparison(patches: Sequence[PatchComparison]) -> Figure:
     """Measured against predicted, and below it how far off each patch is in per cent, with its uncertainty."""
     data: list[Trace] = []
     top = max(max(patch.measured_dn, patch.predicted_dn) for patch in patches)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from lab.diagnose.outcome.detectability import detectable
-from lab.formats.results import DiagnosisResult, Place, ResidualCurve, ResidualPicture, Visibility
+from lab.formats.results import DiagnosisResult, ExaminedPlace, ResidualCurve, ResidualPicture, Visibility
 from lab.report.charts import Figure, axis, layout
 from lab.report.figures import SHOWN_UNITS
 from lab.report.pictures import difference_picture
@@ -74,14 +74,14 @@ def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[
     return maps
 
 
-def _place_map(places: Sequence[Place], *, after: bool) -> Figure:
+def _place_map(places: Sequence[ExaminedPlace], *, after: bool) -> Figure:
     rows = list(dict.fromkeys(place.measurement for place in places))
     axes = list(dict.fromkeys(place.axis for place in places))
 
-    def sigma(place: Place) -> float:
+    def sigma(place: ExaminedPlace) -> float:
         return place.sigma_after if after else place.sigma_before
 
-    worst: dict[tuple[str, str], Place] = {}
+    worst: dict[tuple[str, str], ExaminedPlace] = {}
     for place in places:
         key = place.measurement, place.axis
         if key not in worst or sigma(place) > sigma(worst[key]):

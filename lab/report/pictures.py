@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lab.formats.recording_set import DataSheet
-from lab.formats.results import Patch
+from lab.formats.results import PatchComparison
 from sim.sensor.mosaic import planes
 
 DISPLAY_GAMMA = 2.2
@@ -75,7 +75,7 @@ def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> i
     return margin
 
 
-def patch_colours(patches: tuple[Patch, ...]) -> dict[str, tuple[str, str]]:
+def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, str]]:
     """Patch -> (measured, predicted) as CSS colours: camera R, G, B balanced on the measured white patch, gamma 2.2.
 
     Camera colours, not colorimetry: both go through the same balance, so what differs on the page differs in the recording.

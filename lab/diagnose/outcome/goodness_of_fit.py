@@ -11,12 +11,12 @@ from lab.diagnose.inference.gaussian import ROUNDING, chi2, conditional
 from lab.diagnose.inference.locate import chi2_by_slice
 from lab.diagnose.measurements.summaries import Effects
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.results import HeldOut, MeasurementFit, Place, ResidualCurve
+from lab.formats.results import ExaminedPlace, HeldOut, MeasurementFit, ResidualCurve
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
 
-def places(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[Place]:
+def places(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[ExaminedPlace]:
     """Every slice of every measurement, before and after; significances are corrected for the number of slices."""
     model = verdict.model
     before = chi2_by_slice(model, model.gaussian(), policy)
@@ -24,7 +24,7 @@ def places(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[Pla
     after = {(id(s.block), s.axis, s.where): s for s in with_effects}
     for one in before:
         now = after[id(one.block), one.axis, one.where]
-        yield Place(
+        yield ExaminedPlace(
             side=side,
             measurement=one.block.measurement,
             axis=one.axis,

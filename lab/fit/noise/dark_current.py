@@ -11,7 +11,7 @@ from lab.fit.noise.read_noise import dark_signal_hidden
 from lab.fit.noise.temperature_law import temperature_law
 from lab.fit.rounding import HIDDEN_DN2
 from lab.fit.weighted_lines import dark_line
-from lab.formats.results import DarkCurrentTemperature
+from lab.formats.results import DarkCurrentLaws
 
 
 def dark_current(e: Evaluation) -> tuple[float | None, float | None]:
@@ -60,7 +60,7 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
     return rate / flats.gain**2, std_of_rate / flats.gain**2
 
 
-def dark_current_temperature(e: Evaluation) -> DarkCurrentTemperature | None:
+def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
     """Dark current at every temperature with darks of two exposures, and the laws through those significantly above
     0.
     """

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from lab.fit.weighted_lines import chi2_factor, least_squares
-from lab.formats.results import DarkCurrentTemperature
+from lab.formats.results import DarkCurrentLaws
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5
 ZERO_C_K = 273.15
 
 
-def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentTemperature:
+def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: float = 0.0) -> DarkCurrentLaws:
     """The Arrhenius law and the doubling temperature of EMVA 1288 through dark currents `found`: (deg C, e/s, its
     standard deviation).
 
@@ -23,7 +23,7 @@ def temperature_law(found: Sequence[tuple[float, float, float]], gain_error: flo
     temperatures are needed. `gain_error`: relative error of the gain, common to all.
     """
     listed = np.array(found, float)
-    plain = DarkCurrentTemperature(
+    plain = DarkCurrentLaws(
         temperature_c=tuple(listed[:, 0]),
         dark_current_e_per_s=tuple(listed[:, 1]),
         dark_current_e_per_s_std=tuple(float(std) for std in np.hypot(listed[:, 2], gain_error * listed[:, 1])),

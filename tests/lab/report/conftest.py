@@ -8,7 +8,7 @@ import pytest
 from lab.formats.results import (
     CameraFit,
     Check,
-    Curve,
+    CurveComparison,
     DiagnosisResult,
     FitResult,
     GeometryFit,
@@ -19,7 +19,7 @@ from lab.formats.results import (
     NamedEffect,
     NoiseFit,
     ParameterValue,
-    Patch,
+    PatchComparison,
     PhotonTransfer,
     ResidualCurve,
     Rival,
@@ -138,7 +138,7 @@ def _made_up(seed: int = 3, verdict: str = "explained", sides: tuple[Side, ...] 
                 baseline = np.exp(-2 * (blur * frequency) ** 2) if concealed else truth
                 std = np.full(frequency.size, 0.006)
                 overlays.append(
-                    Curve(
+                    CurveComparison(
                         label=edge,
                         channel=channel,
                         axis="spatial frequency, cy/px",
@@ -210,7 +210,7 @@ def _made_up(seed: int = 3, verdict: str = "explained", sides: tuple[Side, ...] 
         reflectance = np.clip(rng.random((24, 3)), 0.05, 0.9)
         reflectance[18:] = np.array([0.9, 0.59, 0.36, 0.19, 0.09, 0.031])[:, None]
         patches = [
-            Patch(
+            PatchComparison(
                 patch=name,
                 channel=channel,
                 predicted_dn=2000 * reflectance[k, j],

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from lab.formats.results import DiagnosisResult, NamedEffect, Place, ResidualCurve, ResidualPicture, Visibility
+from lab.formats.results import DiagnosisResult, ExaminedPlace, NamedEffect, ResidualCurve, ResidualPicture, Visibility
 from lab.report.diagnosis import context, mood, place_maps, worst_of_each
 
 PLACES = tuple(
-    Place(side="left", measurement=m, axis=axis, where=where, n=10, chi2_before=before, chi2_after=9.0, sigma_before=sigma, sigma_after=0.0)
+    ExaminedPlace(side="left", measurement=m, axis=axis, where=where, n=10, chi2_before=before, chi2_after=9.0, sigma_before=sigma, sigma_after=0.0)
     for m, axis, where, before, sigma in (
         ("a_new_one", "somewhere", "here", 9.0, 0.0),
         ("slanted_edge", "spatial_frequency", "0.1..0.2", 80.0, 5.5),

@@ -14,7 +14,7 @@ import pytest
 
 from lab.errors import InputError
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.formats.results import CameraFit, FitResult, MakerDeparture, Patch, SpectralFit, Unexplained
+from lab.formats.results import CameraFit, FitResult, MakerDeparture, PatchComparison, SpectralFit, Unexplained
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.figures import by_side, measured, rotation_vector_mrad
 from lab.report.pictures import (
@@ -278,11 +278,11 @@ def test_border_that_holds_nothing_is_cut_off() -> None:
 def test_patch_colours_are_balanced_on_the_measured_white() -> None:
     values = {"R": 500.0, "G": 1000.0, "B": 250.0}
     white = [
-        Patch(patch="white", channel=c, predicted_dn=v, predicted_dn_std=1, measured_dn=v, measured_dn_std=1)
+        PatchComparison(patch="white", channel=c, predicted_dn=v, predicted_dn_std=1, measured_dn=v, measured_dn_std=1)
         for c, v in values.items()
     ]
     red = [
-        Patch(patch="red", channel=c, predicted_dn=0.5 * v, predicted_dn_std=1, measured_dn=v * (0.5 if c == "R" else 0.0), measured_dn_std=1)
+        PatchComparison(patch="red", channel=c, predicted_dn=0.5 * v, predicted_dn_std=1, measured_dn=v * (0.5 if c == "R" else 0.0), measured_dn_std=1)
         for c, v in values.items()
     ]  # fmt: skip
     colours = patch_colours((*white, *red))

@@ -1,0 +1,212 @@
+"""The result of `calibench diagnose`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from lab.formats.results.skipped import Skipped
+from sim.camera import Side
+from sim.parameters import Frozen
+
+
+class Mismatch(Frozen):
+    """A part of a measurement whose prediction and recording differ beyond the threshold."""
+
+    side: Side
+    measurement: str
+    axis: str
+    where: str
+    significance_sigma: float
+    captures: tuple[str, ...]
+
+
+class ParameterValue(Frozen):
+    """An estimated parameter of an effect."""
+
+    value: float
+    std: float | None
+    unit: str
+
+
+class Rival(Frozen):
+    """Another effect that explains the same mismatch, with its posterior probability."""
+
+    name: str
+    probability: float
+
+
+class NamedEffect(Frozen):
+    """An effect that the diagnosis names, with its posterior probability."""
+
+    name: str
+    probability: float
+    sides: tuple[Side, ...]
+    parameters: dict[str, ParameterValue]
+    rivals: tuple[Rival, ...] = ()
+    statement: str
+    #: Publication that the effect's law is taken from.
+    reference: str | None = None
+
+
+class Unexplained(Frozen):
+    """A mismatch that no effect of the library explains; a model discrepancy stands for it in the improved model."""
+
+    side: Side
+    measurement: str
+    axis: str
+    where: str
+    shape: str
+    significance_sigma: float
+    chi2_before: float
+    chi2_after: float
+    n: int
+    correction: str = ""  # the model discrepancy, in words
+    check: str = ""  # a stated value of the camera that the recordings contradict, as a sentence
+
+
+class HeldOut(Frozen):
+    """chi2 of captures that neither the fit nor the choice of effects has used.
+
+    `before`: under the baseline. `after`: with the named effects and the mean of the model discrepancy.
+    """
+
+    captures: tuple[str, ...]
+    chi2_before: float
+    chi2_after: float
+    n: int
+
+
+class ResidualCurve(Frozen):
+    """One measurement as recorded and as predicted, before and after the named effects, for the report's figures."""
+
+    side: Side
+    measurement: str
+    label: str
+    channel: str
+    axis: str
+    x: tuple[float, ...]
+    names: tuple[str, ...] = ()  # of the points, where x is only their number
+    measured: tuple[float, ...]
+    measured_std: tuple[float, ...]
+    before: tuple[float, ...]  # prediction of the baseline
+    after: tuple[float, ...]  # prediction with the named effects and the model discrepancy
+    held_out: bool
+
+
+class NextCapture(Frozen):
+    """A capture that could be taken to tell rivals apart.
+
+    `distance`: D = 1/2 d' C^-1 d of the two nearest rivals, with d the difference of their predictions and C the covariance of
+    the measurement. `told_apart`: probability Phi(sqrt(D / 2)) of a right decision between them.
+    """
+
+    side: Side
+    capture: str
+    rivals: tuple[str, str]
+    distance: float
+    told_apart: float
+
+
+class ExaminedPlace(Frozen):
+    """A part of one measurement that was tested: chi2 under the baseline and with the named effects.
+
+    `sigma_before`, `sigma_after`: significance in standard deviations, corrected for the number of places tested.
+    """
+
+    side: Side
+    measurement: str
+    axis: str
+    where: str
+    n: int
+    chi2_before: float
+    chi2_after: float
+    sigma_before: float
+    sigma_after: float
+
+
+class MeasurementFit(Frozen):
+    """chi2 of one whole measurement before and after the named effects and the model discrepancy.
+
+    `n`, `chi2`: of the captures that the fit and the choice of effects used. `held_out`: of the others.
+    """
+
+    side: Side
+    measurement: str
+    n: int
+    chi2_before: float
+    chi2_after: float
+    held_out_n: int
+    held_out_before: float
+    held_out_after: float
+
+
+class Visibility(Frozen):
+    """What the recordings could show of one effect.
+
+    `smallest`: size of each parameter that is detected with a probability of 90 %; a parameter without such a size is left out.
+    `nearest`: the effect with the most similar signature, `cosine`: of the angle between the two signatures, `told_apart`:
+    probability of a right decision between them.
+    """
+
+    side: Side
+    effect: str
+    smallest: dict[str, float]
+    nearest: str | None
+    cosine: float
+    told_apart: float
+
+
+class ResidualPicture(Frozen):
+    """Residuals of a frame averaged over cells, in standard deviations: under the baseline and with the named effects."""
+
+    side: Side
+    kind: str
+    capture: str
+    held_out: bool
+    before: tuple[tuple[float, ...], ...]
+    after: tuple[tuple[float, ...], ...]
+
+
+class Resolution(Frozen):
+    """One capture that `run --resolve` took: what it is, the session that holds its frames, and the diagnosis before it."""
+
+    capture: str
+    session: str
+    verdict_before: Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+    effects_before: tuple[NamedEffect, ...]
+
+
+class PolicyRule(Frozen):
+    """One number by which a diagnosis decided (`lab.diagnose.policy.DecisionPolicy` declares them)."""
+
+    name: str
+    group: str
+    value: float
+    unit: str
+    meaning: str
+
+
+class DiagnosisResult(Frozen):
+    """What the first model left out, and how much better the improved model predicts."""
+
+    format: Literal["calibench-diagnosis"] = "calibench-diagnosis"
+    version: Literal[1] = 1
+    source: str
+    verdict: Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+    mismatches: tuple[Mismatch, ...] = ()
+    effects: tuple[NamedEffect, ...] = ()
+    unexplained: tuple[Unexplained, ...] = ()
+    held_out: HeldOut | None = None
+    next_capture: str | None = None
+    next_captures: tuple[NextCapture, ...] = ()  # best first, for each side
+    resolutions: tuple[Resolution, ...] = ()  # in the order in which they were taken
+    places: tuple[ExaminedPlace, ...] = ()
+    measurements: tuple[MeasurementFit, ...] = ()
+    visibility: tuple[Visibility, ...] = ()
+    pictures: tuple[ResidualPicture, ...] = ()
+    threshold: float | None = None
+    false_alarm_rate: float | None = None
+    curves: tuple[ResidualCurve, ...] = ()
+    skipped: tuple[Skipped, ...] = ()
+    summary: tuple[str, ...] = ()  # the diagnosis in sentences
+    policy: tuple[PolicyRule, ...] = ()  # the rules of decision
