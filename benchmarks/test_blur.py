@@ -29,10 +29,11 @@ from lab.fit.psf.photograph import photographed_kernel
 from lab.fit.psf.screen_kernel import measure_kernels
 from lab.fit.psf.target_displacement import displaced
 from sim.camera import CameraModel, Lens
-from sim.forward import Exposure, expected_electrons, kernel
+from sim.frame import Exposure, expected_electrons
 from sim.optics.imaging import MeasuredPsf
 from sim.optics.traced_table import TableSettings, lens_table
 from sim.optics.zmx import read_zmx
+from sim.point import kernel
 from sim.scene.render import Warp
 from sim.scene.scenes import ScreenPattern
 from sim.sensor.electrons import FixedPattern, sample_from

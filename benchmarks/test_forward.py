@@ -21,9 +21,9 @@ from scipy.interpolate import CubicSpline
 
 from benchmarks.table import Row, show
 from lab.formats.camera_file import default_camera
-from sim import forward
+from sim import plain_image
 from sim.camera import CameraModel, Lens
-from sim.forward import Exposure, sample
+from sim.frame import Exposure, sample
 from sim.optics.field_mapping import ImageFrame, field_mapping
 from sim.optics.imaging import TracedLens
 from sim.optics.kernels import Kernels
@@ -239,7 +239,7 @@ import resource, sys
 import numpy as np
 sys.path.insert(0, ".")
 from benchmarks.test_forward import LAMP, traced_camera
-from sim.forward import Exposure, expected
+from sim.frame import Exposure, expected
 from sim.scene import SpectralImage
 camera = traced_camera()
 wavelength_nm = tuple(np.linspace(400.0, 720.0, 33).tolist())
@@ -295,4 +295,4 @@ def test_of_what_machine() -> None:
         ],
     )
     print(f"peak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
-    assert forward.FRAME_WAVELENGTHS == 5  # the limit above counts five pictures a channel
+    assert plain_image.FRAME_WAVELENGTHS == 5  # the limit above counts five pictures a channel

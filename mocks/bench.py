@@ -8,7 +8,7 @@ wheel, the radiometer's mock reads `Bench.radiance()`, the cameras' mocks call `
 thread-safe, for each instrument answers in its own thread. Time is virtual: an exposure of 2 s moves the clock by 2 s
 and takes none, unless `real_time_factor` asks for it.
 
-Frames are the forward model's (`sim.forward`), of the scenes of `mocks.targets`, so that any effect of the library can be
+Frames are the forward model's (`sim.frame`), of the scenes of `mocks.targets`, so that any effect of the library can be
 concealed. Effects of lamp, monochromator, screen and room change the light that reaches the cameras and not what the radiometer
 says; effects of the radiometer (`mocks.conceal.OF_THE_RADIOMETER`) change what it says and not the light.
 
@@ -45,17 +45,17 @@ from mocks.targets import (
 )
 from mocks.truth import AIR_C, COLS, ROWS, SELF_HEATING_C, Truth, hidden_truth
 from sim.camera import Side
-from sim.forward import (
+from sim.frame import (
     Exposure,
-    KeptTransfers,
     SceneLight,
     collected_electrons,
     dark_electrons,
     read_electrons,
     read_out,
-    scene_gain,
+    right_over_left,
     scene_light,
 )
+from sim.plain_image import KeptTransfers
 from sim.scene import Scene, ScreenPattern, UniformField
 from sim.scene.render import Grid, cells, quadrilateral
 from sim.sensor.electrons import sample_from
@@ -192,7 +192,9 @@ class Bench:
             first_order = self._placed != "screen" and self._light.first_order
             there = Spectrum.of(WAVELENGTH_NM, self._radiance_in_front() * self._drift(self.clock.now()))
             effects = self._truth.cameras["left"].effects  # the radiometer's are the same on both sides
-            w, true = misread(there, effects, "narrowband" if first_order else "flat").arrays
+            w, true = misread(
+                self._truth.cameras["left"].model, there, effects, "narrowband" if first_order else "flat"
+            ).arrays
             w, value = w[::2], true[::2].copy()
             value *= 1.0 + 1.5e-3 * self._radiometer_rng.standard_normal(value.size)
             value += 2e-9 * self._radiometer_rng.standard_normal(value.size)
@@ -281,7 +283,7 @@ class Bench:
         seen, light = self._seen(side)
         source = self._drift(begin_s + 0.5 * exposure_s)
         if side == "right" and not isinstance(seen, UniformField):
-            source *= scene_gain(camera.acting)
+            source *= right_over_left(camera.model, camera.acting)
         exposure = Exposure(
             seen, exposure_s, gain_db, self.sensor_temperature_c(side), elapsed_s=self._elapsed_s(begin_s)
         )

@@ -3,7 +3,7 @@
     left:nonlinearity:quadratic_percent=2
     both:source_drift:drift_percent_per_min=0.5,settling_min=8
 
-Effects of the rig (lamp, monochromator, radiometer, screen, room, pair) act on both sides, as both cameras stand at one rig.
+Effects on the light (lamp, monochromator, radiometer, screen, room, pair) act on both sides, as both cameras stand at one rig.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Literal, get_origin
 from pydantic import ValidationError
 
 from sim.camera import Side
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.effects.library import effects as library
 
 SIDES: tuple[Side, ...] = ("left", "right")
@@ -59,7 +59,7 @@ def _parsed(spec: str) -> tuple[tuple[Side, ...], Effect]:
     if name in NOT_SHOWN:
         raise ConcealError(f"--conceal {spec}: the bench can't show {name}: {NOT_SHOWN[name]}")
     kind = library()[name]
-    if kind.stage is Stage.RIG and sides != SIDES:
+    if "light" in kind.stages() and sides != SIDES:
         raise ConcealError(f"--conceal {spec}: {name} is of the rig before both cameras; write both:{name}:{text}")
     return sides, _made(spec, kind, text)
 
@@ -96,7 +96,7 @@ def _made(spec: str, kind: type[Effect], text: str) -> Effect:
 
 def check(concealed: Concealed) -> None:
     """Raises `ConcealError` for effects that the bench can't show, and for effects of the rig that differ from side to side."""
-    rig = {side: [effect for effect in concealed.get(side, ()) if effect.stage is Stage.RIG] for side in SIDES}
+    rig = {side: [effect for effect in concealed.get(side, ()) if "light" in effect.stages()] for side in SIDES}
     if rig["left"] != rig["right"]:
         names = sorted({effect.name for side in SIDES for effect in rig[side]})
         raise ConcealError(f"{', '.join(names)}: of the rig before both cameras; conceal the same on both sides")

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mocks.conceal import OF_THE_RADIOMETER
+from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.wavelength_offset import WavelengthOffset
-from sim.forward import radiance_at_lens
 from sim.spectrum import Spectrum
+from sim.uniform import radiance_at_lens
 
 #: Steps towards the level at which a radiometer that isn't linear reads; each leaves a few per cent of the error before it.
 LEVEL_STEPS = 40
 
 
-def misread(radiance: Spectrum, effects: Sequence[Effect], kind: str) -> Spectrum:
+def misread(camera: CameraModel, radiance: Spectrum, effects: Sequence[Effect], kind: str) -> Spectrum:
     """What a radiometer with `effects` says of `radiance`: the reading from which the forward model gets that light.
 
     A scale that is shifted by d reads the light of w + d at w. One that isn't linear reads the shape at a level s that the
@@ -23,12 +24,12 @@ def misread(radiance: Spectrum, effects: Sequence[Effect], kind: str) -> Spectru
     for effect in reversed([e for e in effects if e.name in OF_THE_RADIOMETER]):
         if isinstance(effect, WavelengthOffset):
             back = effect.having(offset_nm=-effect.offset_nm)
-            radiance = radiance_at_lens(radiance, [back], kind)
+            radiance = radiance_at_lens(camera, radiance, [back], kind)
             continue
         wavelength_nm, value = radiance.arrays
         peak, level = float(value.max()), 1.0
         for _ in range(LEVEL_STEPS if peak > 0 else 0):
-            seen = radiance_at_lens(Spectrum.of(wavelength_nm, value * level), [effect], kind)
+            seen = radiance_at_lens(camera, Spectrum.of(wavelength_nm, value * level), [effect], kind)
             level *= peak / max(seen.value)
         radiance = Spectrum.of(wavelength_nm, value * level)
     return radiance

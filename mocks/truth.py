@@ -25,6 +25,7 @@ from sim.effects.infrared_cut_filter import InfraredCutFilter
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import FloatArray, Spectrum
+from sim.stages import ComplexArray, Image, image_of
 
 ROWS, COLS, PITCH_UM = 480, 640, 3.0
 #: Distance of the cameras, and from them to where targets stand (mm). Both look at the same point there.
@@ -39,22 +40,27 @@ SELF_HEATING_C: dict[Side, float] = {"left": 8.0, "right": 7.8}
 class DispersingLowPassFilter(OpticalLowPassFilter):
     """The anti-alias filter with quartz's dispersion: its displacement is as stated at 550 nm and 3 % more at 440 nm."""
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
+    def on_image(self, image: Image) -> Image:
+        split = image_of(image.camera, (OpticalLowPassFilter(**dict(self)),)).transfer
+
         def birefringence(nm: float) -> float:  # quartz, fitted to 0.00964 at 400 nm and 0.00904 at 650 nm
             return 0.00867 + 0.000155 / (nm * 1e-3) ** 2
 
-        factor = birefringence(wavelength_nm) / birefringence(550.0)
-        return super().transfer(fx_cy_per_um * factor, fy_cy_per_um * factor, wavelength_nm, camera)
+        def transfer(fx: FloatArray, fy: FloatArray, wavelength_nm: float) -> FloatArray | ComplexArray:
+            factor = birefringence(wavelength_nm) / birefringence(550.0)
+            return split[0](fx * factor, fy * factor, wavelength_nm)
+
+        return image.adding(transfer=transfer) if split else image
 
 
 class RipplingInfraredCutFilter(InfraredCutFilter):
     """The infrared-cut filter with the ripple that a coating's pass band has: 0.3 %."""
 
-    def transmittance(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
-        ripple = 1.0 - 0.0015 * (1.0 + np.cos(2 * np.pi * np.asarray(wavelength_nm, float) / 60.0))
-        return super().transmittance(wavelength_nm, sin_theta) * ripple
+    def on_image(self, image: Image) -> Image:
+        def rippled(wavelength_nm: FloatArray, sin_theta: FloatArray) -> FloatArray:
+            return np.asarray(1.0 - 0.0015 * (1.0 + np.cos(2 * np.pi * wavelength_nm / 60.0)))
+
+        return super().on_image(image).adding(transmittance=rippled)
 
 
 @dataclass(frozen=True, eq=False)

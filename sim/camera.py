@@ -56,7 +56,7 @@ class Geometry(Frozen):
 
 
 class CameraModel(Frozen):
-    """What calibench knows of one camera. Fits fill it, `sim.forward` predicts with it.
+    """What calibench knows of one camera. Fits fill it, `sim.frame` predicts with it.
 
     `quantum_efficiency` is the sensor's with its colour filters, electrons a photon, per channel (`R`, `G`, `B`, or `Y` of
     a MONO sensor), without the lens's transmittance and without any infrared filter that the maker left out. `std` holds

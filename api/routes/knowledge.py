@@ -47,7 +47,7 @@ def list_parameters() -> list[Parameter]:
 def _effect(effect: type[EffectType]) -> Effect:
     return Effect(
         name=effect.name,
-        stage=effect.stage.value,
+        stage=", ".join(effect.stages()),
         reference=effect.reference,
         sentence=effect.sentence,
         parameters=tuple(_parameter(name, quantity) for name, quantity in effect.quantities().items()),

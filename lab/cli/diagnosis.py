@@ -139,14 +139,14 @@ def effects(
         for heading in ("effect", "acts in", "parameters"):
             table.add_column(heading)
         for kind in library.effects().values():
-            table.add_row(kind.name, str(kind.stage), escape(" ".join(kind.quantities())))
+            table.add_row(kind.name, ", ".join(kind.stages()), escape(" ".join(kind.quantities())))
         out.print(table)
         return
     try:
         kind = library.effect(name)
     except KeyError as unknown:
         raise InputError(str(unknown.args[0])) from None
-    out.print(escape(f"{kind.name} ({kind.stage}): {kind.sentence}"))
+    out.print(escape(f"{kind.name} ({', '.join(kind.stages())}): {kind.sentence}"))
     table = Table(box=None, pad_edge=False)
     for heading in ("parameter", "unit", "from", "to", "usual", "absent", "what it is"):
         table.add_column(heading)

@@ -1,29 +1,20 @@
-"""From what a maker says and a fit found to a camera model, and from that to the means that uniform light leaves."""
+"""From what a maker says and a fit found to a camera model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri
 
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import CameraFit
 from sim.camera import CameraModel, Geometry, Lens, Side
-from sim.effects.base import Effect
-from sim.optics.illumination import optical_axis_px, relative_illumination
-from sim.sensor import mosaic
-from sim.spectrum import FloatArray, Spectrum
+from sim.spectrum import Spectrum
 
 #: Where the maker doesn't say it.
 USUAL_PITCH_UM = 3.5
 #: Where neither fit nor maker gives a sensitivity: (peak, standard deviation in nm), for the colour of edges and screens only.
 TYPICAL_SENSITIVITY_NM = {"R": (600.0, 40.0), "G": (535.0, 40.0), "B": (460.0, 30.0), "Y": (550.0, 90.0)}
-
-
-#: Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1.
-NOISE_NODES = ndtri((np.arange(48) + 0.5) / 48) / np.std(ndtri((np.arange(48) + 0.5) / 48))
 
 
 @dataclass(frozen=True)
@@ -141,106 +132,3 @@ def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:
         parts.append((outer[beyond], factor * stated.at(outer[beyond])))
     (before, low), (after, high) = parts
     return Spectrum.of(np.concatenate([before, wavelength_nm, after]), np.concatenate([low, value, high]))
-
-
-# --- uniform light -----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Field:
-    """Points on the sensor that stand for the whole frame: (points,) um from the optical axis, and the baseline's light there."""
-
-    x_um: FloatArray
-    y_um: FloatArray
-    light: FloatArray
-
-    @staticmethod
-    def of(camera: CameraModel, rows: int = 8, cols: int = 10) -> Field:
-        """Gauss's points and equal areas would differ by less than 1e-5 of a cos^4 field's mean on 8 x 10 cells' centres."""
-        row = (np.arange(rows) + 0.5) / rows * camera.rows - 0.5
-        col = (np.arange(cols) + 0.5) / cols * camera.cols - 0.5
-        grid_row, grid_col = (g.ravel() for g in np.meshgrid(row, col, indexing="ij"))
-        return Field.at(camera, grid_row, grid_col)
-
-    @staticmethod
-    def at(camera: CameraModel, row: FloatArray, col: FloatArray) -> Field:
-        row0, col0 = optical_axis_px(camera)
-        pitch = camera.pixel_pitch_um
-        return Field((col - col0) * pitch, (row - row0) * pitch, relative_illumination(camera, row, col))
-
-    def under(self, camera: CameraModel, effects: Sequence[Effect]) -> Field:
-        """The same points in the light that the effects leave of it there."""
-        light = self.light
-        for effect in effects:
-            if type(effect).illumination is not Effect.illumination:
-                light = light * effect.illumination(self.x_um, self.y_um, camera)
-        return replace(self, light=light)
-
-
-def collected_electrons(
-    camera: CameraModel,
-    rates: Mapping[str, float],
-    exposure_s: float,
-    effects: Sequence[Effect] = (),
-    *,
-    field: Field,
-    elapsed_s: float = 0.0,
-) -> dict[str, FloatArray]:
-    """Mean electrons (points of `field`,) by channel in uniform light of `rates` (e/s on axis, with the effects on radiance
-    and transmittance in them), dark current included; effects on exposure, source and charge are applied here, those on place in
-    `Field.under`."""
-    time, drift = exposure_s, 1.0
-    ambient = dict.fromkeys(rates, 0.0)
-    for effect in effects:
-        time = effect.exposure(time)
-        drift *= effect.drift(elapsed_s)
-        for channel in ambient:
-            ambient[channel] += effect.ambient_e_per_s(channel, camera)
-    dark = camera.dark_current_e_per_s * exposure_s
-    electrons = {c: rate * drift * time * field.light + ambient[c] * exposure_s for c, rate in rates.items()}
-    mixed = mixed_charge({c: rates.get(c, 1.0) for c in camera.channels}, exposure_s, effects, camera)
-    return {c: e * mixed.get(c, 1.0) + dark for c, e in electrons.items()}
-
-
-def mean_dn(
-    camera: CameraModel, electrons: Mapping[str, FloatArray], effects: Sequence[Effect] = ()
-) -> dict[str, float]:
-    """Mean DN above the black level over the points, by channel, after the effects on the read-out; those on codes are averaged over
-    shot and read noise."""
-    means = {}
-    coding = [effect for effect in effects if type(effect).codes is not Effect.codes]
-    for channel, value in electrons.items():
-        out = value
-        for effect in effects:
-            out = effect.response(out, camera)
-        dn = camera.conversion_gain_dn_per_e * out
-        if coding:
-            noise = camera.conversion_gain_dn_per_e * np.sqrt(np.maximum(value, 0.0) + camera.read_noise_e**2)
-            codes = camera.black_level_dn + dn[..., None] + noise[..., None] * NOISE_NODES
-            for effect in coding:
-                codes = effect.codes(codes, camera)
-            dn = codes - camera.black_level_dn
-        means[channel] = float(np.mean(dn))
-    return means
-
-
-def mixed_charge(
-    rates: Mapping[str, float], exposure_s: float, effects: Sequence[Effect], camera: CameraModel
-) -> dict[str, float]:
-    """Factor on each channel's mean by effects that move charge between neighbouring pixels, from a small uniform mosaic."""
-    moving = [e for e in effects if type(e).charge is not Effect.charge]
-    if not moving:
-        return {}
-    size = 12
-    tile = mosaic.assemble({c: np.full((size, size), rate) for c, rate in rates.items()}, camera.cfa)
-    after = tile
-    for effect in moving:
-        after = effect.charge(after, exposure_s, camera)
-    inner = slice(4, 8)
-    factors = {}
-    for channel, rate in rates.items():
-        where = np.zeros((size, size), bool)
-        for row, col in mosaic.phases(camera.cfa)[channel]:
-            where[row :: mosaic.step(camera.cfa), col :: mosaic.step(camera.cfa)] = True
-        factors[channel] = float(after[inner, inner][where[inner, inner]].mean()) / rate if rate > 0 else 1.0
-    return factors

@@ -20,7 +20,7 @@ from lab.fit.mtf.transfer_function import EdgeMtf
 from lab.formats.recording_set import RecordingSet
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
-from sim.forward import Exposure, dark_electrons, expected_electrons, read_out
+from sim.frame import Exposure, dark_electrons, expected_electrons, is_steady, read_out
 from sim.scene.scenes import EdgeRegion, KnifeEdge, Scene
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
@@ -73,8 +73,7 @@ class Replay:
 
     def _scene_key(self, capture: Capture, effects: Sequence[Effect]) -> object:
         told = capture.model_dump(exclude={"id", "frame", "time"})
-        steady = not any(type(e).drift is not Effect.drift or type(e).lit is not Effect.lit for e in effects)
-        return repr(told) if steady else capture.id
+        return repr(told) if is_steady(self.camera, effects) else capture.id
 
     def _electrons(self, capture: Capture, effects: Sequence[Effect]) -> tuple[Exposure, FloatArray]:
         edge = self._edge(capture) if isinstance(capture, SlantedEdgeCapture) else None

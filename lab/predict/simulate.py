@@ -27,11 +27,10 @@ from lab.formats.raw_file import (
 )
 from lab.formats.scene_file import light, scene
 from lab.report.provenance import installed_versions
-from sim import forward
+from sim import frame as sim_frame
 from sim.camera import CameraModel, Lens
-from sim.effects.base import Effect
 from sim.effects.distortion import Distortion
-from sim.forward import Exposure
+from sim.frame import Exposure
 from sim.optics.imaging import TracedLens
 from sim.parameters import Frozen, Quantity
 from sim.scene.catalogue import View
@@ -45,9 +44,6 @@ Progress = Callable[[str, float], None]
 BRIGHTEST_PERCENT, AUTO_SHARE = 1.0, 0.7
 #: Beyond these an automatic exposure makes no sense: something is wrong with the light.
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
-
-#: Hooks of an effect that may make electrons grow with the exposure in another way than in proportion.
-BENDING_HOOKS = ("exposure", "charge", "lit", "overflow")
 
 
 class SimulateOptions(Frozen):
@@ -160,20 +156,18 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
             )
 
         tell("optics", 0.1)
-        each_second = forward.expected_electrons(camera, exposed(1.0), content.effects)
-        dark = forward.dark_electrons(camera, exposed(1.0), content.effects)
+        each_second = sim_frame.expected_electrons(camera, exposed(1.0), content.effects)
+        dark = sim_frame.dark_electrons(camera, exposed(1.0), content.effects)
         _check_light(each_second, dark, options, white, camera)
         seconds = options.exposure_s
         if seconds is None:
             seconds = automatic_exposure_s(each_second, camera, options.gain_db)
         exposure = exposed(seconds)
-        proportional = all(
-            getattr(type(one), hook) is getattr(Effect, hook) for one in content.effects for hook in BENDING_HOOKS
-        )
+        proportional = sim_frame.grows_with_exposure(camera, content.effects)
         electrons = (
-            each_second * seconds if proportional else forward.expected_electrons(camera, exposure, content.effects)
+            each_second * seconds if proportional else sim_frame.expected_electrons(camera, exposure, content.effects)
         )
-        forward.check_not_saturated(camera, exposure, electrons)
+        sim_frame.check_not_saturated(camera, exposure, electrons)
         tell("sensor", 0.8)
         frame = _read(electrons, camera, content, exposure, options)
     except ValueError as error:
@@ -207,7 +201,7 @@ def automatic_exposure_s(electrons_per_s: FloatArray, camera: CameraModel, gain_
 def _read(
     electrons: FloatArray, camera: CameraModel, content: CameraFile, exposure: Exposure, options: SimulateOptions
 ) -> Frame:
-    read_out = forward.read_out(camera, exposure, content.effects)
+    read_out = sim_frame.read_out(camera, exposure, content.effects)
     if options.expected:
         mean, _ = sensor.dn_moments(electrons, camera, exposure.gain_db, read_out)
         return np.clip(np.rint(mean), 0.0, camera.white_level_dn).astype(np.uint16)
@@ -216,7 +210,7 @@ def _read(
         camera,
         np.random.default_rng(options.seed),
         FixedPattern.draw(camera, np.random.default_rng([options.pattern_seed, 1])),
-        dark_electrons=forward.dark_electrons(camera, exposure, content.effects),
+        dark_electrons=sim_frame.dark_electrons(camera, exposure, content.effects),
         gain_db=exposure.gain_db,
         read_out=read_out,
     )

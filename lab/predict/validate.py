@@ -37,10 +37,11 @@ from lab.formats.results import (
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
-from sim.forward import edge_profile, electron_rate, optical_transfer
 from sim.optics.illumination import relative_illumination
+from sim.point import edge_profile, optical_transfer
 from sim.scene.colorchecker import reflectances
 from sim.spectrum import FloatArray
+from sim.uniform import Uniform, electron_rate
 
 PASSED_QUANTILE = 0.999
 #: Systematic parts of the comparison that the fits' uncertainties don't hold.
@@ -128,10 +129,8 @@ def _chart(
     for i, p in enumerate(points):
         fall_off = float(relative_illumination(model, p.row, p.col))
         rate = electron_rate(model, p.channel, light, effects, "chart", reflectance=known[p.name])
-        electrons = rate * exposure * fall_off + p.tail / gain + dark
-        for effect in effects:
-            electrons = float(effect.response(np.asarray(electrons), model))
-        predicted[i] = electrons * gain
+        electrons = np.asarray(rate * exposure * fall_off + p.tail / gain + dark)
+        predicted[i] = float(Uniform(model, effects).response(electrons)) * gain
         spread[i] = _curve_std(model, p.channel, light.arrays[0]) * rate * exposure * fall_off * gain
     measured = np.array([p.level for p in points]) - black
     covariance = patch_covariance(study, points, np.maximum(measured - dark * gain, 0.1))

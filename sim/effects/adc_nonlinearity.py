@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Codes
 
 
 class AdcNonlinearity(Effect):
@@ -17,7 +17,6 @@ class AdcNonlinearity(Effect):
     gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-3)."""
 
     name: ClassVar[str] = "adc_nonlinearity"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = (
         "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"
     )
@@ -47,12 +46,16 @@ class AdcNonlinearity(Effect):
         ),
     ] = 0.0
 
-    def codes(self, dn: FloatArray, camera: CameraModel) -> FloatArray:
+    def on_codes(self, codes: Codes) -> Codes:
         errors = (self.error_dn, self.second_dn, self.third_dn)
         if not any(errors):
-            return dn
-        full = 2.0**camera.bit_depth
-        # the three highest bits, as the number of the eighth of the range
-        eighth = (np.minimum(np.maximum(dn, 0.0), full - 1.0) * (8.0 / full)).astype(np.intp)
+            return codes
+        full = 2.0**codes.camera.bit_depth
+        #: By the three highest bits: the number of the eighth of the range.
         off = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) @ np.array(errors)
-        return np.asarray(dn * (1.0 - sum(errors) / full) + off[eighth])
+
+        def converted(dn: FloatArray) -> FloatArray:
+            eighth = (np.minimum(np.maximum(dn, 0.0), full - 1.0) * (8.0 / full)).astype(np.intp)
+            return np.asarray(dn * (1.0 - sum(errors) / full) + off[eighth])
+
+        return codes.adding(codes=converted)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
+from sim.stages import Light
 
 
 class AmbientLight(Effect):
     """Electrons a second added while the shutter is open: e in green (and in a camera without colour), e sqrt(c) in red, e / sqrt(c) in blue."""
 
     name: ClassVar[str] = "ambient_light"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, measuring set-up"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
@@ -56,5 +56,10 @@ class AmbientLight(Effect):
         colours = (1.0,) if camera.cfa == "MONO" else (1.0, 3.0, 0.4)
         return tuple((cls(rate_e_per_s=15.0, red_over_blue=c),) for c in colours)
 
-    def ambient_e_per_s(self, channel: str, camera: CameraModel) -> float:
-        return self.rate_e_per_s * self.red_over_blue ** {"R": 0.5, "B": -0.5}.get(channel, 0.0)
+    def on_light(self, light: Light) -> Light:
+        if self.rate_e_per_s == 0.0:
+            return light
+        share = {"R": 0.5, "B": -0.5}
+        return light.adding(
+            ambient_e_per_s=lambda channel: self.rate_e_per_s * self.red_over_blue ** share.get(channel, 0.0)
+        )

@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar, Literal, Self, get_args
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 Corner = Literal["top_left", "top_right", "bottom_left", "bottom_right"]
 
@@ -18,7 +18,6 @@ class AmplifierGlow(Effect):
     """g exp(-r / r0) electrons a second on top, r from the outermost pixel of one corner; it glows while charge is collected."""
 
     name: ClassVar[str] = "amplifier_glow"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, luminescence"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
@@ -48,14 +47,14 @@ class AmplifierGlow(Effect):
             for share in (0.1, 0.3, 0.7)
         )
 
-    def even_dark_current(
-        self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
-    ) -> FloatArray | float:
+    def on_charge(self, charge: Charge) -> Charge:
         if self.glow_e_per_s == 0.0:
-            return e_per_s
+            return charge
+        camera = charge.camera
         side, end = self.corner.split("_")
         down, across = np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float)
         down = down if side == "top" else down[::-1]
         across = across if end == "left" else across[::-1]
         distance_mm = np.hypot(down[:, None], across[None, :]) * camera.pixel_pitch_um * 1e-3
-        return e_per_s + self.glow_e_per_s * np.exp(-distance_mm / self.reach_mm)
+        glow = self.glow_e_per_s * np.exp(-distance_mm / self.reach_mm)
+        return charge.adding(dark_current=lambda e_per_s, temperature_c: e_per_s + glow)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.aberration import Aberration
-from sim.effects.base import Stage
+from sim.effects.base import Effect
 from sim.optics.pupil import Wavefront
 from sim.parameters import Quantity
+from sim.stages import Image
 
 
-class Astigmatism(Aberration):
+class Astigmatism(Effect):
     """Path errors quadratic along x and y apart: W = (x_defocus x^2 + y_defocus y^2) / (8 N^2)."""
 
     name: ClassVar[str] = "astigmatism"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
@@ -46,6 +44,9 @@ class Astigmatism(Aberration):
                  prior=(0.0, 20.0), absent=0.0, slope_power=2),
     ] = 0.0  # fmt: skip
 
-    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
-        scale = 1.0 / (8.0 * camera.lens.f_number**2)
-        return Wavefront.of({(2, 0): self.defocus_x_um * scale, (0, 2): -self.defocus_y_um * scale})
+    def on_image(self, image: Image) -> Image:
+        if self.defocus_x_um == 0.0 and self.defocus_y_um == 0.0:
+            return image
+        scale = 1.0 / (8.0 * image.camera.lens.f_number**2)
+        path = Wavefront.of({(2, 0): self.defocus_x_um * scale, (0, 2): -self.defocus_y_um * scale})
+        return image.adding(pupil=lambda wavelength_nm: path)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
-from sim.effects.aberration import Aberration
-from sim.effects.base import Stage
+from sim.effects.base import Effect
 from sim.optics.pupil import Wavefront, seidel
 from sim.parameters import Quantity
+from sim.stages import Image
 
 #: The wavelength that is in focus.
 FOCUSED_NM = 550.0
 
 
-class AxialChromaticAberration(Aberration):
+class AxialChromaticAberration(Effect):
     """The sensor lies dz = a t + b t^2 from the focus of a wavelength, t = (wavelength - 550 nm) / 100 nm: W = dz / (8 N^2) rho^2.
 
     a is the primary spectrum, b what a corrected lens leaves. Alone, either acts by its square; with a defocus of the whole
@@ -22,7 +22,6 @@ class AxialChromaticAberration(Aberration):
     """
 
     name: ClassVar[str] = "axial_chromatic_aberration"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on chromatic aberration"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
@@ -49,6 +48,13 @@ class AxialChromaticAberration(Aberration):
         # the two signs differ only beside a defocus, and then they are no small change of each other
         return tuple((cls(slope_um=sign * 4.0), cls(curvature_um=sign * 4.0)) for sign in (1.0, -1.0))
 
-    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
-        t = (wavelength_nm - FOCUSED_NM) / 100.0
-        return seidel(defocus_um=t * (self.slope_um + self.curvature_um * t) / (8.0 * camera.lens.f_number**2))
+    def on_image(self, image: Image) -> Image:
+        if self.slope_um == 0.0 and self.curvature_um == 0.0:
+            return image
+
+        def path(wavelength_nm: float) -> Wavefront:
+            t = (wavelength_nm - FOCUSED_NM) / 100.0
+            defocus_um = t * (self.slope_um + self.curvature_um * t)
+            return seidel(defocus_um=defocus_um / (8.0 * image.camera.lens.f_number**2))
+
+        return image.adding(pupil=path)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
+from sim.stages import Signal
 
 
 class BlackLevelDrift(Effect):
     """DN added: a t + b (T - 25 C), t from the first capture."""
 
     name: ClassVar[str] = "black_level_drift"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, dark signal"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -38,6 +37,12 @@ class BlackLevelDrift(Effect):
         ),
     ] = 0.0
 
-    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
-        warmer = 0.0 if temperature_c is None else temperature_c - 25.0
-        return self.drift_dn_per_min * elapsed_s / 60.0 + self.drift_dn_per_c * warmer
+    def on_signal(self, signal: Signal) -> Signal:
+        if self.drift_dn_per_min == 0.0 and self.drift_dn_per_c == 0.0:
+            return signal
+
+        def offset(elapsed_s: float, temperature_c: float | None) -> float:
+            warmer = 0.0 if temperature_c is None else temperature_c - 25.0
+            return self.drift_dn_per_min * elapsed_s / 60.0 + self.drift_dn_per_c * warmer
+
+        return signal.adding(offset_dn=offset)

@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 
 class Blooming(Effect):
@@ -17,7 +17,6 @@ class Blooming(Effect):
     pixels to their full wells one after the other; the rest is drained. What runs off the frame is lost."""
 
     name: ClassVar[str] = "blooming"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, blooming"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "time"})
@@ -31,17 +30,22 @@ class Blooming(Effect):
         Quantity("%", "share of the excess that runs over", lower=0.0, upper=100.0, prior=(0.0, 10.0), absent=0.0),
     ] = 0.0
 
-    def overflow(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
+    def on_charge(self, charge: Charge) -> Charge:
         if self.share_percent == 0.0:
-            return electrons
-        excess = 0.005 * self.share_percent * np.maximum(electrons - camera.full_well_e, 0.0)
-        if not np.any(excess):
-            return electrons
-        filled = electrons - 2.0 * excess
-        for rows in (range(len(filled)), range(len(filled) - 1, -1, -1)):
-            carried = np.zeros(filled.shape[1])
-            for row in rows:
-                taken = np.minimum(carried, np.maximum(camera.full_well_e - filled[row], 0.0))
-                filled[row] += taken
-                carried += excess[row] - taken
-        return filled
+            return charge
+        full_well_e = charge.camera.full_well_e
+
+        def overflow(electrons: FloatArray) -> FloatArray:
+            excess = 0.005 * self.share_percent * np.maximum(electrons - full_well_e, 0.0)
+            if not np.any(excess):
+                return electrons
+            filled = electrons - 2.0 * excess
+            for rows in (range(len(filled)), range(len(filled) - 1, -1, -1)):
+                carried = np.zeros(filled.shape[1])
+                for row in rows:
+                    taken = np.minimum(carried, np.maximum(full_well_e - filled[row], 0.0))
+                    filled[row] += taken
+                    carried += excess[row] - taken
+            return filled
+
+        return charge.adding(overflow=overflow)

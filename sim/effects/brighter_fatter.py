@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 
 class BrighterFatter(Effect):
@@ -21,7 +21,6 @@ class BrighterFatter(Effect):
     """
 
     name: ClassVar[str] = "brighter_fatter"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "P. Astier et al., A&A 629, A36 (2019)"
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -61,10 +60,18 @@ class BrighterFatter(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return ((cls(loss_percent=1.5), cls(loss_percent=1.5, shared_percent=1.5)),)
 
-    def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
-        return noise_e2 - electrons * (self.loss_percent / 100.0) * electrons / camera.full_well_e
-
-    def neighbour_correlation(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
-        if self.shared_percent == 0.0:
-            return 0.0
-        return 0.25 * (self.shared_percent / 100.0) * np.clip(electrons / camera.full_well_e, 0.0, 1.0)
+    def on_charge(self, charge: Charge) -> Charge:
+        full_well_e = charge.camera.full_well_e
+        if self.loss_percent != 0.0:
+            charge = charge.adding(
+                variance_e2=lambda electrons, variance_e2: (
+                    variance_e2 - electrons * (self.loss_percent / 100.0) * electrons / full_well_e
+                )
+            )
+        if self.shared_percent != 0.0:
+            charge = charge.adding(
+                correlation=lambda electrons: (
+                    0.25 * (self.shared_percent / 100.0) * np.clip(electrons / full_well_e, 0.0, 1.0)
+                )
+            )
+        return charge

@@ -7,9 +7,10 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 
 class ChargeDiffusion(Effect):
@@ -21,7 +22,6 @@ class ChargeDiffusion(Effect):
     """
 
     name: ClassVar[str] = "charge_diffusion"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "D. Seib, IEEE Trans. Electron Devices 21, 210 (1974)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "level", "orientation", "time"})
@@ -65,10 +65,12 @@ class ChargeDiffusion(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return tuple((cls(length_um=0.2, wavelength_power=power),) for power in (0.0, 1.0, 3.0))
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
+    def on_charge(self, charge: Charge) -> Charge:
         if self.length_um == 0.0:
-            return None
-        length = self.length_um * (wavelength_nm / 550.0) ** self.wavelength_power
-        return np.asarray(np.exp(-2.0 * np.pi**2 * length**2 * (fx_cy_per_um**2 + fy_cy_per_um**2)))
+            return charge
+
+        def transfer(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray:
+            length = self.length_um * (wavelength_nm / 550.0) ** self.wavelength_power
+            return np.asarray(np.exp(-2.0 * np.pi**2 * length**2 * (fx_cy_per_um**2 + fy_cy_per_um**2)))
+
+        return charge.adding(transfer=transfer)

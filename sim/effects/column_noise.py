@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
-import numpy as np
-
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Lines, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.sensor.lines import LineNoise
+from sim.stages import Signal
 
 
 class ColumnNoise(Effect):
@@ -17,7 +16,6 @@ class ColumnNoise(Effect):
     a difference of odd columns from even ones, which two ways of read-out leave; a normal variable a column and frame."""
 
     name: ClassVar[str] = "column_noise"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, spatial and temporal variances of rows and columns"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
@@ -62,26 +60,11 @@ class ColumnNoise(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return ((cls(offset_e=0.3), cls(noise_e=0.3), cls(odd_even_e=0.3), cls(odd_even_e=-0.3)),)
 
-    def added(self, shape: tuple[int, ...], rng: np.random.Generator, camera: CameraModel) -> FloatArray | None:
+    def on_signal(self, signal: Signal) -> Signal:
         if self.offset_e == 0.0 and self.odd_even_e == 0.0 and self.noise_e == 0.0:
-            return None
-        total = np.broadcast_to(np.asarray(self.added_e(shape, camera), float), (1, shape[1]))
-        return total if self.noise_e == 0.0 else total + self.noise_e * rng.standard_normal((1, shape[1]))
-
-    def added_e(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
-        if self.offset_e == 0.0 and self.odd_even_e == 0.0:
-            return 0.0
-        offset = np.random.default_rng([self.pattern_seed, 3]).standard_normal((1, shape[1]))
-        odd = np.arange(shape[1])[None, :] % 2 - 0.5
-        return self.offset_e * (offset - offset.mean()) + self.odd_even_e * odd
-
-    def added_e2(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
-        return self.noise_e**2
-
-    def line_spectrum_e2(self, frequency_cy_per_px: FloatArray, lines: Lines, fixed: bool) -> FloatArray | float:
-        if lines != "columns":
-            return 0.0
-        return self.offset_e**2 if fixed else self.noise_e**2
-
-    def line_parity_e(self, lines: Lines) -> float:
-        return self.odd_even_e if lines == "columns" else 0.0
+            return signal
+        return signal.adding(
+            lines=LineNoise(
+                "columns", self.noise_e, fixed_e=self.offset_e, odd_even_e=self.odd_even_e, seed=self.pattern_seed
+            )
+        )

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.aberration import Aberration
-from sim.effects.base import Stage
-from sim.optics.pupil import Wavefront, seidel
+from sim.effects.base import Effect
+from sim.optics.pupil import seidel
 from sim.parameters import Quantity
+from sim.stages import Image
 
 
-class Coma(Aberration):
+class Coma(Effect):
     """Path error W131 rho^2 (x, y) over the pupil along a direction, alike all over the field, as a decentred element makes it.
 
     The spread is lopsided, so that the transfer function gets a phase. Its part in proportion to frequency only moves the image; the
@@ -19,7 +18,6 @@ class Coma(Aberration):
     """
 
     name: ClassVar[str] = "coma"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "V. Mahajan, Optical Imaging and Aberrations, part II, section 4.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
@@ -38,5 +36,8 @@ class Coma(Aberration):
         Quantity("um", "path error at the pupil's rim along rows", lower=-5.0, upper=5.0, prior=(0.0, 0.3), absent=0.0),
     ] = 0.0  # fmt: skip
 
-    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
-        return seidel(coma_um=(self.w131_x_um, self.w131_y_um))
+    def on_image(self, image: Image) -> Image:
+        if self.w131_x_um == 0.0 and self.w131_y_um == 0.0:
+            return image
+        path = seidel(coma_um=(self.w131_x_um, self.w131_y_um))
+        return image.adding(pupil=lambda wavelength_nm: path)

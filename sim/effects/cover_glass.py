@@ -6,15 +6,13 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from sim.camera import CameraModel
-from sim.effects.aberration import Aberration
-from sim.effects.base import Stage
+from sim.effects.base import Effect
 from sim.optics.filters import plate_wavefront
-from sim.optics.pupil import Wavefront
 from sim.parameters import Quantity
+from sim.stages import Image
 
 
-class CoverGlass(Aberration):
+class CoverGlass(Effect):
     """Spherical aberration W040 = t (n^2 - 1) / (128 n^3 N^4), in the new focus, or with t (1 - 1/n) of defocus in the old one.
 
     A component that a camera is known to have. What it does is spherical aberration, so that captures can't tell the two apart: a
@@ -22,7 +20,6 @@ class CoverGlass(Aberration):
     """
 
     name: ClassVar[str] = "cover_glass"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "V. Mahajan, Optical Imaging and Aberrations, part I, section 5.8"
     form_tolerance: ClassVar[float] = 0.06
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
@@ -38,5 +35,10 @@ class CoverGlass(Aberration):
     refractive_index: Annotated[float, Field(ge=1.0, le=3.0, description="refractive index of the plate")] = 1.52
     refocused: bool = True
 
-    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
-        return plate_wavefront(self.thickness_mm, self.refractive_index, camera.lens.f_number, refocused=self.refocused)
+    def on_image(self, image: Image) -> Image:
+        if self.thickness_mm == 0.0:
+            return image
+        path = plate_wavefront(
+            self.thickness_mm, self.refractive_index, image.camera.lens.f_number, refocused=self.refocused
+        )
+        return image.adding(pupil=lambda wavelength_nm: path)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
-from scipy.ndimage import convolve
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 
 class Crosstalk(Effect):
@@ -19,7 +19,6 @@ class Crosstalk(Effect):
     stays white."""
 
     name: ClassVar[str] = "crosstalk"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "K. Hirakawa, Cross-talk explained, ICIP 2008"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time", "field"})
@@ -89,19 +88,5 @@ class Crosstalk(Effect):
         own = 1.0 - 2.0 * along - 2.0 * down - 4.0 * across
         return np.array([[across, down, across], [along, own, along], [across, down, across]])
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        if self.share_percent == 0.0:
-            return None
-        p, kernel = camera.pixel_pitch_um, self.kernel()
-        right, below = np.cos(2.0 * np.pi * fx_cy_per_um * p), np.cos(2.0 * np.pi * fy_cy_per_um * p)
-        return np.asarray(
-            kernel[1, 1] + 2.0 * kernel[1, 0] * right + 2.0 * kernel[0, 1] * below + 4.0 * kernel[0, 0] * right * below
-        )
-
-    def charge(self, electrons: FloatArray, exposure_s: float, camera: CameraModel) -> FloatArray:
-        if self.share_percent == 0.0:
-            return electrons
-        # "mirror" about the outermost pixels' centres keeps the mosaic's phases
-        return np.asarray(convolve(electrons, self.kernel(), mode="mirror"))
+    def on_charge(self, charge: Charge) -> Charge:
+        return charge if self.share_percent == 0.0 else charge.adding(kernels=self.kernel())

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 
 class Decentre(Effect):
@@ -19,7 +19,6 @@ class Decentre(Effect):
     """
 
     name: ClassVar[str] = "decentre"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "D. C. Brown, Photogramm. Eng. 32, 444 (1966)"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
@@ -41,12 +40,14 @@ class Decentre(Effect):
                  prior=(0.0, 1.0), absent=0.0),
     ] = 0.0  # fmt: skip
 
-    def image_shift_um(
-        self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> tuple[FloatArray, FloatArray] | None:
+    def on_image(self, image: Image) -> Image:
         if self.shift_x_um == 0.0 and self.shift_y_um == 0.0:
-            return None
-        x, y, corner = from_axis_um(x_um, y_um, camera)
-        x, y = x / corner, y / corner
-        a, b = self.shift_x_um, self.shift_y_um
-        return a * (3.0 * x * x + y * y) + 2.0 * b * x * y, b * (x * x + 3.0 * y * y) + 2.0 * a * x * y
+            return image
+
+        def shift(x_um: FloatArray, y_um: FloatArray, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
+            x, y, corner = from_axis_um(x_um, y_um, image.camera)
+            x, y = x / corner, y / corner
+            a, b = self.shift_x_um, self.shift_y_um
+            return a * (3.0 * x * x + y * y) + 2.0 * b * x * y, b * (x * x + 3.0 * y * y) + 2.0 * a * x * y
+
+        return image.adding(shift=shift)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.aberration import Aberration
-from sim.effects.base import Stage
-from sim.optics.pupil import Wavefront, seidel
+from sim.effects.base import Effect
+from sim.optics.pupil import seidel
 from sim.parameters import Quantity
+from sim.stages import Image
 
 
-class Defocus(Aberration):
+class Defocus(Effect):
     """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error (Hopkins)."""
 
     name: ClassVar[str] = "defocus"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955)"
     form_tolerance: ClassVar[float] = 0.04
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
@@ -51,5 +49,8 @@ class Defocus(Aberration):
         ),
     ] = 0.0
 
-    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
-        return seidel(defocus_um=self.defocus_um / (8.0 * camera.lens.f_number**2))
+    def on_image(self, image: Image) -> Image:
+        if self.defocus_um == 0.0:
+            return image
+        path = seidel(defocus_um=self.defocus_um / (8.0 * image.camera.lens.f_number**2))
+        return image.adding(pupil=lambda wavelength_nm: path)

@@ -6,12 +6,13 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel, Geometry
-from sim.effects.base import Effect, Stage
+from sim.camera import Geometry
+from sim.effects.base import Effect
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.scene.warp import distort
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 
 class Distortion(Effect):
@@ -23,7 +24,6 @@ class Distortion(Effect):
     """
 
     name: ClassVar[str] = "distortion"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "D. C. Brown, Photogramm. Eng. 37, 855 (1971)"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
@@ -41,19 +41,22 @@ class Distortion(Effect):
 
     geometry: Geometry | None = None
 
-    def image_shift_um(
-        self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> tuple[FloatArray, FloatArray] | None:
+    def on_image(self, image: Image) -> Image:
+        camera = image.camera
         bent = self.geometry is not None and any(self.geometry.distortion)
         if self.corner_percent == 0.0 and not bent:
-            return None
-        x, y, corner = from_axis_um(x_um, y_um, camera)
-        share = self.corner_percent / 100.0 * (x * x + y * y) / corner**2
-        if self.geometry is None or not bent:
-            return share * x, share * y
-        pitch = camera.pixel_pitch_um
-        col, row = np.broadcast_arrays(
-            np.asarray(x_um) / pitch + 0.5 * (camera.cols - 1), np.asarray(y_um) / pitch + 0.5 * (camera.rows - 1)
-        )
-        to_col, to_row = distort(col, row, self.geometry)
-        return share * x + (to_col - col) * pitch, share * y + (to_row - row) * pitch
+            return image
+
+        def shift(x_um: FloatArray, y_um: FloatArray, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
+            x, y, corner = from_axis_um(x_um, y_um, camera)
+            share = self.corner_percent / 100.0 * (x * x + y * y) / corner**2
+            if self.geometry is None or not bent:
+                return share * x, share * y
+            pitch = camera.pixel_pitch_um
+            col, row = np.broadcast_arrays(
+                np.asarray(x_um) / pitch + 0.5 * (camera.cols - 1), np.asarray(y_um) / pitch + 0.5 * (camera.rows - 1)
+            )
+            to_col, to_row = distort(col, row, self.geometry)
+            return share * x + (to_col - col) * pitch, share * y + (to_row - row) * pitch
+
+        return image.adding(shift=shift)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
+from sim.stages import Charge
 
 
 class ExposureOffset(Effect):
     """Exposure t + t0."""
 
     name: ClassVar[str] = "exposure_offset"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, linearity"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -37,5 +37,7 @@ class ExposureOffset(Effect):
         ),
     ] = 0.0
 
-    def exposure(self, exposure_s: float) -> float:
-        return max(exposure_s + self.offset_us * 1e-6, 0.0)
+    def on_charge(self, charge: Charge) -> Charge:
+        if self.offset_us == 0.0:
+            return charge
+        return charge.adding(exposure_s=lambda exposure_s: max(exposure_s + self.offset_us * 1e-6, 0.0))

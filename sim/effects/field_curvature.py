@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
-from sim.effects.aberration import Aberration
-from sim.effects.base import Stage
+from sim.effects.base import Effect
 from sim.optics.pupil import Wavefront, seidel
 from sim.parameters import Quantity
+from sim.stages import Image
 
 
-class FieldCurvature(Aberration):
+class FieldCurvature(Effect):
     """The sensor lies dz = c r^2 + a x + b y from the focus, x, y from its centre in half diagonals: W = dz / (8 N^2) rho^2.
 
     `transfer` is that of one place, the centre unless `at_place` says another: edges and kernels show it, whole frames are drawn
@@ -19,7 +19,6 @@ class FieldCurvature(Aberration):
     """
 
     name: ClassVar[str] = "field_curvature"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on aberrations"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
@@ -44,9 +43,6 @@ class FieldCurvature(Aberration):
         Quantity("um", "the same along rows", lower=-200.0, upper=200.0, prior=(0.0, 20.0), absent=0.0, slope_power=2),
     ] = 0.0  # fmt: skip
 
-    #: (x, y) of the place whose transfer this is, in half diagonals.
-    place: tuple[float, float] = (0.0, 0.0)
-
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         # a defocus that grows from place to place is no small change of the same with the other sign beside another term
@@ -56,11 +52,14 @@ class FieldCurvature(Aberration):
             for sign_y in (1.0, -1.0)
         )
 
-    def at_place(self, x_um: float, y_um: float, camera: CameraModel) -> Self:
-        half_um = camera.half_diagonal_um
-        return self.model_copy(update={"place": (x_um / half_um, y_um / half_um)})
+    def on_image(self, image: Image) -> Image:
+        if self.curvature_um == 0.0 and self.tilt_x_um == 0.0 and self.tilt_y_um == 0.0:
+            return image
+        half_um, f_number = image.camera.half_diagonal_um, image.camera.lens.f_number
 
-    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
-        x, y = self.place
-        away_um = self.curvature_um * (x * x + y * y) + self.tilt_x_um * x + self.tilt_y_um * y
-        return seidel(defocus_um=away_um / (8.0 * camera.lens.f_number**2))
+        def path(wavelength_nm: float, x_um: float, y_um: float) -> Wavefront:
+            x, y = x_um / half_um, y_um / half_um
+            away_um = self.curvature_um * (x * x + y * y) + self.tilt_x_um * x + self.tilt_y_um * y
+            return seidel(defocus_um=away_um / (8.0 * f_number**2))
+
+        return image.adding(pupil_at=path)

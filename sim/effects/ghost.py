@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar
 import numpy as np
 from scipy import ndimage
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 BLUR_PX = 2.0  # a reflection is seldom in focus
 
@@ -19,7 +19,6 @@ class Ghost(Effect):
     """I'(r) = I(r) + q I(-r), r from the frame's middle, the copy blurred by 2 px: two reflections turn the image by half a turn."""
 
     name: ClassVar[str] = "ghost"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "E. Oleszko et al., Computer Graphics Forum 36, 165 (2017)"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
@@ -34,8 +33,12 @@ class Ghost(Effect):
         float, Quantity("%", "the copy's light over the scene's", lower=0.0, upper=30.0, prior=(0.0, 1.0), absent=0.0)
     ] = 0.0
 
-    def image(self, irradiance: FloatArray, camera: CameraModel) -> FloatArray:
+    def on_image(self, image: Image) -> Image:
         if self.share_percent == 0.0:
-            return irradiance
-        copy = ndimage.gaussian_filter(np.asarray(irradiance, float)[::-1, ::-1], BLUR_PX, mode="nearest")
-        return np.asarray(irradiance + 0.01 * self.share_percent * copy)
+            return image
+
+        def reflected(irradiance: FloatArray) -> FloatArray:
+            copy = ndimage.gaussian_filter(np.asarray(irradiance, float)[::-1, ::-1], BLUR_PX, mode="nearest")
+            return np.asarray(irradiance + 0.01 * self.share_percent * copy)
+
+        return image.adding(copies=reflected)

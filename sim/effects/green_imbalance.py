@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.sensor.mosaic import phases, step
 from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 
 class GreenImbalance(Effect):
     """Light of G on red rows x (1 + a / 2), on blue rows x (1 - a / 2): a checker in even light, the greens' mean as before."""
 
     name: ClassVar[str] = "green_imbalance"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = (
         "J. Nakamura (ed.), Image Sensors and Signal Processing for Digital Still Cameras, CRC Press 2006, green imbalance"
     )
@@ -39,10 +38,15 @@ class GreenImbalance(Effect):
         ),
     ] = 0.0
 
-    def lit(self, electrons: FloatArray, exposure_s: float, elapsed_s: float, camera: CameraModel) -> FloatArray:
-        if self.imbalance_percent == 0.0 or camera.cfa == "MONO":
-            return electrons
-        changed, period = electrons.copy(), step(camera.cfa)
-        for (row, col), sign in zip(phases(camera.cfa)["G"], (1.0, -1.0), strict=True):
-            changed[row::period, col::period] *= 1.0 + sign * 0.005 * self.imbalance_percent
-        return changed
+    def on_charge(self, charge: Charge) -> Charge:
+        cfa = charge.camera.cfa
+        if self.imbalance_percent == 0.0 or cfa == "MONO":
+            return charge
+
+        def collected(electrons: FloatArray) -> FloatArray:
+            changed, period = electrons.copy(), step(cfa)
+            for (row, col), sign in zip(phases(cfa)["G"], (1.0, -1.0), strict=True):
+                changed[row::period, col::period] *= 1.0 + sign * 0.005 * self.imbalance_percent
+            return changed
+
+        return charge.adding(collected=collected)

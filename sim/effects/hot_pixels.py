@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.sensor.defects import odd_sizes, size_nodes
-from sim.spectrum import FloatArray
+from sim.sensor.defects import Defects
+from sim.stages import Charge
 
 
 class HotPixels(Effect):
@@ -16,7 +16,6 @@ class HotPixels(Effect):
     spread of 1 is an exponential distribution, 0 are pixels that are all alike."""
 
     name: ClassVar[str] = "hot_pixels"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, logarithmic histograms of defect pixels"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -73,16 +72,9 @@ class HotPixels(Effect):
             for spread in (1.0, 0.3)
         )
 
-    def dark_current(
-        self, e_per_s: FloatArray | float, temperature_c: float | None, camera: CameraModel
-    ) -> FloatArray | float:
+    def on_charge(self, charge: Charge) -> Charge:
         if self.excess_e_per_s == 0.0:
-            return e_per_s
-        excess = odd_sizes((camera.rows, camera.cols), self.share_ppm * 1e-6, self.pattern_seed, self.relative_spread)
-        return e_per_s + self.excess_e_per_s * excess
-
-    def odd_dark_current(self) -> tuple[FloatArray, FloatArray] | None:
-        if self.excess_e_per_s == 0.0:
-            return None
-        weights, sizes = size_nodes(self.relative_spread)
-        return self.share_ppm * 1e-6 * weights, self.excess_e_per_s * sizes
+            return charge
+        return charge.adding(
+            defects=Defects(self.share_ppm * 1e-6, self.excess_e_per_s, self.relative_spread, self.pattern_seed)
+        )

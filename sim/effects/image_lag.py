@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 
 class ImageLag(Effect):
@@ -15,7 +14,6 @@ class ImageLag(Effect):
     in the k-th dark frame, and the first frame of a series lacks q."""
 
     name: ClassVar[str] = "image_lag"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = (
         "E. R. Fossum, Charge transfer noise and lag in CMOS active pixel sensors, IEEE Workshop on CCDs and AIS 2003"
     )
@@ -32,5 +30,7 @@ class ImageLag(Effect):
         float, Quantity("%", "share of the charge that stays", lower=0.0, upper=90.0, prior=(0.0, 1.0), absent=0.0)
     ] = 0.0
 
-    def left_behind(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
-        return 0.0 if self.lag_percent == 0.0 else self.lag_percent / 100.0 * electrons
+    def on_charge(self, charge: Charge) -> Charge:
+        if self.lag_percent == 0.0:
+            return charge
+        return charge.adding(lag=lambda electrons: self.lag_percent / 100.0 * electrons)

@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar, Self
 from pydantic import Field
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.optics.filters import edge_transmittance
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.stages import Image
 
 
 class InfraredCutFilter(Effect):
@@ -22,7 +22,6 @@ class InfraredCutFilter(Effect):
     """
 
     name: ClassVar[str] = "infrared_cut_filter"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "H. A. Macleod, Thin-Film Optical Filters, chapter on edge filters"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
@@ -68,7 +67,9 @@ class InfraredCutFilter(Effect):
             for width in (3.0, 8.0)
         )
 
-    def transmittance(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
-        return edge_transmittance(
-            wavelength_nm, self.cut_wavelength_nm, self.width_nm, sin_theta, self.effective_index, self.steepening
+    def on_image(self, image: Image) -> Image:
+        return image.adding(
+            transmittance=lambda wavelength_nm, sin_theta: edge_transmittance(
+                wavelength_nm, self.cut_wavelength_nm, self.width_nm, sin_theta, self.effective_index, self.steepening
+            )
         )

@@ -6,10 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Stage
 from sim.effects.crosstalk import Crosstalk
-from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 
 class InterPixelCapacitance(Crosstalk):
@@ -17,7 +15,6 @@ class InterPixelCapacitance(Crosstalk):
     astray, and neighbours' shot noise is correlated, 2 c / (1 - 4 c) at all levels of light; read noise comes after."""
 
     name: ClassVar[str] = "inter_pixel_capacitance"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = "A. C. Moore, Z. Ninkov, W. J. Forrest, Optical Engineering 45, 076402 (2006)"
     shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart", "slanted_edge", "bernoulli"})
     rivals: ClassVar[frozenset[str]] = frozenset({"crosstalk", "on_chip_smoothing", "brighter_fatter"})
@@ -25,16 +22,19 @@ class InterPixelCapacitance(Crosstalk):
         "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is common to neighbours at all levels of light, but not in the dark."
     )
 
-    def usual_nats(self) -> float:
+    def log_prior(self) -> float:
         # of hybrid arrays, whose pixels are read through bumps; sensors in one piece of silicon hardly have it
         return 0.0 if self.share_percent == 0.0 else -2.0
 
-    def neighbour_correlation(self, electrons: FloatArray, camera: CameraModel) -> FloatArray | float:
+    def on_charge(self, charge: Charge) -> Charge:
+        if self.share_percent == 0.0:
+            return charge
         kernel = self.kernel()
         own, mean = kernel[1, 1], 0.5 * (kernel[0, 1] + kernel[1, 0])
-        return float(2.0 * own * mean / (own * own + 4.0 * mean * mean))
-
-    def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
-        if self.share_percent == 0.0:
-            return noise_e2
-        return noise_e2 - electrons * (1.0 - float(np.sum(np.square(self.kernel()))))
+        shared = float(2.0 * own * mean / (own * own + 4.0 * mean * mean))
+        lost = 1.0 - float(np.sum(np.square(kernel)))
+        return charge.adding(
+            kernels=kernel,
+            correlation=lambda electrons: shared,
+            variance_e2=lambda electrons, variance_e2: variance_e2 - electrons * lost,
+        )

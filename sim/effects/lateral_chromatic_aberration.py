@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 #: The wavelength that lands where the camera's geometry has it.
 REFERENCE_NM = 550.0
@@ -22,7 +22,6 @@ class LateralChromaticAberration(Effect):
     """
 
     name: ClassVar[str] = "lateral_chromatic_aberration"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "ISO 19084:2015"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "time"})
@@ -42,12 +41,14 @@ class LateralChromaticAberration(Effect):
         Quantity("um", "the same where it grows as the square", lower=-50.0, upper=50.0, prior=(0.0, 2.0), absent=0.0),
     ] = 0.0  # fmt: skip
 
-    def image_shift_um(
-        self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> tuple[FloatArray, FloatArray] | None:
+    def on_image(self, image: Image) -> Image:
         if self.slope_um == 0.0 and self.curvature_um == 0.0:
-            return None
-        t = (wavelength_nm - REFERENCE_NM) / 100.0
-        corner_um = t * (self.slope_um + t * self.curvature_um)
-        x, y, corner = from_axis_um(x_um, y_um, camera)
-        return corner_um / corner * x, corner_um / corner * y
+            return image
+
+        def shift(x_um: FloatArray, y_um: FloatArray, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
+            t = (wavelength_nm - REFERENCE_NM) / 100.0
+            corner_um = t * (self.slope_um + t * self.curvature_um)
+            x, y, corner = from_axis_um(x_um, y_um, image.camera)
+            return corner_um / corner * x, corner_um / corner * y
+
+        return image.adding(shift=shift)

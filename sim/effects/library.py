@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from functools import cache
+from functools import cache, lru_cache
 
 import sim.effects
+from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
+from sim.spectrum import Spectrum
+from sim.stages import laws_of
 
 
 @cache
@@ -38,3 +41,24 @@ def effect(name: str) -> type[Effect]:
 def candidates() -> tuple[type[Effect], ...]:
     """The effects that a diagnosis looks for."""
     return tuple(kind for kind in effects().values() if kind.shown_by)
+
+
+#: Any camera with a mosaic: which laws an effect adds doesn't depend on it.
+_CAMERA = CameraModel(
+    rows=16, cols=24, pixel_pitch_um=3.0, fill_factor=1.0, cfa="RGGB", bit_depth=12, black_level_dn=64.0, white_level_dn=4095.0,
+    conversion_gain_dn_per_e=0.4, full_well_e=1e4, read_noise_e=2.0, dark_current_e_per_s=5.0, dsnu_e=1.0, prnu_percent=1.0,
+    quantum_efficiency={c: Spectrum.of((400.0, 700.0), (0.5, 0.5)) for c in "RGB"}, lens=Lens(f_number=4.0, focal_length_mm=8.0),
+)  # fmt: skip
+
+
+@lru_cache(maxsize=4096)
+def changed_by(effect: Effect) -> frozenset[str]:
+    """Which quantities of the stages the effect as it stands changes, as `stage.field`; none where it is absent."""
+    return laws_of(_CAMERA, (effect,))
+
+
+@cache
+def may_change(kind: type[Effect]) -> frozenset[str]:
+    """Which quantities of the stages an effect changes at any of its prototypes."""
+    every = (one for group in kind.prototypes(_CAMERA) for one in group)
+    return frozenset().union(*(changed_by(one) for one in every))

@@ -7,9 +7,10 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 #: Times from row to row that are tried first: those of rolling shutters from 2000 rows in 10 ms to 200 in 40 ms.
 LINE_TIMES_US = (5.0, 8.0, 12.0, 18.0, 27.0, 40.0, 60.0, 90.0, 140.0, 200.0)
@@ -20,7 +21,6 @@ class LightFlicker(Effect):
     row. Bands that vanish where T is a multiple of 1 / f; with a line time of 0 (global shutter) frames flicker as a whole."""
 
     name: ClassVar[str] = "light_flicker"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "IEEE Std 1789-2015, modulation of current in high-brightness LEDs"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})
@@ -57,10 +57,13 @@ class LightFlicker(Effect):
             for line in LINE_TIMES_US
         )
 
-    def lit(self, electrons: FloatArray, exposure_s: float, elapsed_s: float, camera: CameraModel) -> FloatArray:
+    def on_light(self, light: Light) -> Light:
         if self.modulation_percent == 0.0:
-            return electrons
-        middle_s = elapsed_s + 0.5 * exposure_s + 1e-6 * self.line_time_us * np.arange(len(electrons))
-        depth = 0.01 * self.modulation_percent * np.sinc(self.frequency_hz * exposure_s)
-        factor: FloatArray = 1.0 + depth * np.cos(2.0 * np.pi * self.frequency_hz * middle_s)
-        return electrons * factor[:, None]
+            return light
+
+        def factors(rows: int, exposure_s: float, elapsed_s: float) -> FloatArray:
+            middle_s = elapsed_s + 0.5 * exposure_s + 1e-6 * self.line_time_us * np.arange(rows)
+            depth = 0.01 * self.modulation_percent * np.sinc(self.frequency_hz * exposure_s)
+            return np.asarray(1.0 + depth * np.cos(2.0 * np.pi * self.frequency_hz * middle_s))
+
+        return light.adding(rows=factors)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Charge, Image, Signal
 
 Along = Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"]
 
@@ -25,7 +26,6 @@ class NamelessCorrection(Effect):
     """
 
     name: ClassVar[str] = "nameless_correction"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS  # or earlier, as `along` says
     reference: ClassVar[str] = "M. C. Kennedy and A. O'Hagan, J. R. Statist. Soc. B 63, 425 (2001)"
     form_tolerance: ClassVar[float] = 0.2
     sentence: ClassVar[str] = (
@@ -51,26 +51,34 @@ class NamelessCorrection(Effect):
             raise ValueError("places have to ascend and factors to be above 0: sort them, and leave out what is below")
         return self
 
-    def _factor(self, along: Along, x: FloatArray) -> FloatArray | None:
-        if self.along != along or self.strength == 0.0:
-            return None
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        return tuple((cls(along=along, strength=0.3),) for along in get_args(Along))
+
+    def _factor(self, x: FloatArray) -> FloatArray:
         return 1.0 + self.strength * (np.interp(x, self.at, self.factor) - 1.0)
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        factor = self._factor("frequency_cy_per_um", np.hypot(fx_cy_per_um, fy_cy_per_um))
-        return None if factor is None else factor / (1.0 + self.strength * (np.interp(0.0, self.at, self.factor) - 1.0))
+    def on_image(self, image: Image) -> Image:
+        if self.strength == 0.0:
+            return image
+        if self.along == "frequency_cy_per_um":
+            at_zero = float(self._factor(np.zeros(1))[0])
+            return image.adding(transfer=lambda fx, fy, wavelength_nm: self._factor(np.hypot(fx, fy)) / at_zero)
+        if self.along == "radius_um":
 
-    def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
-        x, y, _ = from_axis_um(x_um, y_um, camera)
-        factor = self._factor("radius_um", np.hypot(x, y))
-        return super().illumination(x_um, y_um, camera) if factor is None else factor
+            def shading(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+                x, y, _ = from_axis_um(x_um, y_um, image.camera)
+                return self._factor(np.hypot(x, y))
 
-    def response(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
-        factor = self._factor("signal_e", electrons)
-        return electrons if factor is None else electrons * factor
+            return image.adding(shading=shading)
+        return image
 
-    def noise_e2(self, electrons: FloatArray, noise_e2: FloatArray, camera: CameraModel) -> FloatArray:
-        factor = self._factor("variance_signal_e", electrons)
-        return noise_e2 if factor is None else noise_e2 * factor
+    def on_charge(self, charge: Charge) -> Charge:
+        if self.strength == 0.0 or self.along != "variance_signal_e":
+            return charge
+        return charge.adding(variance_e2=lambda electrons, variance_e2: variance_e2 * self._factor(electrons))
+
+    def on_signal(self, signal: Signal) -> Signal:
+        if self.strength == 0.0 or self.along != "signal_e":
+            return signal
+        return signal.adding(response=lambda electrons: electrons * self._factor(electrons))

@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 
 class NonUniformIllumination(Effect):
@@ -17,7 +17,6 @@ class NonUniformIllumination(Effect):
     it as a lamp beside the axis leaves it."""
 
     name: ClassVar[str] = "non_uniform_illumination"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, homogeneity of the source"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
@@ -54,10 +53,15 @@ class NonUniformIllumination(Effect):
         ),
     ] = 0.0
 
-    def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
-        half_x, half_y = 0.5 * camera.cols * camera.pixel_pitch_um, 0.5 * camera.rows * camera.pixel_pitch_um
-        slope = self.gradient_x_percent / 100.0 * x_um / half_x + self.gradient_y_percent / 100.0 * y_um / half_y
+    def on_light(self, light: Light) -> Light:
         steepest = float(np.hypot(self.gradient_x_percent, self.gradient_y_percent)) / 100.0
-        if self.bow == 0.0 or steepest == 0.0:
-            return np.asarray(1.0 + slope)
-        return np.asarray(1.0 + slope + self.bow * slope**2 / steepest)
+        if steepest == 0.0:
+            return light
+        camera = light.camera
+        half_x, half_y = 0.5 * camera.cols * camera.pixel_pitch_um, 0.5 * camera.rows * camera.pixel_pitch_um
+
+        def shading(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+            slope = self.gradient_x_percent / 100.0 * x_um / half_x + self.gradient_y_percent / 100.0 * y_um / half_y
+            return np.asarray(1.0 + slope + self.bow * slope**2 / steepest)
+
+        return light.adding(shading=shading)

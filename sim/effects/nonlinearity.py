@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Signal
 
 #: Share of full well over which the toe fades.
 TOE = 0.1
@@ -19,7 +19,6 @@ class Nonlinearity(Effect):
     """electrons (1 + a x + b x^2 + c exp(-x / 0.1)) with x = electrons / full well; a, b in percent at full well, c at none."""
 
     name: ClassVar[str] = "nonlinearity"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, linearity"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "orientation", "time"})
@@ -75,9 +74,13 @@ class Nonlinearity(Effect):
         ),
     ] = 0.0
 
-    def response(self, electrons: FloatArray, camera: CameraModel) -> FloatArray:
+    def on_signal(self, signal: Signal) -> Signal:
         if self.quadratic_percent == 0.0 and self.cubic_percent == 0.0 and self.toe_percent == 0.0:
-            return electrons
-        x = electrons / camera.full_well_e
-        bend = self.quadratic_percent * x + self.cubic_percent * x * x + self.toe_percent * np.exp(-np.abs(x) / TOE)
-        return electrons * (1.0 + bend / 100.0)
+            return signal
+
+        def response(electrons: FloatArray) -> FloatArray:
+            x = electrons / signal.camera.full_well_e
+            bend = self.quadratic_percent * x + self.cubic_percent * x * x + self.toe_percent * np.exp(-np.abs(x) / TOE)
+            return electrons * (1.0 + bend / 100.0)
+
+        return signal.adding(response=response)

@@ -7,10 +7,9 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.stages import Signal
 
 #: Of the blur's weight, across corners.
 CornerShare = Annotated[
@@ -27,7 +26,6 @@ class OnChipFilter(Effect):
     proportion at all levels and in the dark.
     """
 
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"corner_share"})
@@ -37,21 +35,10 @@ class OnChipFilter(Effect):
     def detail(self) -> tuple[float, float]:
         """k and s."""
 
-    def processing(self, camera: CameraModel) -> FloatArray | None:
+    def on_signal(self, signal: Signal) -> Signal:
         share, corners = self.detail()
         if share == 0.0:
-            return None
+            return signal
         next_, across = -0.25 * share * (1.0 - corners), -0.25 * share * corners
         kernel = np.array([[across, next_, across], [next_, 1.0 + share, next_], [across, next_, across]])
-        return kernel
-
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        share, corners = self.detail()
-        if share == 0.0:
-            return None
-        step = camera.pixel_pitch_um * (1 if camera.cfa == "MONO" else 2)
-        across, down = np.cos(2.0 * np.pi * fx_cy_per_um * step), np.cos(2.0 * np.pi * fy_cy_per_um * step)
-        blur = 0.5 * (1.0 - corners) * (across + down) + corners * across * down
-        return np.asarray(1.0 + share * (1.0 - blur))
+        return signal.adding(filters=kernel)

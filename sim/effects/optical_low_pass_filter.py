@@ -6,11 +6,11 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.optics.filters import birefringent_displacement_um, birefringent_otf
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 #: Ratios of the displacements' squares between which two plates aren't nearly alike and one isn't alone, and what that costs.
 UNALIKE, UNUSUAL_NATS = (0.002, 0.02, 0.35, 0.55), -4.0
@@ -25,7 +25,6 @@ class OpticalLowPassFilter(Effect):
     """
 
     name: ClassVar[str] = "optical_low_pass_filter"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "Walker-Pavlopoulos plate displacement; J. Greivenkamp, Appl. Opt. 29, 676 (1990)"
     form_tolerance: ClassVar[float] = 0.01
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
@@ -73,19 +72,21 @@ class OpticalLowPassFilter(Effect):
 
     plate: Literal["quartz"] | None = None
 
-    def usual_nats(self) -> float:
+    def log_prior(self) -> float:
         """Filters are made of one plate, or of two nearly alike: not of a thick one and one of a third of its strength."""
         low, high = sorted((self.displacement_x_um**2, self.displacement_y_um**2))
         return float(np.interp(low / high, UNALIKE, (0.0, UNUSUAL_NATS, UNUSUAL_NATS, 0.0))) if high > 0 else 0.0
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
+    def on_image(self, image: Image) -> Image:
         if self.displacement_x_um == 0.0 and self.displacement_y_um == 0.0:
-            return None
-        share = 1.0
-        if self.plate == "quartz":
-            share = float(birefringent_displacement_um(1.0, wavelength_nm) / birefringent_displacement_um(1.0))
-        return birefringent_otf(
-            fx_cy_per_um, fy_cy_per_um, share * self.displacement_x_um, share * self.displacement_y_um
-        )
+            return image
+
+        def transfer(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray:
+            share = 1.0
+            if self.plate == "quartz":
+                share = float(birefringent_displacement_um(1.0, wavelength_nm) / birefringent_displacement_um(1.0))
+            return birefringent_otf(
+                fx_cy_per_um, fy_cy_per_um, share * self.displacement_x_um, share * self.displacement_y_um
+            )
+
+        return image.adding(transfer=transfer)

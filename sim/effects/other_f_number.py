@@ -6,11 +6,11 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.optics.diffraction import diffraction_otf
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 LEAST_TRANSFER = 1e-6  # of the stated lens: below, there is nothing to scale
 
@@ -23,7 +23,6 @@ class OtherFNumber(Effect):
     """
 
     name: ClassVar[str] = "other_f_number"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "J. W. Goodman, Introduction to Fourier Optics, chapter 6"
     form_tolerance: ClassVar[float] = 0.03
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
@@ -44,11 +43,14 @@ class OtherFNumber(Effect):
         ),
     ] = 1.0
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
+    def on_image(self, image: Image) -> Image:
         if self.ratio == 1.0:
-            return None
-        frequency = np.hypot(fx_cy_per_um, fy_cy_per_um)
-        stated, works = (diffraction_otf(frequency, wavelength_nm, n) for n in (camera.lens.f_number, camera.lens.f_number * self.ratio))  # fmt: skip
-        return np.where(stated > LEAST_TRANSFER, works / np.maximum(stated, LEAST_TRANSFER), 1.0)
+            return image
+        f_number = image.camera.lens.f_number
+
+        def transfer(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray:
+            frequency = np.hypot(fx_cy_per_um, fy_cy_per_um)
+            stated, works = (diffraction_otf(frequency, wavelength_nm, n) for n in (f_number, f_number * self.ratio))
+            return np.where(stated > LEAST_TRANSFER, works / np.maximum(stated, LEAST_TRANSFER), 1.0)
+
+        return image.adding(transfer=transfer)

@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Charge
 
 NULL = 1e-6  # of a transfer
 
@@ -18,7 +18,6 @@ class PixelAperture(Effect):
     """Side of the square aperture changed by a few um: OTF factor sinc(w' fx) sinc(w' fy) / (sinc(w fx) sinc(w fy))."""
 
     name: ClassVar[str] = "pixel_aperture"
-    stage: ClassVar[Stage] = Stage.CHARGE
     reference: ClassVar[str] = (
         "G. Boreman, Modulation Transfer Function in Optical and Electro-Optical Systems, chapter 3"
     )
@@ -54,18 +53,20 @@ class PixelAperture(Effect):
         ),
     ] = 0.0
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
+    def on_charge(self, charge: Charge) -> Charge:
         if self.side_change_um == 0.0:
-            return None
-        side = camera.pixel_pitch_um * camera.fill_factor**0.5
+            return charge
+        side = charge.camera.pixel_pitch_um * charge.camera.fill_factor**0.5
         new = max(side + self.side_change_um, 0.05 * side)
-        ratio = np.ones(np.broadcast_shapes(np.shape(fx_cy_per_um), np.shape(fy_cy_per_um)))
-        for f in (fx_cy_per_um, fy_cy_per_um):
-            below = np.sinc(side * f)
-            # at the stated aperture's nulls the ratio has no value, beside them it is large: the pixel's own transfer makes up for it
-            ratio = ratio * np.where(
-                np.abs(below) > NULL, np.sinc(new * f) / np.where(np.abs(below) > NULL, below, 1.0), 1.0
-            )
-        return ratio
+
+        def transfer(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray:
+            ratio = np.ones(np.broadcast_shapes(np.shape(fx_cy_per_um), np.shape(fy_cy_per_um)))
+            for f in (fx_cy_per_um, fy_cy_per_um):
+                below = np.sinc(side * f)
+                # at the stated aperture's nulls the ratio has no value, beside them it is large: the pixel's own transfer makes up for it
+                ratio = ratio * np.where(
+                    np.abs(below) > NULL, np.sinc(new * f) / np.where(np.abs(below) > NULL, below, 1.0), 1.0
+                )
+            return ratio
+
+        return charge.adding(transfer=transfer)

@@ -6,9 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 #: W sr^-1 m^-2 nm^-1 at which the reading is right: that of a lamp in a sphere. Any other level is a factor on everything, which the
 #: scale of the sensitivity takes.
@@ -20,7 +21,6 @@ class RadiometerNonlinearity(Effect):
     for q = 1 an error in proportion to the level, as of a detector that begins to saturate."""
 
     name: ClassVar[str] = "radiometer_nonlinearity"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "CIE 214:2014; S. Yang, I. Vayshenker, X. Li, T. R. Scott, NIST J. Res. 99, 1 (1994)"
     form_tolerance: ClassVar[float] = 0.04
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "orientation", "time"})
@@ -47,10 +47,16 @@ class RadiometerNonlinearity(Effect):
         Quantity("1", "power of the level with which the error grows", lower=0.0, upper=1.5, prior=(0.0, 0.5), absent=0.0, dispensable=True),
     ] = 0.0  # fmt: skip
 
-    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
-        peak = float(np.max(radiance))
-        if self.exponent_percent == 0.0 or kind != "narrowband" or peak <= 0.0:
-            return radiance
-        level = float(np.log(peak / RIGHT_AT))
-        grown = level if self.growth == 0.0 else float(np.expm1(self.growth * level)) / self.growth
-        return np.asarray(radiance * np.exp(0.01 * self.exponent_percent * grown))
+    def on_light(self, light: Light) -> Light:
+        if self.exponent_percent == 0.0:
+            return light
+
+        def spectrum(wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+            peak = float(np.max(radiance))
+            if kind != "narrowband" or peak <= 0.0:
+                return radiance
+            level = float(np.log(peak / RIGHT_AT))
+            grown = level if self.growth == 0.0 else float(np.expm1(self.growth * level)) / self.growth
+            return np.asarray(radiance * np.exp(0.01 * self.exponent_percent * grown))
+
+        return light.adding(spectrum=spectrum)

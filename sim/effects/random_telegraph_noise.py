@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
-import numpy as np
-
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.sensor.defects import odd_pixels, odd_sizes, size_nodes
-from sim.spectrum import FloatArray
+from sim.sensor.defects import Defects
+from sim.stages import Signal
 
 
 class RandomTelegraphNoise(Effect):
@@ -19,7 +17,6 @@ class RandomTelegraphNoise(Effect):
     (relative spread 0), or gamma distributed about its mean."""
 
     name: ClassVar[str] = "random_telegraph_noise"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "X. Wang et al., Random telegraph signal in CMOS image sensor pixels, IEDM 2006"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -72,26 +69,9 @@ class RandomTelegraphNoise(Effect):
             for spread in (0.0, 1.0)
         )
 
-    def _pixels(self, shape: tuple[int, ...]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        return odd_pixels(shape, self.share_percent / 100.0, self.pattern_seed)
-
-    def _amplitudes_e(self, shape: tuple[int, ...]) -> FloatArray:
-        return self.amplitude_e * odd_sizes(shape, self.share_percent / 100.0, self.pattern_seed, self.relative_spread)
-
-    def added(self, shape: tuple[int, ...], rng: np.random.Generator, camera: CameraModel) -> FloatArray | None:
+    def on_signal(self, signal: Signal) -> Signal:
         if self.amplitude_e == 0.0:
-            return None
-        jump, pixels = np.zeros(shape), self._pixels(shape)
-        jump.flat[pixels] = self._amplitudes_e(shape).flat[pixels] * (rng.integers(0, 2, pixels.size) - 0.5)
-        return jump
-
-    def added_e2(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
-        if self.amplitude_e == 0.0:
-            return 0.0
-        return self._amplitudes_e(shape) ** 2 / 4.0
-
-    def odd_jumps(self) -> tuple[FloatArray, FloatArray] | None:
-        if self.amplitude_e == 0.0:
-            return None
-        weights, sizes = size_nodes(self.relative_spread)
-        return self.share_percent / 100.0 * weights, self.amplitude_e * sizes
+            return signal
+        return signal.adding(
+            telegraph=Defects(self.share_percent / 100.0, self.amplitude_e, self.relative_spread, self.pattern_seed)
+        )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
-import numpy as np
-
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Lines, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.sensor.lines import LineNoise
+from sim.stages import Signal
 
 
 class RowNoise(Effect):
@@ -17,7 +16,6 @@ class RowNoise(Effect):
     row; rows that are n apart have c^n of it in common."""
 
     name: ClassVar[str] = "row_noise"
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, spatial and temporal variances of rows and columns"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
@@ -61,38 +59,9 @@ class RowNoise(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return (*((cls(noise_e=0.5, correlation=c), cls(offset_e=0.5)) for c in (0.0, 0.5)),)
 
-    def added(self, shape: tuple[int, ...], rng: np.random.Generator, camera: CameraModel) -> FloatArray | None:
+    def on_signal(self, signal: Signal) -> Signal:
         if self.noise_e == 0.0 and self.offset_e == 0.0:
-            return None
-        total = np.broadcast_to(np.asarray(self.added_e(shape, camera), float), (shape[0], 1))
-        if self.noise_e > 0.0:
-            total = total + self.noise_e * _alike(rng.standard_normal((shape[0], 1)), self.correlation)
-        return total
-
-    def added_e(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
-        if self.offset_e == 0.0:
-            return 0.0
-        offset = np.random.default_rng([self.pattern_seed, 4]).standard_normal((shape[0], 1))
-        return self.offset_e * (offset - offset.mean())
-
-    def added_e2(self, shape: tuple[int, ...], camera: CameraModel) -> FloatArray | float:
-        return self.noise_e**2
-
-    def line_spectrum_e2(self, frequency_cy_per_px: FloatArray, lines: Lines, fixed: bool) -> FloatArray | float:
-        if lines != "rows":
-            return 0.0
-        if fixed:
-            return self.offset_e**2
-        c = self.correlation
-        turn = np.cos(2.0 * np.pi * np.asarray(frequency_cy_per_px))
-        return np.asarray(self.noise_e**2 * (1.0 - c * c) / (1.0 - 2.0 * c * turn + c * c))
-
-
-def _alike(white: FloatArray, correlation: float) -> FloatArray:
-    """White noise (rows, 1) of variance 1 as a stationary process of first order, of variance 1."""
-    if correlation == 0.0:
-        return white
-    from scipy.signal import lfilter  # here: the library takes a while to load
-
-    fresh = np.sqrt(1.0 - correlation**2)
-    return np.asarray(lfilter([fresh], [1.0, -correlation], np.vstack([white[:1] / fresh, white[1:]]), axis=0))
+            return signal
+        return signal.adding(
+            lines=LineNoise("rows", self.noise_e, self.correlation, fixed_e=self.offset_e, seed=self.pattern_seed)
+        )

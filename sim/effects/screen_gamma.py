@@ -8,9 +8,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 #: Nats by which rims that are only wider, with greys as asked for, are less likely than a gamma's: that is a blurred screen.
 BLURRED_NATS = 20.0
@@ -23,7 +24,6 @@ class ScreenGamma(Effect):
     How wide rims are isn't stated, and drawings take a sample: the exponent is good to tens of per cent."""
 
     name: ClassVar[str] = "screen_gamma"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "R. S. Berns, Displays 16, 173 (1996)"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -59,18 +59,22 @@ class ScreenGamma(Effect):
         wide = tuple((cls(exponent=e, rim_px=0.4),) for e in (0.5, 2.0))
         return ((cls(exponent=0.7), cls(exponent=1.3)), *wide)
 
-    def usual_nats(self) -> float:
+    def log_prior(self) -> float:
         if self.rim_px == 0.0:
             return 0.0
         return -BLURRED_NATS * max(1.0 - abs(float(np.log(self.exponent))) / SURE_POWER, 0.0)
 
-    def screen(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
+    def on_light(self, light: Light) -> Light:
         if self.exponent == 1.0:
-            return share
-        asked = share
-        if self.rim_px > 0.0:
-            steps = float(np.ptp(y_um)) / (share.shape[0] - 1), float(np.ptp(x_um)) / (share.shape[1] - 1)
-            asked = gaussian_filter(
-                share, [self.rim_px * camera.pixel_pitch_um / step for step in steps], mode="nearest"
-            )
-        return np.asarray(np.clip(asked, 0.0, 1.0) ** self.exponent)
+            return light
+
+        def shown(share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+            asked = share
+            if self.rim_px > 0.0:
+                steps = float(np.ptp(y_um)) / (share.shape[0] - 1), float(np.ptp(x_um)) / (share.shape[1] - 1)
+                asked = gaussian_filter(
+                    share, [self.rim_px * light.camera.pixel_pitch_um / step for step in steps], mode="nearest"
+                )
+            return np.asarray(np.clip(asked, 0.0, 1.0) ** self.exponent)
+
+        return light.adding(screen=shown)

@@ -7,9 +7,10 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 
 class ScreenPixelStructure(Effect):
@@ -17,7 +18,6 @@ class ScreenPixelStructure(Effect):
     sensor (px), which a drawing has to choose and a fit doesn't ask for: the grid's first harmonic, which is what a lens passes. Where it is finer than half the pixels it beats."""
 
     name: ClassVar[str] = "screen_pixel_structure"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "I. Amidror, The Theory of the Moire Phenomenon, Springer 2009"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
@@ -37,8 +37,14 @@ class ScreenPixelStructure(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return ((cls(amplitude_percent=20.0),),)
 
-    def screen(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
+    def on_light(self, light: Light) -> Light:
         if self.amplitude_percent == 0.0:
-            return share
-        turns = 2.0 * np.pi / (self.period_px * camera.pixel_pitch_um)
-        return np.asarray(share * (1.0 + 0.01 * self.amplitude_percent * np.cos(turns * x_um) * np.cos(turns * y_um)))
+            return light
+        turns = 2.0 * np.pi / (self.period_px * light.camera.pixel_pitch_um)
+
+        def shown(share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+            return np.asarray(
+                share * (1.0 + 0.01 * self.amplitude_percent * np.cos(turns * x_um) * np.cos(turns * y_um))
+            )
+
+        return light.adding(screen=shown)

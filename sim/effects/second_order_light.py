@@ -6,16 +6,16 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 
 class SecondOrderLight(Effect):
     """Narrowband radiance L(w) + 2 r L(2 w): a line read at w0 brings r of its power along at w0 / 2, in half the width."""
 
     name: ClassVar[str] = "second_order_light"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "C. Palmer, Diffraction Grating Handbook, free spectral range and order sorting"
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
@@ -37,8 +37,14 @@ class SecondOrderLight(Effect):
         ),
     ] = 0.0
 
-    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
-        if self.share_percent == 0.0 or kind != "narrowband":
-            return radiance
-        twice = np.interp(2.0 * wavelength_nm, wavelength_nm, radiance, left=0.0, right=0.0)
-        return np.asarray(radiance + 0.02 * self.share_percent * twice)
+    def on_light(self, light: Light) -> Light:
+        if self.share_percent == 0.0:
+            return light
+
+        def spectrum(wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+            if kind != "narrowband":
+                return radiance
+            twice = np.interp(2.0 * wavelength_nm, wavelength_nm, radiance, left=0.0, right=0.0)
+            return np.asarray(radiance + 0.02 * self.share_percent * twice)
+
+        return light.adding(spectrum=spectrum)

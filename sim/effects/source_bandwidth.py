@@ -6,9 +6,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 #: Gauss-Hermite's: the mean over them of shifted spectra is the convolution.
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
@@ -18,7 +19,6 @@ class SourceBandwidth(Effect):
     """Narrowband radiance convolved with a Gaussian of the stated standard deviation."""
 
     name: ClassVar[str] = "source_bandwidth"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "E. and R. Stearns, Color Res. Appl. 13, 257 (1988)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
@@ -41,10 +41,17 @@ class SourceBandwidth(Effect):
         ),
     ] = 0.0
 
-    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
-        if self.width_nm == 0.0 or kind != "narrowband":
-            return radiance
-        shifted = [
-            np.interp(wavelength_nm - self.width_nm * x, wavelength_nm, radiance, left=0.0, right=0.0) for x in _NODES
-        ]
-        return np.asarray(_WEIGHTS @ np.array(shifted) / _WEIGHTS.sum())
+    def on_light(self, light: Light) -> Light:
+        if self.width_nm == 0.0:
+            return light
+
+        def spectrum(wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+            if kind != "narrowband":
+                return radiance
+            shifted = [
+                np.interp(wavelength_nm - self.width_nm * x, wavelength_nm, radiance, left=0.0, right=0.0)
+                for x in _NODES
+            ]
+            return np.asarray(_WEIGHTS @ np.array(shifted) / _WEIGHTS.sum())
+
+        return light.adding(spectrum=spectrum)

@@ -7,8 +7,9 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
+from sim.stages import Light
 
 #: Longer than any session: a drift in proportion to the time.
 SETTLES_NEVER_MIN = 1e4
@@ -18,7 +19,6 @@ class SourceDrift(Effect):
     """Radiance factor 1 + a T (1 - exp(-t / T)): in proportion to the time at first, settled after a few T. 1 + a t for long T."""
 
     name: ClassVar[str] = "source_drift"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, irradiation"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "orientation"})
@@ -58,7 +58,12 @@ class SourceDrift(Effect):
             for t in (SETTLES_NEVER_MIN, 30.0, 8.0, 2.0)
         )
 
-    def drift(self, elapsed_s: float) -> float:
-        minutes = elapsed_s / 60.0
-        settled = self.settling_min * -np.expm1(-minutes / self.settling_min)
-        return float(1.0 + self.drift_percent_per_min / 100.0 * settled)
+    def on_light(self, light: Light) -> Light:
+        if self.drift_percent_per_min == 0.0:
+            return light
+
+        def level(elapsed_s: float) -> float:
+            settled = self.settling_min * -np.expm1(-elapsed_s / 60.0 / self.settling_min)
+            return float(1.0 + self.drift_percent_per_min / 100.0 * settled)
+
+        return light.adding(level=level)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.camera import CameraModel
-from sim.effects.aberration import Aberration
-from sim.effects.base import Stage
-from sim.optics.pupil import Wavefront, seidel
+from sim.effects.base import Effect
+from sim.optics.pupil import seidel
 from sim.parameters import Quantity
+from sim.stages import Image
 
 
-class SphericalAberration(Aberration):
+class SphericalAberration(Effect):
     """Path error W040 rho^4 over the pupil, in the paraxial focus."""
 
     name: ClassVar[str] = "spherical_aberration"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
@@ -44,5 +42,8 @@ class SphericalAberration(Aberration):
         ),
     ] = 0.0
 
-    def wavefront(self, wavelength_nm: float, camera: CameraModel) -> Wavefront:
-        return seidel(spherical_um=self.w040_um)
+    def on_image(self, image: Image) -> Image:
+        if self.w040_um == 0.0:
+            return image
+        path = seidel(spherical_um=self.w040_um)
+        return image.adding(pupil=lambda wavelength_nm: path)

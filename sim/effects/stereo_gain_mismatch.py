@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
+from sim.stages import Light
 
 
 class StereoGainMismatch(Effect):
@@ -16,7 +17,6 @@ class StereoGainMismatch(Effect):
     """
 
     name: ClassVar[str] = "stereo_gain_mismatch"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "H. Hirschmueller and D. Scharstein, IEEE Trans. PAMI 31, 1582 (2009)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -34,5 +34,5 @@ class StereoGainMismatch(Effect):
         Quantity("%", "right over left, beyond both calibrations", lower=-60.0, upper=150.0, prior=(0.0, 3.0), absent=0.0),
     ] = 0.0  # fmt: skip
 
-    def scene_gain(self) -> float:
-        return 1.0 + 0.01 * self.gain_percent
+    def on_light(self, light: Light) -> Light:
+        return light if self.gain_percent == 0.0 else light.adding(pair_gain=1.0 + 0.01 * self.gain_percent)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
+from sim.stages import Light
 
 
 class StereoTimeOffset(Effect):
     """The right camera captures later by dt: what moves by v in its picture lies off by v dt; what stands still shows nothing."""
 
     name: ClassVar[str] = "stereo_time_offset"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "P. Furgale, J. Rehder and R. Siegwart, IROS 2013"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "time"})
@@ -28,5 +28,5 @@ class StereoTimeOffset(Effect):
         Quantity("ms", "by how much the right camera is later", lower=-1000.0, upper=1000.0, prior=(0.0, 10.0), absent=0.0),
     ] = 0.0  # fmt: skip
 
-    def capture_delay_s(self) -> float:
-        return 1e-3 * self.delay_ms
+    def on_light(self, light: Light) -> Light:
+        return light if self.delay_ms == 0.0 else light.adding(pair_delay_s=1e-3 * self.delay_ms)

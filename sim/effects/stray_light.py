@@ -6,16 +6,16 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Light
 
 
 class StrayLight(Effect):
     """Narrowband radiance plus a share of its integral, spread evenly over the wavelengths stated."""
 
     name: ClassVar[str] = "stray_light"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "Y. Zong et al., Appl. Opt. 45, 1111 (2006)"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
@@ -47,9 +47,15 @@ class StrayLight(Effect):
         ),
     ] = 0.0
 
-    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
-        if self.share_percent == 0.0 or kind != "narrowband":
-            return radiance
+    def on_light(self, light: Light) -> Light:
         share = self.share_percent / 100.0
-        mean = np.trapezoid(radiance, wavelength_nm) / (wavelength_nm[-1] - wavelength_nm[0])
-        return np.asarray((1.0 - share) * radiance + share * mean)
+        if share == 0.0:
+            return light
+
+        def spectrum(wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+            if kind != "narrowband":
+                return radiance
+            mean = np.trapezoid(radiance, wavelength_nm) / (wavelength_nm[-1] - wavelength_nm[0])
+            return np.asarray((1.0 - share) * radiance + share * mean)
+
+        return light.adding(spectrum=spectrum)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
-from sim.optics.filters import veil_otf
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.stages import Image, Veil
 
 
 class VeilingGlare(Effect):
@@ -16,7 +15,6 @@ class VeilingGlare(Effect):
     lowest, where a share h of the veil lies about its source, by a normal distribution N."""
 
     name: ClassVar[str] = "veiling_glare"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "ISO 9358:1994; ISO 18844:2017"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "orientation", "time"})
@@ -49,16 +47,14 @@ class VeilingGlare(Effect):
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return ((cls(share_percent=0.6),), (cls(share_percent=0.6, halo_share=0.7),))
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
-        if self.share_percent == 0.0:
-            return None
-        even = veil_otf(fx_cy_per_um, fy_cy_per_um, self.veil())
-        return even + veil_otf(fx_cy_per_um, fy_cy_per_um, *self.halo(camera)) - 1.0
-
-    def veil(self) -> float:
-        return self.share_percent / 100.0 * (1.0 - self.halo_share)
-
-    def halo(self, camera: CameraModel) -> tuple[float, float]:
-        return self.share_percent / 100.0 * self.halo_share, self.halo_reach * camera.half_diagonal_um
+    def on_image(self, image: Image) -> Image:
+        share = self.share_percent / 100.0
+        if share == 0.0:
+            return image
+        return image.adding(
+            veils=Veil(
+                share * (1.0 - self.halo_share),
+                share * self.halo_share,
+                self.halo_reach * image.camera.half_diagonal_um,
+            )
+        )

@@ -8,16 +8,16 @@ import numpy as np
 from scipy.special import j0
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 
 class VibrationBlur(Effect):
     """OTF factor J0(2 pi (ax fx + ay fy)) of a sinusoidal movement with amplitude (ax, ay), long against its period."""
 
     name: ClassVar[str] = "vibration_blur"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "J. Hadar, I. Dror, N. Kopeika, Opt. Eng. 33, 566 (1994)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})
@@ -54,9 +54,13 @@ class VibrationBlur(Effect):
             for a in np.deg2rad([0, 30, 60, 90, -30, -60])
         )
 
-    def transfer(
-        self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float, camera: CameraModel
-    ) -> FloatArray | None:
+    def on_image(self, image: Image) -> Image:
         if self.amplitude_x_um == 0.0 and self.amplitude_y_um == 0.0:
-            return None
-        return np.asarray(j0(2.0 * np.pi * (self.amplitude_x_um * fx_cy_per_um + self.amplitude_y_um * fy_cy_per_um)))
+            return image
+
+        def transfer(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray:
+            return np.asarray(
+                j0(2.0 * np.pi * (self.amplitude_x_um * fx_cy_per_um + self.amplitude_y_um * fy_cy_per_um))
+            )
+
+        return image.adding(transfer=transfer)

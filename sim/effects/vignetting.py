@@ -7,9 +7,10 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 #: Powers of the radius that are tried first.
 EXPONENTS = (1.0, 2.0, 4.0)
@@ -20,7 +21,6 @@ class Vignetting(Effect):
     that part), 4 and more where a mount's rim only reaches the corners."""
 
     name: ClassVar[str] = "vignetting"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "ISO 17957:2015"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})
@@ -57,7 +57,13 @@ class Vignetting(Effect):
             (cls(corner_loss_percent=1.0, exponent=p), cls(corner_loss_percent=-1.0, exponent=p)) for p in EXPONENTS
         )
 
-    def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
-        corner2 = 0.25 * (camera.cols**2 + camera.rows**2) * camera.pixel_pitch_um**2
-        share = ((x_um**2 + y_um**2) / corner2) ** (0.5 * self.exponent)
-        return np.asarray(1.0 - self.corner_loss_percent / 100.0 * share)
+    def on_image(self, image: Image) -> Image:
+        if self.corner_loss_percent == 0.0:
+            return image
+        corner2 = image.camera.half_diagonal_um**2
+
+        def shading(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+            share = ((x_um**2 + y_um**2) / corner2) ** (0.5 * self.exponent)
+            return np.asarray(1.0 - self.corner_loss_percent / 100.0 * share)
+
+        return image.adding(shading=shading)

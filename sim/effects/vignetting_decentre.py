@@ -7,9 +7,10 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
+from sim.stages import Image
 
 
 class VignettingDecentre(Effect):
@@ -17,7 +18,6 @@ class VignettingDecentre(Effect):
     diagonals: 1 at the centre, as without it. All of a small offset is a slope, which uneven illumination has as well."""
 
     name: ClassVar[str] = "vignetting_decentre"
-    stage: ClassVar[Stage] = Stage.OPTICS
     reference: ClassVar[str] = "ISO 17957:2015; D. B. Goldman, IEEE Trans. Pattern Anal. Mach. Intell. 32, 2276 (2010)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})
@@ -78,8 +78,14 @@ class VignettingDecentre(Effect):
             for a in angles
         )
 
-    def illumination(self, x_um: FloatArray, y_um: FloatArray, camera: CameraModel) -> FloatArray:
-        half = camera.half_diagonal_um
-        rho2 = (x_um / half - self.centre_x) ** 2 + (y_um / half - self.centre_y) ** 2
-        away = rho2 ** (0.5 * self.exponent) - (self.centre_x**2 + self.centre_y**2) ** (0.5 * self.exponent)
-        return np.asarray(1.0 - self.fall_off_percent / 100.0 * away)
+    def on_image(self, image: Image) -> Image:
+        if self.fall_off_percent == 0.0:
+            return image
+        half_um = image.camera.half_diagonal_um
+
+        def shading(x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+            rho2 = (x_um / half_um - self.centre_x) ** 2 + (y_um / half_um - self.centre_y) ** 2
+            away = rho2 ** (0.5 * self.exponent) - (self.centre_x**2 + self.centre_y**2) ** (0.5 * self.exponent)
+            return np.asarray(1.0 - self.fall_off_percent / 100.0 * away)
+
+        return image.adding(shading=shading)

@@ -6,16 +6,15 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
-from sim.spectrum import FloatArray
+from sim.stages import Light
 
 
 class WavelengthOffset(Effect):
     """What was read as radiance at w lies at w + offset."""
 
     name: ClassVar[str] = "wavelength_offset"
-    stage: ClassVar[Stage] = Stage.RIG
     reference: ClassVar[str] = "CIE 214:2014"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation"})
@@ -38,7 +37,11 @@ class WavelengthOffset(Effect):
         ),
     ] = 0.0
 
-    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+    def on_light(self, light: Light) -> Light:
         if self.offset_nm == 0.0:
-            return radiance
-        return np.interp(wavelength_nm - self.offset_nm, wavelength_nm, radiance)
+            return light
+        return light.adding(
+            spectrum=lambda wavelength_nm, radiance, kind: np.interp(
+                wavelength_nm - self.offset_nm, wavelength_nm, radiance
+            )
+        )

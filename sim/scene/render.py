@@ -31,7 +31,7 @@ from sim.scene.warp import Warp
 from sim.spectrum import FloatArray, Spectrum
 
 #: Radiance as the radiometer says (None: equal energy), and the reflectance of what it falls on (None: 1).
-Light = tuple[Spectrum | None, Spectrum | None]
+LitSurface = tuple[Spectrum | None, Spectrum | None]
 Window = tuple[slice, slice]
 EVERYWHERE: Window = (slice(None), slice(None))
 
@@ -64,7 +64,7 @@ class Layer:
     """One light and where it is: `coverage` on the part `window` of a grid, 0 elsewhere. It's a share 0..1 over a ground that
     shines; over a ground of no light it's any factor >= 0."""
 
-    light: Light
+    light: LitSurface
     window: Window
     coverage: FloatArray
 
@@ -73,7 +73,7 @@ class Layer:
 class Drawing:
     """A scene on a grid. `ground` covers what the layers leave; the layers' coverages add up to 1 at most."""
 
-    ground: Light
+    ground: LitSurface
     layers: tuple[Layer, ...]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +13,7 @@ from sim.spectrum import FloatArray
 
 
 @lru_cache(maxsize=8)
-def odd_pixels(shape: tuple[int, ...], share: float, seed: int) -> NDArray[np.intp]:
+def defective_pixels(shape: tuple[int, ...], share: float, seed: int) -> NDArray[np.intp]:
     """Flat indices of round(share x pixels) different pixels, at least one, in random order."""
     pixels = int(np.prod(shape))
     count = min(max(round(share * pixels), 1), pixels)
@@ -21,15 +22,15 @@ def odd_pixels(shape: tuple[int, ...], share: float, seed: int) -> NDArray[np.in
     return chosen
 
 
-#: Below this relative standard deviation all odd pixels are alike.
+#: Below this relative standard deviation all defective pixels are alike.
 ALIKE = 0.02
 
 
 @lru_cache(maxsize=8)
-def odd_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float = 1.0) -> FloatArray:
-    """(shape): variables of mean 1 and standard deviation `spread` in `odd_pixels`, gamma distributed (1: exponential), 0 elsewhere."""
+def defect_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float = 1.0) -> FloatArray:
+    """(shape): variables of mean 1 and standard deviation `spread` in `defective_pixels`, gamma distributed (1: exponential), 0 elsewhere."""
     sizes = np.zeros(shape)
-    chosen = odd_pixels(shape, share, seed)
+    chosen = defective_pixels(shape, share, seed)
     drawn = np.random.default_rng([seed, 2]).exponential(1.0, chosen.size)
     if spread < ALIKE:
         drawn = np.ones(chosen.size)
@@ -43,7 +44,7 @@ def odd_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float = 1
 
 @lru_cache(maxsize=256)
 def size_nodes(spread: float, count: int = 24) -> tuple[FloatArray, FloatArray]:
-    """(weights, sizes), (count,) each, of the distribution that `odd_sizes` draws from: means over parts of it, thinner ones
+    """(weights, sizes), (count,) each, of the distribution that `defect_sizes` draws from: means over parts of it, thinner ones
     towards the tail; weights sum to 1, weighted sizes too."""
     if spread < ALIKE:
         return np.ones(1), np.ones(1)
@@ -54,3 +55,27 @@ def size_nodes(spread: float, count: int = 24) -> tuple[FloatArray, FloatArray]:
     held = np.append(gammainc(k + 1.0, at), 1.0)
     weights = np.diff(below)
     return weights, np.diff(held) / weights
+
+
+@dataclass(frozen=True)
+class Defects:
+    """A share of the pixels, chosen by a seed, with sizes that are gamma distributed about their mean: a `relative_std` of 1 is an
+    exponential distribution, 0 are sizes that are all alike. The unit of `mean_size` is that of what the pixels do."""
+
+    share: float
+    mean_size: float
+    relative_std: float
+    seed: int
+
+    def pixels(self, shape: tuple[int, ...]) -> NDArray[np.intp]:
+        """Their flat indices."""
+        return defective_pixels(shape, self.share, self.seed)
+
+    def sizes(self, shape: tuple[int, ...]) -> FloatArray:
+        """(shape): their sizes, 0 in all other pixels."""
+        return self.mean_size * defect_sizes(shape, self.share, self.seed, self.relative_std)
+
+    def nodes(self) -> tuple[FloatArray, FloatArray]:
+        """The distribution of sizes by nodes: shares of all pixels (k,) and sizes (k,)."""
+        weights, sizes = size_nodes(self.relative_std)
+        return self.share * weights, self.mean_size * sizes

@@ -20,7 +20,8 @@ from mocks.light_path import WAVELENGTH_NM, LightSettings, sphere_radiance
 from mocks.targets import BOARD_POSES, BOARD_SQUARES, EDGE_ANGLES_DEG, SQUARE_MM, board_pose, corners_px
 from mocks.truth import hidden_truth
 from sim.camera import Side
-from sim.forward import Exposure, edge_profile, expected
+from sim.frame import Exposure, expected
+from sim.point import edge_profile
 from sim.scene.scenes import UniformField
 from sim.sensor.electrons import dark_current_e_per_s
 from sim.sensor.mosaic import planes
@@ -200,7 +201,7 @@ class TestFrames:
         assert not np.array_equal(a, Bench(seed=10).expose("left", 0.01))
 
     def test_uniform_field_is_the_forward_models(self, bench: Bench) -> None:
-        """Without concealed effects the bench and `sim.forward` say the same of a flat."""
+        """Without concealed effects the bench and `sim.frame` say the same of a flat."""
         camera = hidden_truth(1).cameras["right"].model
         radiance = Spectrum.of(WAVELENGTH_NM, light(filter_place=2))
         there = expected(camera, Exposure(UniformField(radiance), 0.0008))

@@ -1,6 +1,6 @@
 """Every effect of the library is concealed on the bench, and what the bench then gives is what the forward model predicts.
 
-Predictions start from what stands in front and from what the radiometer says, and take `sim.forward.expected_sequence`; the
+Predictions start from what stands in front and from what the radiometer says, and take `sim.frame.expected_sequence`; the
 bench takes its frames one by one, from its own settings, clock and temperature.
 """
 
@@ -24,7 +24,7 @@ from mocks.truth import HiddenCamera, hidden_truth
 from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
-from sim.forward import Exposure, dark_electrons, expected_sequence, read_out
+from sim.frame import Exposure, dark_electrons, expected_sequence, read_out
 from sim.scene import Darkness, Scene, ScreenPattern, UniformField
 from sim.sensor.electrons import dn_moments
 from sim.spectrum import FloatArray, Spectrum

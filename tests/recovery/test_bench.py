@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mocks.truth import hidden_truth
-from sim.forward import responsivity
+from sim.detection import responsivity
 
 TRUTH = hidden_truth(1)  # the seed of a bench that is told none
 SIDES = ("left", "right")

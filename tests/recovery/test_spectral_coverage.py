@@ -16,7 +16,7 @@ import pytest
 from lab.fit.spectral.recordings import fit_spectral
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.formats.results import NoiseFit
-from sim.forward import Exposure, sample
+from sim.frame import Exposure, sample
 from sim.scene import Darkness, UniformField
 from sim.scene.light import colour_science
 from sim.spectrum import PHOTON_ENERGY_J_NM, FloatArray, Spectrum

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim import forward
+from sim import frame as sim_frame
 from sim.camera import CameraModel, Lens
 from sim.effects import library
-from sim.forward import Exposure, electron_rate, expected_electrons
+from sim.frame import Exposure, expected_electrons
 from sim.optics.imaging import MeasuredPsf, TracedLens
 from sim.optics.table import LensTable
 from sim.scene import (
@@ -27,6 +27,7 @@ from sim.scene import (
 )
 from sim.sensor import mosaic
 from sim.spectrum import Spectrum
+from sim.uniform import electron_rate
 
 
 def _traced(camera: CameraModel, table: LensTable) -> CameraModel:
@@ -140,8 +141,8 @@ def test_every_scene_gives_frames_and_statistics(
 ) -> None:
     camera = _traced(colour_camera, synthetic_lens().table())
     exposure = Exposure(_scenes(lamp)[index], 0.02, magnification=0.1)
-    mean, variance = forward.moments(camera, exposure)
-    frame = forward.sample(camera, exposure, np.random.default_rng(0)).astype(float)
+    mean, variance = sim_frame.moments(camera, exposure)
+    frame = sim_frame.sample(camera, exposure, np.random.default_rng(0)).astype(float)
     assert np.all(np.isfinite(mean)) and np.all(variance > 0)
     chi2 = np.mean((frame - mean) ** 2 / variance)
     assert chi2 == pytest.approx(1.0, abs=6.0 * np.sqrt(2.0 / frame.size))
@@ -169,7 +170,7 @@ def test_light_that_no_channel_sees_is_named(colour_camera: CameraModel, lamp: S
     with pytest.raises(ValueError, match="outside the limits"):
         expected_electrons(colour_camera, Exposure(infrared, 0.1))
     dark = lamp.scaled(0.0)
-    assert forward.expected(colour_camera, Exposure(UniformField(dark), 0.1)).max() < 250.0
+    assert sim_frame.expected(colour_camera, Exposure(UniformField(dark), 0.1)).max() < 250.0
 
 
 def test_an_exposure_that_saturates_everything_is_named(colour_camera: CameraModel, lamp: Spectrum) -> None:
@@ -177,9 +178,9 @@ def test_an_exposure_that_saturates_everything_is_named(colour_camera: CameraMod
         exposure = Exposure(UniformField(lamp), exposure_s, gain_db=gain_db)
         electrons = expected_electrons(colour_camera, exposure)
         with pytest.raises(ValueError, match=f"exposure 20 s saturates all pixels.*limit is {limit} e .*; expose"):
-            forward.check_not_saturated(colour_camera, exposure, electrons)
+            sim_frame.check_not_saturated(colour_camera, exposure, electrons)
     fine = Exposure(UniformField(lamp), 0.02)
-    forward.check_not_saturated(colour_camera, fine, expected_electrons(colour_camera, fine))
+    sim_frame.check_not_saturated(colour_camera, fine, expected_electrons(colour_camera, fine))
 
 
 def test_impossible_lenses_are_named() -> None:

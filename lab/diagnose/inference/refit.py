@@ -247,8 +247,8 @@ def _promised_gain(
 
 
 def _usual_log_odds(effect: Effect, std: dict[str, float | None]) -> float:
-    """The effect's `usual_nats`, the largest within a standard deviation of the values found: noise makes nothing unusual."""
-    if type(effect).usual_nats is Effect.usual_nats:
+    """The effect's `log_prior`, the largest within a standard deviation of the values found: noise makes nothing unusual."""
+    if type(effect).log_prior is Effect.log_prior:
         return 0.0
     quantities = type(effect).quantities()
     near = []
@@ -256,7 +256,7 @@ def _usual_log_odds(effect: Effect, std: dict[str, float | None]) -> float:
         value, low, high = float(getattr(effect, name)), quantities[name].lower, quantities[name].upper
         around = (value - (width or 0.0), value, value + (width or 0.0))
         near.append([min(max(v, -np.inf if low is None else low), np.inf if high is None else high) for v in around])
-    return max(effect.having(**dict(zip(std, v, strict=True))).usual_nats() for v in product(*near))
+    return max(effect.having(**dict(zip(std, v, strict=True))).log_prior() for v in product(*near))
 
 
 def _prediction_jacobian(

@@ -15,8 +15,10 @@ from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import Search
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
+from sim.effects.library import changed_by
 from sim.effects.library import effects as library
 from sim.effects.other_f_number import OtherFNumber
+from sim.point import TRANSFER
 
 #: Name of the hypothesis that no effect of the library is the cause.
 UNKNOWN = "unknown"
@@ -131,7 +133,7 @@ def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, st
     """Log posterior, less prior odds, of the set with another f-number or pitch than stated in the place of an effect that blurs; and that
     in words. -inf for effects that don't blur, and where the fitted ratio is below `misstated_ratio`."""
     model, policy, effect = search.model, search.policy, fit.effects[index]
-    if type(effect).transfer is Effect.transfer:
+    if TRANSFER.isdisjoint(changed_by(effect)):
         return -np.inf, ""
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     starts = [(*rest, OtherFNumber(ratio=ratio)) for ratio in F_NUMBER_RATIOS]

@@ -28,6 +28,7 @@ from lab.fit.geometry.distortion_model import MODELS, free_intrinsics
 from lab.fit.geometry.pinhole import NAMES, intrinsics_of
 from lab.formats.results import Skipped
 from sim.camera import Side
+from sim.point import displaced_um
 from sim.spectrum import FloatArray
 
 ROWS, COLS = 3, 4  # cells of the frame
@@ -130,7 +131,7 @@ def board_block(study: Study) -> Block:
         measurement="boards", axis="field", unit="half diagonals", reach=0.4, value=mean @ corners.left.ravel(),
         covariance=covariance,
         labels=tuple(Label(r, "Y", way, tuple(captures[k] for k in used), out) for r, way, used, out in labels),
-        hooks=frozenset({"image_shift_um"}), predict=predict, scale=np.ones(len(labels)), conditions="direction",
+        reads=frozenset({"image.shift"}), predict=predict, scale=np.ones(len(labels)), conditions="direction",
         conditions_words="corners",
     )  # fmt: skip
 
@@ -140,12 +141,8 @@ def shifts_px(study: Study, place: FloatArray, effects: Effects) -> FloatArray:
     camera = study.camera
     pitch = camera.pixel_pitch_um
     x, y = ((place[:, k] - 0.5 * (n - 1)) * pitch for k, n in ((0, camera.cols), (1, camera.rows)))
-    total = np.zeros_like(place)
-    for effect in effects:
-        shift = effect.image_shift_um(x, y, REFERENCE_NM, camera)
-        if shift is not None:
-            total += np.column_stack(shift) / pitch
-    return total
+    shift = displaced_um(camera, x, y, REFERENCE_NM, effects)
+    return np.zeros_like(place) if shift is None else np.column_stack(shift) / pitch
 
 
 def _cells(study: Study, corners: _Corners, views: int) -> list[tuple[np.ndarray, bool]]:
@@ -267,7 +264,7 @@ def board_colour_block(study: Study) -> Block:
 
     return Block(
         measurement="board_colour", axis="field", unit="half diagonals", reach=0.5, value=np.array(values),
-        covariance=np.diag(variances), labels=tuple(labels), hooks=frozenset({"image_shift_um"}), predict=predict,
+        covariance=np.diag(variances), labels=tuple(labels), reads=frozenset({"image.shift"}), predict=predict,
         scale=np.ones(len(values)),
     )  # fmt: skip
 

@@ -23,6 +23,7 @@ from lab.diagnose.measurements.summaries import Block, Effects, Label, Predictio
 from lab.errors import NotDetermined
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.uniform import Uniform
 
 SHIFTED_FROM = 4  # steps of codes that no fault of a converter makes: one bit may be stuck, two are a shift
 LEAST_NOISE = 3.0  # codes; below, a smooth curve can't be told from steps
@@ -120,7 +121,7 @@ def code_block(study: Study) -> Block:
 
     return Block(
         measurement="code_density", axis="level", unit="DN", reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
-        covariance=block_diag(*covariances), labels=tuple(labels), hooks=frozenset({"codes"}), predict=predict, scale=np.ones(len(labels)),
+        covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict, scale=np.ones(len(labels)),
         along=np.array(places),
     )  # fmt: skip
 
@@ -297,8 +298,7 @@ def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
     margin = 64
     size = len(codes.count)
     x = (np.arange((size + 2 * margin) * FINE) + 0.5) / FINE - 0.5 + codes.first - margin
-    for effect in effects:
-        x = effect.codes(x, study.camera)
+    x = Uniform(study.camera, effects).codes(x)
     # each sample stands for an interval of its output, which may lie across the border of two codes
     top = x + 0.5 / FINE - codes.first
     code = np.rint(top).astype(int)

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from lab.diagnose.measurements.summaries import SPECTRAL_HOOKS, Effects, Study, overrides
+from lab.diagnose.measurements.summaries import Effects, Study, act_on
 from sim.effects.base import Effect
-from sim.forward import electron_rate
 from sim.spectrum import FloatArray, Spectrum, linear_shares
+from sim.uniform import SPECTRAL, Uniform, electron_rate
 
 LEAK_STD = 2.0e-4  # of the curve's peak, alike at all wavelengths: blindness that isn't quite
 MOST_DECIMALS = 6  # of a curve's values; with fewer they are rounded
@@ -29,7 +29,7 @@ class CurveSlopes:
     Per channel: scale, tilt, bend, a rough part on knots with a squared-exponential prior, a leak, and what the curve does between
     the samples that the maker gives. The slope by a factor
     (1 + d(w)) on the curve is the rate with the curve times d: exact, as the rate is linear in the curve. The baseline's rates
-    are `sim.forward`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
+    are `sim.frame`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
     """
 
     def __init__(
@@ -102,18 +102,15 @@ class CurveSlopes:
 
     def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
         """Rates (n,) and the modes' shares in them (n, modes)."""
-        spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
+        spectral = tuple(e for e, acts in zip(effects, act_on(effects, SPECTRAL), strict=True) if acts)
         if spectral not in self._kept:
             weight, level = self._weight, self._all_level
-            if any(type(e).radiance is not Effect.radiance for e in spectral):
-                lit = dict(self.radiance)
-                for effect in spectral:
-                    lit = {path: effect.radiance(self.wavelength, value, self.kind) for path, value in lit.items()}
+            model = Uniform(self.study.camera, spectral)
+            if any(act_on(spectral, frozenset({"light.spectrum"}))):
+                lit = {path: model.radiance(self.wavelength, r, self.kind) for path, r in self.radiance.items()}
                 changed = np.array([lit[path] for path, *_ in self.items])
                 weight, level = changed * self._curve, changed * self._level
-            through = np.ones_like(self.wavelength)
-            for effect in spectral:
-                through = through * effect.transmittance(self.wavelength, np.asarray(0.0))
+            through = model.transmittance(self.wavelength)
             total = weight @ through
             rate = self._rate * total / np.maximum(self._total, 1e-300)
             table = np.column_stack([weight @ (self._modes * through).T, (weight * self._between) @ through])

@@ -20,6 +20,7 @@ from scipy.special import betainc, chdtrc, chdtri, digamma, gammaln, ndtr, polyg
 from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.summaries import (
     BLACK_FLOOR_DN,
+    LAG,
     STATED_BLACK_DN,
     STATED_BLACK_SHARE,
     Block,
@@ -30,8 +31,9 @@ from lab.diagnose.measurements.summaries import (
     held_out_of,
 )
 from lab.errors import NotDetermined
-from sim.effects.base import Effect, Lines
+from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
+from sim.uniform import Uniform
 
 Image = NDArray[np.float32]
 
@@ -438,12 +440,13 @@ def _log_mean_variance(modes: FloatArray | float) -> FloatArray:
 # --- level ------------------------------------------------------------------------------------------------------------------
 
 
-def _even(effects: Effects) -> list[Effect]:
-    return [e for e in effects if type(e).even_dark_current is not Effect.even_dark_current]
+#: Quantities of the stages that dark frames' pixels and lines depend on.
+DEFECTS = frozenset({"charge.defects", "signal.telegraph"})
+LINES = frozenset({"signal.lines"})
 
 
 def _dark_map(study: Study, effects: Effects, temperature_c: float | None) -> FloatArray:
-    """Dark current (e/s) of pixels as large as a cell's twelfth: hooks ask for whole frames, of which nothing is smaller here."""
+    """Dark current (e/s) of pixels as large as a cell's twelfth: laws are of whole frames, of which nothing is smaller here."""
     camera = study.camera
     down = max(min(camera.rows // (12 * CELLS[0]), camera.cols // (12 * CELLS[1])), 1)
     coarse = camera.model_copy(
@@ -453,15 +456,12 @@ def _dark_map(study: Study, effects: Effects, temperature_c: float | None) -> Fl
             "pixel_pitch_um": camera.pixel_pitch_um * down,
         }
     )
-    rate: FloatArray | float = camera.dark_current_e_per_s
-    for effect in _even(effects):
-        rate = effect.even_dark_current(rate, temperature_c, coarse)
-    return np.broadcast_to(np.asarray(rate, float), (coarse.rows, coarse.cols))
+    return Uniform(coarse, effects).dark_e_per_s(temperature_c)
 
 
 def _more_dark_e_per_s(study: Study, effects: Effects, temperature_c: float | None) -> float:
     """What effects add to the mean dark current of pixels that are like their neighbours."""
-    if not _even(effects):
+    if not Uniform(study.camera, effects).changes_dark_current:
         return 0.0
     return float(_dark_map(study, effects, temperature_c).mean()) - study.camera.dark_current_e_per_s
 
@@ -493,7 +493,7 @@ def dark_block(study: Study) -> Block:
         measurement="dark", axis="exposure", unit="s", reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
         covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        hooks=frozenset({"offset_dn", "even_dark_current", "left_behind"}), predict=predict, scale=np.ones(len(value)),
+        reads=LAG | {"signal.offset_dn", "charge.dark_current"}, predict=predict, scale=np.ones(len(value)),
         conditions="exposure and temperature",
     )  # fmt: skip
 
@@ -517,7 +517,7 @@ def black_level_block(study: Study) -> Block:
         measurement="black_level", axis="exposure", unit="s", reach=1.0, value=np.array([study.noise.black]),
         covariance=np.array([[std**2]]),
         labels=(Label(0.0, "all", "stated level", tuple(c.id for c in shortest.captures), False),),
-        hooks=frozenset(), predict=lambda effects: Prediction(np.array([stated]), {}), scale=np.array([max(stated, 1.0)]),
+        reads=frozenset(), predict=lambda effects: Prediction(np.array([stated]), {}), scale=np.array([max(stated, 1.0)]),
     )  # fmt: skip
 
 
@@ -559,15 +559,13 @@ def dark_noise_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         mean = base.copy()
         shot = dark.copy()
+        model, grid = Uniform(study.camera, effects), np.linspace(0.0, 0.5, 65)
+        lines = sum((float(np.mean(one.spectrum_e2(grid, fixed=False))) for one in model.lines), 0.0)
         for i, (f, *_) in enumerate(points):
             t, temperature = f.condition.exposure_s, f.condition.temperature_c
             shot[i] += noise.gain**2 * _more_dark_e_per_s(study, effects, temperature) * t
             mean[i] += shot[i] - dark[i]
-            for effect in effects:
-                mean[i] += _odd_variance(effect, noise.gain, t, float(value[i]))
-                for lines in ("rows", "columns"):
-                    grid = np.linspace(0.0, 0.5, 65)
-                    mean[i] += noise.gain**2 * float(np.mean(effect.line_spectrum_e2(grid, lines, False) * np.ones(65)))
+            mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
         slopes = {
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
@@ -579,7 +577,7 @@ def dark_noise_block(study: Study) -> Block:
         measurement="dark_noise", axis="exposure", unit="s", reach=float(max(np.ptp(exposures), 1e-3)), value=value,
         covariance=covariance,
         labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, _captures(f, out), out) for f, out, _ in points),
-        hooks=frozenset({"even_dark_current", "odd_dark_current", "odd_jumps", "line_spectrum_e2"}), predict=predict, scale=value,
+        reads=DEFECTS | {"charge.dark_current", "signal.lines"}, predict=predict, scale=value,
         conditions="exposure and temperature",
     )  # fmt: skip
 
@@ -610,21 +608,21 @@ def _captures(frames: Frames, held_out: bool) -> tuple[str, ...]:
     return tuple(c.id for c in (frames.condition.held_out if held_out else frames.condition.seen))
 
 
-def _odd_variance(effect: Effect, gain: float, exposure_s: float, variance_dn2: float) -> float:
-    """What odd pixels add to the mean variance (DN^2), contrasts cut off at CLIP standard deviations."""
+def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn2: float) -> float:
+    """What defective pixels add to the mean variance (DN^2), contrasts cut off at CLIP standard deviations."""
     cut = CLIP * np.sqrt(variance_dn2)
     more = 0.0
-    hot = effect.odd_dark_current()
-    if hot is not None:
-        noisy = variance_dn2 + gain**2 * hot[1] * exposure_s
-        more += float(hot[0] @ (_cut_square(np.zeros_like(noisy), noisy, cut) - variance_dn2))
-    jumps = effect.odd_jumps()
-    if jumps is not None:
+    for hot in model.hot:
+        share, excess_e_per_s = hot.nodes()
+        noisy = variance_dn2 + gain**2 * excess_e_per_s * exposure_s
+        more += float(share @ (_cut_square(np.zeros_like(noisy), noisy, cut) - variance_dn2))
+    for jumps in model.telegraph:
+        share, distance_e = jumps.nodes()
         # two frames: both high or both low half of the time
-        apart = gain * jumps[1] / np.sqrt(2.0)
+        apart = gain * distance_e / np.sqrt(2.0)
         still = np.full_like(apart, variance_dn2)
         apart_square = _cut_square(apart, still, cut)
-        more += float(jumps[0] @ (0.5 * (apart_square - variance_dn2)))
+        more += float(share @ (0.5 * (apart_square - variance_dn2)))
     return more
 
 
@@ -666,14 +664,15 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         total = np.zeros(len(frequency))
-        for effect in effects:
-            total += effect.line_spectrum_e2(frequency, lines, False)
+        for one in Uniform(study.camera, effects).lines:
+            if one.lines == lines:
+                total += one.spectrum_e2(frequency, fixed=False)
         return Prediction(np.log1p(over * np.tile(bands.mean(total), sets)), {})
 
     n = len(labels)
     return Block(
         measurement=f"dark_{name}", axis="spatial_frequency", unit="cy/px", reach=0.1, value=np.concatenate(value),
-        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), hooks=frozenset({"line_spectrum_e2"}),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
         predict=predict, scale=np.ones(n),
     )  # fmt: skip
 
@@ -718,10 +717,11 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         still, moving, odd = np.zeros(len(frequency)), np.zeros(len(frequency)), 0.0
-        for effect in effects:
-            still += effect.line_spectrum_e2(frequency, lines, True)
-            moving += effect.line_spectrum_e2(frequency, lines, False)
-            odd += effect.line_parity_e(lines)
+        for one in Uniform(study.camera, effects).lines:
+            if one.lines == lines:
+                still += one.spectrum_e2(frequency, fixed=True)
+                moving += one.spectrum_e2(frequency, fixed=False)
+                odd += one.odd_even_e
         parts = zip(factor, first.fixed.values(), strict=True)
         power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
         return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), {})
@@ -729,7 +729,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     return Block(
         measurement=f"dark_{name}", axis="spatial_frequency", unit="cy/px", reach=0.1,
         value=np.concatenate([*value, parity]), covariance=whole, labels=tuple(labels),
-        hooks=frozenset({"line_spectrum_e2", "line_parity_e"}), predict=predict,
+        reads=LINES, predict=predict,
         scale=np.concatenate([np.ones(n), 10.0 * std]), conditions="pattern",
     )  # fmt: skip
 
@@ -770,7 +770,7 @@ def along_block(study: Study) -> Block:
     # what lines share leaves no trace within them: where there is one, it wasn't the lines
     return Block(
         measurement="dark_correlation", axis="spatial_frequency", unit="cy/px", reach=0.03, value=np.concatenate(value),
-        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), hooks=frozenset({"line_spectrum_e2"}),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
         predict=lambda effects: Prediction(np.zeros(n), {}), scale=np.ones(n), conditions="direction",
     )  # fmt: skip
 
@@ -813,7 +813,7 @@ def dark_field_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         mean = np.zeros(len(value))
-        if _even(effects):
+        if Uniform(study.camera, effects).changes_dark_current:
             for i, (f, *_) in enumerate(points):
                 cells = _cell_means(_dark_map(study, effects, f.condition.temperature_c).astype(np.float32))
                 here = study.noise.gain * f.condition.exposure_s * (cells - cells.mean())
@@ -829,7 +829,7 @@ def dark_field_block(study: Study) -> Block:
     return Block(
         measurement="dark_field", axis="field", unit="of half the diagonal", reach=0.5, value=value, covariance=np.asarray(covariance, float),
         labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out, part in points for k in range(count)),
-        hooks=frozenset({"even_dark_current"}), predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
+        reads=frozenset({"charge.dark_current"}), predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
         conditions="exposure and temperature",
     )  # fmt: skip
 
@@ -864,7 +864,7 @@ def odd_pixel_block(study: Study) -> Block:
     def expected(effects: Effects, times: float = 1.0) -> FloatArray:
         found = []
         for (f, _, part), (moving, fixed) in zip(points, own, strict=True):
-            classes = _classes(effects, study.noise.gain, f.condition.exposure_s)
+            classes = _classes(Uniform(study.camera, effects), study.noise.gain, f.condition.exposure_s)
             skew = times * part.skewness * (part.spread_dn / moving) ** 3
             found.append(
                 size * _tail_shares(classes, moving, fixed, part.of_median, part.spread_dn, study.noise.gain, skew)
@@ -882,7 +882,7 @@ def odd_pixel_block(study: Study) -> Block:
     uncertain = np.abs(expected((), 2.0) - expected((), 0.0)) + 0.2 * base
     return Block(
         measurement="odd_pixels", axis="deviation", unit="sigma", reach=1.0, value=value,
-        covariance=_count_covariance(base, uncertain), labels=labels, hooks=frozenset({"odd_dark_current", "odd_jumps"}),
+        covariance=_count_covariance(base, uncertain), labels=labels, reads=DEFECTS,
         predict=lambda effects: Prediction(_rooted(expected(effects)), {}), scale=np.full(len(value), 10.0),
         along=np.tile(np.sign(low) * np.log(np.abs(low)), len(points)), conditions="exposure and temperature",
     )  # fmt: skip
@@ -911,14 +911,12 @@ class _Class:
     jump_dn: float
 
 
-def _classes(effects: Effects, gain: float, exposure_s: float) -> list[_Class]:
+def _classes(model: Uniform, gain: float, exposure_s: float) -> list[_Class]:
     found = []
-    for effect in effects:
-        hot, jumps = effect.odd_dark_current(), effect.odd_jumps()
-        if hot is not None:
-            found += [_Class(float(s), gain * float(x) * exposure_s, 0.0) for s, x in zip(*hot, strict=True)]
-        if jumps is not None:
-            found += [_Class(float(s), 0.0, gain * float(x)) for s, x in zip(*jumps, strict=True)]
+    for hot in model.hot:
+        found += [_Class(float(s), gain * float(x) * exposure_s, 0.0) for s, x in zip(*hot.nodes(), strict=True)]
+    for jumps in model.telegraph:
+        found += [_Class(float(s), 0.0, gain * float(x)) for s, x in zip(*jumps.nodes(), strict=True)]
     return found
 
 
@@ -974,17 +972,16 @@ def blinking_block(study: Study) -> Block:
     draws = {id(f): _jump_sums(f.condition) for f in fine}
 
     def expected(effects: Effects) -> FloatArray:
-        found = []
+        model, found = Uniform(study.camera, effects), []
         for out, part, freedom, edges in sums:
             shares = _chance_above(np.array([freedom], float), np.zeros(1), edges)[0]
-            for effect in effects:
-                hot, jumps = effect.odd_dark_current(), effect.odd_jumps()
-                if hot is not None:
-                    shares = shares + hot[0] @ (_hot_above(study, part, out, hot[1], edges) - shares)
-                if jumps is not None:
-                    shares = shares + jumps[0] @ (
-                        _jump_above(study, part, out, draws, jumps[1], edges, freedom) - shares
-                    )
+            for hot in model.hot:
+                weight, rate = hot.nodes()
+                shares = shares + weight @ (_hot_above(study, part, out, rate, edges) - shares)
+            for jumps in model.telegraph:
+                weight, distance_e = jumps.nodes()
+                above = _jump_above(study, part, out, draws, distance_e, edges, freedom)
+                shares = shares + weight @ (above - shares)
             found.append(size * (shares - np.append(shares[1:], 0.0)))
         return np.maximum(np.concatenate(found), 0.0)
 
@@ -993,7 +990,7 @@ def blinking_block(study: Study) -> Block:
     return Block(
         measurement="blinking_pixels", axis="variance", unit="times their surroundings'", reach=1.0,
         value=np.concatenate(value), covariance=_count_covariance(base, base), labels=tuple(labels),
-        hooks=frozenset({"odd_dark_current", "odd_jumps"}), predict=lambda effects: Prediction(_rooted(expected(effects)), {}),
+        reads=DEFECTS, predict=lambda effects: Prediction(_rooted(expected(effects)), {}),
         scale=np.full(len(base), 10.0), along=np.log(position),
     )  # fmt: skip
 

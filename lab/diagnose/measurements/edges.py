@@ -26,16 +26,14 @@ from scipy.special import ndtr
 
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.summaries import (
-    SPECTRAL_HOOKS,
     Block,
     Effects,
     Label,
     Prediction,
     Study,
+    act_on,
     held_out_of,
-    overrides,
 )
-from lab.diagnose.measurements.veils import halos, wide_contrast
 from lab.errors import NotDetermined
 from lab.fit.mtf.edge_profile import ROUGHNESS_SHARE
 from lab.fit.mtf.edges_in_frame import find_edges
@@ -44,10 +42,20 @@ from lab.fit.mtf.samples import Region
 from lab.fit.mtf.transfer_function import EdgeGeometry, EdgeMtf
 from lab.fit.rounding import rounding_waves_dn
 from sim.effects.base import Effect
-from sim.forward import common_wavelengths, electron_rate, transfer_at, wavelength_shares
+from sim.frame import charge_response
 from sim.optics.illumination import optical_axis_px, relative_illumination
+from sim.point import (
+    TRANSFER,
+    common_wavelengths,
+    halos,
+    transfer_at,
+    varies_over_field,
+    wavelength_shares,
+    wide_contrast,
+)
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
+from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
 
 ComplexArray = NDArray[np.complex128]
 
@@ -76,12 +84,18 @@ HIGHEST_CY_PER_PX = 10.0
 GRID_PX, FINE_PX = 0.05, 0.0125
 #: Predictions that are kept, and as many of their parts: a step of a refit leaves the others as they were.
 KEPT = 64
-BLURRING_HOOKS = frozenset({"transfer"})
-CHANGING_HOOKS = frozenset({"illumination", "response", "halo", "veil"})
+#: Quantities of the stages that change a profile beside its transfer.
+CHANGING = SHADING | {"signal.response", "image.veils"}
+KERNELS = frozenset({"charge.kernels"})
 
 K = TypeVar("K")
 V = TypeVar("V")
 _Key = tuple[Effect, ...]
+
+
+def _acting(effects: tuple[Effect, ...], reads: frozenset[str]) -> tuple[Effect, ...]:
+    """Those of the effects that change any of these quantities of the stages."""
+    return tuple(e for e, acts in zip(effects, act_on(effects, reads), strict=True) if acts)
 
 
 def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
@@ -112,7 +126,7 @@ def edge_block(study: Study) -> Block:
             Label(float(f), e.channel, e.orientation + (ASIDE if k >= len(REAL_AT) else ""), tuple(c.id for c in e.part), e.held_out)
             for e in edges.edges for k, f in enumerate(x)
         ),
-        hooks=frozenset({"transfer", "transmittance", "charge", "response", "illumination"}), predict=predict,
+        reads=TRANSFER | CHANGING | {"image.transmittance"}, predict=predict,
         scale=np.ones(edges.value.size), conditions="orientation", conditions_words="edges at",
         # what is wrong with contrast says nothing of asymmetry
         along=np.tile(np.where(np.arange(len(x)) < len(REAL_AT), x, x + APART_CY_PER_PX), len(edges.edges)),
@@ -401,7 +415,7 @@ class _Edges:
         self.frequencies = np.concatenate([REAL_AT, IMAGINARY_AT]) * top
         self._at = _shapes(self._quadrature, top)
         self._spectral: dict[_Key, tuple[FloatArray, FloatArray, ComplexArray]] = {}
-        self._blurred: dict[tuple[_Key, _Key], ComplexArray] = {}
+        self._blurred: dict[tuple[_Key, _Key, tuple[float, float]], ComplexArray] = {}
         self._changes: dict[_Key, FloatArray | None] = {}
         self._numbers_of: dict[_Key, FloatArray] = {}
         self._baseline = self._otf(())
@@ -517,26 +531,26 @@ class _Edges:
 
     def _otf(self, effects: tuple[Effect, ...]) -> ComplexArray:
         """(edges, nodes): transfer functions along the edges' normals."""
-        local = [tuple(e.at_place(*p, self._camera) for e in effects) for p in self._places]
-        found = {here: self._sights_otf(here) for here in dict.fromkeys(local)}
-        table = np.array([found[here] for here in local])
+        local = self._places if varies_over_field(self._camera, effects) else [(0.0, 0.0)] * len(self._places)
+        found = {place: self._sights_otf(effects, place) for place in dict.fromkeys(local)}
+        table = np.array([found[place] for place in local])
         # what is spread widely is of the profile (`_change`): its transfer falls within the first of the quadrature's nodes
-        veiled = wide_contrast(effects, self._camera, self._quadrature.frequency)
+        veiled = wide_contrast(self._camera, effects, self._quadrature.frequency)
         return np.asarray(table[self._place, self._sight, self._turn] / veiled)
 
-    def _sights_otf(self, effects: tuple[Effect, ...]) -> ComplexArray:
-        """(sights, directions, nodes)."""
-        spectral = tuple(e for e in effects if overrides(e, SPECTRAL_HOOKS))
+    def _sights_otf(self, effects: tuple[Effect, ...], place_um: tuple[float, float]) -> ComplexArray:
+        """(sights, directions, nodes) at a place."""
+        spectral = _acting(effects, SPECTRAL)
         nodes, shares, kink = self._wavelengths(spectral)
         fx, fy = self._frequencies
-        moving = tuple(e for e in effects if type(e).charge is not Effect.charge and self._camera.cfa != "MONO")
-        optical = tuple(e for e in effects if e not in moving and overrides(e, BLURRING_HOOKS))
+        moving = _acting(effects, KERNELS) if self._camera.cfa != "MONO" else ()
+        optical = _acting(tuple(e for e in effects if e not in moving), TRANSFER)
 
         def blurred() -> ComplexArray:
-            whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical) for w in nodes])
+            whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical, place_um=place_um) for w in nodes])
             return np.asarray(np.tensordot(shares, whole, 1) + kink, complex)
 
-        otf = _kept(self._blurred, (spectral, optical), blurred)
+        otf = _kept(self._blurred, (spectral, optical, place_um), blurred)
         return self._mixed(otf, moving) if moving else otf
 
     @cached_property
@@ -571,10 +585,7 @@ class _Edges:
         fx, fy = self._frequencies
         middle = 4 * step
         out = np.zeros(otf.shape, complex)
-        single = np.zeros((2 * middle + step,) * 2)
-        single[middle, middle] = 1.0
-        for effect in moving:
-            single = effect.charge(single, 0.0, camera)
+        single = charge_response(camera, (2 * middle + 1, 2 * middle + 1), moving)
         rows, cols = np.nonzero(np.abs(single) > 1e-9)
         phases = mosaic.phases(camera.cfa)
         channel_at = {(r % step, c % step): ch for ch, places in phases.items() for r, c in places}
@@ -603,31 +614,29 @@ class _Edges:
 
     def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
         """Change of the profiles (edges, distances) by the effects' shading, by responses that bend and by halos."""
-        changing = tuple(e for e in effects if overrides(e, CHANGING_HOOKS))
+        changing = _acting(effects, CHANGING)
         return _kept(self._changes, changing, lambda: self._changed(changing))
 
     def _changed(self, effects: tuple[Effect, ...]) -> FloatArray | None:
-        shading = tuple(e for e in effects if type(e).illumination is not Effect.illumination)
-        bending = tuple(e for e in effects if type(e).response is not Effect.response)
-        spread = halos(effects, self._camera)
-        if not shading and not bending and not spread:
+        model = Uniform(self._camera, effects)
+        shading = _acting(effects, SHADING)
+        spread = halos(self._camera, effects)
+        if not shading and model.is_linear and not spread:
             return None
         light, operators = self._light_profile, self._operators
         change = np.zeros_like(light)
-        if bending:
+        if not model.is_linear:
             for i, edge in enumerate(self.edges):
                 scale = max(edge.measured.light_level - edge.measured.dark_level, 1e-9) / self._study.noise.gain
                 level = np.linspace(0.0, 1.1, 45) * float(light[i].max())
-                bent = level * scale
-                for e in bending:
-                    bent = e.response(bent, self._camera)
+                bent = model.response(level * scale)
                 change[i] += np.interp(light[i], level, bent / scale) - light[i]
         if shading:
             for i in range(len(self.edges)):
                 ratio = self._shade(i, operators.distance, shading) / operators.shade[i]
                 change[i] += (light[i] + change[i]) * (ratio - 1.0)
         for share, std_px in spread:
-            change += share / wide_contrast(effects, self._camera) * (ndtr(operators.distance / std_px) - 0.5)
+            change += share / wide_contrast(self._camera, effects) * (ndtr(operators.distance / std_px) - 0.5)
         return change
 
     @cached_property
@@ -644,9 +653,7 @@ class _Edges:
     def _shade(self, edge: int, distance: FloatArray, effects: Effects) -> FloatArray:
         """Light over the distance from an edge, averaged along it, of that at the edge."""
         x_um, y_um, light, fit = self._lighting[edge]
-        for e in effects:
-            light = light * e.illumination(x_um, y_um, self._camera)
-        terms = fit @ light
+        terms = fit @ Uniform(self._camera, effects).illuminated(light, x_um, y_um)
         reach = self.edges[edge].measured.geometry.reach_px
         return np.asarray(polynomial.polyval(np.clip(distance, -reach, reach) / UNEVEN_PX, terms / terms[0]))
 

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.diagnose.measurements.neighbours import held_out_flats
-from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
+from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, act_on
 from lab.errors import NotDetermined
 from sim.effects.base import Effect
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.uniform import Uniform
 
 MOST_FRAMES, MOST_LEVELS = 6, 8  # of a level; of a session
 WIDEN = 1.6  # from one band of frequencies to the next
@@ -72,10 +73,10 @@ def flicker_block(study: Study) -> Block:
     band = np.tile(np.arange(len(bands)), len(levels))
 
     def predict(effects: Effects) -> Prediction:
-        moving = [e for e in effects if type(e).lit is not Effect.lit]
+        moving = any(act_on(effects, FLICKER))
         power, spread = 1.0 + offsets, np.zeros(len(value))
         if moving:
-            found = [_modulation(study, level, moving, bands, step) for level in levels]
+            found = [_modulation(study, level, effects, bands, step) for level in levels]
             power = power + np.concatenate([mean for mean, _ in found])
             spread = np.concatenate(
                 [std / np.sqrt(len(level.captures)) for (_, std), level in zip(found, levels, strict=True)]
@@ -99,10 +100,11 @@ def flicker_block(study: Study) -> Block:
         value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.captures[0].id in out)
                      for level in levels for f in frequency),
-        hooks=frozenset({"lit"}), predict=predict, scale=np.ones(len(value)), conditions="exposure", conditions_words="flats of",
+        reads=FLICKER, predict=predict, scale=np.ones(len(value)), conditions="exposure", conditions_words="flats of",
     )  # fmt: skip
 
 
+FLICKER = frozenset({"light.rows"})
 LOG_REACH = 1.0  # over a factor of e in frequency
 
 
@@ -199,14 +201,11 @@ def _modulation(
 ) -> tuple[FloatArray, FloatArray]:
     """What effects on the light add to a level's power by band: mean over the instants, and one frame's spread about it."""
     rows = study.camera.rows // step
-    electrons = np.full((study.camera.rows, 1), level.signal / study.noise.gain)
+    model = Uniform(study.camera, effects)
     exposure = level.captures[0].exposure_s
     profiles = []
     for instant in INSTANTS:
-        lit = electrons
-        for effect in effects:
-            lit = effect.lit(lit, exposure, float(instant), study.camera)
-        own = _profile(lit, step)
+        own = _profile(model.row_factors(study.camera.rows, exposure, float(instant))[:, None], step)
         profiles.append(own / own.mean())
     relative = np.array(profiles)
     relative = relative / relative.mean(0) - 1.0

@@ -22,17 +22,14 @@ from lab.diagnose.measurements.summaries import (
     Label,
     Prediction,
     Study,
-    overrides,
 )
 from lab.errors import NotDetermined
 from lab.fit.rounding import variance_rounding_std
-from lab.predict.camera_model import NOISE_NODES
 from sim.camera import Cfa
-from sim.effects.base import Effect
-from sim.forward import processing_kernel
 from sim.sensor import mosaic
 from sim.sensor.electrons import passed_on
 from sim.spectrum import FloatArray
+from sim.uniform import NOISE_NODES, Uniform
 
 VARIANCE_FLOOR = 0.002  # of a variance: what clipping and rounding leave
 CORRELATION_FLOOR = 3e-4  # of a correlation: what the pixels' own shares of taken-out means leave
@@ -227,13 +224,11 @@ def variance_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         gain = noise.gain * factor
         electrons, slope = behind(signal / gain, light, effects, study)
-        shot = electrons
-        for effect in effects:
-            shot = effect.noise_e2(electrons, shot, camera)
-        shot = np.maximum(shot, 0.0) * np.square(slope)
+        model = Uniform(camera, effects)
+        shot = np.maximum(model.shot_e2(electrons), 0.0) * np.square(slope)
         read = (noise.read_dn / noise.gain) ** 2
         dn2 = gain[:, None] ** 2 * shot
-        if any(overrides(e, frozenset({"codes"})) for e in effects):
+        if not model.has_even_codes:
             dn2 = coded_variance(
                 noise.black + gain[:, None] * electrons, dn2 + noise.read_dn**2, effects, study
             ) - np.square(noise.read_dn)
@@ -247,7 +242,7 @@ def variance_block(study: Study) -> Block:
     return Block(
         measurement="noise", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(p[2], p[1], f"{p[0].exposure_s:.4g} s", p[0].captures, p[0].held_out) for p in points),
-        hooks=frozenset({"response", "noise_e2", "codes"}), predict=predict, scale=value,
+        reads=frozenset({"signal.response", "charge.variance_e2", "codes.codes"}), predict=predict, scale=value,
     )  # fmt: skip
 
 
@@ -267,25 +262,21 @@ def neighbour_block(study: Study) -> Block:
     names = list(PAIRS)
 
     def predict(effects: Effects) -> Prediction:
-        kernel = processing_kernel(camera, effects)
-        shared = any(overrides(e, frozenset({"neighbour_correlation"})) for e in effects)
-        if kernel is None and not shared:
+        model = Uniform(camera, effects)
+        kernel = model.filter_kernel()
+        if kernel is None and not model.shares_shot_noise:
             return Prediction(np.zeros(len(value)), {})
         parts = []
         for r in points:
             gain = noise.gain * r.gain
             electrons = np.array([max(s, 0.0) / gain for s in r.signal.values()])
-            shot, share = electrons, np.zeros(len(electrons))
-            for effect in effects:
-                shot = effect.noise_e2(electrons, shot, camera)
-                share = share + effect.neighbour_correlation(electrons, camera)
             read = max(noise.read_dn**2 - 1.0 / 12.0, 0.1 * noise.read_dn**2) / noise.gain**2
             parts.append(
                 correlations(
                     camera.cfa,
                     list(r.signal),
-                    np.maximum(shot, 0.0),
-                    passed_on(share),
+                    np.maximum(model.shot_e2(electrons), 0.0),
+                    passed_on(model.shared(electrons)),
                     read,
                     1.0 / 12.0 / gain**2,
                     kernel,
@@ -298,7 +289,7 @@ def neighbour_block(study: Study) -> Block:
         value=value, covariance=np.diag(np.square(std) + CORRELATION_FLOOR**2),
         labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)
                      for r, bright in zip(points, lit, strict=True) for name in names),
-        hooks=frozenset({"processing", "neighbour_correlation"}), predict=predict, scale=np.ones(len(value)),
+        reads=frozenset({"signal.filters", "charge.correlation"}), predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -314,16 +305,11 @@ def channel_planes(study: Study) -> dict[str, list[str]]:
 def behind(signal_e: FloatArray, light: FloatArray, effects: Effects, study: Study) -> tuple[FloatArray, FloatArray]:
     """Electrons (levels, points of the field) behind measured mean signals (levels,) in uniform light that falls off as `light`
     says (of mean 1), and the response's slope there: the effects' response undone by three fixed-point steps."""
-    bending = [e for e in effects if type(e).response is not Effect.response]
+    model = Uniform(study.camera, effects)
     electrons = np.maximum(signal_e[:, None] * light, 1e-3)
-    if not bending:
+    if model.is_linear:
         return electrons, np.ones_like(electrons)
-
-    def response(e: FloatArray) -> FloatArray:
-        for effect in bending:
-            e = effect.response(e, study.camera)
-        return e
-
+    response = model.response
     wanted = np.maximum(signal_e, 1e-3)
     for _ in range(3):
         out = response(electrons).mean(1)
@@ -335,9 +321,7 @@ def behind(signal_e: FloatArray, light: FloatArray, effects: Effects, study: Stu
 def coded_variance(dn: FloatArray, dn2: FloatArray, effects: Effects, study: Study) -> FloatArray:
     """Temporal variance (DN^2) of normal variables of means `dn` and variances `dn2` after the converter's codes."""
     values = dn[..., None] + np.sqrt(dn2)[..., None] * NOISE_NODES
-    for effect in effects:
-        values = effect.codes(values, study.camera)
-    return np.asarray(values.var(axis=-1))
+    return np.asarray(Uniform(study.camera, effects).codes(values).var(axis=-1))
 
 
 def correlations(

@@ -20,26 +20,26 @@ from lab.diagnose.measurements.curves import CurveSlopes
 from lab.diagnose.measurements.summaries import (
     CLIPPED_SHARE,
     LEVEL_REACH,
-    SPECTRAL_HOOKS,
-    UNIFORM_HOOKS,
+    REFLECTIONS,
     Block,
     Effects,
     Label,
     Prediction,
     Study,
+    act_on,
     held_out_of,
 )
-from lab.diagnose.measurements.veils import Surroundings, even_share, halo_light, harmonics, wide_contrast
+from lab.diagnose.measurements.veils import Surroundings, halo_light, harmonics
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
 from lab.formats.recording_set import RecordingSet
-from lab.predict.camera_model import Field, mixed_charge
 from sim.camera import CameraModel
-from sim.effects.base import Effect
-from sim.forward import optical_transfer
+from sim.frame import with_reflections
+from sim.point import even_share, optical_transfer, wide_contrast
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.uniform import LEVEL, SPECTRAL, FieldPoints, Uniform
 
 PATCH_STD = 0.01  # of a patch's reflectance, common to the channels
 PATCH_COLOUR_STD = 0.004  # of a patch's reflectance, each channel by itself
@@ -84,7 +84,7 @@ def chart_block(study: Study) -> Block:
     offset = noise.black + noise.dark_dn_per_s * exposures
     signal = np.maximum(value - offset, 0.1)
     surround = np.array([p.frame for p in points]) - offset  # what a veil carries
-    place = Field.at(camera, row, col)
+    place = FieldPoints.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
     curves = CurveSlopes(
         study,
@@ -95,18 +95,14 @@ def chart_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
-        local, time, ambient = place.under(camera, effects).light, exposures, np.zeros(len(points))
-        for effect in effects:
-            time = np.array([effect.exposure(float(t)) for t in time])
-            ambient = ambient + np.array([effect.ambient_e_per_s(p.channel, camera) for p in points]) * exposures
-        electrons = rates * local * time
-        if any(type(e).charge is not Effect.charge for e in effects):
-            electrons = electrons * _mixing(study, points, electrons, effects)
-        veil = even_share(effects) * surround + halo_light([p.around for p in points], effects, camera)
-        electrons = wide_contrast(effects, camera) * electrons + (veil + tail) / noise.gain + ambient
-        out = electrons + noise.dark_dn_per_s / noise.gain * exposures
-        for effect in effects:
-            out = effect.response(out, camera)
+        model = Uniform(camera, effects)
+        time = np.array([model.collected_s(float(t)) for t in exposures])
+        ambient = np.array([model.ambient_e(p.channel, float(t)) for p, t in zip(points, exposures, strict=True)])
+        electrons = rates * model.field(place).light * time
+        electrons = electrons * _mixing(study, points, electrons, model)
+        veil = even_share(camera, effects) * surround + halo_light([p.around for p in points], effects, camera)
+        electrons = wide_contrast(camera, effects) * electrons + (veil + tail) / noise.gain + ambient
+        out = model.response(electrons + noise.dark_dn_per_s / noise.gain * exposures)
         lit = out * noise.gain - noise.dark_dn_per_s * exposures
         shift = np.array([study.offset(p.captures[0], effects) for p in points])
         slopes = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
@@ -127,7 +123,7 @@ def chart_block(study: Study) -> Block:
         labels=tuple(
             Label(float(names[p.name]), p.channel, p.name, tuple(c.id for c in p.captures), p.held_out) for p in points
         ),
-        hooks=(UNIFORM_HOOKS - {"drift"}) | SPECTRAL_HOOKS | {"veil"},
+        reads=(LEVEL - {"light.level"}) | SPECTRAL | {"image.veils"},
         predict=predict,
         scale=signal,
         places="patches",
@@ -202,7 +198,7 @@ def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatA
     return np.asarray(blurred[: plane.shape[0], : plane.shape[1]] - plane)
 
 
-def _mixing(study: Study, points: list[Patch], electrons: FloatArray, effects: Effects) -> FloatArray:
+def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:
     """Factors on the patches by effects that move charge between the channels of a uniform patch."""
     factor = np.ones(len(points))
     by_patch: dict[tuple[str, str], dict[str, int]] = {}
@@ -210,7 +206,7 @@ def _mixing(study: Study, points: list[Patch], electrons: FloatArray, effects: E
         by_patch.setdefault((p.captures[0].id, p.name), {})[p.channel] = i
     for members in by_patch.values():
         if len(members) == len(study.channels):
-            mixed = mixed_charge({c: float(electrons[i]) for c, i in members.items()}, 1.0, effects, study.camera)
+            mixed = model.mixing({c: float(electrons[i]) for c, i in members.items()})
             for c, i in members.items():
                 factor[i] = mixed.get(c, 1.0)
     return factor
@@ -293,22 +289,19 @@ def screen_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         shift = halo_light([p.around for p in points], effects, camera)
-        if any(type(e).response is not Effect.response for e in effects):
+        model = Uniform(camera, effects)
+        if not model.is_linear:
             low = np.maximum(tail, 0.0) / noise.gain
             base = np.array([p.black for p in points]) / noise.gain
-            high = base + low
-            for effect in effects:
-                base, high = effect.response(base, camera), effect.response(high, camera)
-            shift = (high - base) * noise.gain - tail
-        copied = [e for e in effects if type(e).image is not Effect.image]
-        if copied:
-            shift = shift + np.array([_copied(p, copied, camera) for p in points])
-        return Prediction(wide_contrast(effects, camera) * tail + even_share(effects) * lift + shift, {})
+            shift = (model.response(base + low) - model.response(base)) * noise.gain - tail
+        if any(act_on(effects, REFLECTIONS)):
+            shift = shift + np.array([_copied(p, effects, camera) for p in points])
+        return Prediction(wide_contrast(camera, effects) * tail + even_share(camera, effects) * lift + shift, {})
 
     return Block(
         measurement="screen", axis="level", unit="DN", reach=1e9, value=value, covariance=covariance,
         labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
-        hooks=frozenset({"veil", "response", "image"}), predict=predict, scale=np.array([p.white for p in points]),
+        reads=REFLECTIONS | {"image.veils", "signal.response"}, predict=predict, scale=np.array([p.white for p in points]),
         conditions="pattern", places="dark squares",
     )  # fmt: skip
 
@@ -334,9 +327,7 @@ class _DarkSquares:
 
 def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> float:
     """What effects on the whole image bring into the dark squares, DN."""
-    shown = squares.picture
-    for effect in effects:
-        shown = effect.image(shown, camera)
+    shown = with_reflections(camera, squares.picture, effects)
     return float(shown[squares.use].mean() - squares.picture[squares.use].mean())
 
 

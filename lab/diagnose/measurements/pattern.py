@@ -10,9 +10,9 @@ import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.neighbours import held_out_flats
-from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, Block, Effects, Label, Prediction, Study
+from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, Block, Effects, Label, Prediction, Study, act_on
 from lab.errors import NotDetermined
-from sim.effects.base import Effect
+from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -162,13 +162,13 @@ def green_block(study: Study) -> Block:
     cells = len(value) - len(ratios)
 
     def predict(effects: Effects) -> Prediction:
-        acting = [e for e in effects if type(e).lit is not Effect.lit or type(e).charge is not Effect.charge]
-        found = [_predicted_ratio(r, acting, study) if acting else 0.0 for r in ratios]
+        acting = any(act_on(effects, GREENS))
+        found = [_predicted_ratio(r, effects, study) if acting else 0.0 for r in ratios]
         return Prediction(np.concatenate([found, np.zeros(cells)]), {})
 
     return Block(
         measurement="green_balance", axis="wavelength", unit="nm", reach=25.0, value=value, covariance=covariance, labels=tuple(labels),
-        hooks=frozenset({"lit", "charge"}), predict=predict, scale=np.ones(len(value)),
+        reads=GREENS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -232,14 +232,15 @@ def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
     return found
 
 
+#: Quantities of the stages that even light's fine structure depends on.
+GREENS = frozenset({"light.rows", "charge.collected", "charge.kernels"})
+
+
 def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:
     shape = TILE_ROWS, TILE_COLS
     electrons = {c: np.full(shape, max(m, 0.0) / study.noise.gain) for c, m in ratio.mean.items()}
     tile = mosaic.assemble(electrons, study.camera.cfa)
-    for effect in effects:
-        tile = effect.lit(tile, ratio.exposure_s, ratio.elapsed_s, study.camera)
-    for effect in effects:
-        tile = effect.charge(tile, ratio.exposure_s, study.camera)
+    tile = collected_mosaic(study.camera, tile, effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s)
     planes = mosaic.planes(tile, study.camera.cfa)
     return float(planes["G1"].mean() / max(float(planes["G2"].mean()), 1e-9)) - 1.0
 
@@ -285,7 +286,7 @@ def line_block(study: Study) -> Block:
                 covariance[i, j] = covariance[j, i] = min(max(whole[k][0] - whole[k][1], 0.0) for k in (i, j))
     return Block(
         measurement="flat_lines", axis="field", unit="px", reach=1.0, value=np.array(values), covariance=covariance, labels=tuple(labels),
-        hooks=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), {}), scale=np.ones(len(values)),
+        reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), {}), scale=np.ones(len(values)),
     )  # fmt: skip
 
 

@@ -29,16 +29,29 @@ from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
-from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, held_out_of
+from lab.diagnose.measurements.summaries import (
+    REFLECTIONS,
+    SHIFT,
+    SHOWN,
+    Block,
+    Effects,
+    Label,
+    Prediction,
+    Study,
+    act_on,
+    held_out_of,
+)
 from lab.errors import NotDetermined
 from lab.fit.psf.drawn_pattern import area_drawn
 from lab.fit.psf.screen_registration import ScreenWarp, register
 from sim.camera import CameraModel
 from sim.effects.base import Effect
-from sim.forward import common_wavelengths, optical_transfer, transfer_at
+from sim.frame import screen_light, with_reflections
 from sim.optics.diffraction import aperture_otf
+from sim.point import TRANSFER, common_wavelengths, displaced_um, optical_transfer, transfer_at
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import Uniform
 
 OVERSAMPLE = 4
 LARGEST_PX = 320  # a side of the part that is looked at: enough for a band's contrast to 1e-3
@@ -266,8 +279,7 @@ def _turned_by(
 
     def coefficient(effects: Effects) -> float:
         shown, white = picture, lit
-        for effect in effects:
-            shown, white = effect.image(shown, study.camera), effect.image(white, study.camera)
+        shown, white = (with_reflections(study.camera, image, effects) for image in (shown, white))
         after = shown[window][design.mask] / np.maximum(white[window][design.mask], 1e-6)
         return float(weight @ (after - before))
 
@@ -284,7 +296,7 @@ def _shown_by(study: Study, design: _Design, canvas: _Canvas) -> Callable[[Effec
         return np.asarray(design.inverse @ (design.columns @ change[design.mask]))
 
     def coefficients(effects: Effects) -> FloatArray:
-        acting = tuple(e for e in effects if type(e).screen is not Effect.screen)
+        acting = tuple(e for e, on in zip(effects, act_on(effects, SHOWN), strict=True) if on)
         return changed(acting) if acting else none
 
     return coefficients
@@ -353,8 +365,7 @@ class _Canvas:
             for w, n, whole in zip(self.window, self.fine.shape, (camera.rows, camera.cols), strict=True)
         )
         shown, lit = self.fine, np.ones_like(self.fine)
-        for effect in effects:
-            shown, lit = (effect.screen(part, x[None, :], y[:, None], camera) for part in (shown, lit))
+        shown, lit = (screen_light(camera, part, x[None, :], y[:, None], effects) for part in (shown, lit))
         return self._below(np.asarray(fft.rfft2(shown / lit)))
 
     def _below(self, whole: NDArray[np.complex128]) -> NDArray[np.complex128]:
@@ -645,7 +656,7 @@ def contrast_block(study: Study) -> Block:
 
     return Block(
         measurement="bernoulli", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=covariance,
-        labels=tuple(labels), hooks=frozenset({"transfer", "transmittance", "screen"}), predict=predict,
+        labels=tuple(labels), reads=TRANSFER | SHOWN | {"image.transmittance"}, predict=predict,
         scale=np.ones(len(value)), conditions="orientation", conditions_words="patterns' parts at",
     )  # fmt: skip
 
@@ -712,14 +723,12 @@ def rim_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         mean = np.zeros(len(points))
-        bent = any(type(e).response is not Effect.response for e in effects)
+        model = Uniform(study.camera, effects)
         for k, (_, p, b) in enumerate(points):
             mean[k] = p.shown_by(effects)[b]
-            if bent:
+            if not model.is_linear:
                 low, high = p.levels_e
-                out = np.array([low, 0.5 * (low + high), high])
-                for effect in effects:
-                    out = effect.response(out, study.camera)
+                out = model.response(np.array([low, 0.5 * (low + high), high]))
                 # a bend a y (1 - y) lifts the middle by a / 4
                 mean[k] += 4.0 * float((out[1] - out[0]) / (out[2] - out[0]) - 0.5)
         return Prediction(mean, {})
@@ -728,7 +737,7 @@ def rim_block(study: Study) -> Block:
         measurement="screen_rims", axis="level", unit="1", reach=1e9, value=value,
         covariance=_joint(points, study) + np.diag(np.full(len(value), RIM_FLOOR**2)),
         labels=tuple(Label(float(i), p.channel, "rims of cells", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
-        hooks=frozenset({"screen", "response"}), predict=predict, scale=np.ones(len(value)), places="rims",
+        reads=SHOWN | {"signal.response"}, predict=predict, scale=np.ones(len(value)), places="rims",
     )  # fmt: skip
 
 
@@ -738,14 +747,14 @@ def turned_block(study: Study) -> Block:
     value = np.array([p.value[b] for _, p, b in points])
 
     def predict(effects: Effects) -> Prediction:
-        acting = [e for e in effects if type(e).image is not Effect.image]
-        return Prediction(np.array([p.turned(acting) if acting else 0.0 for _, p, _ in points]), {})
+        acting = any(act_on(effects, REFLECTIONS))
+        return Prediction(np.array([p.turned(effects) if acting else 0.0 for _, p, _ in points]), {})
 
     return Block(
         measurement="turned_copy", axis="level", unit="1", reach=1e9, value=value,
         covariance=_joint(points, study) + np.diag(np.full(len(value), TURNED_FLOOR**2)),
         labels=tuple(Label(float(i), p.channel, "pattern turned over", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
-        hooks=frozenset({"image"}), predict=predict, scale=np.ones(len(value)), places="copies",
+        reads=REFLECTIONS, predict=predict, scale=np.ones(len(value)), places="copies",
     )  # fmt: skip
 
 
@@ -791,7 +800,7 @@ def colour_block(study: Study) -> Block:
     return Block(
         measurement="lateral_colour", axis="field", unit="half diagonals", reach=0.5, value=np.concatenate(values),
         covariance=covariance + np.diag(np.full(3 * n, COLOUR_FLOOR_PX**2)), labels=tuple(labels),
-        hooks=frozenset({"image_shift_um"}), predict=predict, scale=np.ones(3 * n), conditions="direction",
+        reads=SHIFT, predict=predict, scale=np.ones(3 * n), conditions="direction",
     )  # fmt: skip
 
 
@@ -807,15 +816,14 @@ def colour_shift_px(
     x, y = distance * half_um * np.cos(turn), distance * half_um * np.sin(turn)
     outwards = np.zeros(len(wavelength))
     for i, w in enumerate(wavelength):
-        for effect in effects:
-            shift = effect.image_shift_um(x, y, float(w), camera)
-            if shift is not None:
-                outwards[i] += float(np.mean(shift[0] * np.cos(turn) + shift[1] * np.sin(turn)))
+        shift = displaced_um(camera, x, y, float(w), effects)
+        if shift is not None:
+            outwards[i] = float(np.mean(shift[0] * np.cos(turn) + shift[1] * np.sin(turn)))
     if not outwards.any():
         return 0.0
     radiance = np.ones_like(wavelength) if light is None else light.at(wavelength)
-    for effect in effects:
-        radiance = effect.radiance(wavelength, radiance, kind) * effect.transmittance(wavelength, 0.0)
+    model = Uniform(camera, effects)
+    radiance = model.radiance(wavelength, radiance, kind) * model.transmittance(wavelength)
     seen = [radiance * wavelength * camera.quantum_efficiency[c].at(wavelength) for c in (channel, "G")]
     own, green = (float(s @ outwards / max(s.sum(), 1e-300)) for s in seen)
     return (own - green) / camera.pixel_pitch_um
@@ -863,9 +871,7 @@ def grid_block(study: Study) -> Block:
     x, y = np.meshgrid(half, half)
 
     def predict(effects: Effects) -> Prediction:
-        shown = np.ones_like(x)
-        for effect in effects:
-            shown = effect.screen(shown, x, y, study.camera)
+        shown = screen_light(study.camera, np.ones_like(x), x, y, effects)
         size = 2.0 * float(np.std(shown)) / float(np.mean(shown))
         return Prediction(
             np.array(
@@ -878,7 +884,7 @@ def grid_block(study: Study) -> Block:
         measurement="screen_grid", axis="spatial_frequency", unit="cy/px", reach=1e9,
         value=np.array([line.normal(line.power) for line in found]), covariance=GRID_STD**2 * np.eye(len(found)),
         labels=tuple(Label(line.cycles_per_px, line.channel, "lit screen", line.captures, False) for line in found),
-        hooks=frozenset({"screen"}), predict=predict, scale=np.ones(len(found)),
+        reads=SHOWN, predict=predict, scale=np.ones(len(found)),
     )  # fmt: skip
 
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from lab.diagnose.measurements.neighbours import held_out_flats
 from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
-from lab.diagnose.measurements.veils import even_share
 from lab.errors import NotDetermined
-from lab.predict.camera_model import Field
 from sim.camera import CameraModel
+from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.uniform import SHADING, FieldPoints, Uniform
 
 ROWS, COLS = 6, 8
 SHADING_FLOOR = 2e-4  # of a cell, alike in its repeats: cos^4 at a cell's points, response at a cell's mean
@@ -67,7 +67,7 @@ def shading_block(study: Study) -> Block:
         value=np.concatenate([p.cells for p in planes]), covariance=_covariance(planes),
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures), p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        hooks=frozenset({"illumination", "response", "veil"}), predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
+        reads=SHADING | {"signal.response", "image.veils"}, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
 
@@ -174,11 +174,11 @@ def _covariance(planes: Sequence[_Plane]) -> FloatArray:
 _POINTS, _SHARES = np.polynomial.legendre.leggauss(3)
 
 
-def _cell_points(camera: CameraModel, off_row_px: float, off_col_px: float) -> Field:
+def _cell_points(camera: CameraModel, off_row_px: float, off_col_px: float) -> FieldPoints:
     row = ((np.arange(ROWS)[:, None] + 0.5 + 0.5 * _POINTS) / ROWS).ravel() * camera.rows - 0.5 - off_row_px
     col = ((np.arange(COLS)[:, None] + 0.5 + 0.5 * _POINTS) / COLS).ravel() * camera.cols - 0.5 - off_col_px
     grid_row, grid_col = np.meshgrid(row, col, indexing="ij")
-    return Field.at(camera, grid_row.ravel(), grid_col.ravel())
+    return FieldPoints.at(camera, grid_row.ravel(), grid_col.ravel())
 
 
 def _cell_means(value: FloatArray) -> FloatArray:
@@ -187,17 +187,16 @@ def _cell_means(value: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("iajb,a,b->ij", parts, 0.5 * _SHARES, 0.5 * _SHARES).ravel())
 
 
-def _shaded(planes: Sequence[_Plane], place: Field, effects: Effects, study: Study) -> FloatArray:
+def _shaded(planes: Sequence[_Plane], place: FieldPoints, effects: Effects, study: Study) -> FloatArray:
     """Cells of every plane relative to their mean, (planes x cells,)."""
-    light = _cell_means(place.under(study.camera, effects).light)
+    model = Uniform(study.camera, effects)
+    light = _cell_means(model.field(place).light)
     # a veil evens out what the lens's fall-off leaves
-    even = even_share(effects)
+    even = even_share(study.camera, effects)
     light = (1.0 - even) * light + even * light.mean()
     found = []
     for plane in planes:
-        electrons = light / light.mean() * plane.level_e
-        for effect in effects:
-            electrons = effect.response(electrons, study.camera)
+        electrons = model.response(light / light.mean() * plane.level_e)
         found.append(electrons / electrons.mean())
     return np.concatenate(found)
 

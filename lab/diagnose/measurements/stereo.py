@@ -25,6 +25,7 @@ from lab.fit.geometry.bundle_adjustment import board_pose
 from lab.fit.geometry.calibration import Calibration, calibrate_robustly
 from lab.fit.geometry.pinhole import project
 from sim.camera import Side
+from sim.frame import right_delay_s, right_over_left
 from sim.optics.illumination import relative_illumination
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -111,12 +112,12 @@ def scene_gain_block(study: Study) -> Block:
     covariance = covariance + np.diag(np.full(len(values), OWN_STD**2))
 
     def predict(effects: Effects) -> Prediction:
-        gain = float(np.prod([e.scene_gain() for e in effects]))
+        gain = right_over_left(study.camera, effects)
         return Prediction(np.full(len(values), np.log(max(gain, 1e-6))), {})
 
     return Block(
         measurement="stereo_gain", axis="level", unit="1", reach=1e9, value=np.array(values), covariance=covariance,
-        labels=tuple(labels), hooks=frozenset({"scene_gain"}), predict=predict, scale=np.ones(len(values)),
+        labels=tuple(labels), reads=frozenset({"light.pair_gain"}), predict=predict, scale=np.ones(len(values)),
         conditions="scene", places="scenes",
     )  # fmt: skip
 
@@ -268,14 +269,14 @@ def time_block(study: Study) -> Block:
     }
 
     def predict(effects: Effects) -> Prediction:
-        return Prediction(sum(e.capture_delay_s() for e in effects) * speed, pointing)
+        return Prediction(right_delay_s(study.camera, effects) * speed, pointing)
 
     return Block(
         measurement="stereo_time", axis="time", unit="px/s", reach=1e9, value=gaps, covariance=np.diag(noise + SHIFT_STD_PX**2),
         labels=tuple(
             Label(float(v), "Y", pose, (a.capture.id, b.capture.id), i % 3 == 1) for i, (v, (pose, a, b)) in enumerate(zip(speed, pairs, strict=True))
         ),
-        hooks=frozenset({"capture_delay_s"}), predict=predict, scale=np.ones(len(pairs)),
+        reads=frozenset({"light.pair_delay_s"}), predict=predict, scale=np.ones(len(pairs)),
     )  # fmt: skip
 
 

@@ -21,11 +21,12 @@ from lab.capture_kinds.base import Capture
 from lab.errors import NotDetermined
 from lab.fit.rounding import unrounded
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.predict.camera_model import Field
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
+from sim.effects.library import changed_by, may_change
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import FieldPoints, Uniform
 
 Effects = Sequence[Effect]
 T = TypeVar("T")
@@ -76,7 +77,7 @@ class Block:
     value: FloatArray
     covariance: FloatArray
     labels: tuple[Label, ...]
-    hooks: frozenset[str]  # hooks of an effect that can change the prediction
+    reads: frozenset[str]  # quantities of the stages (`sim.stages`) that the prediction depends on
     predict: Callable[[Effects], Prediction]
     scale: FloatArray  # size of a discrepancy of 1, (n,)
     along: FloatArray | None = (
@@ -96,15 +97,16 @@ class Block:
 
     def touched_by(self, effect: type[Effect]) -> bool:
         """Whether the effect acts on anything that this measurement sees."""
-        return any(getattr(effect, hook) is not getattr(Effect, hook) for hook in self.hooks)
+        return not self.reads.isdisjoint(may_change(effect))
 
 
-SPECTRAL_HOOKS = frozenset({"radiance", "transmittance"})
-UNIFORM_HOOKS = frozenset(
-    {"codes", "drift", "exposure", "illumination", "ambient_e_per_s", "charge", "response", "offset_dn"}
-)
 #: Of measurements in whose prediction the frame before enters.
-SEQUENCE_HOOKS = frozenset({"left_behind"})
+LAG = frozenset({"charge.lag"})
+#: Of measurements of patterns: what a screen shows of what it is asked for, and reflections of the whole image.
+SHOWN = frozenset({"light.screen"})
+REFLECTIONS = frozenset({"image.copies"})
+#: Of measurements of where light lands.
+SHIFT = frozenset({"image.shift"})
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ class Study:
         warm = [c.temperature_c for c in recordings.captures(side=side) if c.temperature_c is not None]
         #: The sensor's, at most captures; None where none is stated.
         self.temperature_c = float(np.median(warm)) if warm else None
-        self.field = Field.of(camera)
+        self.field = FieldPoints.of(camera)
         if saturation_dn is None:
             self.saturation_dn = _saturation(self)
         self.noise: NoiseGuess = noise_guess(self)
@@ -273,24 +275,19 @@ class Study:
     def carried_e(self, capture: Capture, channel: str, effects: Effects) -> float:
         """By how many electrons a channel's mean changes where charge is left behind, given what was read of it and of the capture
         before: read is y_t = (1 - q) x_t + q y_(t-1), of which q (y_(t-1) - y_t) is new. The first one follows empty pixels."""
-        lagging = [e for e in effects if type(e).left_behind is not Effect.left_behind]
-        if not lagging:
+        if not any(act_on(effects, LAG)):
             return 0.0
+        model = Uniform(self.camera, effects)
         before = self._before.get(capture.id)
         read, left = (
             max(self.levels(c).whole[channel] - self.noise.black, 0.0) / self.noise.gain if c is not None else 0.0
             for c in (capture, before)
         )
-        return float(
-            sum(
-                np.mean(e.left_behind(np.array([left]), self.camera) - e.left_behind(np.array([read]), self.camera))
-                for e in lagging
-            )
-        )
+        return float(np.mean(model.lag_e(np.array([left])) - model.lag_e(np.array([read]))))
 
     def offset(self, capture: Capture, effects: Effects) -> float:
         elapsed = self.elapsed_s(capture)
-        return sum(e.offset_dn(elapsed, capture.temperature_c, self.camera) for e in effects)
+        return Uniform(self.camera, effects).offset_dn(elapsed, capture.temperature_c)
 
     def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
         """Slopes by black level and dark current, whose priors are a few of their first guess's uncertainties."""
@@ -581,5 +578,6 @@ def held_out_of(group: Sequence[Capture], index: int, groups: int) -> set[str]:
     return {group[0].id} if groups >= 3 and index % 3 == 1 else set()
 
 
-def overrides(effect: Effect, hooks: frozenset[str]) -> bool:
-    return any(getattr(type(effect), hook) is not getattr(Effect, hook) for hook in hooks)
+def act_on(effects: Effects, reads: frozenset[str]) -> list[bool]:
+    """Of each effect, whether it changes any of these quantities of the stages."""
+    return [not reads.isdisjoint(changed_by(effect)) for effect in effects]

@@ -12,25 +12,22 @@ from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.curves import CurveSlopes
 from lab.diagnose.measurements.neighbours import held_out_flats
 from lab.diagnose.measurements.summaries import (
+    LAG,
     LEVEL_REACH,
     NARROWBAND_FLOOR,
-    SEQUENCE_HOOKS,
-    SPECTRAL_HOOKS,
-    UNIFORM_HOOKS,
     Block,
     Effects,
     Label,
     Prediction,
     Study,
+    act_on,
     held_out_of,
-    overrides,
     repeated_levels,
 )
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
-from lab.predict.camera_model import collected_electrons, mean_dn
-from sim.forward import electron_rate
 from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import LEVEL, SPECTRAL, Uniform, electron_rate
 
 LEVEL_FLOOR = 1.0e-4  # of a level, one for its repeats: non-linearity below what a linear camera may have, and rounding
 READING_COLOUR_STD = 5e-4  # of a lamp's reading, by channel: the radiometer's noise by wavelength
@@ -72,26 +69,24 @@ def linearity_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         changed = relative
-        if any(overrides(e, SPECTRAL_HOOKS) for e in effects):
+        if any(act_on(effects, SPECTRAL)):
             changed = {}
             for (path, channel), share in relative.items():
                 below = electron_rate(study.camera, channel, study.spectrum(path))
                 above = electron_rate(study.camera, channel, study.spectrum(path), effects)
                 changed[path, channel] = share * (above / below if below > 0 else 1.0)
-        field = study.field.under(study.camera, effects)
+        model = Uniform(study.camera, effects)
+        field = model.field(study.field)
         mean, lit = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
         for i, (capture, channel, _, _) in enumerate(points):
             if capture.id not in done:
                 lamp, elapsed = study.lamps[capture.radiance], study.elapsed_s(capture)
                 rates = {c: rate[lamp, c] * changed[capture.radiance, c] for c in study.channels if (lamp, c) in rate}
-                collected = collected_electrons(
-                    study.camera, rates, capture.exposure_s, effects, field=field, elapsed_s=elapsed
-                )
-                done[capture.id] = mean_dn(study.camera, collected, effects)
+                collected = model.electrons(rates, capture.exposure_s, field=field, elapsed_s=elapsed)
+                done[capture.id] = model.mean_dn(collected)
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
-            carried = noise.gain * study.carried_e(capture, channel, effects)
-            mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
+            mean[i] = done[capture.id][channel] + _beside_light(study, capture, channel, effects)
         slopes = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
         for lamp, channel in rate:
             slopes[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
@@ -107,8 +102,14 @@ def linearity_block(study: Study) -> Block:
     return Block(
         measurement="photon_transfer", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
-        hooks=UNIFORM_HOOKS | SEQUENCE_HOOKS, predict=predict, scale=signal,
+        reads=LEVEL | LAG, predict=predict, scale=signal,
     )  # fmt: skip
+
+
+def _beside_light(study: Study, capture: Any, channel: str, effects: Effects) -> float:
+    """DN of a channel's mean that isn't light's: black level, image lag, offsets."""
+    lag_dn = study.noise.gain * study.carried_e(capture, channel, effects)
+    return study.noise.black + lag_dn + study.offset(capture, effects)
 
 
 def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
@@ -204,37 +205,31 @@ def narrowband_block(study: Study) -> Block:
         return slopes | {k: v * share for k, v in curves.slopes(effects).items()}
 
     def predict(effects: Effects) -> Prediction:
-        camera = study.camera
         rates = curves.rates(effects)
-        if not any(overrides(e, UNIFORM_HOOKS | SEQUENCE_HOOKS) for e in effects):
+        if not any(act_on(effects, LEVEL | LAG)):
             # what acts on the light's colours alone leaves signals in proportion to its rates
             share = noise.gain * float(study.field.light.mean()) * exposures
             return Prediction(noise.black + noise.dark_dn_per_s * exposures + share * rates, slopes_of(effects, share))
         lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
-        field = study.field.under(camera, effects)
+        model = Uniform(study.camera, effects)
+        field = model.field(study.field)
         mean, share = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
         for i, (capture, channel, _, _) in enumerate(points):
             if capture.id not in done:
                 by_channel = dict(zip(known, lit[capture.radiance].tolist(), strict=True))
-                electrons = collected_electrons(
-                    camera,
-                    by_channel,
-                    capture.exposure_s,
-                    effects,
-                    field=field,
-                    elapsed_s=study.elapsed_s(capture),
+                electrons = model.electrons(
+                    by_channel, capture.exposure_s, field=field, elapsed_s=study.elapsed_s(capture)
                 )
-                done[capture.id] = mean_dn(camera, electrons, effects)
-            carried = noise.gain * study.carried_e(capture, channel, effects)
-            mean[i] = noise.black + done[capture.id][channel] + carried + study.offset(capture, effects)
+                done[capture.id] = model.mean_dn(electrons)
+            mean[i] = done[capture.id][channel] + _beside_light(study, capture, channel, effects)
             share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
         return Prediction(mean, slopes_of(effects, share))
 
     return Block(
         measurement="narrowband", axis="wavelength", unit="nm", reach=25.0, value=value, covariance=covariance,
         labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
-        hooks=UNIFORM_HOOKS | SEQUENCE_HOOKS | SPECTRAL_HOOKS, predict=predict, scale=np.maximum(signal, 1.0),
+        reads=LEVEL | LAG | SPECTRAL, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
 
 

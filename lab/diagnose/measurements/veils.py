@@ -11,40 +11,18 @@ from scipy import fft
 
 from lab.diagnose.measurements.summaries import Effects
 from sim.camera import CameraModel
+from sim.point import halos
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 LOWEST = 48  # harmonics of a frame: all that a halo of a fifth of its half diagonal leaves of a picture
 
 
-def even_share(effects: Effects) -> float:
-    """Of the light: what the effects spread evenly over the frame."""
-    return 1.0 - float(np.prod([1.0 - e.veil() for e in effects]))
-
-
-def halos(effects: Effects, camera: CameraModel) -> list[tuple[float, float]]:
-    """Share and standard deviation (px) of what effects spread about its place."""
-    found = [e.halo(camera) for e in effects]
-    return [(share, std_um / camera.pixel_pitch_um) for share, std_um in found if share > 0.0]
-
-
-def wide_contrast(
-    effects: Effects, camera: CameraModel, frequency_cy_per_px: FloatArray | float = np.inf
-) -> FloatArray:
-    """Contrast that the effects leave at a frequency that the frame holds; as it stands to anything smaller than their halos."""
-    left: FloatArray = np.ones(np.shape(frequency_cy_per_px))
-    for e in effects:
-        share, std_um = e.halo(camera)
-        kept = np.exp(-2.0 * np.square(np.pi * std_um / camera.pixel_pitch_um * frequency_cy_per_px))
-        left = left * (1.0 - e.veil() - share * (1.0 - kept))
-    return left
-
-
 def halo_light(places: Sequence[Surroundings], effects: Effects, camera: CameraModel) -> FloatArray:
     """What the effects' halos bring from around to places in planes of the mosaic, (places,), in the planes' unit."""
     step = mosaic.step(camera.cfa)
     found = np.zeros(len(places))
-    for share, std_px in halos(effects, camera):
+    for share, std_px in halos(camera, effects):
         found += share * np.array([place.mean(std_px / step) for place in places])
     return found
 

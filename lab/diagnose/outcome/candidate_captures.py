@@ -16,11 +16,11 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
 from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, LAMP_FLOOR, NARROWBAND_FLOOR
 from lab.formats.recording_set import RecordingSet
-from lab.predict.camera_model import Field, collected_electrons, mean_dn
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
-from sim.forward import electron_rate, optical_transfer
+from sim.point import optical_transfer
 from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import FieldPoints, Uniform, electron_rate
 
 #: Size of a capture that is assumed: pixels of a channel, repeats, and the brightest channel's electrons over the full well.
 PIXELS, REPEATS, FILLED = 2e4, 4, 0.6
@@ -83,11 +83,11 @@ def _exposed(camera: CameraModel, light: Spectrum, kind: str = "flat") -> float:
 def _means(h: Hypothesis, light: Spectrum, kind: str, exposure_s: float, elapsed_s: float = 0.0) -> dict[str, float]:
     """Mean electrons of uniform light by channel, after the read-out."""
     rates = {c: electron_rate(h.camera, c, light, h.effects, kind) for c in h.camera.channels}
-    collected = collected_electrons(
-        h.camera, rates, exposure_s, h.effects, field=Field.of(h.camera).under(h.camera, h.effects), elapsed_s=elapsed_s
-    )
+    model = Uniform(h.camera, h.effects)
+    field = model.field(FieldPoints.of(h.camera))
+    collected = model.electrons(rates, exposure_s, field=field, elapsed_s=elapsed_s)
     gain = h.camera.conversion_gain_dn_per_e
-    return {c: value / gain for c, value in mean_dn(h.camera, collected, h.effects).items()}
+    return {c: value / gain for c, value in model.mean_dn(collected).items()}
 
 
 def _narrowband(camera: CameraModel) -> Iterator[Design]:
@@ -166,9 +166,7 @@ def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
         def predict(h: Hypothesis, steps: list[tuple[Spectrum, float]] = steps) -> FloatArray:
             levels = [list(_means(h, light, "flat", seconds).values()) for light, seconds in steps]
             mean = np.array(levels).T.ravel()
-            variance = mean + h.camera.read_noise_e**2
-            for effect in h.effects:
-                variance = effect.noise_e2(mean, variance, h.camera)
+            variance = Uniform(h.camera, h.effects).shot_e2(mean) + h.camera.read_noise_e**2
             return np.concatenate([mean, variance])
 
         mean, variance = np.split(predict(Hypothesis("", (), camera)), 2)
@@ -228,12 +226,9 @@ def _darks(camera: CameraModel) -> Iterator[Design]:
         def predict(h: Hypothesis, steps: list[tuple[float, float, float]] = steps) -> FloatArray:
             found = []
             for seconds, elapsed, temperature in steps:
-                dark: FloatArray | float = h.camera.dark_current_e_per_s
-                shift = 0.0
-                for effect in h.effects:
-                    dark = effect.dark_current(dark, temperature, h.camera)
-                    shift += effect.offset_dn(elapsed, temperature, h.camera)
-                found.append(float(np.mean(dark)) * seconds * gain + shift)
+                model = Uniform(h.camera, h.effects)
+                dark = float(np.mean(model.dark_e_per_s(temperature))) + model.mean_hot_e_per_s
+                found.append(dark * seconds * gain + model.offset_dn(elapsed, temperature))
             return np.array(found)
 
         seconds = np.array([s for s, _, _ in steps])

@@ -22,13 +22,13 @@ from sim.effects.nameless_correction import NamelessCorrection
 from sim.spectrum import FloatArray, Spectrum
 
 Applied = Literal["transfer", "sensitivity", "illumination", "response", "noise"]
-#: Stages on which a smooth factor can act: the stage, the axis of the measurement, and the hook that can change it.
+#: Stages on which a smooth factor can act: the stage, the axis of the measurement, and the quantity of the stages that changes it.
 PLACES: tuple[tuple[Applied, str, str], ...] = (
-    ("transfer", "spatial_frequency", "transfer"),
-    ("sensitivity", "wavelength", "transmittance"),
-    ("illumination", "field", "illumination"),
-    ("noise", "level", "noise_e2"),
-    ("response", "level", "response"),
+    ("transfer", "spatial_frequency", "image.transfer"),
+    ("sensitivity", "wavelength", "image.transmittance"),
+    ("illumination", "field", "image.shading"),
+    ("noise", "level", "charge.variance_e2"),
+    ("response", "level", "signal.response"),
 )
 #: Share of the largest signal below which the discrepancy's relative size isn't known.
 LEAST_CONTRAST = 0.05
@@ -123,7 +123,7 @@ def _place_for(block: Block) -> Applied | None:
     """The stage that a smooth factor along the measurement's axis can act on."""
     if block.places:
         return None
-    return next((kind for kind, axis, hook in PLACES if block.axis == axis and hook in block.hooks), None)
+    return next((kind for kind, axis, quantity in PLACES if block.axis == axis and quantity in block.reads), None)
 
 
 def _factor(

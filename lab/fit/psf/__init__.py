@@ -26,7 +26,7 @@ On recordings:
 - `expected_kernel`: the kernel that the estimator finds for a given transfer function; `photograph`: the kernel from a
   single photograph.
 
-A kernel is on the pixels of the sensor, as `sim.forward.kernel` defines it: element [half + i, half + j] is the
+A kernel is on the pixels of the sensor, as `sim.point.kernel` defines it: element [half + i, half + j] is the
 response i px down and j px right of light spread over one pixel.
 """
 

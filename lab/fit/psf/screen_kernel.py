@@ -49,7 +49,7 @@ class ScreenKernel:
         """Kernel on the pixels of the sensor that this estimator reports, noise-free and at this very place, for a
         predicted one.
 
-        `fine_kernel` is on the grid of `fine.kernel`: `sim.forward.kernel(..., support=len(fine.kernel),
+        `fine_kernel` is on the grid of `fine.kernel`: `sim.point.kernel(..., support=len(fine.kernel),
         oversample=oversample)`.
         """
         fine = self.fine

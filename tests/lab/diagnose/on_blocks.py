@@ -18,9 +18,10 @@ from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
-from sim.forward import Exposure, electron_rate, sample
+from sim.frame import Exposure, sample
 from sim.scene.scenes import Darkness, UniformField
 from sim.spectrum import Spectrum
+from sim.uniform import electron_rate
 
 UNIFORM = ("dark", "flat", "narrowband")
 WAVELENGTH = np.arange(380.0, 781.0)

@@ -26,6 +26,7 @@ from mocks.former import ConcealedCamera, Plan
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import candidates, effect, effects
+from sim.point import TRANSFER, Blur
 from sim.spectrum import Spectrum
 
 FREQUENCY = np.linspace(0.02, 0.9, 23)
@@ -45,12 +46,9 @@ CAMERA = _camera()
 
 
 def _transfer(acting: Sequence[Effect], angle: float) -> np.ndarray:
-    f = FREQUENCY / 3.0
-    value = np.exp(-2.0 * FREQUENCY)  # any baseline will do
-    for e in acting:
-        factor = e.transfer(f * np.cos(angle), f * np.sin(angle), 550.0, CAMERA)
-        value = value if factor is None else value * np.real(factor)
-    return value
+    blur = Blur(CAMERA, acting)  # over any baseline
+    factor = blur.beside_lens(550.0, FREQUENCY * np.cos(angle), FREQUENCY * np.sin(angle))
+    return np.asarray(np.exp(-2.0 * FREQUENCY) * np.real(factor))
 
 
 def _model(rng: np.random.Generator, truth: Sequence[Effect] = (), extra: np.ndarray | float = 0.0) -> MeasurementModel:
@@ -63,7 +61,7 @@ def _model(rng: np.random.Generator, truth: Sequence[Effect] = (), extra: np.nda
     value = np.concatenate([_transfer(truth, a) + extra for a in angles]) + NOISE * rng.standard_normal(n)
     block = Block(
         measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=NOISE**2 * np.eye(n),
-        labels=labels, hooks=frozenset({"transfer"}), scale=np.ones(n),
+        labels=labels, reads=TRANSFER, scale=np.ones(n),
         predict=lambda acting: Prediction(np.concatenate([_transfer(acting, a) for a in angles]), {}),
     )  # fmt: skip
     return MeasurementModel((block,), CAMERA)
@@ -182,7 +180,7 @@ def _spectral(rng: np.random.Generator, extra: Callable[[np.ndarray], np.ndarray
     n = len(x)
     block = Block(
         measurement="narrowband", axis="wavelength", unit="nm", reach=40.0, value=extra(x) + NOISE * rng.standard_normal(n),
-        covariance=NOISE**2 * np.eye(n), labels=labels, hooks=frozenset({"transmittance"}), predict=lambda _: Prediction(np.zeros(n), {}),
+        covariance=NOISE**2 * np.eye(n), labels=labels, reads=frozenset({"image.transmittance"}), predict=lambda _: Prediction(np.zeros(n), {}),
         scale=np.ones(n),
     )  # fmt: skip
     return MeasurementModel((block,), CAMERA)

@@ -17,7 +17,7 @@ from lab.fit.spectral.recordings import fit_spectral
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet, read
 from lab.formats.results import NoiseFit, SpectralFit
 from sim.camera import CameraModel, Lens
-from sim.forward import Exposure, sample
+from sim.frame import Exposure, sample
 from sim.scene import Darkness, UniformField
 from sim.spectrum import PHOTON_ENERGY_J_NM, Spectrum
 

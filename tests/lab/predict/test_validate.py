@@ -20,7 +20,7 @@ from lab.predict.validate import validate
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed_laws
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
-from sim.forward import kernel, optical_transfer
+from sim.point import kernel, optical_transfer
 
 DISPLACEMENT_UM = 1.6
 

@@ -7,6 +7,7 @@ import pytest
 
 from sim.camera import CameraModel, Lens
 from sim.effects.ambient_light import AmbientLight
+from sim.effects.base import Effect
 from sim.effects.non_uniform_illumination import NonUniformIllumination
 from sim.effects.other_f_number import OtherFNumber
 from sim.effects.radiometer_nonlinearity import RIGHT_AT, RadiometerNonlinearity
@@ -15,8 +16,10 @@ from sim.effects.second_order_light import SecondOrderLight
 from sim.effects.source_drift import SourceDrift
 from sim.effects.vignetting import Vignetting
 from sim.effects.vignetting_decentre import VignettingDecentre
-from sim.forward import optical_transfer
+from sim.frame import screen_light
+from sim.point import optical_transfer
 from sim.spectrum import Spectrum
+from sim.uniform import Uniform
 
 WAVELENGTH = np.arange(380.0, 961.0)
 CAMERA = CameraModel(
@@ -29,60 +32,66 @@ HALF_UM = 100.0  # half the diagonal of 60 x 80 pixels of 2 um
 PLACE = np.linspace(-HALF_UM, HALF_UM, 9)
 
 
+def _light(one: Effect, x_um: np.ndarray, y_um: np.ndarray) -> np.ndarray:
+    return Uniform(CAMERA, (one,)).illuminated(np.ones(np.shape(x_um)), x_um, y_um)
+
+
 def test_vignetting_takes_its_share_in_the_corner_whatever_its_power() -> None:
     for power in (1.0, 2.0, 4.0):
         one = Vignetting(corner_loss_percent=8.0, exponent=power)
-        assert one.illumination(np.array(80.0), np.array(60.0), CAMERA) == pytest.approx(0.92)
-        assert one.illumination(np.array(40.0), np.array(30.0), CAMERA) == pytest.approx(1 - 0.08 * 0.5**power)
+        assert _light(one, np.array(80.0), np.array(60.0)) == pytest.approx(0.92)
+        assert _light(one, np.array(40.0), np.array(30.0)) == pytest.approx(1 - 0.08 * 0.5**power)
 
 
 def test_a_fall_off_off_the_centre_is_that_about_it_and_a_slope() -> None:
     """Square law: rho^2 - rho_0^2 = r^2 - 2 r . c."""
     one = VignettingDecentre(fall_off_percent=8.0, centre_x=0.3, centre_y=0.0)
     centred = Vignetting(corner_loss_percent=8.0)
-    expected = centred.illumination(PLACE, 0 * PLACE, CAMERA) + 0.08 * 2 * 0.3 * PLACE / HALF_UM
-    np.testing.assert_allclose(one.illumination(PLACE, 0 * PLACE, CAMERA), expected)
-    there = VignettingDecentre(fall_off_percent=8.0, exponent=3.0).illumination(PLACE, PLACE, CAMERA)
-    np.testing.assert_allclose(
-        there, Vignetting(corner_loss_percent=8.0, exponent=3.0).illumination(PLACE, PLACE, CAMERA)
-    )
+    expected = _light(centred, PLACE, 0 * PLACE) + 0.08 * 2 * 0.3 * PLACE / HALF_UM
+    np.testing.assert_allclose(_light(one, PLACE, 0 * PLACE), expected)
+    there = _light(VignettingDecentre(fall_off_percent=8.0, exponent=3.0), PLACE, PLACE)
+    np.testing.assert_allclose(there, _light(Vignetting(corner_loss_percent=8.0, exponent=3.0), PLACE, PLACE))
 
 
 def test_a_bow_lies_along_its_slope() -> None:
     one = NonUniformIllumination(gradient_x_percent=3.0, gradient_y_percent=4.0, bow=0.2)
     x, y = np.array([48.0, -24.0]), np.array([30.0, -45.0])
     s = 0.03 * x / 80.0 + 0.04 * y / 60.0
-    np.testing.assert_allclose(one.illumination(x, y, CAMERA), 1 + s + 0.2 * s**2 / 0.05)
+    np.testing.assert_allclose(_light(one, x, y), 1 + s + 0.2 * s**2 / 0.05)
 
 
 def test_a_warm_up_starts_as_a_drift_and_settles() -> None:
     steady, settling = SourceDrift(drift_percent_per_min=0.3), SourceDrift(drift_percent_per_min=0.3, settling_min=8.0)
-    assert settling.drift(1.0) - 1 == pytest.approx(steady.drift(1.0) - 1, rel=2e-3)
-    assert steady.drift(600.0) == pytest.approx(1.03, rel=1e-4)
-    assert settling.drift(36000.0) == pytest.approx(1 + 0.003 * 8.0)
+    assert Uniform(CAMERA, (settling,)).source(1.0) - 1 == pytest.approx(
+        Uniform(CAMERA, (steady,)).source(1.0) - 1, rel=2e-3
+    )
+    assert Uniform(CAMERA, (steady,)).source(600.0) == pytest.approx(1.03, rel=1e-4)
+    assert Uniform(CAMERA, (settling,)).source(36000.0) == pytest.approx(1 + 0.003 * 8.0)
 
 
 def test_second_order_brings_half_the_wavelength_with_its_share_of_the_power() -> None:
     line = np.exp(-0.5 * ((WAVELENGTH - 900.0) / 6.0) ** 2)
-    after = SecondOrderLight(share_percent=4.0).radiance(WAVELENGTH, line, "narrowband")
+    after = Uniform(CAMERA, (SecondOrderLight(share_percent=4.0),)).radiance(WAVELENGTH, line, "narrowband")
     blue = WAVELENGTH < 600.0
     assert after[blue].sum() == pytest.approx(0.04 * line.sum(), rel=1e-6)
     assert np.sum((after * WAVELENGTH)[blue]) / after[blue].sum() == pytest.approx(450.0)
-    np.testing.assert_array_equal(SecondOrderLight(share_percent=4.0).radiance(WAVELENGTH, line, "flat"), line)
+    np.testing.assert_array_equal(
+        Uniform(CAMERA, (SecondOrderLight(share_percent=4.0),)).radiance(WAVELENGTH, line, "flat"), line
+    )
 
 
 def test_a_radiometer_s_nonlinearity_is_a_power_of_the_level() -> None:
     one = RadiometerNonlinearity(exponent_percent=2.0)
     for level in (RIGHT_AT, 10 * RIGHT_AT):
         line = level * np.exp(-0.5 * ((WAVELENGTH - 600.0) / 6.0) ** 2)
-        ratio = one.radiance(WAVELENGTH, line, "narrowband")[220] / line[220]
+        ratio = Uniform(CAMERA, (one,)).radiance(WAVELENGTH, line, "narrowband")[220] / line[220]
         assert ratio == pytest.approx((level / RIGHT_AT) ** 0.02)
 
 
 def test_the_room_s_colour_leaves_green_as_it_is() -> None:
     one = AmbientLight(rate_e_per_s=100.0, red_over_blue=4.0)
-    assert [one.ambient_e_per_s(c, CAMERA) for c in "RGB"] == pytest.approx([200.0, 100.0, 50.0])
-    assert one.ambient_e_per_s("Y", CAMERA) == 100.0
+    assert [Uniform(CAMERA, (one,)).ambient_e(c, 1.0) for c in "RGB"] == pytest.approx([200.0, 100.0, 50.0])
+    assert Uniform(CAMERA, (one,)).ambient_e("Y", 1.0) == 100.0
 
 
 def test_a_screen_s_gamma_moves_the_edges_of_lit_cells() -> None:
@@ -91,12 +100,12 @@ def test_a_screen_s_gamma_moves_the_edges_of_lit_cells() -> None:
     x_um = (np.arange(400) - 199.5)[None, :] * 0.05 * CAMERA.pixel_pitch_um
     step = np.broadcast_to(x_um > 0, (4, 400)).astype(float)
     y_um = np.arange(4)[:, None] * 0.05 * CAMERA.pixel_pitch_um
-    shown = ScreenGamma(exponent=5.0, rim_px=0.4).screen(step, x_um, y_um, CAMERA)
+    shown = screen_light(CAMERA, step, x_um, y_um, (ScreenGamma(exponent=5.0, rim_px=0.4),))
     lost_px = 0.05 * float((step - shown)[0].sum())
     assert abs(lost_px - 1.16296 * 0.4) < 0.002  # samples of 0.05 px
-    assert ScreenGamma(rim_px=0.4).screen(step, x_um, y_um, CAMERA) is step
+    assert screen_light(CAMERA, step, x_um, y_um, (ScreenGamma(rim_px=0.4),)) is step
     assert (
-        ScreenGamma(exponent=1.05, rim_px=0.4).usual_nats() < -10.0 < ScreenGamma(exponent=2.0, rim_px=0.4).usual_nats()
+        ScreenGamma(exponent=1.05, rim_px=0.4).log_prior() < -10.0 < ScreenGamma(exponent=2.0, rim_px=0.4).log_prior()
     )
 
 

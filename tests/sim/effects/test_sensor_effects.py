@@ -18,8 +18,9 @@ from sim.effects.image_lag import ImageLag
 from sim.effects.light_flicker import LightFlicker
 from sim.effects.random_telegraph_noise import RandomTelegraphNoise
 from sim.effects.row_noise import RowNoise
-from sim.forward import (
+from sim.frame import (
     Exposure,
+    collected_mosaic,
     dark_electrons,
     expected,
     expected_electrons,
@@ -31,6 +32,8 @@ from sim.forward import (
 from sim.scene.scenes import Darkness, UniformField
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray, Spectrum
+from sim.stages import charge_of, signal_of
+from sim.uniform import Uniform
 
 LIGHT = Spectrum.of([500.0, 600.0], [2e-3, 2e-3])
 CAMERA = CameraModel(
@@ -89,7 +92,8 @@ def test_column_offsets_stay_and_have_no_mean() -> None:
     assert offset.std() == pytest.approx(6.0, rel=4.5 / np.sqrt(2 * 64))
     bright = expected(CAMERA, BRIGHT, (one,)) - expected(CAMERA, BRIGHT)
     np.testing.assert_allclose(bright[0] / 0.5, offset, atol=1e-2)  # the dark frame's noise rounds to 1e-2
-    assert np.any(ColumnNoise(offset_e=6.0, pattern_seed=1).added_e((48, 64), CAMERA) != one.added_e((48, 64), CAMERA))
+    (drawn,), (other,) = (signal_of(CAMERA, (e,)).lines for e in (one, ColumnNoise(offset_e=6.0, pattern_seed=1)))
+    assert np.any(drawn.mean_e((48, 64)) != other.mean_e((48, 64)))
 
 
 def test_hot_pixels_are_as_many_and_as_hot_as_stated() -> None:
@@ -113,9 +117,8 @@ def test_glow_falls_from_its_corner() -> None:
         "bottom_left": (47, 0),
         "bottom_right": (47, 63),
     }.items():
-        rate = np.asarray(
-            AmplifierGlow(glow_e_per_s=40.0, reach_mm=0.069, corner=corner).dark_current(10.0, None, CAMERA)
-        )
+        one = AmplifierGlow(glow_e_per_s=40.0, reach_mm=0.069, corner=corner)
+        rate = np.asarray(dark_electrons(CAMERA, Exposure(Darkness(), 1.0), (one,)))
         assert rate[at] == pytest.approx(50.0)
         assert rate.max() == rate[at]
         row = rate[at[0]] if at[1] == 0 else rate[at[0], ::-1]
@@ -175,11 +178,12 @@ def test_frames_of_a_sequence_are_drawn_around_its_means() -> None:
 
 def test_telegraph_pixels_have_two_levels() -> None:
     one = RandomTelegraphNoise(amplitude_e=40.0, share_percent=5.0)
-    drawn = np.stack([one.added((48, 64), np.random.default_rng(k), CAMERA) for k in range(400)])
+    (noise,) = signal_of(CAMERA, (one,)).random
+    drawn = np.stack([noise.draw((48, 64), np.random.default_rng(k)) for k in range(400)])
     blinking = np.any(drawn != 0, axis=0)
     assert blinking.sum() == round(0.05 * 48 * 64)
     assert set(np.unique(drawn[:, blinking])) == {-20.0, 20.0}
-    variance = np.asarray(one.added_e2((48, 64), CAMERA))
+    variance = np.asarray(noise.variance_e2((48, 64)))
     assert set(np.unique(variance)) == {0.0, 400.0}
     assert np.all(variance[blinking] == 400.0)
     # each half of the time: the mean of 400 x 154 signs
@@ -187,18 +191,19 @@ def test_telegraph_pixels_have_two_levels() -> None:
 
 
 def test_the_converters_bits_jump_where_they_stand() -> None:
-    one = AdcNonlinearity(error_dn=3.0, second_dn=-1.0, third_dn=0.5)
-    below, above = one.codes(np.array([2047.999, 2048.0]), CAMERA)
+    one = Uniform(CAMERA, (AdcNonlinearity(error_dn=3.0, second_dn=-1.0, third_dn=0.5),))
+    below, above = one.codes(np.array([2047.999, 2048.0]))
     # at half scale the highest bit comes and the two below it go
     assert above - below == pytest.approx(3.0 - (-1.0 + 0.5), abs=0.01)
-    assert one.codes(np.array([0.0]), CAMERA)[0] == 0.0
+    assert one.codes(np.array([0.0]))[0] == 0.0
     # nothing changes at code 2^bits: the last code has all bits
-    assert one.codes(np.array([4095.999]), CAMERA)[0] == pytest.approx(4095.999, abs=0.01)
+    assert one.codes(np.array([4095.999]))[0] == pytest.approx(4095.999, abs=0.01)
     # between jumps, a line
-    step = np.diff(one.codes(np.arange(1024.0, 1536.0), CAMERA))
+    step = np.diff(one.codes(np.arange(1024.0, 1536.0)))
     np.testing.assert_allclose(step, 1.0 - 2.5 / 4096.0, atol=1e-9)
-    two = AdcNonlinearity(error_dn=6.0, second_dn=-2.0, third_dn=1.0).codes(np.array([3000.0]), CAMERA) - 3000.0
-    assert two[0] == pytest.approx(2.0 * (one.codes(np.array([3000.0]), CAMERA)[0] - 3000.0))
+    twice = Uniform(CAMERA, (AdcNonlinearity(error_dn=6.0, second_dn=-2.0, third_dn=1.0),))
+    two = twice.codes(np.array([3000.0])) - 3000.0
+    assert two[0] == pytest.approx(2.0 * (one.codes(np.array([3000.0]))[0] - 3000.0))
 
 
 @pytest.mark.parametrize("at", [(20, 30), (24, 5)])
@@ -206,7 +211,7 @@ def test_blooming_conserves_charge_and_keeps_to_the_column(at: tuple[int, int]) 
     full = CAMERA.full_well_e
     before = np.full((48, 64), 500.0)
     before[at] = 6.0 * full
-    after = Blooming(share_percent=60.0).overflow(before, CAMERA)
+    after = charge_of(CAMERA, (Blooming(share_percent=60.0),)).overflown(before)
     assert after.sum() == pytest.approx(before.sum(), rel=1e-12)  # none reaches the rim
     changed = after != before
     assert set(np.flatnonzero(changed.any(axis=0))) == {at[1]}
@@ -222,12 +227,12 @@ def test_blooming_of_neighbours_adds_up_and_runs_off_the_frame() -> None:
     full = CAMERA.full_well_e
     before = np.zeros((10, 2))
     before[0, 0], before[1, 0] = 3.0 * full, 2.0 * full
-    after = Blooming(share_percent=100.0).overflow(before, CAMERA)
+    after = charge_of(CAMERA, (Blooming(share_percent=100.0),)).overflown(before)
     # downwards 1 + 0.5 full wells; upwards from row 1 through the full row 0, and from row 0, off the frame
     np.testing.assert_allclose(after[:, 0], [full, full, full, 0.5 * full, *[0.0] * 6])
     np.testing.assert_array_equal(after[:, 1], 0.0)
     even = np.full((10, 2), 0.9 * full)
-    np.testing.assert_array_equal(Blooming(share_percent=50.0).overflow(even, CAMERA), even)
+    np.testing.assert_array_equal(charge_of(CAMERA, (Blooming(share_percent=50.0),)).overflown(even), even)
 
 
 def test_greens_differ_by_their_ratio_and_keep_their_mean() -> None:
@@ -244,18 +249,22 @@ def test_greens_differ_by_their_ratio_and_keep_their_mean() -> None:
     np.testing.assert_array_equal(expected(CAMERA, BRIGHT, (GreenImbalance(imbalance_percent=3.0),)), expected(CAMERA, BRIGHT))  # fmt: skip
 
 
+def _lit(one: LightFlicker, even: FloatArray, exposure_s: float, elapsed_s: float) -> FloatArray:
+    return collected_mosaic(CAMERA, even, (one,), exposure_s=exposure_s, elapsed_s=elapsed_s)
+
+
 def test_flicker_has_its_period_its_null_and_its_mean() -> None:
     one = LightFlicker(modulation_percent=20.0, frequency_hz=100.0, line_time_us=100.0)
     even = np.full((200, 3), 1000.0)  # 200 rows of 0.1 ms: two periods
-    short = one.lit(even, 1e-6, 0.0, CAMERA)[:, 0]
+    short = _lit(one, even, 1e-6, 0.0)[:, 0]
     assert short.mean() == pytest.approx(1000.0, rel=1e-9)
     assert short.max() == pytest.approx(1200.0, rel=1e-5) and short.min() == pytest.approx(800.0, rel=1e-5)
     np.testing.assert_allclose(short[100:], short[:100], rtol=1e-9)
     for periods in (1, 2, 5):
-        np.testing.assert_allclose(one.lit(even, periods / 100.0, 0.3, CAMERA), even, rtol=1e-9)
+        np.testing.assert_allclose(_lit(one, even, periods / 100.0, 0.3), even, rtol=1e-9)
     # half a period later light and dark change places
-    np.testing.assert_allclose(one.lit(even, 1e-6, 0.005, CAMERA)[:, 0], 2000.0 - short, rtol=1e-6)
+    np.testing.assert_allclose(_lit(one, even, 1e-6, 0.005)[:, 0], 2000.0 - short, rtol=1e-6)
     # half a period long: sinc(1/2) = 2 / pi
-    assert one.lit(even, 0.005, 0.0, CAMERA).max() == pytest.approx(1000.0 * (1 + 0.2 * 2 / np.pi), rel=1e-3)
-    whole = LightFlicker(modulation_percent=20.0, line_time_us=0.0).lit(even, 0.002, 0.0013, CAMERA)
+    assert _lit(one, even, 0.005, 0.0).max() == pytest.approx(1000.0 * (1 + 0.2 * 2 / np.pi), rel=1e-3)
+    whole = _lit(LightFlicker(modulation_percent=20.0, line_time_us=0.0), even, 0.002, 0.0013)
     assert np.ptp(whole) == 0.0

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from sim.camera import CameraModel, Geometry
-from sim.forward import Exposure, expected_electrons
+from sim.frame import Exposure, expected_electrons
 from sim.optics.illumination import (
     MeasuredIllumination,
     RadialIllumination,

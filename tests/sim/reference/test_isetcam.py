@@ -11,14 +11,16 @@ from scipy.io import loadmat
 
 from sim.camera import CameraModel, Lens
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
-from sim.forward import Exposure, electron_rate, expected_electrons, optical_transfer
+from sim.frame import Exposure, expected_electrons
 from sim.optics.filters import birefringent_spots
 from sim.optics.illumination import irradiance_factor, relative_illumination
+from sim.point import optical_transfer
 from sim.scene.scenes import SpectralImage
 from sim.scene.warp import Warp
 from sim.sensor import mosaic
 from sim.sensor.electrons import FixedPattern, dn_moments, sample_from
 from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import electron_rate
 
 REFERENCE = Path(__file__).parents[4] / "shared" / "reference" / "isetcam"
 pytestmark = pytest.mark.skipif(

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sim import forward
+from sim import frame as sim_frame
+from sim import uniform
 from sim.camera import CameraModel, Geometry, Lens, StereoRig
-from sim.forward import Exposure
+from sim.frame import Exposure
 from sim.scene import KnifeEdge, PlanarTarget, ReflectanceChart, ScreenPattern, SpectralImage
 from sim.scene.catalogue import SCENES, Cube, PictureOnScreen, View, charuco_texture, scene_by_name
 from sim.scene.light import luminance_cd_m2
@@ -60,8 +61,8 @@ def test_a_pattern_and_a_target_of_one_size_lie_on_each_other() -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_every_scene_makes_a_frame(camera: CameraModel, name: str) -> None:
     scene = scene_by_name(name, camera, WHITE)
-    electrons = forward.expected_electrons(camera, Exposure(scene, 0.01), oversample=2, margin_px=8)
-    white = forward.electron_rate(camera, "Y", WHITE) * 0.01 + forward.dark_electrons(camera, Exposure(scene, 0.01))
+    electrons = sim_frame.expected_electrons(camera, Exposure(scene, 0.01), oversample=2, margin_px=8)
+    white = uniform.electron_rate(camera, "Y", WHITE) * 0.01 + sim_frame.dark_electrons(camera, Exposure(scene, 0.01))
     assert electrons.shape == (60, 90)
     # No more than white, but for what a sharp picture's transform overshoots by on 2 x 2 samples a pixel.
     assert electrons.min() >= 0
@@ -188,7 +189,7 @@ def test_both_cameras_of_a_rig_see_one_plane_where_it_stands(mono_camera: Camera
     )
     found = []
     for camera, view in zip((left, right), views, strict=True):
-        frame = forward.expected(camera, Exposure(view, 0.002), oversample=2, margin_px=8)
+        frame = sim_frame.expected(camera, Exposure(view, 0.002), oversample=2, margin_px=8)
         grey = np.clip((frame - frame.min()) / np.ptp(frame) * 255, 0, 255).astype(np.uint8)
         corners, ids, _, _ = detector.detectBoard(grey)
         refined = cv2.cornerSubPix(

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim import forward
+from sim import frame as sim_frame
 from sim.camera import CameraModel, Geometry
-from sim.forward import Exposure
+from sim.frame import Exposure
 from sim.scene import (
     Darkness,
     EdgeRegion,
@@ -256,8 +256,8 @@ def test_a_drawn_edge_blurs_to_the_edges_exact_profile(mono_camera: CameraModel,
             lamp,
             "slanted_edge",
         )
-        exact = forward.expected_electrons(camera, Exposure(scene, 0.01))
-        blurred = forward.expected_electrons(camera, Exposure(pattern, 0.01), oversample=6, margin_px=16)
+        exact = sim_frame.expected_electrons(camera, Exposure(scene, 0.01))
+        blurred = sim_frame.expected_electrons(camera, Exposure(pattern, 0.01), oversample=6, margin_px=16)
         inside = (slice(24, 48), slice(24, 72))  # away from the grid's ends, where the other side's light comes in
         step = np.ptp(exact)
         np.testing.assert_allclose(blurred[inside], exact[inside], rtol=0, atol=2e-3 * step)
@@ -490,7 +490,7 @@ def test_black_and_white_codes_are_a_screens_pattern(mono_camera: CameraModel) -
     )
     camera = mono_camera.model_copy(update={"rows": 40, "cols": 60})
     one, other = (
-        forward.expected_electrons(camera, Exposure(scene, 0.001), oversample=2, margin_px=4)
+        sim_frame.expected_electrons(camera, Exposure(scene, 0.001), oversample=2, margin_px=4)
         for scene in (image, shown)
     )
     # The two spread their lights over wavelengths by other Gauss rules, each within 1e-3 of the transfer.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim.camera import CameraModel, Lens
-from sim.forward import Exposure, dark_electrons
+from sim.frame import Exposure, dark_electrons
 from sim.scene.scenes import Darkness
 from sim.sensor.electrons import FixedPattern, ReadOut, dn_moments, sample_from
 from sim.spectrum import FloatArray, Spectrum

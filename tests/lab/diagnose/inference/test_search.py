@@ -17,9 +17,11 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.summaries import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
 from sim.camera import CameraModel, Lens
-from sim.effects.base import Effect, Stage
+from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray, Spectrum
+from sim.stages import Signal
+from sim.uniform import Uniform
 
 X = np.linspace(0.0, 1.0, 60)
 NOISE = 0.01
@@ -27,15 +29,19 @@ THRESHOLD = 12.0
 
 
 class _Curve(Effect):
-    """Adds `size` times a shape to the line that is measured; it borrows the hook for offsets."""
+    """Adds `size` times a shape to the line that is measured; it borrows the law for offsets."""
 
-    stage: ClassVar[Stage] = Stage.ELECTRONICS
     reference: ClassVar[str] = "made up"
     sentence: ClassVar[str] = "Made up."
     form_tolerance: ClassVar[float] = 0.01
     size_dn: Annotated[float, Quantity("DN", "size", prior=(0.0, 0.1), absent=0.0)] = 0.0
 
-    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+    def on_signal(self, signal: Signal) -> Signal:
+        if self.size_dn == 0.0:
+            return signal
+        return signal.adding(offset_dn=lambda elapsed_s, temperature_c: self.added_dn(elapsed_s))
+
+    def added_dn(self, elapsed_s: float) -> float:
         return self.size_dn * float(self.shape(np.asarray(elapsed_s)))
 
     def shape(self, x: FloatArray) -> FloatArray:
@@ -95,12 +101,12 @@ def _model(truth: Sequence[Effect], rng: np.random.Generator) -> MeasurementMode
     camera = _camera()
 
     def line(acting: Sequence[Effect]) -> FloatArray:
-        return np.array([sum(e.offset_dn(float(x), None, camera) for e in acting) for x in X])
+        return np.array([Uniform(camera, acting).offset_dn(float(x), None) for x in X])
 
     block = Block(
         measurement="dark", axis="time", unit="s", reach=0.2, value=line(truth) + NOISE * rng.standard_normal(X.size),
         covariance=NOISE**2 * np.eye(X.size), labels=tuple(Label(float(x), "all", "", (f"c{i}",), False) for i, x in enumerate(X)),
-        hooks=frozenset({"offset_dn"}), predict=lambda acting: Prediction(line(acting), {}), scale=np.ones(X.size),
+        reads=frozenset({"signal.offset_dn"}), predict=lambda acting: Prediction(line(acting), {}), scale=np.ones(X.size),
     )  # fmt: skip
     return MeasurementModel((block,), camera)
 
@@ -142,7 +148,7 @@ class _Squared(_Curve):
     ] = 0.0
     skew: ClassVar[float] = 0.0
 
-    def offset_dn(self, elapsed_s: float, temperature_c: float | None, camera: CameraModel) -> float:
+    def added_dn(self, elapsed_s: float) -> float:
         return (self.size_dn**2 + self.skew * self.size_dn) * elapsed_s
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lab.diagnose.measurements.curves import LEAK_STD, CurveSlopes, _last_place
-from sim.forward import electron_rate
 from sim.spectrum import Spectrum
+from sim.uniform import electron_rate
 from tests.lab.diagnose.on_blocks import former, study
 
 

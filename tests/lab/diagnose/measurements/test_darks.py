@@ -26,11 +26,12 @@ from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import effect
 from sim.effects.row_noise import RowNoise
-from sim.forward import Exposure, sample
+from sim.frame import Exposure, sample
 from sim.scene.scenes import Darkness
-from sim.sensor.defects import odd_sizes, size_nodes
+from sim.sensor.defects import defect_sizes, size_nodes
 from sim.sensor.electrons import FixedPattern
 from sim.spectrum import Spectrum
+from sim.stages import signal_of
 
 ROWS, COLS = 96, 128
 
@@ -143,18 +144,17 @@ def test_nodes_have_the_distribution_that_is_drawn(spread: float) -> None:
     assert weights.sum() == pytest.approx(1.0)
     assert weights @ sizes == pytest.approx(1.0, rel=1e-6)
     assert np.sqrt(weights @ np.square(sizes - 1.0)) == pytest.approx(spread, rel=0.05, abs=1e-9)
-    drawn = odd_sizes((300, 300), 0.2, 3, spread)
+    drawn = defect_sizes((300, 300), 0.2, 3, spread)
     drawn = drawn[drawn > 0]
     assert drawn.mean() == pytest.approx(1.0, abs=4.5 * spread / np.sqrt(drawn.size) + 1e-9)
 
 
 def test_correlated_rows_have_their_spectrum() -> None:
     """Mean over all frequencies: the variance. Drawn rows: neighbours have the stated correlation, to 4.5 / sqrt(rows)."""
-    one = RowNoise(noise_e=2.0, correlation=0.6)
+    (one,) = signal_of(_model(), (RowNoise(noise_e=2.0, correlation=0.6),)).lines
     f = np.linspace(-0.5, 0.5, 4001)[:-1]
-    assert np.mean(one.line_spectrum_e2(f, "rows", False)) == pytest.approx(4.0, rel=1e-3)
-    drawn = one.added((4000, 5), np.random.default_rng(3), _model())
-    assert drawn is not None
+    assert np.mean(one.spectrum_e2(f, fixed=False)) == pytest.approx(4.0, rel=1e-3)
+    drawn = one.draw((4000, 5), np.random.default_rng(3))
     r = np.asarray(drawn)[:, 0]
     assert r.std() == pytest.approx(2.0, rel=0.1)
     assert np.corrcoef(r[1:], r[:-1])[0, 1] == pytest.approx(0.6, abs=4.5 / np.sqrt(4000))

@@ -17,7 +17,7 @@ from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
 from sim.effects.base import Effect
 from sim.effects.library import effect
-from sim.forward import edge_profile, optical_transfer
+from sim.point import edge_profile, optical_transfer
 
 EDGES = Plan(("dark", "slanted_edge"))
 

@@ -21,7 +21,7 @@ from mocks.former.laws import BrighterFatterLaw, InterPixelCapacitanceLaw, OnChi
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.effects.library import effect
-from sim.forward import Exposure, dark_electrons, expected_electrons, read_out
+from sim.frame import Exposure, dark_electrons, expected_electrons, read_out
 from sim.scene.scenes import Darkness, UniformField
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum

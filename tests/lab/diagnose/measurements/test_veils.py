@@ -10,6 +10,7 @@ from lab.diagnose.measurements.edges import edge_block
 from lab.diagnose.measurements.patches import chart_block, screen_block
 from lab.diagnose.measurements.veils import Surroundings, harmonics
 from mocks.former import laws as concealed
+from sim.point import halos
 from tests.lab.diagnose.on_blocks import former, names, verdict
 
 
@@ -34,4 +35,4 @@ def test_a_glare_has_its_name_whatever_its_reach(variant: int) -> None:
     found = verdict(recordings, edge_block, chart_block, screen_block)
     assert names(found) == ["veiling_glare"]
     # of what a lens spreads a halo's share is told apart only where there is one
-    assert (found.named[0].effect.halo(found.model.camera)[0] > 0.0) == (variant == 1)
+    assert bool(halos(found.model.camera, (found.named[0].effect,))) == (variant == 1)

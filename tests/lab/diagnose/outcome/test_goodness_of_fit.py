@@ -24,6 +24,7 @@ from mocks.former import laws as concealed_laws
 from sim.effects.base import Effect
 from sim.effects.defocus import Defocus
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from sim.point import TRANSFER, Blur
 
 CAMERA = default_camera().camera
 FREQUENCY = np.linspace(0.05, 0.9, 18)
@@ -35,13 +36,10 @@ def _verdict(named: tuple[Effect, ...] = ()) -> Verdict:
     angles = [0.0, 0.0, 0.8, 0.8]
 
     def predict(acting: Sequence[Effect]) -> Prediction:
-        parts = []
+        parts, blur = [], Blur(CAMERA, acting)
         for angle in angles:
-            value, f = np.exp(-2.0 * FREQUENCY), FREQUENCY / CAMERA.pixel_pitch_um
-            for e in acting:
-                factor = e.transfer(f * np.cos(angle), f * np.sin(angle), 550.0, CAMERA)
-                value = value if factor is None else value * np.real(factor)
-            parts.append(value)
+            factor = blur.beside_lens(550.0, FREQUENCY * np.cos(angle), FREQUENCY * np.sin(angle))
+            parts.append(np.exp(-2.0 * FREQUENCY) * np.real(factor))
         return Prediction(np.concatenate(parts), {})
 
     labels = tuple(
@@ -50,7 +48,7 @@ def _verdict(named: tuple[Effect, ...] = ()) -> Verdict:
     value = predict((TRUTH,)).mean + NOISE * np.random.default_rng(8).standard_normal(len(labels))
     block = Block(
         measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value,
-        covariance=NOISE**2 * np.eye(len(labels)), labels=labels, hooks=frozenset({"transfer"}), predict=predict,
+        covariance=NOISE**2 * np.eye(len(labels)), labels=labels, reads=TRANSFER, predict=predict,
         scale=np.ones(len(labels)), conditions="orientation",
     )  # fmt: skip
     candidates = tuple(Candidate(e, {}, 1.0, (), 100.0) for e in named)

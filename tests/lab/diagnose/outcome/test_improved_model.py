@@ -24,6 +24,8 @@ from mocks.former import ConcealedCamera, Plan
 from mocks.former import laws as concealed_laws
 from sim.effects.base import Effect
 from sim.effects.nameless_correction import NamelessCorrection
+from sim.point import TRANSFER, Blur
+from sim.uniform import Uniform
 
 SET = RecordingSet(
     Manifest.model_validate(
@@ -68,7 +70,7 @@ def test_a_saved_model_simulates_with_what_was_found(filtered: tuple[RecordingSe
         float(simulate(options, content).frame.mean()) - saved.camera.black_level_dn
         for content in (saved, replace(saved, effects=()))
     )
-    passed = float(saved.effects[0].transmittance(np.array([695.0]), 0.0)[0])
+    passed = float(Uniform(saved.camera, saved.effects).transmittance(np.array([695.0]))[0])
     assert without > 50.0
     assert with_it == pytest.approx(passed * without, rel=0.05, abs=1.0)  # codes are whole numbers; a line 5 nm wide
 
@@ -82,21 +84,17 @@ NOISE = 0.004
 def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
     """Two channels' contrasts exp(-2 f), off by `departs`; without effects but corrections."""
     content = default_camera()
-    pitch = content.camera.pixel_pitch_um
     labels = tuple(Label(float(f), c, "5 deg", ("edge-1",), False) for c in "RG" for f in FREQUENCY)
     contrast = np.tile(np.exp(-2.0 * FREQUENCY), 2)
 
     def predict(acting: Sequence[Effect]) -> Prediction:
-        value = contrast
-        for e in acting:
-            factor = e.transfer(np.tile(FREQUENCY, 2) / pitch, np.zeros(46), 550.0, content.camera)
-            value = value if factor is None else value * np.real(factor)
-        return Prediction(value, {})
+        factor = Blur(content.camera, acting).beside_lens(550.0, np.tile(FREQUENCY, 2), np.zeros(46))
+        return Prediction(contrast * np.real(factor), {})
 
     value = contrast * np.tile(1.0 + departs, 2) + NOISE * np.random.default_rng(3).standard_normal(46)
     block = Block(
         measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=NOISE**2 * np.eye(46),
-        labels=labels, hooks=frozenset({"transfer"}), predict=predict, scale=np.ones(46), conditions="orientation",
+        labels=labels, reads=TRANSFER, predict=predict, scale=np.ones(46), conditions="orientation",
     )  # fmt: skip
     return block, content
 
@@ -112,8 +110,7 @@ def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
     assert [(c.measurement, c.kind) for c in corrections] == [("slanted_edge", "transfer")]
     (one,) = improved.effects
     assert isinstance(one, NamelessCorrection)
-    x = FREQUENCY / content.camera.pixel_pitch_um
-    follows = np.real(one.transfer(x, 0 * x, 550.0, content.camera)) - 1.0 - ripple
+    follows = np.real(Blur(content.camera, (one,)).beside_lens(550.0, FREQUENCY, 0 * FREQUENCY)) - 1.0 - ripple
     assert np.abs(follows[FREQUENCY < 0.6]).max() < 3 * NOISE / np.sqrt(2) / np.exp(-1.2)
     mended = MeasurementModel((replace(block, predict=lambda acting: block.predict((one, *acting))),), content.camera)
     assert chi2(mended.value - mended.mean(), block.covariance) < 46 + 3 * np.sqrt(92)
@@ -133,12 +130,12 @@ def test_what_the_model_has_no_place_for_is_said() -> None:
 
 
 @pytest.mark.parametrize(
-    ("axis", "unit", "hook", "along"),
-    [("field", "mm", "illumination", "radius_um"), ("level", "DN", "response", "signal_e"), ("level", "DN", "noise_e2", "variance_signal_e")],
+    ("axis", "unit", "quantity", "along"),
+    [("field", "mm", "image.shading", "radius_um"), ("level", "DN", "signal.response", "signal_e"), ("level", "DN", "charge.variance_e2", "variance_signal_e")],
 )  # fmt: skip
-def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str, hook: str, along: str) -> None:
+def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str, quantity: str, along: str) -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
-    other = replace(block, axis=axis, unit=unit, hooks=frozenset({hook}), conditions="")
+    other = replace(block, axis=axis, unit=unit, reads=frozenset({quantity}), conditions="")
     model = MeasurementModel((other,), content.camera)
     gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
     improved, _ = improved_model(SET, "left", None, content, model, (), (gap,))

@@ -24,6 +24,7 @@ from sim.effects.infrared_cut_filter import InfraredCutFilter
 from sim.effects.library import effect
 from sim.effects.nonlinearity import Nonlinearity
 from sim.effects.source_drift import SourceDrift
+from sim.point import TRANSFER, Blur
 
 CAMERA = default_camera().camera
 SET = RecordingSet(
@@ -40,15 +41,12 @@ def _model(acting: Sequence[Effect] = ()) -> MeasurementModel:
     """A contrast along rows, of one wavelength: too little to tell blurs apart."""
 
     def predict(effects: Sequence[Effect]) -> Prediction:
-        value = np.exp(-2.0 * FREQUENCY)
-        for e in effects:
-            factor = e.transfer(FREQUENCY / CAMERA.pixel_pitch_um, 0.0 * FREQUENCY, 550.0, CAMERA)
-            value = value if factor is None else value * np.real(factor)
-        return Prediction(value, {})
+        factor = Blur(CAMERA, effects).beside_lens(550.0, FREQUENCY, 0.0 * FREQUENCY)
+        return Prediction(np.exp(-2.0 * FREQUENCY) * np.real(factor), {})
 
     block = Block(
         measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=predict(acting).mean, covariance=4e-6 * np.eye(16),
-        labels=tuple(Label(float(f), "G", "5 deg", ("edge-1",), False) for f in FREQUENCY), hooks=frozenset({"transfer"}),
+        labels=tuple(Label(float(f), "G", "5 deg", ("edge-1",), False) for f in FREQUENCY), reads=TRANSFER,
         predict=predict, scale=np.ones(16),
     )  # fmt: skip
     return MeasurementModel((block,), CAMERA)

@@ -1,0 +1,328 @@
+"""The entry for a point of the image: what blurs it. Transfer functions, edges' profiles, kernels, displaced light, veils.
+
+Frequencies are cy/px, fx along columns (to the right), fy along rows (down). Without effects, or with effects at their absent
+values, the result is the baseline bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft
+from scipy.interpolate import CubicSpline
+
+from sim.camera import CameraModel
+from sim.detection import check_finite, detected, otf_wavelengths, otf_weight
+from sim.optics.diffraction import aperture_otf
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
+from sim.stages import Acts, Charge, ComplexArray, Image, Signal, charge_of, image_of, kernel_otf, signal_of
+
+#: Quantities of the stages that a transfer function depends on.
+TRANSFER = frozenset(
+    {
+        "image.pupil",
+        "image.pupil_at",
+        "image.transfer",
+        "image.veils",
+        "charge.transfer",
+        "charge.kernels",
+        "signal.filters",
+    }
+)
+
+#: Wavelengths at which an optical transfer function is averaged over light and sensitivity (Gauss's rule for that weight): within
+#: 1e-4 of a 1 nm sum.
+OTF_WAVELENGTHS = 10
+
+#: Frequencies beyond which an edge's profile isn't followed: 64 cy/px, where a pixel's aperture passes < 0.5 %.
+HIGHEST_CY_PER_PX = 64.0
+
+
+class Blur:
+    """Transfer of lens and effects at one wavelength, without the pixel's aperture; the stages' states taken once."""
+
+    def __init__(self, camera: CameraModel, effects: Sequence[Acts] = (), *, collected: bool = False) -> None:
+        """`collected`: without what moves charge between pixels and without filters on the chip."""
+        self.camera = camera
+        self.image: Image = image_of(camera, effects)
+        self.charge: Charge = charge_of(camera, effects)
+        self.signal = Signal(camera) if collected else signal_of(camera, effects)
+        self.kernels = () if collected else self.charge.kernels
+
+    def at(
+        self,
+        wavelength_nm: float,
+        fx_cy_per_px: FloatArray,
+        fy_cy_per_px: FloatArray,
+        place_um: tuple[float, float] = (0.0, 0.0),
+    ) -> FloatArray | ComplexArray:
+        """At frequencies in cy/px, which broadcast, and a place."""
+        fx, fy = fx_cy_per_px / self.camera.pixel_pitch_um, fy_cy_per_px / self.camera.pixel_pitch_um
+        lens = self.image.otf(fx, fy, wavelength_nm, place_um)
+        return times(lens, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px))
+
+    def beside_lens(
+        self,
+        wavelength_nm: float,
+        fx_cy_per_px: FloatArray,
+        fy_cy_per_px: FloatArray,
+        place_um: tuple[float, float] = (0.0, 0.0),
+    ) -> FloatArray | ComplexArray:
+        """The same over the transfer of the lens without effects."""
+        fx, fy = fx_cy_per_px / self.camera.pixel_pitch_um, fy_cy_per_px / self.camera.pixel_pitch_um
+        beside = self.image.otf_beside_lens(fx, fy, wavelength_nm, place_um)
+        return times(beside, self._in_pixels(wavelength_nm, fx_cy_per_px, fy_cy_per_px))
+
+    @property
+    def is_lens_alone(self) -> bool:
+        """Whether no effect blurs."""
+        states = (*self.image.changed(), *self.charge.changed(), *self.signal.changed())
+        return not TRANSFER.intersection(states)
+
+    def _in_pixels(
+        self, wavelength_nm: float, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray
+    ) -> FloatArray | ComplexArray | float:
+        pitch = self.camera.pixel_pitch_um
+        value: FloatArray | ComplexArray | float = self.charge.otf(
+            fx_cy_per_px / pitch, fy_cy_per_px / pitch, wavelength_nm
+        )
+        for kernel in self.kernels:
+            value = value * kernel_otf(kernel, fx_cy_per_px, fy_cy_per_px)
+        plane = mosaic.step(self.camera.cfa)  # filters on the chip run over each colour's plane
+        for kernel in self.signal.filters:
+            value = value * kernel_otf(kernel, plane * fx_cy_per_px, plane * fy_cy_per_px)
+        return value
+
+
+def times(transfer: FloatArray | ComplexArray, factor: FloatArray | ComplexArray | float) -> FloatArray | ComplexArray:
+    """Product of transfer functions."""
+    return cast("FloatArray | ComplexArray", transfer * factor)
+
+
+def varies_over_field(camera: CameraModel, effects: Sequence[Acts]) -> bool:
+    """Whether any effect's path error changes with the place."""
+    return bool(image_of(camera, effects).pupil_at)
+
+
+def displaced_um(
+    camera: CameraModel, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float, effects: Sequence[Acts]
+) -> tuple[FloatArray, FloatArray] | None:
+    """How far (dx, dy) effects let light of one wavelength land from the place where the baseline has it; None where they don't."""
+    image = image_of(camera, effects)
+    if not image.moves:
+        return None
+    right, down = image.shifted_um(x_um, y_um, wavelength_nm)
+    return np.asarray(right), np.asarray(down)
+
+
+def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:
+    """Of the light: what effects spread evenly over the frame."""
+    return 1.0 - float(np.prod([1.0 - veil.even_share for veil in image_of(camera, effects).veils]))
+
+
+def halos(camera: CameraModel, effects: Sequence[Acts]) -> list[tuple[float, float]]:
+    """Share and standard deviation (px) of what effects spread widely about its place."""
+    veils = image_of(camera, effects).veils
+    return [(v.halo_share, v.halo_std_um / camera.pixel_pitch_um) for v in veils if v.halo_share > 0.0]
+
+
+def wide_contrast(
+    camera: CameraModel, effects: Sequence[Acts], frequency_cy_per_px: FloatArray | float = np.inf
+) -> FloatArray:
+    """Contrast that veils and halos leave at a frequency that the frame holds; as it stands to anything smaller than the halos."""
+    left: FloatArray = np.ones(np.shape(frequency_cy_per_px))
+    for veil in image_of(camera, effects).veils:
+        kept = np.exp(-2.0 * np.square(np.pi * veil.halo_std_um / camera.pixel_pitch_um * frequency_cy_per_px))
+        left = left * (1.0 - veil.even_share - veil.halo_share * (1.0 - kept))
+    return left
+
+
+def optical_transfer(
+    camera: CameraModel,
+    channel: str,
+    radiance: Spectrum | None,
+    fx_cy_per_px: ArrayLike,
+    fy_cy_per_px: ArrayLike,
+    effects: Sequence[Acts] = (),
+    kind: str = "slanted_edge",
+    *,
+    reflectance: Spectrum | None = None,
+    place_um: tuple[float, float] = (0.0, 0.0),
+    collected: bool = False,
+) -> ComplexArray:
+    """Optical transfer function of one channel, 1 at zero frequency; complex, of the broadcast shape of fx and fy (cy/px).
+
+    The average of the lens's transfer (`Lens.imaging`) x the effects', weighted by the detected electrons (light x responsivity) over
+    wavelength, times the pixel's aperture. `radiance` None: light of equal energy at every wavelength. `place_um`: where, for path
+    errors that change over the field. `collected`: as the pixels collect it, before charge moves between them and filters on the
+    chip act: what a frame is drawn with, in which these act on the pixels themselves.
+    """
+    fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_px, float), np.asarray(fy_cy_per_px, float))
+    wavelength_nm, weight = detected(camera, channel, [(radiance, reflectance)], effects, kind)
+    nodes, share = otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
+    total: FloatArray | ComplexArray = np.zeros(fx.shape)
+    blur = Blur(camera, effects, collected=collected)
+    for node, part in zip(nodes, share, strict=True):
+        total = total + part * blur.at(float(node), fx, fy, place_um)
+    return np.asarray(total * aperture_otf(fx, fy, camera.fill_factor), complex)
+
+
+def common_wavelengths(
+    camera: CameraModel,
+    sights: Sequence[tuple[str, Spectrum | None]],
+    effects: Sequence[Acts] = (),
+    kind: str = "slanted_edge",
+    count: int = OTF_WAVELENGTHS,
+) -> tuple[FloatArray, FloatArray]:
+    """Wavelengths (nm), at most `count`, that serve several sights (channel, light) at once, and how much each counts for each
+    of them, (sights, wavelengths): sum 1 over a sight.
+
+    Gauss's nodes for the sights' mean spectral weight; the shares integrate the polynomial through the nodes, so that they may be
+    below 0. Transfers of broad and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's
+    cutoff, which is no polynomial in the wavelength, 5e-4).
+    """
+    found = _seen_light(camera, sights, effects, kind)
+    # sights have most of their wavelengths in common: each once
+    position, which = np.unique(np.concatenate([at for at, _ in found]), return_inverse=True)
+    pooled = np.bincount(which, np.concatenate([part for _, part in found])) / len(found)
+    nodes, _ = gauss_rule(position, pooled, count)
+    return nodes, np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
+
+
+def wavelength_shares(
+    camera: CameraModel,
+    sights: Sequence[tuple[str, Spectrum | None]],
+    wavelength_nm: FloatArray,
+    effects: Sequence[Acts] = (),
+    kind: str = "slanted_edge",
+) -> FloatArray:
+    """How much each of `wavelength_nm` (ascending) counts for each of several sights (channel, light) in a mean over the light that it
+    detects, (sights, wavelengths), of what is linear between them: sum 1 over a sight."""
+    seen = _seen_light(camera, sights, effects, kind)
+    return np.array([linear_shares(at, part, wavelength_nm) for at, part in seen])
+
+
+def _seen_light(
+    camera: CameraModel, sights: Sequence[tuple[str, Spectrum | None]], effects: Sequence[Acts], kind: str
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Of each sight, wavelengths (nm) and how much each counts, sum 1; a sight without light is that of equal energy."""
+    found = []
+    for channel, radiance in sights:
+        wavelength_nm, weight = detected(camera, channel, [(radiance, None)], effects, kind)
+        found.append(otf_weight(camera, channel, wavelength_nm, weight[0]))
+    return found
+
+
+def transfer_at(
+    camera: CameraModel,
+    wavelength_nm: float,
+    fx_cy_per_px: FloatArray,
+    fy_cy_per_px: FloatArray,
+    effects: Sequence[Acts] = (),
+    *,
+    place_um: tuple[float, float] = (0.0, 0.0),
+) -> FloatArray | ComplexArray:
+    """Transfer of lens, pixel and effects at one wavelength, of the broadcast shape of fx and fy (cy/px). `place_um` matters to
+    path errors that change over the field."""
+    blur = Blur(camera, effects)
+    transfer = blur.at(wavelength_nm, fx_cy_per_px, fy_cy_per_px, place_um)
+    return transfer * aperture_otf(fx_cy_per_px, fy_cy_per_px, camera.fill_factor)
+
+
+def edge_profile(
+    camera: CameraModel,
+    channel: str,
+    radiance: Spectrum | None,
+    angle_deg: float,
+    distance_px: ArrayLike,
+    effects: Sequence[Acts] = (),
+    kind: str = "slanted_edge",
+    *,
+    place_um: tuple[float, float] = (0.0, 0.0),
+    collected: bool = False,
+) -> FloatArray:
+    """What a pixel at signed perpendicular distance d (px, positive on the light side) from a straight edge sees: 0..1.
+
+    ESF(d) = 1/2 + integral_0^inf [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df, H the optical transfer function along
+    the edge's normal (fx, fy) = f (cos angle, sin angle); angle from the vertical, positive turns the top to the right.
+    """
+    distance_px = np.asarray(distance_px, float)
+    check_finite("distance from the edge", distance_px, "px")
+    reach = max(64.0, 1.05 * float(np.max(np.abs(distance_px), initial=0.0)))
+    # The integral becomes a sum over harmonics of a period that is long against the reach and against the tails.
+    period = 16.0 * reach
+    highest = _highest_cy_per_px(camera, channel, radiance, effects, kind)
+    count = int(np.ceil(highest * period)) + 1
+    f = np.arange(1, count) / period
+    angle = np.deg2rad(angle_deg)
+    transfer = optical_transfer(
+        camera,
+        channel,
+        radiance,
+        f * np.cos(angle),
+        f * np.sin(angle),
+        effects,
+        kind,
+        place_um=place_um,
+        collected=collected,
+    )
+    samples = fft.next_fast_len(int(period * max(32.0, 4.0 * highest)), real=True)
+    series = np.zeros(samples // 2 + 1, complex)
+    series[1:count] = transfer / (2j * np.pi * np.arange(1, count))
+    profile = fft.irfft(series, samples) * samples
+    # The term at zero frequency is half of (2 d Re H + Im H' / pi) / period. Both are limits from above: a veil wider than
+    # the period, a spike at zero frequency, lies even on both sides.
+    ramp = float(np.real(2.0 * transfer[0] - transfer[1]))
+    level = 0.5 + float(np.imag(transfer[0])) / (2.0 * np.pi)
+    step = period / samples
+    wing = int(np.ceil(reach / step)) + 4
+    at = np.arange(-wing, wing + 1)
+    table = CubicSpline(at * step, profile[at] + ramp * (at * step / period) + level)
+    return np.asarray(table(distance_px))
+
+
+def kernel(
+    camera: CameraModel,
+    channel: str,
+    radiance: Spectrum | None,
+    support: int,
+    oversample: float = 1,
+    effects: Sequence[Acts] = (),
+    kind: str = "bernoulli",
+) -> FloatArray:
+    """Point spread function with the pixel's aperture, (support, support) samples of 1/oversample px, sum 1.
+
+    A sample is the response of the middle pixel to light spread evenly over the sample's square: what light of that square
+    does there. So the kernel convolves a picture drawn by area; element [half + i, half + j] is the answer i down and j to the
+    right of the light. `support` is odd; `oversample` below 1 gives the coarse grid of a mosaic's plane (1/2).
+    """
+    if support < 1 or support % 2 == 0:
+        raise ValueError(f"support {support} of the kernel has to be odd and at least 1: take {support + 1}")
+    if not oversample > 0:
+        raise ValueError(f"oversample {oversample} of the kernel has to be above 0: 1 gives samples of one pixel")
+    highest = _highest_cy_per_px(camera, channel, radiance, effects, kind)
+    # Sampled finely enough for the optics, then every `fine`-th sample is taken: coarse kernels alias as a mosaic does.
+    fine = max(1, int(np.ceil(2.0 * min(highest, 8.0) / oversample)))
+    size = fft.next_fast_len(max(4 * support, 64)) * fine
+    fy = fft.fftfreq(size, 1.0 / (oversample * fine))
+    fx = fft.rfftfreq(size, 1.0 / (oversample * fine))
+    transfer = optical_transfer(camera, channel, radiance, fx[None, :], fy[:, None], effects, kind)
+    square = np.sinc(fx / oversample)[None, :] * np.sinc(fy / oversample)[:, None]
+    spread = fft.irfft2(transfer * square, (size, size))[::fine, ::fine]
+    half = support // 2
+    psf = np.roll(spread, (half, half), axis=(0, 1))[:support, :support]
+    return psf / np.sum(psf)
+
+
+def _highest_cy_per_px(
+    camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Acts], kind: str
+) -> float:
+    """The lens's cutoff at the shortest wavelength that counts."""
+    wavelength_nm, weight = detected(camera, channel, [(radiance, None)], effects, kind)
+    nodes, _ = otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
+    cutoff = camera.pixel_pitch_um * camera.lens.imaging.cutoff_cy_per_um(float(np.min(nodes)), camera.lens.f_number)
+    return min(cutoff, HIGHEST_CY_PER_PX)

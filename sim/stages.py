@@ -1,0 +1,408 @@
+"""The stages of the chain of light, each with its state: what the camera model leaves to effects, as laws that act one after the other.
+
+    Light (what reaches the lens) -> Image (irradiance by wavelength and place) -> Charge (electrons in the pixels)
+    -> Signal (after read-out) -> Codes
+
+A state is immutable. Its fields are tuples of laws; a state without laws is the baseline. An effect takes the state of its stage
+and returns it with a law added (`State.adding`). The methods of a state apply its laws in their order. Only `sim` applies them: other
+code asks the three entries `sim.uniform`, `sim.point` and `sim.frame`.
+
+Places are in um from the sensor's centre, x along columns (to the right), y along rows (down). Frequencies follow the same axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
+from functools import reduce
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve
+
+from sim.camera import CameraModel
+from sim.optics.filters import veil_otf
+from sim.optics.pupil import Wavefront, pupil_ratio
+from sim.sensor.defects import Defects
+from sim.sensor.lines import LineNoise
+from sim.spectrum import FloatArray
+
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class State:
+    """Base of the five states: the camera model, and laws in the order in which effects added them."""
+
+    camera: CameraModel
+
+    def adding(self, **laws: Any) -> Self:
+        """This state with one more law in each field that is named. Raises TypeError for a field that the stage doesn't have."""
+        changed: dict[str, Any] = {name: (*getattr(self, name), law) for name, law in laws.items()}
+        return replace(self, **changed)
+
+    def changed(self) -> frozenset[str]:
+        """Names of the fields that hold a law, as `stage.field`."""
+        stage = type(self).__name__.lower()
+        return frozenset(f"{stage}.{f.name}" for f in fields(self) if f.name != "camera" and getattr(self, f.name))
+
+
+@dataclass(frozen=True)
+class Light(State):
+    """What reaches the lens, given what the radiometer and the screen were told.
+
+    `spectrum`: (wavelength_nm, radiance, kind of capture) -> radiance. `level`: elapsed_s -> factor on the source. `rows`: (number of
+    rows, exposure_s, elapsed_s) -> factor (rows,) on the source's light in one frame. `shading`: (x_um, y_um) -> factor by place on the sensor. `ambient_e_per_s`: channel -> electrons a second of
+    light beside the source. `screen`: (share asked for, x_um, y_um) -> share of the lit state that is shown. `pair_gain`: factors
+    on the right camera's signal over the left one's in one scene. `pair_delay_s`: by how much the right camera captures later.
+    """
+
+    spectrum: tuple[Callable[[FloatArray, FloatArray, str], FloatArray], ...] = ()
+    level: tuple[Callable[[float], float], ...] = ()
+    rows: tuple[Callable[[int, float, float], FloatArray], ...] = ()
+    shading: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    ambient_e_per_s: tuple[Callable[[str], float], ...] = ()
+    screen: tuple[Callable[[FloatArray, FloatArray, FloatArray], FloatArray], ...] = ()
+    pair_gain: tuple[float, ...] = ()
+    pair_delay_s: tuple[float, ...] = ()
+
+    def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
+        """The radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
+        return reduce(lambda value, law: law(wavelength_nm, value, kind), self.spectrum, radiance)
+
+    def source(self, elapsed_s: float) -> float:
+        """Factor on the source's radiance at a time after the first capture."""
+        return reduce(lambda value, law: value * max(law(elapsed_s), 0.0), self.level, 1.0)
+
+    def row_factors(self, rows: int, exposure_s: float, elapsed_s: float) -> FloatArray | None:
+        """Factor (rows,) on the source's light in each row of one frame; None where no law says one."""
+        if not self.rows:
+            return None
+        return reduce(lambda value, law: value * law(rows, exposure_s, elapsed_s), self.rows, np.ones(rows))
+
+    def ambient(self, channel: str) -> float:
+        """Electrons a second that reach a pixel of a channel beside the source while the shutter is open."""
+        return sum((law(channel) for law in self.ambient_e_per_s), 0.0)
+
+    def shown(self, share: FloatArray, x_um: FloatArray, y_um: FloatArray) -> FloatArray:
+        """What a screen shows of `share` (rows, cols), 0..1 of its lit state, at places in equal steps."""
+        return reduce(lambda value, law: law(value, x_um, y_um), self.screen, share)
+
+
+@dataclass(frozen=True)
+class Veil:
+    """Light that the lens scatters: `even_share` of it evenly over the frame, `halo_share` about its place by a normal distribution of
+    `halo_std_um`, too wide for an edge's surroundings to show and narrower than the frame."""
+
+    even_share: float
+    halo_share: float = 0.0
+    halo_std_um: float = 1.0
+
+
+@dataclass(frozen=True)
+class Image(State):
+    """Irradiance on the sensor by wavelength and place.
+
+    `transmittance`: (wavelength_nm, sine of the chief ray's angle) -> factor. `pupil`: wavelength_nm -> path error; `pupil_at`:
+    (wavelength_nm, x_um, y_um) -> path error at a place: path errors add up before the transfer function is formed. `transfer`: (fx, fy
+    in cy/um, wavelength_nm) -> factor on the optical transfer function, 1 at zero frequency. `veils`: scattered light. `shading`:
+    (x_um, y_um) -> factor. `shift`: (x_um, y_um, wavelength_nm) -> (dx, dy) in um by which light lands off. `copies`: whole image of a
+    channel (rows, cols) -> image with reflections, linear in it.
+    """
+
+    transmittance: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    pupil: tuple[Callable[[float], Wavefront], ...] = ()
+    pupil_at: tuple[Callable[[float, float, float], Wavefront], ...] = ()
+    transfer: tuple[Callable[[FloatArray, FloatArray, float], FloatArray | ComplexArray], ...] = ()
+    veils: tuple[Veil, ...] = ()
+    shading: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    shift: tuple[Callable[[FloatArray, FloatArray, float], tuple[FloatArray, FloatArray]], ...] = ()
+    copies: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+
+    def transmitted(self, wavelength_nm: FloatArray, sin_theta: FloatArray | float) -> FloatArray:
+        """Factor on the light by wavelength and sine of the chief ray's angle at the sensor, which broadcast."""
+        sine = np.asarray(sin_theta, float)
+        none = np.ones(np.broadcast_shapes(np.shape(wavelength_nm), sine.shape))
+        return reduce(lambda value, law: value * law(wavelength_nm, sine), self.transmittance, none)
+
+    def wavefront(self, wavelength_nm: float, place_um: tuple[float, float] = (0.0, 0.0)) -> Wavefront:
+        """The sum of all path errors (um) at a place."""
+        total = reduce(lambda value, law: value + law(wavelength_nm), self.pupil, Wavefront(()))
+        return reduce(lambda value, law: value + law(wavelength_nm, *place_um), self.pupil_at, total)
+
+    def otf(
+        self,
+        fx_cy_per_um: FloatArray,
+        fy_cy_per_um: FloatArray,
+        wavelength_nm: float,
+        place_um: tuple[float, float] = (0.0, 0.0),
+    ) -> FloatArray | ComplexArray:
+        """Transfer function of the lens with all of this at one wavelength and place."""
+        value = self.camera.lens.imaging.transfer(
+            fx_cy_per_um,
+            fy_cy_per_um,
+            wavelength_nm,
+            self.camera.lens.f_number,
+            self.wavefront(wavelength_nm, place_um),
+        )
+        return self._blurred(value, fx_cy_per_um, fy_cy_per_um, wavelength_nm)
+
+    def otf_beside_lens(
+        self,
+        fx_cy_per_um: FloatArray,
+        fy_cy_per_um: FloatArray,
+        wavelength_nm: float,
+        place_um: tuple[float, float] = (0.0, 0.0),
+    ) -> FloatArray | ComplexArray:
+        """The same over the lens's own; path errors as those of a perfect lens's pupil over that lens."""
+        value: FloatArray | ComplexArray = np.ones(np.broadcast_shapes(np.shape(fx_cy_per_um), np.shape(fy_cy_per_um)))
+        path = self.wavefront(wavelength_nm, place_um)
+        if path.terms:
+            value = pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, self.camera.lens.f_number, path)
+        return self._blurred(value, fx_cy_per_um, fy_cy_per_um, wavelength_nm)
+
+    def _blurred(
+        self, value: FloatArray | ComplexArray, fx: FloatArray, fy: FloatArray, wavelength_nm: float
+    ) -> FloatArray | ComplexArray:
+        for law in self.transfer:
+            value = value * law(fx, fy, wavelength_nm)
+        for veil in self.veils:
+            even = veil_otf(fx, fy, veil.even_share)
+            value = value * (even + veil_otf(fx, fy, veil.halo_share, veil.halo_std_um) - 1.0)
+        return value
+
+    @property
+    def moves(self) -> bool:
+        """Whether any law lets light land elsewhere."""
+        return bool(self.shift)
+
+    def shifted_um(
+        self, x_um: FloatArray, y_um: FloatArray, wavelength_nm: float
+    ) -> tuple[FloatArray | float, FloatArray | float]:
+        """How far (dx, dy) light of one wavelength lands from where the baseline has it."""
+        right: FloatArray | float = 0.0
+        down: FloatArray | float = 0.0
+        for law in self.shift:
+            dx, dy = law(x_um, y_um, wavelength_nm)
+            right, down = right + dx, down + dy
+        return right, down
+
+    def with_copies(self, image: FloatArray) -> FloatArray:
+        """A channel's whole image (rows, cols) with its reflections."""
+        return reduce(lambda value, law: law(value), self.copies, image)
+
+
+@dataclass(frozen=True)
+class Charge(State):
+    """Electrons in the pixels: where they come from and where they end up.
+
+    `exposure_s`: time asked for -> time in which light is collected. `collected`: electrons of light (rows, cols) -> electrons, pixel by
+    pixel. `dark_current`: (e/s, sensor temperature) -> e/s, of all
+    pixels or of each (rows, cols). `defects`: pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) ->
+    factor on the transfer function, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1: they
+    act on whole frames, and as transfer functions where there is one channel. `overflow`: mean electrons (rows, cols) -> the same
+    after full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame. `variance_e2`: (mean electrons,
+    shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.
+    """
+
+    exposure_s: tuple[Callable[[float], float], ...] = ()
+    collected: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    dark_current: tuple[Callable[[FloatArray | float, float | None], FloatArray | float], ...] = ()
+    defects: tuple[Defects, ...] = ()
+    transfer: tuple[Callable[[FloatArray, FloatArray, float], FloatArray], ...] = ()
+    kernels: tuple[FloatArray, ...] = ()
+    overflow: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    lag: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
+    correlation: tuple[Callable[[FloatArray], FloatArray | float], ...] = ()
+
+    def collected_s(self, exposure_s: float) -> float:
+        """The time in which light is collected, given the time that was asked for."""
+        return reduce(lambda value, law: law(value), self.exposure_s, exposure_s)
+
+    def lit(self, electrons: FloatArray) -> FloatArray:
+        """Mean electrons of light (rows, cols) as the pixels collect them."""
+        return reduce(lambda value, law: law(value), self.collected, electrons)
+
+    def even_dark_e_per_s(self, e_per_s: FloatArray | float, temperature_c: float | None) -> FloatArray | float:
+        """Dark current of pixels that aren't defective, given what the camera model says for that temperature."""
+        return reduce(lambda value, law: law(value, temperature_c), self.dark_current, e_per_s)
+
+    def dark_e_per_s(self, e_per_s: FloatArray | float, temperature_c: float | None) -> FloatArray | float:
+        """Dark current of every pixel, defective ones with their own."""
+        shape = self.camera.rows, self.camera.cols
+        even = self.even_dark_e_per_s(e_per_s, temperature_c)
+        return reduce(lambda value, defects: value + defects.sizes(shape), self.defects, even)
+
+    def otf(self, fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> FloatArray | float:
+        """Factor on the transfer function, alike for all colours, without `kernels`."""
+        value: FloatArray | float = 1.0
+        for law in self.transfer:
+            value = value * law(fx_cy_per_um, fy_cy_per_um, wavelength_nm)
+        return value
+
+    def moved(self, electrons: FloatArray) -> FloatArray:
+        """Electrons of a whole frame (rows, cols) where they end up. The frame goes on as its mirror image about the outermost pixels'
+        centres, which keeps the mosaic's phases."""
+        return reduce(lambda value, kernel: np.asarray(convolve(value, kernel, mode="mirror")), self.kernels, electrons)
+
+    def overflown(self, electrons: FloatArray) -> FloatArray:
+        """Mean electrons of a whole frame after what is above the full well has run over."""
+        return reduce(lambda value, law: law(value), self.overflow, electrons)
+
+    def staying(self, electrons: FloatArray) -> FloatArray | float:
+        """How many of a frame's electrons aren't read but stay for the next frame: image lag."""
+        return sum((law(electrons) for law in self.lag), 0.0)
+
+    def shot_e2(self, electrons: FloatArray) -> FloatArray:
+        """Variance of the shot noise at mean signals, in e^2."""
+        return reduce(lambda value, law: law(electrons, value), self.variance_e2, electrons)
+
+    def shared(self, electrons: FloatArray) -> FloatArray | float:
+        """Correlation of a pixel's shot noise with each of its four next pixels', between 0 and 1/4."""
+        return sum((law(electrons) for law in self.correlation), 0.0)
+
+
+class Disturbance(Protocol):
+    """What read-out adds to the pixels of a frame, anew in each: how it is drawn, and its moments."""
+
+    def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+        """Electrons of one frame; they broadcast to `shape`."""
+
+    def mean_e(self, shape: tuple[int, ...]) -> FloatArray | float:
+        """Mean of what is drawn, pixel by pixel."""
+
+    def variance_e2(self, shape: tuple[int, ...]) -> FloatArray | float:
+        """Temporal variance of what is drawn, pixel by pixel."""
+
+
+@dataclass(frozen=True)
+class Signal(State):
+    """What read-out makes of the electrons, up to the converter.
+
+    `response`: electrons -> electrons, point by point. `offset_dn`: (elapsed_s, sensor temperature) -> DN added to the black level.
+    `lines`: noise that rows or columns share. `telegraph`: pixels that jump between two levels. `disturbances`: whatever else is added at
+    random. `filters`: kernels (odd, odd) of sum 1 that the chip runs over each colour's plane, signal and noise alike, before rounding.
+    """
+
+    response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
+    lines: tuple[LineNoise, ...] = ()
+    telegraph: tuple[Defects, ...] = ()
+    disturbances: tuple[Disturbance, ...] = ()
+    filters: tuple[FloatArray, ...] = ()
+
+    def read(self, electrons: FloatArray) -> FloatArray:
+        """What the read-out makes of signals in electrons."""
+        return reduce(lambda value, law: law(value), self.response, electrons)
+
+    def shift_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
+        """DN added to the black level."""
+        return sum((law(elapsed_s, temperature_c) for law in self.offset_dn), 0.0)
+
+    @property
+    def random(self) -> tuple[Disturbance, ...]:
+        """Everything that is drawn anew in each frame."""
+        return (*self.lines, *(Telegraph(jumps) for jumps in self.telegraph), *self.disturbances)
+
+    def filter_kernel(self) -> FloatArray | None:
+        """Kernel of all filters, one after the other; None for none."""
+        if len(self.filters) > 1:
+            from scipy.signal import convolve2d  # here: the library takes a while to load
+
+            return np.asarray(reduce(convolve2d, self.filters))
+        return self.filters[0] if self.filters else None
+
+
+@dataclass(frozen=True)
+class Telegraph:
+    """Random telegraph noise: each pixel of `jumps` is read with +A/2 or -A/2, each half of the time and anew in every frame."""
+
+    jumps: Defects
+
+    def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+        """Electrons (rows, cols) of one frame."""
+        jump, pixels = np.zeros(shape), self.jumps.pixels(shape)
+        jump.flat[pixels] = self.jumps.sizes(shape).flat[pixels] * (rng.integers(0, 2, pixels.size) - 0.5)
+        return jump
+
+    def mean_e(self, shape: tuple[int, ...]) -> float:
+        """None."""
+        return 0.0
+
+    def variance_e2(self, shape: tuple[int, ...]) -> FloatArray:
+        """A^2 / 4 in these pixels."""
+        return np.asarray(self.jumps.sizes(shape) ** 2 / 4.0)
+
+
+@dataclass(frozen=True)
+class Codes(State):
+    """`codes`: level in DN before rounding -> what the converter makes of it."""
+
+    codes: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+
+    def converted(self, dn: FloatArray) -> FloatArray:
+        """Levels in DN after the converter, before rounding."""
+        return reduce(lambda value, law: law(value), self.codes, dn)
+
+
+def kernel_otf(kernel: FloatArray, fx_cy_per_px: FloatArray, fy_cy_per_px: FloatArray) -> FloatArray | ComplexArray:
+    """Transfer function sum_ij k_ij exp(-2 pi i (fx (j - c) + fy (i - c))) of a kernel (odd, odd); real where the kernel is symmetric."""
+    half = kernel.shape[0] // 2, kernel.shape[1] // 2
+    even = np.array_equal(kernel, kernel[::-1, ::-1])
+    total: FloatArray | ComplexArray = np.zeros(np.broadcast_shapes(np.shape(fx_cy_per_px), np.shape(fy_cy_per_px)))
+    for (i, j), weight in np.ndenumerate(kernel):
+        down, right = i - half[0], j - half[1]
+        if weight == 0.0 or (even and (down, right) < (0, 0)):
+            continue
+        turn = 2.0 * np.pi * (fx_cy_per_px * right + fy_cy_per_px * down)
+        twice = 2.0 if even and (down, right) != (0, 0) else 1.0
+        total = total + (twice * weight * np.cos(turn) if even else weight * np.exp(-1j * turn))
+    return total
+
+
+class Acts(Protocol):
+    """What the chain asks of an effect: `sim.effects.base.Effect` says when to write which."""
+
+    def on_light(self, light: Light) -> Light: ...
+
+    def on_image(self, image: Image) -> Image: ...
+
+    def on_charge(self, charge: Charge) -> Charge: ...
+
+    def on_signal(self, signal: Signal) -> Signal: ...
+
+    def on_codes(self, codes: Codes) -> Codes: ...
+
+
+def light_of(camera: CameraModel, effects: Iterable[Acts]) -> Light:
+    """The light's state with all that effects add."""
+    return reduce(lambda state, effect: effect.on_light(state), effects, Light(camera))
+
+
+def image_of(camera: CameraModel, effects: Iterable[Acts]) -> Image:
+    """The image's."""
+    return reduce(lambda state, effect: effect.on_image(state), effects, Image(camera))
+
+
+def charge_of(camera: CameraModel, effects: Iterable[Acts]) -> Charge:
+    """The charge's."""
+    return reduce(lambda state, effect: effect.on_charge(state), effects, Charge(camera))
+
+
+def signal_of(camera: CameraModel, effects: Iterable[Acts]) -> Signal:
+    """The signal's."""
+    return reduce(lambda state, effect: effect.on_signal(state), effects, Signal(camera))
+
+
+def codes_of(camera: CameraModel, effects: Iterable[Acts]) -> Codes:
+    """The codes'."""
+    return reduce(lambda state, effect: effect.on_codes(state), effects, Codes(camera))
+
+
+def laws_of(camera: CameraModel, effects: Iterable[Acts]) -> frozenset[str]:
+    """Which quantities effects change, as `stage.field`."""
+    acting = tuple(effects)
+    states = (f(camera, acting) for f in (light_of, image_of, charge_of, signal_of, codes_of))
+    return frozenset().union(*(state.changed() for state in states))
