@@ -47,6 +47,7 @@ from mocks.truth import AIR_C, COLS, ROWS, SELF_HEATING_C, Truth, hidden_truth
 from sim.camera import Side
 from sim.frame import (
     Exposure,
+    KeptTransfers,
     SceneLight,
     collected_electrons,
     dark_electrons,
@@ -55,7 +56,6 @@ from sim.frame import (
     right_over_left,
     scene_light,
 )
-from sim.plain_image import KeptTransfers
 from sim.scene import Scene, ScreenPattern, UniformField
 from sim.scene.render import Grid, cells, quadrilateral
 from sim.sensor.electrons import sample_from

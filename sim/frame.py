@@ -21,7 +21,8 @@ from sim.detection import efficiency
 from sim.effects.base import Effect
 from sim.optics.illumination import irradiance_factor, relative_illumination
 from sim.optics.imaging import TracedLens
-from sim.plain_image import KeptTransfers, plain_images
+from sim.plain_image import KeptTransfers as KeptTransfers  # noqa: PLC0414  whoever draws many scenes hands one to `scene_light`
+from sim.plain_image import plain_images
 from sim.scene.scenes import Darkness, Scene, SpectralImage
 from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
