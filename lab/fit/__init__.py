@@ -1,5 +1,5 @@
-"""Fits: from recordings to a camera's parameters with their uncertainties. `fit_recording_set` runs all that there
-are.
+"""Fits: the parameters of a camera from its recordings, with their uncertainties. `fit_recording_set` runs all of
+them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STEPS = ("noise", "spectral", "mtf", "psf", "geometry")
 
 
 class _Run:
-    """What the steps of one fit share: the skipped ones and the count of those done."""
+    """State common to the steps of one fit: the skipped ones, and the number of those done."""
 
     def __init__(self, total: int, progress: Progress | None) -> None:
         self.total, self.progress = total, progress
@@ -31,7 +31,7 @@ class _Run:
         self.lock = threading.Lock()
 
     def step(self, name: str, side: Side | None, work: Callable[[], T]) -> T | None:
-        """The result of `work`, or None with a line in `skipped` where the recordings don't determine it."""
+        """The result of `work`, or None and a line in `skipped` where the recordings don't determine it."""
         result: T | None = None
         try:
             result = work()
@@ -46,9 +46,11 @@ class _Run:
 
 
 def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None) -> FitResult:
-    """Run every fit on every side, and the stereo pair; what the recordings don't determine stands in `skipped`.
+    """Run every fit on every side, and the stereo pair. What the recordings don't determine is in `skipped`, with the
+    reason.
 
-    Both sides, and each side's geometry beside its radiometry, run at the same time.
+    Both sides, and the geometry and the radiometry of each side, run at the same time. `progress` is called after each
+    step.
     """
     from lab.fit.geometry.recordings import fit_geometry
     from lab.fit.mtf.recordings import fit_mtf
@@ -96,7 +98,7 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
         source=recordings.source,
         cameras=cameras,
         stereo=found,
-        skipped=tuple(  # the order of threads mustn't show
+        skipped=tuple(  # independent of the order of the threads
             sorted(run.skipped, key=lambda item: (order[item.side], steps.get(item.step, len(steps))))
         ),
     )

@@ -1,10 +1,10 @@
 """Two calibrations of one rig: what changed beyond its uncertainty.
 
-Every number that a fit states with a standard uncertainty is compared, found by its name: `x` beside `x_std`. Numbers
-of curves and kernels share one row, of the point at which they differ most, with the number of points allowed for
-(Sidak). Cameras' geometry is also compared by what it does: both project the same points, the rigid motion that the
-two calibrations imply between each other taken out first (`lab.fit.geometry.projection_errors`), since parameters that
-differ by much may project alike, and the other way round.
+Every number that a fit states with a standard deviation is compared, found by its name: `x` beside `x_std`. The
+numbers of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number
+of points (Sidak). The geometry of cameras is also compared by its effect: both calibrations project the same points,
+after the rigid motion that they imply between each other is removed (`lab.fit.geometry.projection_errors`). Parameters
+that differ much may project alike, and the reverse.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ Array = NDArray[np.floating[Any]]
 FALSE_ALARM_RATE = 0.01
 MIN_SEEN = 20  # corners, below which no implied motion is determined
 ROUNDING = 1e-9  # of a value: a smaller uncertainty is none
-FEW = 9  # numbers in a row of their own each; more are a curve
-POINTS = (PhotonTransfer, Emva1288Points)  # of plots: of the recordings, not of the camera
-OF_THE_SET_UP = {"angle_deg"}  # an edge's angle says nothing about the camera
+FEW = 9  # numbers with a row each; more are a curve
+POINTS = (PhotonTransfer, Emva1288Points)  # points of plots: properties of the recordings, not of the camera
+OF_THE_SET_UP = {"angle_deg"}  # the angle of an edge isn't a property of the camera
 AXES = ("wavelength_nm", "frequency_cy_per_px", "radius_px")
 
 
 @dataclass(frozen=True)
 class _Numbers:
-    """What stands under one name: values and standard uncertainties, along `axis` where there is one."""
+    """Values and standard deviations under one name, along `axis` where there is one."""
 
     name: str
     value: Array
@@ -59,9 +59,10 @@ class _Numbers:
 
 
 def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RATE) -> ComparisonResult:
-    """What differs between two fits of one rig, number by number. `false_alarm_rate` is the chance of any `changed`
-    between two calibrations of an unchanged rig; numbers are taken as independent, which they are not: the true rate
-    is lower.
+    """Differences between two fits of one rig, number by number.
+
+    `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. Numbers are taken as
+    independent. They are not; the true rate is lower.
     """
     skipped: list[Skipped] = []
     rows: list[Change] = []
@@ -81,7 +82,7 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
                 projections.append(found)
     if a.stereo is not None and b.stereo is not None:
         rows += _compared(dict(_numbers(a.stereo, "stereo ")), dict(_numbers(b.stereo, "stereo ")), None, skipped)
-        rows += _turned(a.stereo, b.stereo)
+        rows += _rotation_changes(a.stereo, b.stereo)
     elif (a.stereo is None) != (b.stereo is None):
         skipped.append(Skipped(step="stereo", reason=f"only {'A' if a.stereo else 'B'} has it"))
     threshold = _sigma(_sidak_part(false_alarm_rate, len(rows) + len(projections)))
@@ -98,33 +99,34 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
     )
 
 
-# --- significance ------------------------------------------------------------------------------------------------------------
+# --- significance ----------------------------------------------------------------------------------------------------
 
 
 def _sigma(p_value: float) -> float:
+    """A probability as standard deviations of a normal distribution, two-sided."""
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
 
 
 def _sidak_part(rate: float, number: int) -> float:
-    """The chance that each of `number` tests may have, so that any of them has `rate`."""
+    """Probability allowed for each of `number` tests, so that any of them has `rate` (Sidak)."""
     return float(-np.expm1(np.log1p(-rate) / max(number, 1)))
 
 
 def _sidak_whole(p_value: float, number: int) -> float:
-    """The chance of one so small among `number`."""
+    """Probability of a value so small among `number` tests (Sidak)."""
     return float(-np.expm1(number * np.log1p(-min(p_value, 1.0 - 1e-16))))
 
 
-# --- numbers, by their names -------------------------------------------------------------------------------------------------
+# --- numbers, by their names -----------------------------------------------------------------------------------------
 
 
 def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
-    """Every fitted number under `model`, by name. A model in a list is named by what in it is text: capture, channel,
+    """Every fitted number under `model`, by name. A model in a list is named by its text fields: capture, channel,
     board.
     """
     if isinstance(model, POINTS):
         return
-    inflation = _model_error(model) if isinstance(model, GeometryFit) else 1.0
+    std_factor = _model_error(model) if isinstance(model, GeometryFit) else 1.0
     axis_name = next((name for name in AXES if name in type(model).model_fields), "")
     axis = np.array(getattr(model, axis_name), dtype=float) if axis_name else None
     for field in type(model).model_fields:
@@ -139,26 +141,26 @@ def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
             continue
         elif isinstance(value, dict):
             for key in value.keys() & std.keys():
-                yield _listed(f"{name} {key}", value[key], std[key], axis_name, axis, inflation)
+                yield _listed(f"{name} {key}", value[key], std[key], axis_name, axis, std_factor)
         else:
-            yield _listed(name, value, std, axis_name, axis, inflation)
+            yield _listed(name, value, std, axis_name, axis, std_factor)
 
 
 def _listed(
-    name: str, value: Any, std: Any, axis_name: str, axis: Array | None, inflation: float
+    name: str, value: Any, std: Any, axis_name: str, axis: Array | None, std_factor: float
 ) -> tuple[str, _Numbers]:
     values, stds = np.atleast_1d(np.array(value, dtype=float)), np.atleast_1d(np.array(std, dtype=float))
     along = axis if axis is not None and values.shape == axis.shape else None
-    return name, _Numbers(name, values, inflation * stds, axis_name if along is not None else "", along)
+    return name, _Numbers(name, values, std_factor * stds, axis_name if along is not None else "", along)
 
 
 def _identity(model: Frozen) -> str:
-    """What names one of a list: its text fields."""
+    """Name of a model in a list: its text fields."""
     return " ".join(str(value) for field in type(model).model_fields if isinstance(value := getattr(model, field), str))
 
 
 def _model_error(geometry: GeometryFit) -> float:
-    """By how much a geometry's uncertainties fall short: where its own halves differ beyond them, by that much."""
+    """Factor by which the uncertainties of a geometry are too small, where its own halves differ beyond them; else 1."""
     own = geometry.cross_validation
     return max(1.0, own.difference_px / own.expected_px) if own is not None and own.model_error_px > 0 else 1.0
 
@@ -181,7 +183,7 @@ def _compared(
 
 
 def _aligned(a: _Numbers, b: _Numbers) -> tuple[_Numbers, _Numbers]:
-    """Both on A's axis, where B's covers it."""
+    """Both on the axis of A, where that of B covers it."""
     if a.axis is None or b.axis is None or np.array_equal(a.axis, b.axis) or not len(b.axis):
         return a, b
     inside = (a.axis >= b.axis[0]) & (a.axis <= b.axis[-1])
@@ -195,7 +197,7 @@ def _aligned(a: _Numbers, b: _Numbers) -> tuple[_Numbers, _Numbers]:
 def _rows(a: _Numbers, b: _Numbers, side: Side | None) -> Iterator[Change]:
     value_a, value_b, std_a, std_b = (np.ravel(part) for part in (a.value, b.value, a.std, b.std))
     std = np.hypot(std_a, std_b)
-    # A normalised curve is 1 at frequency 0 by definition: its uncertainty there is that of rounding, and so is the difference.
+    # A normalised curve is 1 at frequency 0 by definition; its uncertainty and its difference there are rounding
     least = ROUNDING * np.maximum(np.abs(value_a), np.abs(value_b))
     known = np.flatnonzero(np.isfinite(value_a + value_b) & np.isfinite(std) & (std > least))
     if not len(known):
@@ -240,11 +242,11 @@ def _where(numbers: _Numbers, at: int) -> str:
     return f"[{place}]"
 
 
-# --- geometry ----------------------------------------------------------------------------------------------------------------
+# --- geometry --------------------------------------------------------------------------------------------------------
 
 
 def _covariance(fit: GeometryFit) -> Array | None:
-    """(12, 12) of the intrinsics, or None where the fit doesn't state it."""
+    """Covariance (12, 12) of the intrinsics, or None where the fit doesn't state it."""
     if fit.covariance is None:
         return None
     found = np.zeros((COUNT, COUNT))
@@ -261,7 +263,7 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
         return Skipped(
             step="projection", reason=f"{which} states no covariance of its intrinsics: fit it again", side=side
         )
-    # Both calibrations' corners, in the first camera's frame: where they were seen, as far away as they were.
+    # Corners of both calibrations in the frame of the first camera
     places = [seen_points(a)]
     other = seen_points(b)
     if len(other):
@@ -294,7 +296,7 @@ def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange 
 
 
 def _frame(a: GeometryFit, b: GeometryFit) -> tuple[int, int]:
-    """Rows and columns of the frame, by the maps over it."""
+    """Rows and columns of the frame, from the maps over it."""
     fit = a if a.projection else b
     if fit.projection:
         return round(fit.projection[0].y_px[-1]) + 1, round(fit.projection[0].x_px[-1]) + 1
@@ -303,11 +305,11 @@ def _frame(a: GeometryFit, b: GeometryFit) -> tuple[int, int]:
     return int(rows) + 1, int(cols) + 1
 
 
-def _turned(a: StereoFit, b: StereoFit) -> Iterator[Change]:
-    """The turn from A's rig to B's, about the right camera's axes."""
+def _rotation_changes(a: StereoFit, b: StereoFit) -> Iterator[Change]:
+    """Rotation from the rig of A to that of B, about the axes of the right camera."""
     if a.rotation_std_rad is None or b.rotation_std_rad is None:
         return
-    turn = 1e3 * Rotation.from_matrix(np.array(b.rotation) @ np.array(a.rotation).T).as_rotvec()
+    rotation_mrad = 1e3 * Rotation.from_matrix(np.array(b.rotation) @ np.array(a.rotation).T).as_rotvec()
     for k, axis in enumerate("xyz"):
         std_a, std_b = 1e3 * a.rotation_std_rad[k], 1e3 * b.rotation_std_rad[k]
         std = float(np.hypot(std_a, std_b))
@@ -318,10 +320,10 @@ def _turned(a: StereoFit, b: StereoFit) -> Iterator[Change]:
             where=f"about {axis}, from A's",
             a=0.0,
             a_std=std_a,
-            b=float(turn[k]),
+            b=float(rotation_mrad[k]),
             b_std=std_b,
-            difference=float(turn[k]),
+            difference=float(rotation_mrad[k]),
             difference_std=std,
-            significance_sigma=_sigma(2.0 * float(special.ndtr(-abs(turn[k]) / std))),
+            significance_sigma=_sigma(2.0 * float(special.ndtr(-abs(rotation_mrad[k]) / std))),
             changed=False,
         )

@@ -1,13 +1,13 @@
 """Extrinsics of a stereo pair: x_right = rotation x_left + translation_mm, from poses of a board that both cameras
 saw.
 
-One least-squares problem over everything that both cameras saw: the rig's rotation and translation, both cameras'
-intrinsics, the boards' warp and the pose of the board in every capture (`lab.fit.geometry.bundle_adjustment`). Solving
-for the rig alone, with the intrinsics held where each camera's own views put them, would push their errors into the
-rig and leave them out of its uncertainty.
+One least-squares problem over everything that both cameras saw: rotation and translation of the rig, the intrinsics of
+both cameras, the warp of the boards and the pose of the board in every capture (`lab.fit.geometry.bundle_adjustment`).
+A solve for the rig alone, with the intrinsics held at the values of the single cameras, would transfer their errors to
+the rig and leave them out of its uncertainty.
 
-From the joint covariance follows what a depth is worth. A point P in the left camera's frame is seen at q(theta, P),
-(4,) px in both frames. With A = dq/dP and B = dq/dtheta, the triangulated point moves by dP = -(A^T A)^-1 A^T (B
+The joint covariance gives the uncertainty of a depth. A point P in the frame of the left camera is seen at q(theta,
+P), (4,) px in both frames. With A = dq/dP and B = dq/dtheta, the triangulated point moves by dP = -(A^T A)^-1 A^T (B
 dtheta - dq).
 """
 
@@ -60,7 +60,7 @@ DEPTHS_MM = (500.0, 1000.0, 2000.0)
 
 
 @dataclass(frozen=True)
-class Pair:
+class StereoPair:
     """One pose as both cameras saw it."""
 
     left: BoardView
@@ -75,17 +75,17 @@ def fit_stereo(
 ) -> StereoFit:
     """Rotation and translation between the cameras from the `charuco` captures of equal `pose`, with uncertainties.
 
-    `rms_px` is over all corners of both cameras, of the corner's distance from its prediction. Used are the corners
-    that the single cameras' fits rest on; a pair whose rms is more than 3 times the pairs' median is left out.
-    `depths_mm`: where the depth's uncertainty is mapped. Raises `NotDetermined` below 2 pairs, or where no rig
-    explains them.
+    `rms_px` is the root mean square of the distances of all corners of both cameras from their predictions. The
+    corners are those that the fits of the single cameras rest on. A pair whose rms is more than 3 times the median of
+    the pairs is left out. `depths_mm`: where the uncertainty of the depth is mapped. Raises `NotDetermined` below 2
+    pairs, or where no rig explains them.
     """
     shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
     return fit_pairs(paired_views(recordings, left, right), left, right, shapes, depths_mm)
 
 
 def fit_pairs(
-    pairs: Sequence[Pair],
+    pairs: Sequence[StereoPair],
     left: GeometryFit,
     right: GeometryFit,
     shapes: Sequence[tuple[int, int]],
@@ -121,16 +121,16 @@ def fit_pairs(
     return _result(solution, pairs, shapes, depths_mm, tuple(rejected))
 
 
-def paired_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[Pair]:
-    """Views of both cameras with the same `pose`, the first of each where a pose was repeated, in the left one's
-    order.
+def paired_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit) -> list[StereoPair]:
+    """Views of both cameras with the same `pose`, in the order of the left camera; the first of each where a pose was
+    repeated.
     """
     of_left, of_right = _views_by_pose(recordings, "left", left), _views_by_pose(recordings, "right", right)
-    return [Pair(view, of_right[pose]) for pose, view in of_left.items() if pose in of_right]
+    return [StereoPair(view, of_right[pose]) for pose, view in of_left.items() if pose in of_right]
 
 
 def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> dict[str, BoardView]:
-    """The views that a camera's fit rests on, without the corners that it has left out."""
+    """The views that the fit of a camera rests on, by pose, without the corners that it left out."""
     captures = {capture.id: capture for capture in recordings.captures("charuco", side)}
     found: dict[str, BoardView] = {}
     for view in fit.residuals:
@@ -146,33 +146,35 @@ def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> di
 
 
 def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
-    """Mask (12,) of the intrinsics that a fit has let free."""
+    """Mask (12,) of the intrinsics that a fit has fitted."""
     if fit.parameters:
         return np.array([name in fit.parameters for name in NAMES])
     return np.append(np.ones(8, dtype=bool), intrinsics_of_fit(fit)[8:] != 0.0)
 
 
-def solve_rig(pairs: Sequence[Pair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int]) -> Solution:
-    """Joint least squares of the rig, both cameras' intrinsics, the boards' warps and their poses, from where the
-    single cameras' fits ended. Sights stand pair by pair, left then right.
+def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int]) -> Solution:
+    """Joint least squares of the rig, the intrinsics of both cameras, the warps of the boards and their poses.
+
+    It starts from the fits of the single cameras. Observations are pair by pair, left then right. `shape`: (rows,
+    cols).
     """
     cameras = np.array([intrinsics_of_fit(left), intrinsics_of_fit(right)])
     keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
-    observations, poses, turns, shifts = [], [], [], []
+    observations, poses, turns, translations = [], [], [], []
     for k, pair in enumerate(pairs):
         board = keys.index(board_key(pair.left))
         observations += [Observation(pair.left, k, board, 0), Observation(pair.right, k, board, 1)]
-        (turn_one, shift_one), (turn_two, shift_two) = (
+        (rotation_one, translation_one), (rotation_two, translation_two) = (
             board_pose(view, camera) for view, camera in zip((pair.left, pair.right), cameras, strict=True)
         )
-        rotation = turn_two @ turn_one.T
-        poses.append((turn_one, shift_one))
+        rotation = rotation_two @ rotation_one.T
+        poses.append((rotation_one, translation_one))
         turns.append(Rotation.from_matrix(rotation).as_rotvec())
-        shifts.append(shift_two - rotation @ shift_one)
+        translations.append(translation_two - rotation @ translation_one)
     start = State(
         intrinsics=cameras,
         rotation=Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(),
-        translation_mm=np.median(shifts, axis=0),
+        translation_mm=np.median(translations, axis=0),
         warps_mm=np.zeros((len(keys), 3)),
         rotations=np.array([turn for turn, _ in poses]),
         translations_mm=np.array([shift for _, shift in poses]),
@@ -182,7 +184,7 @@ def solve_rig(pairs: Sequence[Pair], left: GeometryFit, right: GeometryFit, shap
 
 def _result(
     solution: Solution,
-    pairs: Sequence[Pair],
+    pairs: Sequence[StereoPair],
     shapes: Sequence[tuple[int, int]],
     depths_mm: Sequence[float],
     rejected: tuple[Skipped, ...],
@@ -193,14 +195,14 @@ def _result(
     translation = state.translation_mm
     baseline = float(np.linalg.norm(translation))
     along = translation / baseline
-    of_shift = solution.covariance[at + 3 : at + 6, at + 3 : at + 6]
+    of_translation = solution.covariance[at + 3 : at + 6, at + 3 : at + 6]
     return StereoFit(
         rotation=triples(state.rotation),
         rotation_std_rad=triple(std[:3]),
         translation_mm=triple(translation),
         translation_mm_std=triple(std[3:]),
         baseline_mm=baseline,
-        baseline_mm_std=float(np.sqrt(along @ of_shift @ along)),
+        baseline_mm_std=float(np.sqrt(along @ of_translation @ along)),
         rms_px=solution.rms_px,
         pairs=len(pairs),
         camera_matrix_left=triples(matrix_of(state.intrinsics[0])),
@@ -216,11 +218,11 @@ def _result(
     )
 
 
-# --- depth -------------------------------------------------------------------------------------------------------------------
+# --- depth -----------------------------------------------------------------------------------------------------------
 
 
 def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Array]:
-    """Slopes of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by the shared
+    """Jacobian of where both cameras see `points` (n, 3), left then right: by the point (n, 4, 3), and by the shared
     parameters (n, 4, parameters).
     """
     state, free = solution.state, solution.free
@@ -240,8 +242,10 @@ def triangulation_jacobian(solution: Solution, points: Array) -> tuple[Array, Ar
 
 
 def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[Array, Array]:
-    """Standard uncertainty (n,) of the triangulated depth of `points`, mm: by the calibration, and with corners in
-    both pictures that scatter by `corner_px_std` a coordinate, too.
+    """Standard deviation (n,), mm, of the triangulated depth of `points` (n, 3): by the calibration, and by
+    calibration and corners together.
+
+    `corner_px_std`: standard deviation of a coordinate of a corner in both pictures.
     """
     by_point, shared = triangulation_jacobian(solution, points)
     inverse = np.linalg.pinv(by_point)[:, 2, :]  # (n, 4): the row of the depth
@@ -252,7 +256,7 @@ def depth_std(solution: Solution, points: Array, corner_px_std: float) -> tuple[
 
 
 def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tuple[int, int]]) -> DepthUncertainty:
-    """The map of `depth_std` over the left camera's frame at one depth, where the right camera sees the point."""
+    """The map of `depth_std` over the frame of the left camera at one depth, where the right camera sees the point."""
     x, y = grid(shapes[0])
     state = solution.state
     points = unproject(grid_points(x, y), state.intrinsics[0]) * depth_mm
@@ -277,32 +281,32 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
     )
 
 
-# --- rectification -----------------------------------------------------------------------------------------------------------
+# --- rectification ---------------------------------------------------------------------------------------------------
 
 
-def rectification(state: State, pairs: Sequence[Pair], shape: tuple[int, int]) -> Rectification:
-    """OpenCV's rectification, with the rows' disagreement of the corners that both cameras saw."""
+def rectification(state: State, pairs: Sequence[StereoPair], shape: tuple[int, int]) -> Rectification:
+    """The rectification of OpenCV, with the rms difference of the rows of the corners that both cameras saw."""
     one, two = (matrix_of(camera) for camera in state.intrinsics)
     of_one, of_two = (distortion_of(camera) for camera in state.intrinsics)
     found = cv2.stereoRectify(
         one, of_one, two, of_two, shape[::-1], state.rotation, state.translation_mm[:, None], alpha=0.0
     )
-    turn_one, turn_two, new_one, new_two, to_depth = found[:5]
+    rotation_one, rotation_two, new_one, new_two, to_depth = found[:5]
     gaps = []
     for pair in pairs:
         _, at_left, at_right = np.intersect1d(pair.left.index, pair.right.index, return_indices=True)
         row_px = [
             cv2.undistortPoints(view.image_px[at][:, None, :], matrix, distortion, R=turn, P=new)[:, 0, 1]
             for view, at, matrix, distortion, turn, new in (
-                (pair.left, at_left, one, of_one, turn_one, new_one),
-                (pair.right, at_right, two, of_two, turn_two, new_two),
+                (pair.left, at_left, one, of_one, rotation_one, new_one),
+                (pair.right, at_right, two, of_two, rotation_two, new_two),
             )
             if len(at)
         ]
         gaps += [row_px[1] - row_px[0]] if row_px else []
     return Rectification(
-        rotation_left=triples(turn_one),
-        rotation_right=triples(turn_two),
+        rotation_left=triples(rotation_one),
+        rotation_right=triples(rotation_two),
         projection_left=rows(new_one),
         projection_right=rows(new_two),
         disparity_to_depth=rows(to_depth),
@@ -311,9 +315,10 @@ def rectification(state: State, pairs: Sequence[Pair], shape: tuple[int, int]) -
 
 
 def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, tuple[Array, Array]]:
-    """OpenCV's maps (x, y), each of `shape` (rows, cols) float32, for `cv2.remap` of each side's frames into the
-    rectified pair, in which a point stands in the same row of both. Raises `NotDetermined` where the fit has no
-    rectification.
+    """Maps (x, y) of OpenCV, each of `shape` (rows, cols), float32, for `cv2.remap` of the frames of each side into
+    the rectified pair.
+
+    In it a point is in the same row of both frames. Raises `NotDetermined` where the fit has no rectification.
     """
     if stereo.rectification is None or stereo.camera_matrix_left is None or stereo.camera_matrix_right is None:
         raise NotDetermined("rectification", "the stereo fit has none: fit again cameras of equal size")
@@ -334,4 +339,5 @@ def rectification_maps(stereo: StereoFit, shape: tuple[int, int]) -> dict[Side, 
 
 
 def _open_rows(values: Array) -> tuple[tuple[float | None, ...], ...]:
+    """A matrix, row by row; None where it isn't finite."""
     return tuple(tuple(float(value) if np.isfinite(value) else None for value in row) for row in values)

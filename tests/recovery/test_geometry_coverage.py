@@ -15,7 +15,7 @@ from lab.fit.geometry.lateral_colour import channel_geometry
 from lab.fit.geometry.pinhole import intrinsics_of
 from lab.fit.geometry.projection_errors import difference, grid, grid_points, points_at
 from lab.fit.geometry.recordings import geometry_result
-from lab.fit.stereo import Pair, depth_std, solve_rig
+from lab.fit.stereo import StereoPair, depth_std, solve_rig
 from lab.formats.results import CameraFit, FitResult
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
 
@@ -102,7 +102,7 @@ def test_geometry_covers() -> None:
         # the rig
         fit_left, fit_right = geometry_result(one), geometry_result(two)
         fits.append(FitResult(source=f"{draw}", cameras={"left": CameraFit(geometry=fit_left)}))
-        pairs = [Pair(a, b) for a, b in zip(one.views, two.views, strict=True)]
+        pairs = [StereoPair(a, b) for a, b in zip(one.views, two.views, strict=True)]
         rig = solve_rig(pairs, fit_left, fit_right, SHAPE)
         at_rig = rig.names.index("turn_x_rad")
         std = np.sqrt(np.diag(rig.covariance)[at_rig : at_rig + 6])

@@ -255,8 +255,8 @@ class BundleAdjustment:
         at = 0
         for camera, mask in enumerate(self.free):
             its = self.of_camera == camera
-            _, slope, by_camera = project_with_jacobian(own[its], state.intrinsics[camera])
-            by_point[its] = slope
+            _, point_jacobian, by_camera = project_with_jacobian(own[its], state.intrinsics[camera])
+            by_point[its] = point_jacobian
             if not self.only_poses:
                 shared[its, :, at : at + int(mask.sum())] = by_camera[:, :, mask]
                 at += int(mask.sum())

@@ -187,7 +187,7 @@ def _remove_outlying_corners(
 
 def _corner_reason(numbers: list[tuple[int, float]], noise_px: float) -> str:
     which = ", ".join(f"{index} ({px:.2f} px)" for index, px in sorted(numbers))
-    return f"corners {which} lie off, where the others std by {noise_px:.3f} px"
+    return f"corners {which} lie off, where the others have a standard deviation of {noise_px:.3f} px"
 
 
 def _check_board(views: Sequence[BoardView], solution: Solution, shape: tuple[int, int]) -> None:

@@ -155,7 +155,7 @@ def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures
     remarks = []
     if of_pictures is not None and solution.noise_px > 2.0 * max(of_pictures, 1e-3):
         remarks.append(
-            f"The corners std by {solution.noise_px:.3f} px about the model, where the pictures' noise accounts for "
+            f"The corners depart from the model by {solution.noise_px:.3f} px (standard deviation), where the pictures' noise accounts for "
             f"{of_pictures:.3f} px: the rest is the board's print and shape, motion, or the lens model."
         )
     if validation is None:

@@ -61,7 +61,8 @@ class SpatialVariance:
         `total`, `rows_mean`, `columns_mean`: measured variances of the mean frame, of the averages of its rows
         (s^2_rav) and of its columns (s^2_cav); `share`: the temporal variance over L in `total`.
 
-            s^2 = s_row^2 + s_col^2 + s_pixel^2,   s_rav^2 = s_row^2 + s_pixel^2 / N,   s_cav^2 = s_col^2 + s_pixel^2 / M
+            s^2 = s_row^2 + s_col^2 + s_pixel^2
+            s_rav^2 = s_row^2 + s_pixel^2 / N,   s_cav^2 = s_col^2 + s_pixel^2 / M
             s_pixel^2 = M N / (M N - M - N) (s^2 - s_cav^2 - s_rav^2)
         """
         m, n = shape

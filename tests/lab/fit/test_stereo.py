@@ -13,7 +13,7 @@ from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.recordings import fit_geometry, geometry_result
-from lab.fit.stereo import Pair, fit_pairs, fit_stereo, rectification_maps
+from lab.fit.stereo import StereoPair, fit_pairs, fit_stereo, rectification_maps
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from tests.lab.fit.projected import SHAPE, poses, seen
 
@@ -50,7 +50,7 @@ def drawn_pairs(rng: np.random.Generator, noise_px: float = 0.1, count: int = 10
     at = poses(count)
     sides = [seen(rng, at, noise_px=noise_px, side=side) for side in ("left", "right")]
     calibrations = [calibrate_robustly(views, SHAPE) for views in sides]
-    pairs = [Pair(one, two) for one, two in zip(calibrations[0].views, calibrations[1].views, strict=True)]
+    pairs = [StereoPair(one, two) for one, two in zip(calibrations[0].views, calibrations[1].views, strict=True)]
     return pairs, *[geometry_result(calibration) for calibration in calibrations]
 
 
@@ -93,13 +93,13 @@ def test_a_mirrored_camera_makes_no_rig():
     pairs, left, right = drawn_pairs(np.random.default_rng(2))
     mirrored = [replace(p.right, image_px=np.array([SHAPE[1] - 1.0, 0.0]) + p.right.image_px * [-1, 1]) for p in pairs]
     with pytest.raises(NotDetermined, match="no rig explains the pairs"):
-        fit_pairs([Pair(p.left, m) for p, m in zip(pairs, mirrored, strict=True)], left, right, (SHAPE, SHAPE))
+        fit_pairs([StereoPair(p.left, m) for p, m in zip(pairs, mirrored, strict=True)], left, right, (SHAPE, SHAPE))
 
 
 def test_a_pair_that_is_not_one_is_left_out():
     """One pose under another's name."""
     pairs, left, right = drawn_pairs(np.random.default_rng(3))
-    wrong = Pair(pairs[3].left, replace(pairs[3].right, image_px=pairs[3].right.image_px + np.array([4.0, 1.0])))
+    wrong = StereoPair(pairs[3].left, replace(pairs[3].right, image_px=pairs[3].right.image_px + np.array([4.0, 1.0])))
     fit = fit_pairs([*pairs[:3], wrong, *pairs[4:]], left, right, (SHAPE, SHAPE))
     assert fit.pairs == len(pairs) - 1
     assert [item.step for item in fit.rejected] == ["pose pose-3"]

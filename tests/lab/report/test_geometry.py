@@ -10,7 +10,7 @@ import pytest
 
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.recordings import geometry_result
-from lab.fit.stereo import Pair, fit_pairs
+from lab.fit.stereo import StereoPair, fit_pairs
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
 from lab.formats.results import ChannelGeometry, GeometryFit
 from lab.report.geometry import (
@@ -32,7 +32,7 @@ def rig():
     rng, at = np.random.default_rng(0), poses(7)
     sides = [seen(rng, at, side=side) for side in ("left", "right")]
     fits = [geometry_result(calibrate_robustly(views, SHAPE)) for views in sides]
-    pairs = [Pair(one, two) for one, two in zip(*sides, strict=True)]
+    pairs = [StereoPair(one, two) for one, two in zip(*sides, strict=True)]
     return pairs, fits, fit_pairs(pairs, *fits, (SHAPE, SHAPE))
 
 
