@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 
 from drivers.instrument import Instrument
 
@@ -21,3 +22,6 @@ class Stage(Instrument):
     @abstractmethod
     def targets(self) -> tuple[str, ...]:
         """Names of the targets at hand; empty if the stage can't tell."""
+
+    def instruct(self, instructions: Mapping[str, str]) -> None:
+        """Tell what an operator does for each target. A stage that moves by itself needs no instruction."""

@@ -57,6 +57,10 @@ class PromptStage(Stage):
             raise Interrupted(f"target stage: stopped at {target} by the operator; start again and it resumes")
         self._placed = target
 
+    def instruct(self, instructions: Mapping[str, str]) -> None:
+        """Instructions for targets that have none yet: those of the station file come first."""
+        self._instructions = {**instructions, **self._instructions}
+
     def placed(self) -> str:
         return self._placed
 

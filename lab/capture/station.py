@@ -191,12 +191,15 @@ def drivers_of(station: Station) -> Drivers:
     def made(family: str, entry: Address | None) -> Any:
         return entry and _make(family, family, entry.driver, entry.address, entry.settings)
 
+    stage = made("stage", station.stage)
+    if stage is not None:
+        stage.instruct({name: target.instruction for name, target in station.targets.items()})
     return Drivers(
         cameras={
             side: cast(CameraDriver, _make("camera", f"cameras.{side}", entry.driver, entry.address, entry.settings))
             for side, entry in station.cameras.items()
         },
-        stage=made("stage", station.stage),
+        stage=stage,
         monochromator=made("monochromator", station.monochromator),
         spectroradiometer=made("spectroradiometer", station.spectroradiometer),
         display=made("display", station.display),

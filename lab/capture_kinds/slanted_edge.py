@@ -117,7 +117,7 @@ class SlantedEdgeCapture(Capture):
     `angle_deg`: from the vertical, nominal; positive turns the edge's top to the right.
     """
 
-    shows: ClassVar[str] = "one straight edge in `region`"
+    shows: ClassVar[str] = "a straight edge in each region"
     sequence: ClassVar[type[Sequence] | None] = EdgeSequence
     shares_frame: ClassVar[bool] = True
 

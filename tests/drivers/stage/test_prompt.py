@@ -25,6 +25,15 @@ def test_the_person_is_asked_once_for_each_target() -> None:
     ]
 
 
+def test_the_station_files_instruction_comes_before_the_targets_own() -> None:
+    asked: list[str] = []
+    stage = PromptStage(instructions={"cap": "put the caps on"}, ask=lambda question: asked.append(question) or "")
+    stage.instruct({"cap": "close every lens", "sphere": "turn to the sphere"})
+    for target in ("cap", "sphere"):
+        stage.place(target)
+    assert [question.split(",")[0] for question in asked] == ["cap: put the caps on", "sphere: turn to the sphere"]
+
+
 def test_the_person_can_stop() -> None:
     stage = PromptStage(ask=lambda question: "q")
     with pytest.raises(Interrupted, match="stopped at sphere by the operator"):
