@@ -39,6 +39,8 @@ commands = typer.Typer()
 
 #: Says what a bench conceals that is told nothing on its command line.
 CONCEAL_VARIABLE = "CALIBENCH_CONCEAL"
+#: The dark current doubles every few degrees: beyond this, darks saturate.
+WARMEST_C = 40.0
 
 
 class Place(Light, Targets, Screen, Protocol):
@@ -180,6 +182,8 @@ def _concealed(specs: list[str], healthy: bool) -> Concealed | None:
 def _bench(seed: int, real_time: float, concealed: Concealed | None, warm_up_c: float) -> Bench:
     from mocks.bench import Bench
 
+    if not abs(warm_up_c) <= WARMEST_C:
+        raise _Unusable(f"--warm-up {warm_up_c:g}: beyond {WARMEST_C:g} degrees; give how much warmer the sensors get")
     place = Bench(seed, max(0.0, real_time), concealed, warm_up_c=warm_up_c, session_clock=time.time)
     place.compile_loops()
     return place

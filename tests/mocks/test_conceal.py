@@ -271,6 +271,7 @@ def test_effects_of_the_rig_are_the_same_for_both() -> None:
         (("--conceal", "left:defocus:depth=3"), "", "no parameter 'depth'"),
         ((), "left:defocus:defocus_um=3; left:defocus:depth=3", "no parameter 'depth'"),
         (("--healthy", "--conceal", "left:defocus:defocus_um=3"), "", "--healthy conceals nothing"),
+        (("--warm-up", "nan"), "", "--warm-up nan: beyond 40 degrees"),
     ],
 )
 def test_the_command_refuses_in_one_line(arguments: tuple[str, ...], environment: str, complaint: str) -> None:

@@ -1,0 +1,97 @@
+"""The steps of an exposure one by one, as a bench takes them that keeps a scene's light."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.ambient_light import AmbientLight
+from sim.effects.exposure_offset import ExposureOffset
+from sim.effects.image_lag import ImageLag
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
+from sim.effects.source_drift import SourceDrift
+from sim.effects.stereo_gain_mismatch import StereoGainMismatch
+from sim.effects.wavelength_offset import WavelengthOffset
+from sim.forward import (
+    Exposure,
+    KeptTransfers,
+    collected_electrons,
+    expected_electrons,
+    expected_sequence,
+    radiance_at_lens,
+    read_electrons,
+    scene_gain,
+    scene_light,
+)
+from sim.scene import Darkness, ScreenPattern, UniformField, Warp
+from sim.spectrum import Spectrum
+
+
+def test_one_light_serves_many_exposures(colour_camera: CameraModel, lamp: Spectrum) -> None:
+    effects = (
+        SourceDrift(drift_percent_per_min=3.0),
+        AmbientLight(rate_e_per_s=500.0),
+        ExposureOffset(offset_us=800.0),
+    )
+    light = scene_light(colour_camera, UniformField(lamp), effects)
+    for exposure_s, elapsed_s in ((0.01, 0.0), (0.02, 120.0)):
+        exposure = Exposure(UniformField(lamp), exposure_s, elapsed_s=elapsed_s)
+        assert np.array_equal(
+            collected_electrons(light, colour_camera, exposure, effects),
+            expected_electrons(colour_camera, exposure, effects),
+        )
+
+
+def test_the_room_keeps_its_light_when_the_source_changes(colour_camera: CameraModel, lamp: Spectrum) -> None:
+    effects = (AmbientLight(rate_e_per_s=500.0),)
+    light = scene_light(colour_camera, UniformField(lamp), effects)
+    exposure = Exposure(UniformField(lamp), 0.01)
+    full, half, none = (
+        collected_electrons(light, colour_camera, exposure, effects, source=source) for source in (1.0, 0.5, 0.0)
+    )
+    assert np.allclose(half - none, 0.5 * (full - none))
+    assert np.allclose(none, 5.0 + colour_camera.dark_current_e_per_s * 0.01)
+
+
+def test_kept_transfers_give_the_same_frames(colour_camera: CameraModel, lamp: Spectrum) -> None:
+    rng = np.random.default_rng(2)
+    warp = Warp.from_corners(30, 30, [(2, 4), (3, 92), (70, 90), (68, 3)])
+    effects = (OpticalLowPassFilter(displacement_x_um=2.0, displacement_y_um=1.0),)
+    kept = KeptTransfers()
+    for light in (lamp, lamp, lamp.scaled(2.0)):
+        pattern = rng.integers(0, 2, (30, 30)).astype(np.uint8)
+        scene = ScreenPattern(pattern, warp, light.scaled(0.01), light)
+        plain = scene_light(colour_camera, scene, effects).scene
+        assert np.allclose(
+            scene_light(colour_camera, scene, effects, transfers=kept).scene, plain, atol=1e-5 * plain.max()
+        )
+
+
+def test_transfers_are_made_once_a_light() -> None:
+    kept, made = KeptTransfers(most=2), []
+
+    def make() -> list[np.ndarray[tuple[int, int], np.dtype[np.complex128]]]:
+        made.append(1)
+        return [np.ones((2, 2), complex)]
+
+    for key in ("a", "a", "b", "a", "c", "b"):
+        assert kept.get(key, make)[0].dtype == np.complex64
+    assert len(made) == 4  # b fell out when c came
+
+
+def test_what_is_read_and_what_stays_is_what_was_held(colour_camera: CameraModel, lamp: Spectrum) -> None:
+    effects = (ImageLag(lag_percent=4.0),)
+    exposures = [Exposure(UniformField(lamp), 0.01), Exposure(Darkness(), 0.01)]
+    left: np.ndarray[tuple[int, ...], np.dtype[np.float64]] | float = 0.0
+    for exposure, together in zip(exposures, expected_sequence(colour_camera, exposures, effects), strict=True):
+        held = expected_electrons(colour_camera, exposure, effects) + left
+        read, left = read_electrons(held, colour_camera, effects)
+        assert np.allclose(read, together)
+        assert np.allclose(read + left, held)
+
+
+def test_what_the_radiometer_says_and_what_is_there(lamp: Spectrum) -> None:
+    there = radiance_at_lens(lamp, (WavelengthOffset(offset_nm=5.0),), "flat")
+    wavelength_nm = np.arange(450.0, 650.0, 5.0)
+    assert np.allclose(there.at(wavelength_nm), lamp.at(wavelength_nm - 5.0))
+    assert scene_gain((StereoGainMismatch(gain_percent=4.0), WavelengthOffset())) == 1.04
