@@ -12,19 +12,19 @@ from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.effects.source_drift import SourceDrift
 from sim.effects.stereo_gain_mismatch import StereoGainMismatch
 from sim.effects.wavelength_offset import WavelengthOffset
-from sim.forward import (
+from sim.frame import (
     Exposure,
     KeptTransfers,
     collected_electrons,
     expected_electrons,
     expected_sequence,
-    radiance_at_lens,
     read_electrons,
-    scene_gain,
+    right_over_left,
     scene_light,
 )
 from sim.scene import Darkness, ScreenPattern, UniformField, Warp
 from sim.spectrum import Spectrum
+from sim.uniform import radiance_at_lens
 
 
 def test_one_light_serves_many_exposures(colour_camera: CameraModel, lamp: Spectrum) -> None:
@@ -90,8 +90,8 @@ def test_what_is_read_and_what_stays_is_what_was_held(colour_camera: CameraModel
         assert np.allclose(read + left, held)
 
 
-def test_what_the_radiometer_says_and_what_is_there(lamp: Spectrum) -> None:
-    there = radiance_at_lens(lamp, (WavelengthOffset(offset_nm=5.0),), "flat")
+def test_what_the_radiometer_says_and_what_is_there(colour_camera: CameraModel, lamp: Spectrum) -> None:
+    there = radiance_at_lens(colour_camera, lamp, (WavelengthOffset(offset_nm=5.0),), "flat")
     wavelength_nm = np.arange(450.0, 650.0, 5.0)
     assert np.allclose(there.at(wavelength_nm), lamp.at(wavelength_nm - 5.0))
-    assert scene_gain((StereoGainMismatch(gain_percent=4.0), WavelengthOffset())) == 1.04
+    assert right_over_left(colour_camera, (StereoGainMismatch(gain_percent=4.0), WavelengthOffset())) == 1.04

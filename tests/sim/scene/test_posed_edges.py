@@ -11,7 +11,7 @@ from sim.camera import CameraModel, Geometry
 from sim.effects.defocus import Defocus
 from sim.effects.distortion import Distortion
 from sim.effects.field_curvature import FieldCurvature
-from sim.forward import Exposure, expected_electrons
+from sim.frame import Exposure, expected_electrons
 from sim.scene import EdgeRegion, KnifeEdge, PlaneEdge, PosedEdges, ReflectanceChart, Warp
 from sim.scene.render import Grid, draw
 from sim.scene.warp import distort
