@@ -1,4 +1,4 @@
-"""The REST service and the operator's page. Routes are thin; what they share is a `Service`."""
+"""The REST service and the operator's page. Routes parse and call one function of `lab`; they share a `Service`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def health() -> Health:
 
 @open_to_all.post("/login", tags=["access"], responses=answers(401, 403, 413, 422, 429))
 async def login(service: Here, request: Request, asked: Login, response: Response) -> Me:
-    """Swap a key for the page's cookie. Wrong keys are answered slowly."""
+    """Exchange a key for the page's cookie. A wrong key is answered after a pause."""
     key = holder(asked.key.strip(), stored_keys(service.store))
     if key is None:
         await request.app.state.patience.after_failure()
@@ -103,7 +103,7 @@ def static_file(name: str) -> Response:
 
 @open_to_all.get("/favicon.ico", include_in_schema=False)
 def favicon() -> Response:
-    """None; said once, so that browsers don't ask again and again."""
+    """There is no icon; browsers remember this answer for a day."""
     return Response(status_code=204, headers={"Cache-Control": "max-age=86400"})
 
 
@@ -122,8 +122,8 @@ def create_app(
     """The application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
-    the service is reached, beside this computer's own. `connect` makes a station's drivers. At its end, the application
-    stops what runs: sessions are left resumable with shutters closed, jobs are cancelled.
+    the service is reached, beside this computer's own. `connect` makes a station's drivers. When the application ends, it cancels
+    its jobs and aborts its sessions, which can be resumed; shutters are closed.
     """
     folder = stations or store.root / "stations"
     folder.mkdir(parents=True, exist_ok=True)
@@ -173,7 +173,7 @@ def create_app(
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The schema, with the errors' and the events' data, which no answer's model names."""
+    """The OpenAPI schema, with the models of errors and events, which no route's return type names."""
     if app.openapi_schema is None:
         made = get_openapi(
             title=app.title,

@@ -24,7 +24,7 @@ Folder = Annotated[
     Path | None, typer.Option("--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
 ]
 FIRST_KEY = "first"
-_ANY = ("0.0.0.0", "::", "")  # addresses of this computer that are nobody's name
+_ANY = ("0.0.0.0", "::", "")  # addresses that listen everywhere and name no computer
 
 
 def _store(folder: Path | None) -> Store:
@@ -40,7 +40,7 @@ def _first_key(store: Store) -> None:
 
 
 def logging_config() -> dict[str, Any]:
-    """uvicorn's, with keys hidden that a client wrote into a URL."""
+    """uvicorn's logging configuration, with a filter that removes keys from URLs."""
     from uvicorn.config import LOGGING_CONFIG
 
     config = copy.deepcopy(LOGGING_CONFIG)
@@ -79,7 +79,7 @@ def serve(
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM, the certificate's private key")] = None,
     data: Folder = None,
 ) -> None:
-    """Run the REST service and the operator's page. At its first start on loopback it makes a key and prints it."""
+    """Run the REST service and the operator's page. The first start on loopback makes a key and prints it."""
     import uvicorn
 
     from api.app import create_app
@@ -122,7 +122,7 @@ def create(
     scope: Annotated[Permission, typer.Option(help="what it allows; each includes read")] = Permission.READ,
     data: Folder = None,
 ) -> None:
-    """Make a key and print it: this is the only time that it can be seen."""
+    """Make a key and print it. It can't be printed again."""
     typer.echo(create_key(_store(data), name, scope))
 
 
@@ -135,6 +135,6 @@ def list_keys(data: Folder = None) -> None:
 
 @key.command("remove")
 def remove(name: str, data: Folder = None) -> None:
-    """Take a key away, with the page's logins that it opened."""
+    """Remove a key and the logins of the operator's page that were made with it."""
     _store(data).remove_key(name)
     typer.echo(f"removed: {name}")

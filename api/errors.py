@@ -1,4 +1,4 @@
-"""Errors as answers: one line in `detail`, and the status that fits."""
+"""Errors as HTTP responses: one line in `detail`, and a status."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ T = TypeVar("T")
 
 
 class Conflict(Exception):
-    """What is asked for doesn't go with what goes on: 409."""
+    """The request conflicts with what is under way (status 409)."""
 
 
 class Problem(BaseModel):
-    """Every error's body."""
+    """The body of every error response."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -39,7 +39,7 @@ _MEANINGS = {
     401: "no valid key",
     403: "the key's scope doesn't reach, or a foreign Origin",
     404: "there is no such thing",
-    409: "doesn't go with what goes on",
+    409: "conflicts with what is under way",
     413: "larger than allowed",
     422: "can't be used: what, where, remedy",
     429: "too often",
@@ -48,13 +48,13 @@ _MEANINGS = {
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The error answers of a route, for OpenAPI; JSON whatever the route answers else, so not by FastAPI's `model`."""
+    """OpenAPI's error responses of a route. They are JSON whatever the route returns, so FastAPI's `model` doesn't fit."""
     content = {"application/json": {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
 
 def known(what: str, look: Callable[[], T]) -> T:
-    """What `look` finds; where it raises InputError, 404 with `what` in one line."""
+    """The result of `look`. Raises 404 with `what` as its one line where `look` raises InputError."""
     try:
         return look()
     except InputError:
@@ -82,13 +82,13 @@ def _invalid(request: Request, error: Exception) -> JSONResponse:
 
 
 class Defects:
-    """Answers what nobody expected with 500 and without its text, which stays in the log."""
+    """Turns an unexpected exception into status 500. Its text stays in the log."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let the request pass, and catch what comes of it."""
+        """Handle one request."""
         begun = False
 
         async def watched(message: Message) -> None:

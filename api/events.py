@@ -1,4 +1,4 @@
-"""Server-sent events: what a follower gets first is how things stand, so that nobody has to have been there from the start."""
+"""Server-sent events. The first event holds the present state, so a client may connect at any time."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def event(name: str, content: BaseModel) -> ServerSentEvent:
 
 
 def stream(events: Callable[[anyio.Event], AsyncIterator[ServerSentEvent]]) -> EventSourceResponse:
-    """The answer; a comment goes out every 15 s, so that proxies don't cut the line. `events` gets what is set when the
-    service stops, and ends then."""
+    """The streaming response. A comment every 15 s keeps proxies from closing the connection. `events` is given an event that
+    is set when the service stops, and ends then."""
     stopping = anyio.Event()
     return EventSourceResponse(
         events(stopping), ping=KEEP_ALIVE_S, send_timeout=30.0, shutdown_event=stopping, shutdown_grace_period=2.0
@@ -35,8 +35,8 @@ async def watched(
     stopping: anyio.Event,
     every_s: float = 0.5,
 ) -> AsyncIterator[ServerSentEvent]:
-    """How something stands now and after each change, by looking at the registry, which other processes write too; the last
-    one is called `end`."""
+    """The state now and after each change; the last event is called `end`. `look` reads the registry every `every_s` seconds,
+    because other processes write to it, too."""
     seen = None
     while True:
         found = await asyncio.to_thread(look)
@@ -53,7 +53,7 @@ async def watched(
 
 
 def described(*events: tuple[str, type[BaseModel], str]) -> dict[int | str, dict[str, Any]]:
-    """The 200 answer of a stream for OpenAPI: which events, with which data."""
+    """OpenAPI's description of a stream: each event's name, its data, and when it is sent."""
     lines = [f"- `{name}`: {when}; its data is a `{model.__name__}`." for name, model, when in events]
     schema = {
         "type": "string",

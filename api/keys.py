@@ -1,7 +1,7 @@
-"""Keys: what they are, what they allow, how they are kept.
+"""Keys of the REST service, and what each allows.
 
-A key is 256 random bits. Only its SHA-256 is stored (a slow hash would protect nothing more at that entropy), compared in
-constant time.
+A key is 256 random bits. Only its SHA-256 is stored, and it is compared in constant time. A slow hash would protect a password; at
+256 bits it adds nothing.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def stored_keys(store: Store) -> list[StoredKey]:
 
 
 def create_key(store: Store, name: str, scope: Permission) -> str:
-    """Register a new key and return it; this is the only time that it can be seen. Raises InputError if the name is taken."""
+    """Register a new key and return it; it can't be read again. Raises InputError if the name is taken."""
     if not re.fullmatch(r"[\w.@-]{1,100}", name):
         raise InputError(f"key name {name!r}: use up to 100 letters, digits and any of _ . @ -")
     key = new_key()
@@ -82,10 +82,10 @@ def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
 
 
 class HideKeys(logging.Filter):
-    """Takes keys out of log lines, where a client wrote one into a URL against all advice."""
+    """Removes keys from log lines: a client may have written one into a URL."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Let every record pass, without the keys in it."""
+        """Remove the keys from a record; no record is dropped."""
         text = record.getMessage()
         hidden = _KEYS.sub(KEY_PREFIX + "***", text)
         if hidden != text and isinstance(record.args, tuple):
@@ -107,7 +107,7 @@ def is_loopback(host: str) -> bool:
 
 
 def check_bind(host: str, keys: Iterable[StoredKey]) -> None:
-    """Raises InputError if others could reach a service that nobody has a key for."""
+    """Raises InputError for a service without keys that other computers could reach."""
     if not is_loopback(host) and not any(True for _ in keys):
         raise InputError(
             f"--host {host}: others could reach this service, and it has no key; "

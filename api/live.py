@@ -1,4 +1,4 @@
-"""The sessions that this process runs: one thread each, and whoever wants to follow them."""
+"""The sessions that this process runs, one thread each, and their followers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POLL_S, PATIENCE_S = 0.2, 60.0
 
 
 class LiveSession:
-    """One session in its thread, with its latest progress; followers get that first and then every change they keep up with."""
+    """One session in a thread of its own. A follower gets the latest progress first, then later ones; a slow follower misses some."""
 
     def __init__(self, station: Station) -> None:
         self.station = station
@@ -41,22 +41,22 @@ class LiveSession:
 
     @property
     def latest(self) -> Progress | None:
-        """The last word of the run."""
+        """The latest progress of the run; None before the first."""
         return self._latest
 
     @property
     def ended(self) -> bool:
-        """Whether the run is over, whatever came of it."""
+        """Whether the run has ended, well or not."""
         return self._ended
 
     def begin(self, capture: CaptureSession) -> None:
-        """Run in a thread of its own; what comes of it is in the registry."""
+        """Start the run's thread. How the run ends is written to the registry."""
         self.capture = capture
         self._thread = threading.Thread(target=self._work, args=(capture,), name=f"session {capture.id}", daemon=True)
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the end of the run; whether it came."""
+        """Wait `timeout_s` at most; True if the run has ended."""
         if self._thread is not None:
             self._thread.join(timeout_s)
         return self._ended
@@ -72,7 +72,7 @@ class LiveSession:
             self._changed(ended=True)
 
     def tell(self, progress: Progress) -> None:
-        """What the run calls from its thread."""
+        """Called by the run, from its thread, at every progress."""
         if progress.state != "running":
             self.pausing = False
         self._changed(progress)
@@ -88,12 +88,12 @@ class LiveSession:
                 loop.call_soon_threadsafe(wake.set)
 
     def nudge(self) -> None:
-        """Let the followers look again."""
+        """Wake the followers, because the session's state changed without progress."""
         self._changed()
 
     async def follow(self, stopping: anyio.Event) -> AsyncIterator[Progress]:
-        """The latest progress, then each later one, until the run ends or the service stops. A slow follower misses some,
-        never the last."""
+        """The latest progress, then later ones, until the run ends or the service stops. A slow follower misses some, never the
+        last."""
         wake = asyncio.Event()
         me = (asyncio.get_running_loop(), wake)
         with self._lock:
@@ -117,7 +117,7 @@ class LiveSession:
 
 
 class LiveSessions:
-    """Starts, controls and ends sessions. At most one runs on an instrument at a time, this process's or another's."""
+    """Starts, controls and ends sessions. Only one session at a time runs on an instrument, also across processes."""
 
     def __init__(self, store: Store, connect: Callable[[Station], Drivers] = drivers_of) -> None:
         self._store, self._connect = store, connect
@@ -126,7 +126,7 @@ class LiveSessions:
         self._closed = False
 
     def find(self, session_id: str) -> LiveSession | None:
-        """The session, if this process runs it now."""
+        """The session if this process runs it now, else None."""
         live = self._live.get(session_id)
         return live if live is not None and not live.ended else None
 
@@ -150,8 +150,8 @@ class LiveSessions:
         return capture.id
 
     def resume(self, session_id: str, moved: Station | None = None) -> None:
-        """Go on after a pause, or run a session again that ended early, on `moved` if its instruments have other addresses
-        now. Raises Conflict where it is neither."""
+        """Continue a paused session, or a session that ended early. `moved`: the station, if its instruments have other addresses
+        now. Raises Conflict for a session that is running or finished."""
         with self._lock:
             live = self.find(session_id)
             if live is not None and live.capture is not None:
@@ -221,12 +221,12 @@ class LiveSessions:
         live.nudge()
 
     def abort(self, session_id: str, reason: str) -> None:
-        """End the run now; what is finished stays, and the session can be resumed."""
+        """End the run now. Finished steps are kept, and the session can be resumed."""
         capture, _ = self._running(session_id)
         capture.abort(reason)
 
     def close(self, patience_s: float = PATIENCE_S) -> None:
-        """End every run in good order: shutters closed, sessions resumable."""
+        """End every run: shutters are closed, and the sessions can be resumed."""
         with self._lock:
             self._closed = True
             live = {id: session for id, session in self._live.items() if not session.ended}
@@ -266,7 +266,7 @@ class LiveSessions:
 
 
 def _addresses(station: Station) -> set[str]:
-    """Where the instruments of a station are reached."""
+    """The addresses of a station's instruments."""
     entries = [
         station.monochromator,
         station.spectroradiometer,

@@ -1,4 +1,4 @@
-"""A raw frame as a small picture for people: black taken off, one value a colour and mosaic cell, shrunk, gamma'd."""
+"""A raw frame as a small picture: black subtracted, one value per colour and mosaic cell, reduced, gamma-encoded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lab.formats.recording_set import DataSheet
 from sim.sensor.mosaic import planes
 
-#: sRGB's curve is near enough a power of this.
+#: The power law that approximates sRGB's encoding.
 GAMMA = 2.2
 
 

@@ -1,4 +1,4 @@
-"""What the service says and takes, beyond the results of `lab.formats.results`, which are the same as on the command line."""
+"""The requests and responses of the service. Results are those of `lab.formats.results`, as on the command line."""
 
 from __future__ import annotations
 
@@ -50,27 +50,27 @@ JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 
 
 class Schema(BaseModel):
-    """Base of all: immutable, and an unknown field is an error."""
+    """Base of all schemas: immutable, and an unknown field is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Health(Schema):
-    """That the service is up; says nothing else, for it needs no key."""
+    """Says that the service is up. It needs no key, so it says nothing else."""
 
     status: Literal["ok"] = "ok"
     version: str
 
 
 class Me(Schema):
-    """Whose key it is."""
+    """Name and scope of the key of the request."""
 
     name: str
     scope: Permission
 
 
 class Login(Schema):
-    """A key, once, for a cookie."""
+    """A key, to be exchanged for a cookie."""
 
     key: str = Field(min_length=1, max_length=200)
 
@@ -105,7 +105,7 @@ class SessionStart(Schema):
 
 
 class SessionResume(Schema):
-    """Where to go on, if its instruments have moved."""
+    """On which station a session continues."""
 
     station: str | None = Field(
         default=None,
@@ -145,7 +145,7 @@ class Session(Schema):
 
 
 class SessionDetail(Session):
-    """A session with where it runs, how far it is, and with what it was taken."""
+    """A session with its station, its progress and its provenance."""
 
     station: str
     progress: Progress | None = Field(description="null unless this service runs it now")
@@ -203,7 +203,7 @@ class PipelineResults(Schema):
 
 
 class Job(Schema):
-    """Work on one source: a session, or recordings that were sent in."""
+    """A job on one source: a session, or recordings that were sent in."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -1,4 +1,4 @@
-"""What the routes of one application share."""
+"""The service behind the routes of one application, and the dependencies that routes declare."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lab.pipeline import ReportFile
 
 @dataclass(frozen=True)
 class Limits:
-    """Caps on what is sent in."""
+    """Upper limits of request bodies and archives."""
 
     body_bytes: int = 1 << 20
     upload_bytes: int = 4 << 30
@@ -35,7 +35,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Service:
-    """One per application."""
+    """What the routes work on; one per application."""
 
     store: Store
     stations: Path
@@ -82,7 +82,7 @@ class Service:
             raise InputError(f"{written.path}: can't be read ({error.strerror}); make the report again") from error
 
     def progress(self, session_id: str) -> Progress | None:
-        """How far a session is that this process runs."""
+        """The latest progress of a session that this process runs, else None."""
         live = self.live.find(session_id)
         return live.latest if live is not None else None
 

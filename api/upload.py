@@ -1,7 +1,7 @@
-"""Recording sets that are sent in: streamed to the disk under a cap, unpacked under caps into a folder of their own.
+"""Recording sets that are sent in: streamed to the disk and unpacked, both with upper limits, into a folder of their own.
 
-An archive is believed in nothing: sizes are counted while they are written, not read from its headers; names that lead out of
-the folder, links and devices are refused; and the recording set's own reader decides whether what came is one.
+Nothing that an archive states is trusted. Sizes are counted while they are written, not read from its headers. Names that lead
+out of the folder, links and devices are refused. The reader of recording sets then checks the content.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _MANIFEST = "manifest.json"
 
 
 class TooMuch(InputError):
-    """More than the cap allows."""
+    """More than the upper limit."""
 
 
 async def receive(body: AsyncIterator[bytes], file: BinaryIO, limit_bytes: int) -> int:
-    """Write a body to `file` as it comes in; its size. Raises TooMuch beyond `limit_bytes`."""
+    """Write a body to `file` while it arrives; returns its size. Raises TooMuch beyond `limit_bytes`."""
     taken = 0
     async for chunk in body:
         taken += len(chunk)
@@ -46,7 +46,7 @@ async def receive(body: AsyncIterator[bytes], file: BinaryIO, limit_bytes: int) 
 
 
 def _inside(name: str) -> PurePosixPath:
-    """A member's name as a path below the folder. Raises InputError where it leads elsewhere."""
+    """A member's name as a path in the folder. Raises InputError for a path that leads out of it."""
     path = PurePosixPath(name)
     parts = path.parts
     if (
@@ -88,7 +88,7 @@ def _write_members(packed: zipfile.ZipFile, folder: Path, limit_bytes: int, limi
                 made.write(chunk)
 
 
-#: What `zipfile` raises for archives that aren't as they should be.
+#: What `zipfile` raises for a damaged archive.
 _BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -103,7 +103,7 @@ _BROKEN = (
 
 
 def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> None:
-    """Unpack a .zip into `folder`, which must not be there yet. Raises InputError, or TooMuch beyond the caps."""
+    """Unpack a .zip into `folder`, which must not exist. Raises InputError, and TooMuch beyond a limit."""
     try:
         with zipfile.ZipFile(archive) as packed:
             _write_members(packed, folder, limit_bytes, limit_files)
@@ -138,7 +138,7 @@ class Inbox:
 
     @contextlib.contextmanager
     def receiving(self) -> Iterator[Path]:
-        """A place for an archive while it comes in; gone afterwards."""
+        """A temporary folder for an archive while it arrives."""
         self.root.mkdir(parents=True, exist_ok=True)
         place = self.root / f".incoming-{secrets.token_hex(8)}"
         place.mkdir(mode=0o700)
@@ -148,7 +148,7 @@ class Inbox:
             shutil.rmtree(place, ignore_errors=True)
 
     def take_in(self, place: Path, archive: Path, limit_bytes: int, limit_files: int) -> tuple[str, RecordingSet]:
-        """Unpack, read with every check, and keep. Raises InputError (all that is wrong), and then nothing is kept."""
+        """Unpack a recording set, check it completely, and keep it. Raises InputError with all problems; nothing is kept then."""
         unpacked = place / "set"
         unpack(archive, unpacked, limit_bytes, limit_files)
         top = _top(unpacked)
@@ -161,12 +161,12 @@ class Inbox:
         return id, recordings
 
     def manifest(self, id: str) -> Manifest:
-        """The manifest of recordings that were taken in, not looked through again."""
+        """The manifest of kept recordings, which were checked when they were sent in."""
         file = self.folder(id) / _MANIFEST
         return recording.parse_manifest(file.read_text(encoding="utf-8-sig"), _MANIFEST)[0]
 
 
 def _top(folder: Path) -> Path:
-    """Where the manifest is: in the folder, or in the one folder that it holds."""
+    """The folder that holds the manifest: `folder`, or the only folder in it."""
     inner = [entry for entry in folder.iterdir() if entry.is_dir() and entry.name != "__MACOSX"]
     return inner[0] if not (folder / _MANIFEST).exists() and len(inner) == 1 else folder

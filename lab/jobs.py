@@ -175,7 +175,7 @@ class JobRunner:
         return Lock(self.store.root / "runners" / f"{runner}.lock")
 
     def fail_orphans(self) -> int:
-        """Mark the unfinished jobs of runners that are gone as failed; how many there were."""
+        """Mark the unfinished jobs of runners whose process ended as failed; returns how many there were."""
         with self.store.transaction() as db:
             rows = db.scalars(sa.select(JobRow).where(JobRow.state.in_(("queued", "running")))).all()
             gone = {runner for runner in {row.runner for row in rows} if not self._lock_of(runner).is_held()}

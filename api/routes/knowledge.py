@@ -1,4 +1,4 @@
-"""What the models know: who asks, quantities with unit, bounds and prior, effects with reference and rivals."""
+"""The key of the request, the camera model's parameters, and the library of effects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ router = APIRouter()
 
 @router.get("/me", tags=["access"], responses=answers(401))
 def me(key: Annotated[StoredKey, Depends(Demand(Permission.READ))]) -> Me:
-    """The name and the scope of the key that asks."""
+    """Name and scope of the key of the request."""
     return Me(name=key.name, scope=key.scope)
 
 
@@ -39,7 +39,7 @@ def _parameter(name: str, quantity: Quantity) -> Parameter:
 
 @router.get("/parameters", tags=["knowledge"], dependencies=[READ], responses=answers(401))
 def list_parameters() -> list[Parameter]:
-    """The camera model's quantities, as they are declared; the lens's with `lens.` before the name."""
+    """The parameters of the camera model with unit, bounds and prior; those of its lens are called `lens.NAME`."""
     camera = [_parameter(name, quantity) for name, quantity in declared(CameraModel).items()]
     return camera + [_parameter(f"lens.{name}", quantity) for name, quantity in declared(Lens).items()]
 

@@ -1,4 +1,4 @@
-"""Recording sets that are sent in, to be worked on like a session."""
+"""Recording sets that are sent in, on which jobs run as on a session."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _recordings(id: str, manifest: Manifest, warnings: tuple[str, ...] = ()) -> 
     },
 )
 async def send_recordings(service: Here, request: Request, response: Response) -> Recordings:
-    """Send in a recording set: its folder as a .zip, as the body. It is looked through completely before it is kept."""
+    """Send in a recording set: its folder as a .zip, as the body. It is checked completely before it is kept."""
     sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if sent not in TYPES:
         raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the .zip itself as application/zip")

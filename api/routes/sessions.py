@@ -72,7 +72,9 @@ def _state(info: SessionInfo, live: LiveSession | None) -> Any:
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     live = service.live.find(info.id)
     fields = info.model_dump(exclude={"packed"}) | {"state": _state(info, live)}
-    return fields | ({"error": None} if live is not None else {})  # what ended the run before is mended
+    return fields | (
+        {"error": None} if live is not None else {}
+    )  # the error of an earlier run doesn't concern this one
 
 
 def _session(service: Service, session_id: str) -> Session:
@@ -81,7 +83,7 @@ def _session(service: Service, session_id: str) -> Session:
 
 @router.get("/sessions", tags=["sessions"], dependencies=[READ], responses=answers(401))
 def list_sessions(service: Here) -> list[Session]:
-    """All sessions, the newest first."""
+    """All sessions, newest first."""
     return [Session(**_fields(service, info)) for info in service.store.sessions()]
 
 
@@ -93,7 +95,7 @@ def list_sessions(service: Here) -> list[Session]:
     responses=answers(401, 403, 404, 409, 422),
 )
 def start_session(service: Here, start: SessionStart, response: Response) -> Session:
-    """Start a session; it runs on its own, follow its events. 409 while another runs on the same instruments."""
+    """Start a session, which runs in the background. 409 while another session runs on the same instruments."""
     station = service.station(start.station)
     session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
@@ -120,7 +122,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     responses=answers(401, 403, 404, 409, 422),
 )
 def pause_session(service: Here, session_id: SessionId) -> Session:
-    """Pause when the step under way is done: the shutter closes, the screen goes dark."""
+    """Pause at the end of the present step. The shutter closes, the screen goes dark."""
     service.session(session_id)
     service.live.pause(session_id)
     return _session(service, session_id)
@@ -134,7 +136,7 @@ def pause_session(service: Here, session_id: SessionId) -> Session:
     responses=answers(401, 403, 404, 409, 422),
 )
 def resume_session(service: Here, session_id: SessionId, resume: SessionResume | None = None) -> Session:
-    """Go on after a pause; or run a session on that ended early: finished steps aren't taken again."""
+    """Continue after a pause, or continue a session that ended early. Finished steps aren't taken again."""
     service.session(session_id)
     service.live.resume(session_id, service.station(resume.station) if resume and resume.station else None)
     return _session(service, session_id)
@@ -148,7 +150,7 @@ def resume_session(service: Here, session_id: SessionId, resume: SessionResume |
     responses=answers(401, 403, 404, 409, 422),
 )
 def abort_session(service: Here, session_id: SessionId) -> Session:
-    """End the run now. The step under way is dropped, finished ones stay, and the session can be resumed."""
+    """End the run now. The present step is dropped, finished steps are kept, and the session can be resumed."""
     service.session(session_id)
     service.live.abort(session_id, "aborted over the network")
     return _session(service, session_id)
@@ -222,7 +224,7 @@ def list_captures(
     offset: Annotated[int, Query(ge=0)] = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
 ) -> list[Capture]:
-    """What a session captured, in the order in which it was taken."""
+    """The captures of a session, in the order in which they were taken."""
     service.session(session_id)
     chosen = [
         info
@@ -266,7 +268,7 @@ def preview_capture(
     width: Annotated[int, Query(ge=16, le=4096, description="px, at most")] = 480,
     stretch: Annotated[bool, Query(description="white is the frame's own brightest, not the data sheet's")] = False,
 ) -> Response:
-    """A small picture: black taken off, one value a colour and mosaic cell, gamma'd, without white balance."""
+    """A small picture: black subtracted, one value per colour and mosaic cell, gamma-encoded, without white balance."""
     info = _known_capture(service, session_id, capture_id)
     tag = f'"{session_id}-{capture_id}-{width}-{int(stretch)}"'
     headers = FOR_EVER | {"ETag": tag}
