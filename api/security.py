@@ -1,6 +1,6 @@
-"""Who asks, and from where: keys in headers, a cookie for the page, checks of Host and Origin, headers, caps on bodies.
+"""Access control: keys, the page's cookie, Host and Origin, security headers, limits of request bodies.
 
-A key comes in the header `Authorization: Bearer KEY`, never in a URL. The page swaps it once for a cookie that scripts
+A key is sent in the header `Authorization: Bearer KEY`, never in a URL. The operator's page exchanges it for a cookie that scripts
 can't read and other sites can't send.
 """
 
@@ -32,14 +32,14 @@ COOKIE_LIFETIME_S = 12 * 3600.0
 
 @dataclass
 class Logins:
-    """The page's sessions: random tokens in memory, gone with the process."""
+    """The logins of the operator's page: random tokens, kept in memory until the process ends."""
 
     clock: Callable[[], float] = time.monotonic
     _tokens: dict[str, tuple[StoredKey, float]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def open(self, key: StoredKey) -> str:
-        """A token for `key`, good for twelve hours."""
+        """A token for `key`, valid for twelve hours."""
         token, at = secrets.token_urlsafe(32), self.clock()
         with self._lock:
             self._tokens = {known: entry for known, entry in self._tokens.items() if at < entry[1]}
@@ -47,7 +47,7 @@ class Logins:
         return token
 
     def holder(self, token: str) -> StoredKey | None:
-        """The key that opened `token`, or None where it is unknown or has run out."""
+        """The key that `token` was made for; None for an unknown or expired token."""
         with self._lock:
             key, until = self._tokens.get(digest(token), (None, 0.0))
         return key if key is not None and self.clock() < until else None
@@ -60,7 +60,7 @@ class Logins:
 
 @dataclass
 class Patience:
-    """Slows guessing down: failed logins are answered one after the other, each after a pause, and only so many wait."""
+    """Slows down guessing of keys: failed logins are answered one after the other, each after a pause; at most `queue` wait."""
 
     pause_s: float = 0.5
     queue: int = 20
@@ -68,7 +68,7 @@ class Patience:
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def after_failure(self) -> None:
-        """Wait one's turn and the pause; 429 at once where too many wait already."""
+        """Wait for one's turn and for the pause. Raises 429 at once where `queue` others wait."""
         if self._waiting >= self.queue:
             raise HTTPException(429, "too many failed logins; try again in a minute", headers={"Retry-After": "60"})
         self._waiting += 1
@@ -81,13 +81,13 @@ class Patience:
 
 @dataclass(frozen=True)
 class Gate:
-    """Finds out who asks; one per application."""
+    """Identifies the key of a request; one per application."""
 
     keys: Callable[[], Iterable[StoredKey]]
     logins: Logins = field(default_factory=Logins)
 
     def identify(self, request: Request) -> StoredKey | None:
-        """The key behind a request: from the Authorization header, else from the page's cookie."""
+        """The key of a request, from the Authorization header, else from the page's cookie; None without a valid one."""
         header = request.headers.get("authorization", "")
         scheme, _, key = header.partition(" ")
         if header:
@@ -109,7 +109,7 @@ _COOKIE = APIKeyCookie(
 
 
 class Demand:
-    """A dependency of a route: 401 without a valid key, 403 where its scope doesn't reach."""
+    """A dependency of a route: 401 without a valid key, 403 for a key whose scope doesn't allow `wanted`."""
 
     def __init__(self, wanted: Permission) -> None:
         self.wanted = wanted
@@ -120,7 +120,7 @@ class Demand:
         bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_BEARER)],
         cookie: Annotated[str | None, Security(_COOKIE)],
     ) -> StoredKey:
-        """The key behind the request; the two schemes are parameters only so that OpenAPI tells of them."""
+        """The key of the request. `bearer` and `cookie` are parameters only so that OpenAPI lists the two schemes."""
         gate: Gate = request.app.state.gate
         key = gate.identify(request)
         if key is None:
@@ -135,7 +135,7 @@ class Demand:
 
 
 def set_cookie(response: Response, token: str, *, secure: bool) -> None:
-    """Put a login's token where only the browser can send it, and only to us."""
+    """Set the login's cookie: hidden from scripts, sent only to this service."""
     response.set_cookie(
         COOKIE, token, max_age=int(COOKIE_LIFETIME_S), httponly=True, samesite="strict", secure=secure, path="/"
     )
@@ -145,14 +145,14 @@ def set_cookie(response: Response, token: str, *, secure: bool) -> None:
 
 
 class SameHost:
-    """Refuses a foreign Host (DNS rebinding) and a foreign Origin on anything that changes state (cross-site requests)."""
+    """Refuses a foreign Host (against DNS rebinding), and a foreign Origin where the request changes state (against cross-site requests)."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
         self.app = app
         self.hosts = hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let the request pass, or answer 400 (Host) or 403 (Origin)."""
+        """Pass the request on, or answer 400 (Host) or 403 (Origin)."""
         if scope["type"] == "http" and (refusal := self._refusal(scope)) is not None:
             await refusal(scope, receive, send)
             return
@@ -197,7 +197,7 @@ REPORT_POLICY = (
 
 
 class SafeHeaders:
-    """Puts the security headers on every answer; a route that needs another policy sets its own."""
+    """Adds the security headers to every response. A route that needs another policy sets its own."""
 
     DEFAULTS: dict[str, str] = {
         "X-Content-Type-Options": "nosniff",
@@ -213,7 +213,7 @@ class SafeHeaders:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer with the headers added."""
+        """Pass the request on, and add the headers to its response."""
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -226,13 +226,13 @@ class SafeHeaders:
 
 
 class SmallBodies:
-    """Refuses bodies beyond a cap, stated or streamed, before they fill the memory; `except_path` has a cap of its own."""
+    """Refuses bodies above `limit_bytes`, by their stated or their streamed size. `except_path` has a limit of its own."""
 
     def __init__(self, app: ASGIApp, limit_bytes: int, except_path: str) -> None:
         self.app, self.limit_bytes, self.except_path = app, limit_bytes, except_path
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let the request pass while its body stays small, else answer 413."""
+        """Pass the request on while its body is below the limit, else answer 413."""
         if scope["type"] != "http" or (scope["method"] == "POST" and scope["path"] == self.except_path):
             await self.app(scope, receive, send)
             return

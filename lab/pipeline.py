@@ -277,9 +277,17 @@ class _Pipeline:
         self._report: Path | None = None
 
     def run(self) -> PipelineResult:
+        steps: dict[Step, Callable[[], None]] = {
+            "capture": self._capture_step,
+            "fit": self._fit_step,
+            "validate": self._validate_step,
+            "diagnose": self._diagnose_step,
+            "resolve": self._resolve_step,
+            "report": self._report_step,
+        }
         for step in self.request.steps:
             self._say(step, "")
-            getattr(self, f"_{step}_step")()
+            steps[step]()
         return PipelineResult(
             recordings=self.recordings,
             session=self._session,
