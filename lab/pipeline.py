@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from lab.capture.store import Store
     from lab.diagnose import Diagnosis
     from lab.diagnose.outcome.next_capture import Proposal
+    from lab.diagnose.policy import DecisionPolicy
     from lab.formats.camera_file import CameraFile
 
 M = TypeVar("M", bound=BaseModel)
@@ -56,8 +57,6 @@ TYPICAL_S: dict[Step, float] = {
     "resolve": 110.0,
     "report": 10.0,
 }
-#: A tie between two rivals is given up when its captures, by their predictions, would have left it open with less than this probability.
-GIVE_UP_PROBABILITY = 1e-3
 
 
 # --- what is asked for ---------------------------------------------------------------------------------------------------
@@ -418,10 +417,12 @@ class _Pipeline:
         capture is worth taking."""
         from dataclasses import replace
 
+        from lab.diagnose.policy import DecisionPolicy
+
         assert self._examined is not None
         assert self.store is not None
         examined, recordings = self._examined, self.recordings
-        ties = _Ties()
+        ties = _Ties(DecisionPolicy())
         resolutions: list[Resolution] = []
         while (proposal := ties.next_to_take(examined.proposals)) is not None:
             capture = proposal.capture
@@ -477,7 +478,8 @@ class _Pipeline:
 class _Ties:
     """The captures that were taken to settle ties between rivals."""
 
-    def __init__(self) -> None:
+    def __init__(self, policy: DecisionPolicy) -> None:
+        self._policy = policy
         self._taken: set[tuple[Side, str]] = set()
         #: By side and rivals: how probably the captures taken would have left the tie open, as they were predicted.
         self._open: dict[tuple[Side, frozenset[str]], float] = {}
@@ -490,14 +492,12 @@ class _Ties:
 
     def _may_settle(self, proposal: Proposal) -> bool:
         """Whether a station can take the capture, it is worth taking, and the tie isn't given up."""
-        from lab.diagnose.policy import DecisionPolicy
-
         capture = proposal.capture
         return (
             proposal.plan is not None
-            and capture.distance >= DecisionPolicy().next_capture_distance
+            and capture.distance >= self._policy.next_capture_distance
             and (capture.side, capture.capture) not in self._taken
-            and self._open.get((capture.side, frozenset(capture.rivals)), 1.0) >= GIVE_UP_PROBABILITY
+            and self._open.get((capture.side, frozenset(capture.rivals)), 1.0) >= self._policy.resolve_open_probability
         )
 
     def next_to_take(self, proposals: tuple[Proposal, ...]) -> Proposal | None:

@@ -434,6 +434,15 @@ class DecisionPolicy(Frozen):
         ),
     ] = 2.0
     next_captures_listed: Annotated[int, Rule("report", "1", "captures that are listed", "chosen")] = 5
+    resolve_open_probability: Annotated[
+        float,
+        Rule(
+            "report",
+            "1",
+            "predicted probability that the captures taken leave a tie open, below which no more are taken",
+            "a tenth of `false_alarm_rate`: a tie that stays open all the same contradicts the predictions of its captures",
+        ),
+    ] = 0.001
 
     @classmethod
     def rules(cls) -> dict[str, Rule]:

@@ -18,7 +18,8 @@ from lab.capture.session import CaptureSession, Progress
 from lab.capture.store import Store
 from lab.capture_kinds.dark import DarkSequence
 from lab.diagnose import Diagnosis
-from lab.diagnose.outcome.next_capture import WORTH_TAKING, Proposal
+from lab.diagnose.outcome.next_capture import Proposal
+from lab.diagnose.policy import DecisionPolicy
 from lab.errors import Cancelled, InputError
 from lab.formats import recording_set
 from lab.formats.recording_set import RecordingSet
@@ -254,7 +255,7 @@ TIE = "partly_explained"
             id="the best that the station takes by itself",
         ),
         pytest.param(
-            [[proposal("darks", distance=0.9 * WORTH_TAKING)]],
+            [[proposal("darks", distance=0.9 * DecisionPolicy().next_capture_distance)]],
             [],
             "no capture that the station takes by itself would tell defocus from coma",
             id="not worth it",
