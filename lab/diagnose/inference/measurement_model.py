@@ -154,14 +154,14 @@ class MeasurementModel:
         columns = dict(self.unstated_jacobian)
         acting = self._numbered((*self.always, *effects))
         for index, at in enumerate(self.slices):
-            for name, column in self._prediction(index, acting).slopes.items():
+            for name, column in self._prediction(index, acting).jacobian.items():
                 columns.setdefault(name, np.zeros(len(self.value)))[at] = column
         return columns
 
     @cached_property
     def _single_block_nuisances(self) -> frozenset[str]:
         """Nuisance parameters of one block alone, which belong to the covariance of that block."""
-        count = Counter(name for i in range(len(self.blocks)) for name in self._prediction(i, []).slopes)
+        count = Counter(name for i in range(len(self.blocks)) for name in self._prediction(i, []).jacobian)
         return frozenset(name for name, blocks in count.items() if blocks == 1)
 
     def _shared_jacobian(self, effects: Effects) -> FloatArray:
@@ -207,7 +207,7 @@ class MeasurementModel:
             block, both = self.blocks[index], np.ix_(only, only)
             covariance = block.covariance[both].copy()
             prediction = self._prediction(index, here)
-            own = [c[only] for name, c in prediction.slopes.items() if name in self._single_block_nuisances]
+            own = [c[only] for name, c in prediction.jacobian.items() if name in self._single_block_nuisances]
             if own:
                 covariance += np.transpose(own) @ np.array(own)
             for i, one in enumerate(here):

@@ -94,7 +94,7 @@ def measurement_model(
 
 
 def _any_aperture(model: MeasurementModel) -> dict[str, FloatArray]:
-    """Slopes that span what an aperture of any side does beside that of the whole pixel: its principal directions over even sides."""
+    """Jacobian by an unstated pixel aperture: the principal components of the changes that apertures of evenly spaced sides make."""
     camera, sides = model.camera, np.linspace(LEAST_SIDE, 1.0, APERTURES, endpoint=False)
     lowest = PixelAperture.quantities()["side_change_um"].lower or -np.inf
     effects = [PixelAperture(side_change_um=max(lowest, (s - 1.0) * camera.pixel_pitch_um)) for s in sides]

@@ -120,12 +120,12 @@ def board_block(study: Study) -> Block:
     covariance = noise_px**2 * projected @ projected.T
     covariance += np.diag(np.full(len(labels), CELL_FLOOR_PX**2))
     covariance += np.diag(_between_views(corners, mean, noise_px) / np.maximum(views_of_cell, 1.0))
-    slopes = {} if known is None else _calibrated(corners, projected, solution, shape)
+    jacobian = {} if known is None else _calibrated(corners, projected, solution, shape)
     captures = [v.capture.id for v in views]
 
     def predict(effects: Effects) -> Prediction:
         shifts = shifts_px(study, corners.place, effects)
-        return Prediction(projected @ shifts.ravel(), slopes)
+        return Prediction(projected @ shifts.ravel(), jacobian)
 
     return Block(
         measurement="boards", axis="field", unit="half diagonals", reach=0.4, value=mean @ corners.left.ravel(),
@@ -197,7 +197,7 @@ def _between_views(corners: _Corners, mean: FloatArray, noise_px: float) -> floa
 def _calibrated(
     corners: _Corners, projected: FloatArray, solution: Solution, shape: tuple[int, int]
 ) -> dict[str, FloatArray]:
-    """Slopes by the terms of a distortion that was calibrated before, each as large as `CALIBRATED_STD_PX` at the frame's corner."""
+    """Jacobian by the terms of a distortion that was calibrated before, each as large as `CALIBRATED_STD_PX` at the frame's corner."""
     intrinsics = solution.state.intrinsics[0]
     focal = float(intrinsics[0])
     x, y = ((corners.place[:, k] - intrinsics[2 + k]) / focal for k in (0, 1))

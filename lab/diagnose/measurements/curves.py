@@ -23,8 +23,8 @@ CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
 CURVE_STEP_NM = 2.5  # of a curve that is written out
 
 
-class CurveSlopes:
-    """Electron rates of a list of (light, channel), and their slopes by what is free of the maker's curves.
+class CurveJacobian:
+    """Electron rates of a list of (light, channel), and their Jacobian by nuisance parameters of the maker's curves.
 
     Per channel: scale, tilt, bend, a rough part on knots with a squared-exponential prior, a leak, and what the curve does between
     the samples that the maker gives. The slope by a factor
@@ -97,7 +97,7 @@ class CurveSlopes:
 
     @cached_property
     def sample_shares(self) -> FloatArray:
-        """Relative slopes of the baseline's rates by the light's relative value in each nanometre, (n, wavelengths): rows' sums are 1."""
+        """Derivatives d ln(rate) / d ln(light) of the baseline's rates by the light in each nanometre, (n, wavelengths): rows sum to 1."""
         return np.asarray(self._weight / np.maximum(self._total, 1e-300)[:, None])
 
     def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
@@ -125,7 +125,7 @@ class CurveSlopes:
         """Electrons a second on axis, (n,)."""
         return self._under(effects)[0]
 
-    def slopes(self, effects: Effects) -> dict[str, FloatArray]:
+    def jacobian(self, effects: Effects) -> dict[str, FloatArray]:
         """By the free quantities, in electrons a second."""
         table = self._under(effects)[1]
         named = {}
@@ -155,7 +155,7 @@ def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
 
 
 def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) -> Spectrum:
-    """A maker's curve with what is free of it at `quantities` (as `CurveSlopes.slopes` names them, in prior standard deviations); the
+    """A maker's curve with what is free of it at `quantities` (as `CurveJacobian.jacobian` names them, in prior standard deviations); the
     same curve where none is among them."""
     names = [name for name in quantities if name.startswith(f"curve:{channel}:")]
     if not names:

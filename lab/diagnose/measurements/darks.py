@@ -566,12 +566,12 @@ def dark_noise_block(study: Study) -> Block:
             shot[i] += noise.gain**2 * _more_dark_e_per_s(study, effects, temperature) * t
             mean[i] += shot[i] - dark[i]
             mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
-        slopes = {
+        jacobian = {
             "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
             "dark": noise.gain * exposures * noise.dark_std,
         }
-        slopes["gain" if flats else "dark_gain"] = gain_std * shot
-        return Prediction(mean, slopes)
+        jacobian["gain" if flats else "dark_gain"] = gain_std * shot
+        return Prediction(mean, jacobian)
 
     return Block(
         measurement="dark_noise", axis="exposure", unit="s", reach=float(max(np.ptp(exposures), 1e-3)), value=value,
@@ -818,12 +818,12 @@ def dark_field_block(study: Study) -> Block:
                 cells = _cell_means(_dark_map(study, effects, f.condition.temperature_c).astype(np.float32))
                 here = study.noise.gain * f.condition.exposure_s * (cells - cells.mean())
                 mean[i * count : (i + 1) * count] = here.ravel()
-        slopes = {}
+        jacobian = {}
         for i in range(len(points)):
             column = np.zeros(len(value))
             column[i * count : (i + 1) * count] = 1.0
-            slopes[f"dark_field:{i}"] = column
-        return Prediction(mean, slopes)
+            jacobian[f"dark_field:{i}"] = column
+        return Prediction(mean, jacobian)
 
     longest = max(float(exposures.max()), 1e-9)
     return Block(

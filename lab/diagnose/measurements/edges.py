@@ -117,7 +117,7 @@ def edge_block(study: Study) -> Block:
     x = edges.frequencies
 
     def predict(effects: Effects) -> Prediction:
-        return Prediction(edges.predict(effects).ravel(), edges.slopes)
+        return Prediction(edges.predict(effects).ravel(), edges.jacobian)
 
     return Block(
         measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=edges.value.ravel(),
@@ -679,7 +679,7 @@ class _Edges:
         return found
 
     @cached_property
-    def slopes(self) -> dict[str, FloatArray]:
+    def jacobian(self) -> dict[str, FloatArray]:
         """By what is free: the bend of the light on the target, one for each region, direction and light; and the colour of light of which
         nothing is said."""
         base = self.predict(())
@@ -717,10 +717,10 @@ class _Edges:
 def _relative(scatter: FloatArray, rows: FloatArray) -> FloatArray:
     """Covariance of departures relative to the contrast, of what was reported."""
     departure = rows[2:] / rows[0]
-    slopes = (
+    jacobian = (
         np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1) / rows[0]
     )
-    return np.asarray(slopes @ scatter @ slopes.T)
+    return np.asarray(jacobian @ scatter @ jacobian.T)
 
 
 def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[np.intp]]:

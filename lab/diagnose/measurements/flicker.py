@@ -83,17 +83,17 @@ def flicker_block(study: Study) -> Block:
             )
         mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
         slope = mean / (3.0 * power)
-        slopes = {}
+        jacobian = {}
         for k in range(len(bands)):
-            slopes[f"rows:offset:{k}"] = np.where(band == k, slope * offsets_std, 0.0)
-            slopes[f"rows:colour:{k}"] = np.where(
+            jacobian[f"rows:offset:{k}"] = np.where(band == k, slope * offsets_std, 0.0)
+            jacobian[f"rows:colour:{k}"] = np.where(
                 band == k, slope * COLOUR_STD * (1.0 + 4.0 * (frequency[k] > 0.15)), 0.0
             )
-            slopes[f"rows:pattern:{k}"] = np.where(band == k, slope * pattern, 0.0)
+            jacobian[f"rows:pattern:{k}"] = np.where(band == k, slope * pattern, 0.0)
         # a level's few frames catch the light at phases of their own: that much its power may lie off the mean over all phases
         for i in np.flatnonzero(spread):
-            slopes[f"rows:phase:{i}"] = np.where(np.arange(len(value)) == i, slope[i] * spread[i], 0.0)
-        return Prediction(mean, slopes)
+            jacobian[f"rows:phase:{i}"] = np.where(np.arange(len(value)) == i, slope[i] * spread[i], 0.0)
+        return Prediction(mean, jacobian)
 
     return Block(
         measurement="flat_rows", axis="row_frequency", unit="cy/row", reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),

@@ -233,11 +233,11 @@ def variance_block(study: Study) -> Block:
                 noise.black + gain[:, None] * electrons, dn2 + noise.read_dn**2, effects, study
             ) - np.square(noise.read_dn)
         mean = dn2.mean(1) + gain**2 * read
-        slopes = {"gain": GAIN_STD * dn2.mean(1)}
+        jacobian = {"gain": GAIN_STD * dn2.mean(1)}
         for setting in settings:
             name = "read" if setting == 1.0 else f"read:{setting:.4g}"
-            slopes[name] = np.where(factor == setting, READ_STD * (noise.read_dn * setting) ** 2 + 0.05, 0.0)
-        return Prediction(mean, slopes)
+            jacobian[name] = np.where(factor == setting, READ_STD * (noise.read_dn * setting) ** 2 + 0.05, 0.0)
+        return Prediction(mean, jacobian)
 
     return Block(
         measurement="noise", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,

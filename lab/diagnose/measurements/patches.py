@@ -16,7 +16,7 @@ from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.white import WhiteCapture
-from lab.diagnose.measurements.curves import CurveSlopes
+from lab.diagnose.measurements.curves import CurveJacobian
 from lab.diagnose.measurements.summaries import (
     CLIPPED_SHARE,
     LEVEL_REACH,
@@ -86,7 +86,7 @@ def chart_block(study: Study) -> Block:
     surround = np.array([p.frame for p in points]) - offset  # what a veil carries
     place = FieldPoints.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
-    curves = CurveSlopes(
+    curves = CurveJacobian(
         study,
         [(p.captures[0].radiance, p.channel, p.captures[0].exposure_s, "chart", known[p.name]) for p in points],
         signal / noise.gain / exposures,
@@ -105,12 +105,12 @@ def chart_block(study: Study) -> Block:
         out = model.response(electrons + noise.dark_dn_per_s / noise.gain * exposures)
         lit = out * noise.gain - noise.dark_dn_per_s * exposures
         shift = np.array([study.offset(p.captures[0], effects) for p in points])
-        slopes = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
-        slopes |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.slopes(effects).items()}
-        slopes["chart:scale"] = CHART_SCALE_STD * lit
-        slopes["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
-        slopes["chart:y"] = CHART_GRADIENT_STD * lit * (row / camera.rows - 0.5) * 2
-        return Prediction(noise.black + out * noise.gain + shift, slopes)
+        jacobian = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
+        jacobian |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.jacobian(effects).items()}
+        jacobian["chart:scale"] = CHART_SCALE_STD * lit
+        jacobian["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
+        jacobian["chart:y"] = CHART_GRADIENT_STD * lit * (row / camera.rows - 0.5) * 2
+        return Prediction(noise.black + out * noise.gain + shift, jacobian)
 
     return Block(
         measurement="chart",

@@ -214,7 +214,7 @@ def _measured(
         points = _points(design.mask, window)
         field = _field(camera, points, moved)
         if channel != reference and np.abs(field).max() > MOVED_PX:
-            # so far out that its slopes don't tell what is lost: drawn anew where it is
+            # too far for a linear step: the pattern is drawn anew at the shifted place
             there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
             drawn = _Canvas.of(target, warp.displaced(there), window)
             design = _Design.of(study, drawn, channel, light, whole, turned, laid)
@@ -649,10 +649,10 @@ def contrast_block(study: Study) -> Block:
                     kept = real @ np.real(placed) + imaginary @ np.imag(placed) + p.shown_by(effects)[: len(real)]
                     mean[members] = kept[parts]
             mean[~np.isfinite(mean)] = 1.0
-        slopes = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
+        jacobian = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
         for name in dict.fromkeys(scales):
-            slopes[name] = CONTRAST_SCALE_STD * mean * np.array([s == name for s in scales])
-        return Prediction(mean, slopes)
+            jacobian[name] = CONTRAST_SCALE_STD * mean * np.array([s == name for s in scales])
+        return Prediction(mean, jacobian)
 
     return Block(
         measurement="bernoulli", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=covariance,

@@ -1,8 +1,8 @@
 """What a diagnosis looks at: numbers taken from the recordings, their covariance, and how a model predicts them.
 
-A `Block` is one kind of measurement. Its prediction goes through the estimator that made the numbers; what the baseline leaves
-free (levels, gain, a smooth few per cent of the maker's curves) enters as slopes with a prior, and is marginalised by the
-covariance (`evidence.py`). A block that the recordings don't allow is left out with a reason (`NotDetermined`).
+A `Block` is one kind of measurement. Its prediction goes through the estimator that made the numbers. Nuisance parameters
+(levels, gain, a smooth few per cent of the maker's curves) enter by the Jacobian and a normal prior; the measurement model
+marginalises them. A block that the recordings don't allow is left out with a reason (`NotDetermined`).
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ LEVEL_REACH = 0.8  # of a level's logarithm: over a factor of 2 a smooth departu
 
 @dataclass(frozen=True)
 class Prediction:
-    """Mean (n,) and its slopes by the free quantities, (n,) each, in units of their prior standard deviation."""
+    """Mean (n,) and the Jacobian: its derivatives (n,) by every nuisance parameter, per prior standard deviation."""
 
     mean: FloatArray
-    slopes: dict[str, FloatArray]
+    jacobian: dict[str, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -290,14 +290,15 @@ class Study:
         return Uniform(self.camera, effects).offset_dn(elapsed, capture.temperature_c)
 
     def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
-        """Slopes by black level and dark current, whose priors are a few of their first guess's uncertainties."""
+        """Jacobian by black level and dark current, per prior standard deviation: that of their first guess."""
         return {
             "black": np.full(len(exposures), self.noise.black_std),
             "dark": exposures * self.noise.dark_std,
         }
 
     def free_warmth(self, captures: Sequence[Capture]) -> dict[str, FloatArray]:
-        """Slope by what a degree does to the dark current of captures that aren't as warm as most; darks tell of it by themselves."""
+        """Jacobian by the change of dark current per degree, for captures at another temperature than most. Dark frames don't take it:
+        they measure the change."""
         if self.temperature_c is None:
             return {}
         warmer = [0.0 if c.temperature_c is None else c.temperature_c - self.temperature_c for c in captures]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.curves import CurveSlopes
+from lab.diagnose.measurements.curves import CurveJacobian
 from lab.diagnose.measurements.neighbours import held_out_flats
 from lab.diagnose.measurements.summaries import (
     LAG,
@@ -87,17 +87,17 @@ def linearity_block(study: Study) -> Block:
                 done[capture.id] = model.mean_dn(collected)
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
             mean[i] = done[capture.id][channel] + _beside_light(study, capture, channel, effects)
-        slopes = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+        jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
         for lamp, channel in rate:
-            slopes[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
+            jacobian[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
         if len(lights) > len(set(study.lamps.values())):
             for path in lights:
                 read_there = np.array([c.radiance == path for c, *_ in points])
-                slopes[f"reading:{path}"] = np.where(read_there, RADIOMETER_STD * lit, 0.0)
+                jacobian[f"reading:{path}"] = np.where(read_there, RADIOMETER_STD * lit, 0.0)
                 for channel in study.channels if len(study.channels) > 1 else ():
                     mine = read_there & np.array([c == channel for _, c, *_ in points])
-                    slopes[f"reading:{path}:{channel}"] = np.where(mine, READING_COLOUR_STD * lit, 0.0)
-        return Prediction(mean, slopes)
+                    jacobian[f"reading:{path}:{channel}"] = np.where(mine, READING_COLOUR_STD * lit, 0.0)
+        return Prediction(mean, jacobian)
 
     return Block(
         measurement="photon_transfer", axis="level", unit="DN", reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
@@ -187,29 +187,31 @@ def narrowband_block(study: Study) -> Block:
     value = np.array([p[2] for p in points])
     noise = study.noise
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 0.0)
-    curves = CurveSlopes(
+    curves = CurveJacobian(
         study,
         [(c.radiance, channel, c.exposure_s, "narrowband", None) for c, channel, *_ in points],
         signal / noise.gain / exposures,
     )
     every = list(dict.fromkeys(c.radiance for c, *_ in points))
     known = [c for c in study.channels if c in study.camera.quantum_efficiency]
-    whole = CurveSlopes(
+    whole = CurveJacobian(
         study, [(path, c, 1.0, "narrowband", None) for path in every for c in known], scale=curves.scale
     )
     covariance = _narrowband_covariance(study, points, signal, curves)
 
-    def slopes_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
+    def jacobian_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
         """By what is free; `share`: DN over electrons a second on axis."""
-        slopes = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
-        return slopes | {k: v * share for k, v in curves.slopes(effects).items()}
+        jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+        return jacobian | {k: v * share for k, v in curves.jacobian(effects).items()}
 
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
         if not any(act_on(effects, LEVEL | LAG)):
             # what acts on the light's colours alone leaves signals in proportion to its rates
             share = noise.gain * float(study.field.light.mean()) * exposures
-            return Prediction(noise.black + noise.dark_dn_per_s * exposures + share * rates, slopes_of(effects, share))
+            return Prediction(
+                noise.black + noise.dark_dn_per_s * exposures + share * rates, jacobian_of(effects, share)
+            )
         lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
         model = Uniform(study.camera, effects)
         field = model.field(study.field)
@@ -224,7 +226,7 @@ def narrowband_block(study: Study) -> Block:
                 done[capture.id] = model.mean_dn(electrons)
             mean[i] = done[capture.id][channel] + _beside_light(study, capture, channel, effects)
             share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
-        return Prediction(mean, slopes_of(effects, share))
+        return Prediction(mean, jacobian_of(effects, share))
 
     return Block(
         measurement="narrowband", axis="wavelength", unit="nm", reach=25.0, value=value, covariance=covariance,
@@ -234,7 +236,7 @@ def narrowband_block(study: Study) -> Block:
 
 
 def _narrowband_covariance(
-    study: Study, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveSlopes
+    study: Study, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveJacobian
 ) -> FloatArray:
     """Of narrowband signals: shot and read noise, what is one for repeats, the radiometer's reading, the lamp's scatter."""
     noise = study.noise

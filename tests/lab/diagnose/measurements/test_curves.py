@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.measurements.curves import LEAK_STD, CurveSlopes, _last_place
+from lab.diagnose.measurements.curves import LEAK_STD, CurveJacobian, _last_place
 from sim.spectrum import Spectrum
 from sim.uniform import electron_rate
 from tests.lab.diagnose.on_blocks import former, study
@@ -21,8 +21,8 @@ def test_a_leak_is_a_flat_sensitivity_and_a_scale_the_curve_itself() -> None:
     recordings = former(3, kinds=("dark", "narrowband"))
     looked_at = study(recordings)
     capture = recordings.captures("narrowband")[8]
-    curves = CurveSlopes(looked_at, [(capture.radiance, "Y", capture.exposure_s, "narrowband", None)])
-    columns = list(curves.slopes(()).values())
+    curves = CurveJacobian(looked_at, [(capture.radiance, "Y", capture.exposure_s, "narrowband", None)])
+    columns = list(curves.jacobian(()).values())
     camera = looked_at.camera
     level = LEAK_STD * max(camera.quantum_efficiency["Y"].value)
     flat = camera.model_copy(update={"quantum_efficiency": {"Y": Spectrum.of((300.0, 1100.0), (level, level))}})
@@ -34,5 +34,5 @@ def test_a_leak_is_a_flat_sensitivity_and_a_scale_the_curve_itself() -> None:
 def test_rounding_of_unrounded_curves_is_next_to_nothing() -> None:
     recordings = former(3, kinds=("dark", "narrowband"))
     capture = recordings.captures("narrowband")[8]
-    curves = CurveSlopes(study(recordings), [(capture.radiance, "Y", capture.exposure_s, "narrowband", None)])
+    curves = CurveJacobian(study(recordings), [(capture.radiance, "Y", capture.exposure_s, "narrowband", None)])
     assert curves.rounding[0] < 1e-5 * curves.rates(())[0]

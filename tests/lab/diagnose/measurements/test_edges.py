@@ -38,7 +38,7 @@ def _misfit(block: Block, *acting: Effect, aside: bool | None = None) -> float:
     """chi2 per number, by which a tenth more than noise makes is allowed for what edges in the same place share: above 1 there is
     more. `aside`: of asymmetries (True) or contrasts (False) alone."""
     model = block.predict(acting)
-    covariance = block.covariance + sum(np.outer(s, s) for s in model.slopes.values())
+    covariance = block.covariance + sum(np.outer(s, s) for s in model.jacobian.values())
     where = np.array([aside is None or label.condition.endswith(ASIDE) == aside for label in block.labels])
     n = int(where.sum())
     value = chi2((block.value - model.mean)[where], covariance[np.ix_(where, where)])

@@ -102,8 +102,8 @@ def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
     for study in (_concealed(770011, cfa=cfa), _concealed(770012, cfa=cfa, repeats=6), _rendered((), cfa=cfa)):
         for block in (variance_block(study), neighbour_block(study)):
             residual = block.value - block.predict(()).mean
-            slopes = np.array(list(block.predict(()).slopes.values())).reshape(-1, len(residual))
-            covariance = block.covariance + slopes.T @ slopes
+            jacobian = np.array(list(block.predict(()).jacobian.values())).reshape(-1, len(residual))
+            covariance = block.covariance + jacobian.T @ jacobian
             chi2 = float(residual @ np.linalg.solve(covariance, residual)) / len(residual)
             assert chi2 < 1.0 + 3.0 * np.sqrt(2.0 / len(residual))
 
