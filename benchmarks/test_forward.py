@@ -1,6 +1,6 @@
 """Whole frames, from light to codes: CPU time beside the limit that transforms, memory and random numbers set, and peak memory.
 
-Prints the tables of docs/performance.md.
+Prints the tables of docs/explanation/performance.md.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ class Law:
     """One piece of physics that a camera conceals, built into the stages of `ConcealedCamera`.
 
     A subclass overrides the methods of the stages that it changes; by default none changes anything. `effect` is its name in the list
-    of effects (docs/results.md), None where that list has none. A law has a `strength` in `unit` and one of `variants` forms, which the
+    of effects (docs/reference/results.md), None where that list has none. A law has a `strength` in `unit` and one of `variants` forms, which the
     subclass's docstring lists in their order. Frame numbers `k` select the random numbers, so that a frame can be drawn again.
     """
 

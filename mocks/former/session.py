@@ -49,7 +49,7 @@ WHOLE_SESSION = Plan()
 
 @dataclass(frozen=True)
 class Session:
-    """What a session hands out, as plain data: the manifest of a recording set (docs/recording-set.md) and the files that it names.
+    """What a session hands out, as plain data: the manifest of a recording set (docs/reference/recording-set.md) and the files that it names.
 
     Frames are raw DN, spectra values at WAVELENGTH_NM, targets cells of a screen.
     """

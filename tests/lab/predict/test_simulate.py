@@ -224,7 +224,7 @@ def scene_row(scene: type[NamedScene]) -> str:
 
 
 def test_the_documentation_is_what_the_declarations_say() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "simulate.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "simulate.md").read_text()
     lines = text.splitlines()
     for model in (CameraModel, Lens):
         for key, quantity in declared(model).items():

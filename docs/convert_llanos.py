@@ -1,5 +1,5 @@
 """Makes folders for `calibench import --from raw-folder` of what was published with bllanos/chromatic-aberration (a Flea3 before a
-ColorChecker behind band-pass filters, 2019-02-18): `python docs/llanos.py DATA OUT` writes OUT/darks, the dark frames as they are, and
+ColorChecker behind band-pass filters, 2019-02-18): `python docs/convert_llanos.py DATA OUT` writes OUT/darks, the dark frames as they are, and
 OUT/white, the chart's white patch cut out of the frames behind every filter, and the same pixels of the dark frames."""
 
 from __future__ import annotations
