@@ -1,4 +1,4 @@
-"""What a driver raises: one kind of error for the caller, with what happened told apart for the driver's own recovery."""
+"""Errors that drivers raise: one base class for the caller, subclasses for the driver's own recovery."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ class InstrumentError(Exception):
 
 
 class NoAnswer(InstrumentError):
-    """Nothing, or not all of an answer, came within the time-out."""
+    """No answer, or an incomplete one, within the time-out."""
 
 
 class Disconnected(InstrumentError):
-    """The line is gone: unplugged, refused, or closed by the other side."""
+    """The connection is gone: unplugged, refused, or closed by the other side."""
 
 
 class Garbled(InstrumentError):
-    """Something came that isn't an answer to what was asked."""
+    """Something was received that isn't an answer to the request."""
 
 
 class Interrupted(InstrumentError):
-    """A wait was ended by `stop` from another thread."""
+    """`stop`, called from another thread, ended a wait."""
 
 
 class Refused(InstrumentError):

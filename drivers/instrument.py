@@ -1,4 +1,4 @@
-"""What all instruments have in common: who they are, and how their wire is written down."""
+"""What all instruments have in common: their identity, and the transcript of their conversations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Recorder = Callable[[Literal["sent", "received"], bytes], None]
 
 @dataclass(frozen=True)
 class Identity:
-    """Who an instrument says it is; what it doesn't say is an empty string."""
+    """An instrument's identity as it reports it; an empty string where it doesn't."""
 
     maker: str
     model: str
@@ -25,13 +25,13 @@ class Identity:
 class Instrument(ABC):
     """A connected instrument.
 
-    Building one touches no wire; `connect` does, and every later call reconnects by itself after a failure. Every call
-    ends within its time-out, with `drivers.errors.InstrumentError` if it must.
+    Creating one sends nothing. `connect` does, and every later call reconnects after a failure. Every call ends within
+    its time-out, by `drivers.errors.InstrumentError` if necessary.
     """
 
     @abstractmethod
     def connect(self) -> None:
-        """Open the line, check that the right instrument answers, and bring it into a known state."""
+        """Open the connection, check the instrument's identity, and bring it into a known state."""
 
     @abstractmethod
     def identity(self) -> Identity:
@@ -43,7 +43,7 @@ class Instrument(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Bring it into its safe state and let go of the line. Never raises; closing twice is fine."""
+        """Bring it into its safe state and close the connection. Never raises; may be called twice."""
 
     def __enter__(self) -> Self:
         self.connect()

@@ -51,7 +51,7 @@ def parse(text: str) -> Iterator[list[Piece]]:
 
 
 class TranscriptFile:
-    """A recorder that appends every piece to a file at once; several instruments may not share one."""
+    """A recorder that appends every piece to a file at once; one file for each instrument."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("a", encoding="ascii")

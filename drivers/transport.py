@@ -1,4 +1,4 @@
-"""Lines to instruments: a serial port or a TCP connection, with a time-out on every call and a transcript of every byte."""
+"""Connections to instruments: a serial port or TCP, with a time-out on every call and a transcript of every byte."""
 
 from __future__ import annotations
 
@@ -20,17 +20,16 @@ _LONGEST_ANSWER = 1 << 20
 
 
 def shown(data: bytes) -> str:
-    """Bytes as one line for a message: printable ASCII as it is, the rest escaped, cut at 60 characters."""
+    """Bytes as one line of a message: printable ASCII unchanged, the rest escaped, cut at 60 characters."""
     text = data.decode("latin-1").encode("unicode_escape").decode("ascii")
     return repr(data)[1:] if len(text) <= 60 else f"'{text[:57]}...'"
 
 
 class Transport:
-    """A byte line to one instrument.
+    """A byte stream to one instrument. `address` is a device path (`/dev/ttyUSB0`, `COM3`) or `socket://host:port`.
 
-    `address` is a device path (`/dev/ttyUSB0`, `COM3`) or `socket://host:port`. `device` is the name that messages
-    call the instrument. `recorder` gets every piece sent and received. One thread talks at a time; only `interrupt` may
-    come from another.
+    `device` is the instrument's name in messages. `recorder` gets every piece sent and received. One thread talks at a
+    time; only `interrupt` may be called from another.
     """
 
     def __init__(
@@ -53,11 +52,11 @@ class Transport:
 
     @property
     def name(self) -> str:
-        """The instrument and where it is, for messages."""
+        """The instrument and its address, for messages."""
         return f"{self.device} at {self.address}"
 
     def open(self) -> None:
-        """Open the line anew, 8N1 without flow control, with nothing left over in it. Raises `Disconnected`."""
+        """Open the connection anew, 8N1 without flow control, and discard what is in it. Raises `Disconnected`."""
         self.close()
         options = {} if "://" in self.address else {"exclusive": True}
         try:
@@ -71,7 +70,7 @@ class Transport:
             ) from error
 
     def close(self) -> None:
-        """Let go of the line; never raises."""
+        """Close the connection; never raises."""
         port, self._port = self._port, None
         self._received.clear()
         if port is not None:
@@ -79,11 +78,11 @@ class Transport:
                 port.close()
 
     def interrupt(self) -> None:
-        """End a wait that another thread is in: it raises `Interrupted`."""
+        """End the wait of another thread: it raises `Interrupted`."""
         self._interrupted.set()
 
     def resume(self) -> None:
-        """Take back `interrupt`."""
+        """Revoke `interrupt`."""
         self._interrupted.clear()
 
     def write(self, data: bytes) -> None:
@@ -96,14 +95,15 @@ class Transport:
         self._record("sent", data)
 
     def read(self, count: int, timeout_s: float | None = None, asked: str = "") -> bytes:
-        """Exactly `count` bytes. Raises `NoAnswer` with what came instead, `Disconnected`, `Interrupted`."""
+        """Exactly `count` bytes. Raises `NoAnswer` with what was received instead, `Disconnected`, `Interrupted`."""
         deadline = self._deadline(timeout_s)
         while len(self._received) < count:
             self._fill(deadline, asked)
         return self._take(count)
 
     def read_until(self, end: bytes, timeout_s: float | None = None, asked: str = "") -> bytes:
-        """Everything up to and with the next `end`. Raises `NoAnswer`, `Disconnected`, `Garbled` or `Interrupted`."""
+        """Everything up to and including the next `end`. Raises `NoAnswer`, `Disconnected`, `Garbled` or
+        `Interrupted`."""
         deadline = self._deadline(timeout_s)
         while True:
             at = self._received.find(end)
@@ -114,7 +114,8 @@ class Transport:
             self._fill(deadline, asked)
 
     def drain(self, quiet_s: float = 0.05, limit_s: float = 1.0) -> bytes:
-        """Throw away what comes until the line has been quiet for `quiet_s`; returns it. Raises `Disconnected`."""
+        """Discard what is received until the connection has been silent for `quiet_s`; returns it. Raises
+        `Disconnected`."""
         end = time.monotonic() + limit_s
         last = time.monotonic()
         while time.monotonic() < min(end, last + quiet_s):
@@ -150,7 +151,7 @@ class Transport:
                 )
 
     def _receive(self, timeout_s: float) -> bool:
-        """Take in what is there, waiting for at most `timeout_s`; False if there was nothing."""
+        """Read the available bytes, waiting for at most `timeout_s`; False if there were none."""
         port = self._open_port()
         try:
             port.timeout = timeout_s
@@ -174,7 +175,7 @@ class Transport:
 
 
 class WireInstrument(Instrument):
-    """An instrument on a `Transport`: one conversation at a time, and a fresh start after one that failed."""
+    """An instrument on a `Transport`: one conversation at a time, and a new connection after one that failed."""
 
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
@@ -184,11 +185,11 @@ class WireInstrument(Instrument):
 
     @abstractmethod
     def _establish(self) -> None:
-        """Find the instrument on a line just opened, and bring it into a known state."""
+        """Identify the instrument on a connection just opened, and bring it into a known state."""
 
     @abstractmethod
     def _make_safe(self) -> None:
-        """Bring the instrument into its safe state, in a conversation."""
+        """Bring the instrument into its safe state, within a conversation."""
 
     def connect(self) -> None:
         with self._conversation():
@@ -213,10 +214,8 @@ class WireInstrument(Instrument):
 
     @contextmanager
     def _conversation(self) -> Iterator[Transport]:
-        """Hold the line; after any failure but a refusal, the next conversation opens it anew.
-
-        Nothing that came late may be taken for the answer to a later question.
-        """
+        """Hold the connection; after any failure but a refusal, the next conversation opens it anew, so that a late
+        answer is never taken for the answer to a later question."""
         with self._lock:
             if not self._live:
                 self._meet()
@@ -230,7 +229,8 @@ class WireInstrument(Instrument):
                 raise
 
     def _meet(self) -> None:
-        """Open the line and find the instrument; once more if it was known before, for a late answer may still come in."""
+        """Open the connection and identify the instrument; twice if it was known before, as a late answer may still
+        arrive."""
         for last in (not self._met, True):
             self._transport.open()
             try:

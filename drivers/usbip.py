@@ -62,7 +62,7 @@ _DEVICE_DESCRIPTOR, _CONFIGURATION, _STRING, _INTERFACE, _ENDPOINT = 1, 2, 3, 4,
 
 @dataclass
 class Descriptor:
-    """A descriptor's fields under the names that pyusb reads."""
+    """A descriptor's fields under pyusb's names."""
 
     values: dict[str, Any]
 
@@ -142,7 +142,7 @@ class Configuration:
 
 @dataclass
 class RemoteDevice:
-    """What pyusb calls `dev`: where a device is, and its descriptors once they were read."""
+    """pyusb's `dev`: the address of a device, and its descriptors once they were read."""
 
     bus: int
     address: int
@@ -169,11 +169,11 @@ class Pipe:
 
     @abstractmethod
     def close(self) -> None:
-        """Let the device go."""
+        """Release the device."""
 
 
 def timed_out() -> usb.core.USBTimeoutError:
-    """What pyusb's own backends raise on a time-out."""
+    """The exception that pyusb's own backends raise on a time-out."""
     return usb.core.USBTimeoutError("Operation timed out", error_code=-7, errno=errno.ETIMEDOUT)
 
 
@@ -187,7 +187,7 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
 
     @abstractmethod
     def devices(self) -> Sequence[RemoteDevice]:
-        """What is plugged in now."""
+        """Devices that are connected now."""
 
     @abstractmethod
     def open_pipe(self, device: RemoteDevice) -> Pipe:
@@ -271,7 +271,7 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
         self._request(dev_handle, 0x01, 11, altsetting, intf)
 
     def claim_interface(self, dev_handle: Pipe, intf: int) -> None:
-        """Nothing to do: whoever opened the device has all of it."""
+        """Nothing to do: an open device is held with all of its interfaces."""
 
     def release_interface(self, dev_handle: Pipe, intf: int) -> None:
         """Nothing to do, as for claiming."""
@@ -348,7 +348,8 @@ def receive_exactly(connection: socket.socket, count: int) -> bytes:
 
 
 class TcpPipe(Pipe):
-    """An imported device: requests go out with a sequence number, and a thread hands the answers to whoever waits."""
+    """An imported device: requests carry a sequence number, and a thread passes each answer to the thread that waits
+    for it."""
 
     def __init__(self, connection: socket.socket, device_id: int) -> None:
         self._socket = connection
@@ -391,7 +392,7 @@ class TcpPipe(Pipe):
         return urb.data
 
     def _unlink(self, number: int, urb: _Urb) -> None:
-        """Take a request back; it may still have ended in the meantime, which counts."""
+        """Cancel a request; its answer counts if it ended in the meantime."""
         with self._lock:
             if urb.done.is_set() or self._closed:
                 return
@@ -562,7 +563,7 @@ def open_device(address: str) -> usb.core.Device:
 
 
 def translate(error: usb.core.USBError, who: str, doing: str) -> InstrumentError:
-    """A driver's error for one of pyusb's: what kind it is, in one line."""
+    """The driver's error for one of pyusb's, in one line."""
     if isinstance(error, usb.core.USBTimeoutError):
         return NoAnswer(f"{who}: no answer while {doing}; check the cable and the power")
     if error.errno in (errno.ENODEV, errno.EIO, errno.ESHUTDOWN):

@@ -19,7 +19,7 @@ Trigger = Literal["software", "line"]
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """What the camera itself says of its sensor. None: it doesn't say."""
+    """What the camera reports of its sensor; None where it doesn't."""
 
     rows: int
     cols: int
@@ -31,10 +31,10 @@ class SensorInfo:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame as it left the converter, (rows, cols) DN, with the camera's own words on how it was taken.
+    """One frame as it left the converter, (rows, cols) DN, with the settings that the camera reports.
 
-    `exposure_s` and `gain_db` are what the camera rounded the settings to. `time` (UTC) is when the exposure was started.
-    `frame_id` counts the frames since acquisition started.
+    `exposure_s` and `gain_db` are the camera's rounded settings. `time` (UTC) is the start of the exposure. `frame_id`
+    counts the frames since acquisition started.
     """
 
     raw: NDArray[np.uint16]

@@ -60,7 +60,7 @@ RESPONSE_FLOOR_MS = 500
 
 
 class GenCp:
-    """The control channel: `read` and `write` of the camera's memory, each with time-out and repeat.
+    """The control channel: `read` and `write` of the camera's memory, each with time-out and repetition.
 
     Thread-safe. Raises `Refused` with GenCP's status, `NoAnswer`, `Disconnected`, `Garbled`.
     """
@@ -79,7 +79,7 @@ class GenCp:
         self.max_command = self.max_ack = LEAST_PACKET
 
     def read(self, address: int, length: int) -> bytes:
-        """`length` bytes at `address`, in as many packets as the camera asks for."""
+        """`length` bytes at `address`, in packets of the size that the camera allows."""
         data = bytearray()
         most = max(4, self.max_ack - PREFIX.size)
         while len(data) < length:

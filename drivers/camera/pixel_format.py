@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """How pixels lie in the payload."""
+    """Layout of the pixels in the payload."""
 
     name: str
     code: int
@@ -19,7 +19,7 @@ class PixelFormat:
     packed: bool  # 12p, 10p: a stream of bits, least significant first; else 8 or 16 bits a pixel
 
     def payload_bytes(self, pixels: int) -> int:
-        """Bytes that so many pixels take."""
+        """Bytes of that number of pixels."""
         return (pixels * self.bits + 7) // 8 if self.packed else pixels * (1 if self.bits == 8 else 2)
 
     def unpack(self, payload: bytes | bytearray, rows: int, cols: int, padding: int = 0) -> NDArray[np.uint16]:

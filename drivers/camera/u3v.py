@@ -94,9 +94,8 @@ class _Interfaces:
 class U3vCamera(Camera):
     """One USB3 Vision camera at `usbip://HOST:PORT/SERIAL` or `usb://SERIAL` (or an already found pyusb `device`).
 
-    `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits that the camera offers (16 only if it has
-    no other). `timeout_s`: how long beyond the
-    exposure a frame may take.
+    `pixel_format`: a format's name, or None for the deepest raw format of up to 14 bits that the camera offers (16
+    only if it has no other). `timeout_s`: longest time beyond the exposure until a frame has arrived.
     """
 
     def __init__(
@@ -124,7 +123,7 @@ class U3vCamera(Camera):
     # --- connection ---------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Find the camera, read its registers and XML, choose the pixel format, and stop whatever it was doing."""
+        """Find the camera, read its registers and XML, choose the pixel format, and stop any acquisition."""
         with self._lock:
             self.close()
             device = self._given if self._given is not None else open_device(self.address)
@@ -194,7 +193,8 @@ class U3vCamera(Camera):
         )
 
     def _prepare_stream(self) -> None:
-        """Write the stream's transfer sizes: whole megabytes, then what is left, rounded up to the camera's alignment."""
+        """Write the stream's transfer sizes: whole megabytes, then the remainder, rounded up to the camera's
+        alignment."""
         control, sirm = self._control, self._sirm
         alignment = 1 << (control.integer(sirm + SIRM_INFO) >> 24)
         payload = control.integer(sirm + SIRM_PAYLOAD, 8)
@@ -345,7 +345,7 @@ class U3vCamera(Camera):
         return bytes(self._device.read(self._at.stream_in, size, left_ms))
 
     def _recover(self) -> None:
-        """After a broken frame: stop, throw away what is still in the pipe; the next `arm` starts afresh."""
+        """After a broken frame: stop, and discard what is still in the pipe; the next `arm` starts anew."""
         try:
             self._stop_acquisition()
             assert self._device is not None
@@ -364,7 +364,7 @@ class U3vCamera(Camera):
 
     @contextlib.contextmanager
     def _lost(self) -> Iterator[None]:
-        """A lost connection is forgotten, so that the next call connects again."""
+        """Forget a lost connection, so that the next call connects again."""
         try:
             yield
         except usb.core.USBError as error:

@@ -1,4 +1,5 @@
-"""The display abstraction: a pattern on a screen, one cell a whole number of screen pixels, and the word that it is on the glass."""
+"""The display abstraction: a pattern on a screen, each cell a whole number of screen pixels, and the confirmation that
+it is displayed."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from drivers.instrument import Instrument
 
 @dataclass(frozen=True)
 class Shown:
-    """What the screen said once the pattern was on the glass. Sizes are (rows, cols)."""
+    """The screen's report once the pattern is displayed. Sizes are (rows, cols)."""
 
     device_pixel_ratio: float
     canvas_px: tuple[int, int]
@@ -28,7 +29,7 @@ class Display(Instrument):
     def show(self, pattern: NDArray[np.uint8], cell_px: int = 1) -> Shown:
         """Show (rows, cols) cells of 0 (dark) and 1 (lit), `cell_px` screen pixels square, centred; the rest is dark.
 
-        Returns when the pattern is on the glass. Raises `InstrumentError` if it doesn't fit, if one canvas pixel isn't
+        Returns when the pattern is displayed. Raises `InstrumentError` if it doesn't fit, if one canvas pixel isn't
         one screen pixel, or if no screen answers in time.
         """
 

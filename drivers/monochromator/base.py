@@ -14,10 +14,10 @@ from drivers.instrument import Instrument
 
 @dataclass(frozen=True)
 class OrderSortingFilter:
-    """One place of the filter wheel, and the wavelengths (nm, the upper end excluded) for which it is the right one.
+    """One position of the filter wheel, and the wavelengths (nm, the upper end excluded) for which it is used.
 
-    In first order at w a grating also passes w/2 in second order: the filter of a band must block half of every
-    wavelength in it and pass the band itself.
+    A grating that passes w in first order also passes w/2 in second order: a band's filter must block half of every
+    wavelength in it and transmit the band itself.
     """
 
     place: int
@@ -67,7 +67,7 @@ def order_sorting_filters(table: Sequence[object] | None) -> tuple[OrderSortingF
 
 
 def filter_place(filters: Sequence[OrderSortingFilter], wavelength_nm: float) -> int:
-    """Place of the order-sorting filter for a wavelength (nm). Raises `InstrumentError` if the table has none for it."""
+    """Position of the order-sorting filter for a wavelength (nm). Raises `InstrumentError` if the table has none."""
     for row in filters:
         if row.from_nm <= wavelength_nm < row.to_nm:
             return row.place
@@ -83,11 +83,11 @@ class Monochromator(Instrument):
 
     @abstractmethod
     def move_nm(self, wavelength_nm: float) -> None:
-        """Go to a wavelength (nm; 0 is zero order, white light) through its order-sorting filter; returns on arrival."""
+        """Go to a wavelength (nm; 0 is zero order, white light) with its order-sorting filter; returns on arrival."""
 
     @abstractmethod
     def wavelength_nm(self) -> float:
-        """Wavelength (nm) at which the instrument says it stands."""
+        """Wavelength (nm) that the instrument reports."""
 
     @abstractmethod
     def open_shutter(self) -> None:
@@ -99,15 +99,15 @@ class Monochromator(Instrument):
 
     @abstractmethod
     def shutter_is_open(self) -> bool:
-        """What the instrument says of its shutter."""
+        """State of the shutter that the instrument reports."""
 
     @abstractmethod
     def select_filter(self, place: int) -> None:
-        """Turn the filter wheel to a place; `move_nm` does so by itself."""
+        """Turn the filter wheel to a position; `move_nm` does so by itself."""
 
     @abstractmethod
     def selected_filter(self) -> int:
-        """Place at which the filter wheel stands."""
+        """Position of the filter wheel."""
 
     @abstractmethod
     def slit_um(self) -> float:

@@ -1,4 +1,4 @@
-"""The spectroradiometer abstraction: the spectral radiance of a spot."""
+"""The spectroradiometer abstraction: spectral radiance of a spot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim.spectrum import Spectrum
 
 @dataclass(frozen=True)
 class RadianceMeasurement:
-    """One measurement: spectral radiance (W sr^-1 m^-2 nm^-1), how long it integrated, and who measured it."""
+    """One measurement: spectral radiance (W sr^-1 m^-2 nm^-1), integration time, and the instrument's identity."""
 
     radiance_w_sr_m2_nm: Spectrum
     integration_time_s: float | None
@@ -19,7 +19,7 @@ class RadianceMeasurement:
 
 
 class Spectroradiometer(Instrument):
-    """A spectroradiometer aimed at what lies in front of the cameras."""
+    """A spectroradiometer aimed at the scene in front of the cameras."""
 
     @abstractmethod
     def measure(self) -> RadianceMeasurement:

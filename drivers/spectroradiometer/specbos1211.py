@@ -133,7 +133,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         raise failure
 
     def _make_safe(self) -> None:
-        """It emits nothing and moves nothing."""
+        """Nothing to do: it emits nothing and moves nothing."""
 
     def _set(self, command: str) -> None:
         """A setting: ACK, or NAK and the reason."""
@@ -165,7 +165,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         return Refused(f"{self._transport.name}: {command!r} failed: error {code}, {meaning}; {remedy}", code)
 
     def _fetch_spectrum(self) -> Spectrum:
-        """The spectrum just measured; asked for again while it comes broken."""
+        """The last measured spectrum; requested again while it arrives incomplete."""
         failure: InstrumentError | None = None
         for _ in range(FETCHES):
             try:
@@ -208,7 +208,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         return Spectrum.of(wavelengths, values)
 
     def _integration_time_s(self) -> float | None:
-        """Integration time of the last measurement; None where the firmware doesn't tell."""
+        """Integration time of the last measurement; None where the firmware doesn't report it."""
         try:
             found = re.search(r"(\d+(?:\.\d+)?)\s*(?:ms)?\s*$", self._ask("*fetch:tint"))
         except Refused:

@@ -112,7 +112,8 @@ class Usb2000Plus(Spectroradiometer):
             return Identity("Ocean Optics", "USB2000+", str(self._connected().serial_number))
 
     def measure(self) -> RadianceMeasurement:
-        """Spectral radiance: scans at a time of its own choice, dark pixels subtracted, bend taken out, divided by the response."""
+        """Spectral radiance: scans at an integration time of its own choice, dark pixels subtracted, corrected for
+        nonlinearity, divided by the response."""
         with self._lock:
             self._stopped.clear()
             pixels = self._connected().f.spectrometer
@@ -130,7 +131,7 @@ class Usb2000Plus(Spectroradiometer):
             return RadianceMeasurement(radiance, integration_s, str(self._open.serial_number))
 
     def stop(self) -> None:
-        """End a measurement after the scan under way; it emits nothing and moves nothing."""
+        """End a measurement after the current scan; the instrument emits nothing and moves nothing."""
         self._stopped.set()
 
     def close(self) -> None:
@@ -206,7 +207,7 @@ class Usb2000Plus(Spectroradiometer):
         )
 
     def _signal(self, counts: FloatArray) -> FloatArray:
-        """Counts above the covered pixels' dark, with the maker's polynomial for the bend divided out."""
+        """Counts above the covered pixels' dark, corrected by the maker's nonlinearity polynomial."""
         above = counts - np.median(counts[self._dark_pixels])
         return np.asarray(above / np.polynomial.polynomial.polyval(above, self._bend))
 

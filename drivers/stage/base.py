@@ -1,4 +1,4 @@
-"""The stage abstraction: which target stands in front of the cameras, whoever puts it there."""
+"""The stage abstraction: which target stands in front of the cameras."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from drivers.instrument import Instrument
 
 
 class Stage(Instrument):
-    """Something, or someone, that places targets."""
+    """A device or a person that places targets."""
 
     @abstractmethod
     def place(self, target: str) -> None:
-        """Put a target in front of the cameras and return once it stands there."""
+        """Put a target in front of the cameras and return once it is there."""
 
     @abstractmethod
     def placed(self) -> str:
-        """The target that stands there; an empty string if nobody knows."""
+        """The target in place; an empty string if it isn't known."""
 
     @abstractmethod
     def targets(self) -> tuple[str, ...]:
-        """Names of the targets at hand; empty if the stage can't tell."""
+        """Names of the available targets; empty if the stage doesn't report them."""
 
     def instruct(self, instructions: Mapping[str, str]) -> None:
         """Tell what an operator does for each target. A stage that moves by itself needs no instruction."""

@@ -1,4 +1,4 @@
-"""A person at the terminal as stage: asked to put a target in place, and to say so."""
+"""A person at the terminal as stage: asked to put a target in place and to confirm it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from drivers.stage.base import Stage
 
 
 class PromptStage(Stage):
-    """Asks on the terminal. `instructions`: target -> what to do, for those whose name doesn't say it.
+    """Asks on the terminal.
 
-    `ask` shows a question and returns the answer; the terminal's `input` if not given. A person takes the time it
-    takes: only a closed terminal ends the wait.
+    `instructions`: target -> what to do, where its name doesn't say it. `ask` shows a question and returns the answer,
+    by default on the terminal. There is no time-out: only a closed terminal ends the wait.
     """
 
     def __init__(

@@ -93,7 +93,7 @@ def score_command(
     seals = load(Seals, folder / "seals.json")
     cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
     runs = run_all(folder, cases, jobs or os.cpu_count() or 1, _say)
-    opened = load(Truths, truths)  # only now: what the diagnosis says is written down
+    opened = load(Truths, truths)  # only now that all diagnoses are written
     found = score(opened, seals, runs, broken_seals(folder, seals, opened))
     if page is not None:
         write_page(found, page)

@@ -1,4 +1,4 @@
-"""The mix of a challenge: which cameras, what they conceal and how strongly, and what is stated wrongly of them."""
+"""The mix of a challenge: cameras, what they conceal and how strongly, and what is stated wrongly of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is stated wrongly of a sound camera, or goes wrong on its rig: mismatches that no effect explains."""
+"""Faults of a sound camera's metadata or rig: mismatches that no effect explains."""
 
 from __future__ import annotations
 

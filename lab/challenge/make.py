@@ -1,4 +1,4 @@
-"""Writing a challenge: sealed recording sets in a folder, their truths apart."""
+"""Writing a challenge: sealed recording sets in a folder, their truths elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lab.challenge.truth import CaseTruth, Seals, Truths, digest, load, purpose_
 from lab.errors import InputError
 from lab.formats import recording_set
 
-#: What all files of a challenge are dated, s since 1970: when one was written says nothing.
+#: Modification time of all files of a challenge, s since 1970, so that times reveal nothing.
 FILE_TIME_S = 1_772_442_000
 
 
@@ -37,8 +37,11 @@ def make(
     out: Path, cases: int, seed: int, truths_file: Path, size: str, jobs: int, *, cfa: str | None = None,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> Truths:  # fmt: skip
-    """Write what isn't there yet of a challenge. Raises InputError where the truths would lie among the recordings, or where a
-    challenge of another seed, size or number is there already."""
+    """Write the missing cases of a challenge.
+
+    Raises InputError where the truths would lie among the recordings, or where a challenge of another seed, size or
+    number exists there.
+    """
     out, truths_file = out.resolve(), truths_file.resolve()
     if out in truths_file.parents or truths_file == out:
         raise InputError(f"{truths_file}: lies within the challenge's folder {out}; give a file outside it")

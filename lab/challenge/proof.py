@@ -1,4 +1,4 @@
-"""The page on the proof: tables and a confusion-matrix picture, with the seed and the seals' hash."""
+"""The proof's page: tables and a confusion matrix, with the seed and the hash of the seals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAID_NOTHING = ("unexplained", "no_mismatch", "failed")
 
 
 def refuse_scored(seed: int, page: Path) -> None:
-    """Raises InputError where the page says that this proof seed was scored: a case once scored is never used again."""
+    """Raises InputError where the page lists this proof seed as scored: a scored seed is never used again."""
     if page.is_file() and re.search(rf"^\| proof \| {seed} \|", page.read_text(encoding="utf-8"), re.MULTILINE):
         raise InputError(f"seed {seed}: was scored already, see {page}; leave --seed out for a fresh one")
 
@@ -76,7 +76,8 @@ def table(found: ChallengeScore) -> str:
 
 
 def write_page(found: ChallengeScore, page: Path) -> None:
-    """Put the section of this purpose into the page, its picture beside it, and the seed into the page's list of seeds."""
+    """Write the section of this purpose into the page, its picture beside it, and the seed into the page's list of
+    seeds."""
     text = page.read_text(encoding="utf-8") if page.is_file() else "# Proof\n"
     picture = page.with_name(f"{page.stem}-{found.purpose}.svg")
     section = (
@@ -115,7 +116,8 @@ def _row(case: CaseScore) -> str:
 
 
 def confusion(found: ChallengeScore) -> str:
-    """SVG: rows what was concealed (singles above 50, healthy, outside), columns what was said; numbers of cases."""
+    """Confusion matrix as SVG: rows are concealed (single effects above 50, healthy, outside the library), columns
+    diagnosed; numbers of cases."""
     shown = [
         s
         for s in found.case_scores

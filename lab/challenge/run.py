@@ -1,4 +1,5 @@
-"""Diagnosing the cases of a challenge, each for itself: what is there already is kept, and one that fails doesn't end the run."""
+"""Diagnosis of the cases of a challenge, each by itself: existing results are kept, and a case that fails doesn't end
+the run."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from sim.parameters import Frozen
 
 
 class CaseRun(Frozen):
-    """A diagnosis (without its curves) with what it took, or why there is none. `memory_mib`: the process's peak while it ran."""
+    """A diagnosis (without its curves) with its cost, or the reason why there is none. `memory_mib`: peak of the
+    process."""
 
     case: str
     wall_s: float
@@ -57,7 +59,7 @@ def run_case(folder: Path) -> CaseRun:
 def run_all(
     folder: Path, cases: tuple[str, ...], jobs: int, progress: Callable[[str, float], None] = lambda _text, _share: None
 ) -> dict[str, CaseRun]:
-    """Results by case, from DIR/results/CASE.json where it is there, else diagnosed and written there."""
+    """Results by case: from DIR/results/CASE.json where it exists, else diagnosed and written there."""
     file = {case: folder / "results" / f"{case}.json" for case in cases}
     runs = {case: load(CaseRun, file[case]) for case in cases if file[case].exists()}
     missing = [case for case in cases if case not in runs]

@@ -17,16 +17,16 @@ from lab.formats.results import DiagnosisResult
 from sim.parameters import Frozen
 
 CONFIDENCE = 0.95
-#: A parameter's interval: so many standard uncertainties, 95 % of a normal distribution.
+#: Half width of a parameter's 95 % interval, standard deviations.
 INTERVAL_SIGMAS = 1.959964
 STRONG, SEEN = 50.0, 25.0
 CPU_GOAL_S, MEMORY_GOAL_MIB = 120.0, 3072.0  # 60 s on two cores
-#: Excess chi2 of held-out numbers above which its removal can be judged, in standard deviations of chi2.
+#: Smallest excess of held-out chi2 whose removal is scored, standard deviations of chi2.
 EXCESS_SIGMAS = 3.0
 
 
 class Rate(Frozen):
-    """`count` of `of`, with the Clopper-Pearson interval of 95 %; None where there is nothing to count."""
+    """`count` of `of` with its Clopper-Pearson interval of 95 %; None where `of` is 0."""
 
     count: int
     of: int
@@ -47,7 +47,8 @@ class Rate(Frozen):
 
 
 class Goal(Frozen):
-    """`met`: None where no case could tell. `sure`: whether the interval of 95 % lies on one side of what is wanted."""
+    """A goal of the proof. `met`: None where no case applies. `sure`: whether the 95 % interval lies entirely on one
+    side of the limit."""
 
     name: str
     wanted: str
@@ -57,7 +58,7 @@ class Goal(Frozen):
 
 
 class CaseScore(Frozen):
-    """One case: what it concealed, what was said."""
+    """One case: what it concealed, and the diagnosis of it."""
 
     case: str
     kind: str
@@ -76,7 +77,8 @@ class CaseScore(Frozen):
 
 
 class SinglesScore(Frozen):
-    """Single effects of one class of non-centrality: the first name is right; it is the only one; nothing is named."""
+    """Single effects of one class of non-centrality: shares with the right first name, with only that name, and
+    without a name."""
 
     noncentrality: str
     top_1: Rate
@@ -85,7 +87,7 @@ class SinglesScore(Frozen):
 
 
 class EffectScore(Frozen):
-    """One effect over all the singles that conceal it: how often its name came first, and what came instead."""
+    """All single cases of one effect: how often its name came first, and what came instead."""
 
     effect: str
     top_1: Rate
@@ -132,7 +134,7 @@ class ChallengeScore(Frozen):
 
 
 def broken_seals(folder: Path, seals: Seals, truths: Truths) -> tuple[str, ...]:
-    """Cases whose truth or recordings aren't what was sealed, or of which either is missing."""
+    """Cases whose truth or recordings differ from what was sealed, or of which either is missing."""
     broken = []
     for case in sorted({*seals.seals, *truths.truths}):
         salted = truths.truths.get(case)
@@ -155,7 +157,7 @@ def seals_sha256(seals: Seals) -> str:
 
 
 def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str] = ()) -> ChallengeScore:
-    """All figures. Cases with a broken seal count nowhere, cases that failed count as saying nothing."""
+    """All figures. Cases with a broken seal are left out; cases that failed count as without a verdict."""
     cases = [
         (case, truths.truths[case].truth, runs[case])
         for case in sorted(runs)
@@ -261,7 +263,8 @@ def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
 
 
 def _removed(truth: CaseTruth, found: DiagnosisResult | None) -> float | None:
-    """(before - after) / (before - n) of held-out chi2, -1..1, where what is concealed left an excess to remove there."""
+    """Share of the held-out excess chi2 that the improved model removes, (before - after) / (before - n), limited to
+    -1..1; None where the concealed law left no significant excess there."""
     held = found.held_out if found is not None else None
     if held is None or max((c.noncentrality for c in truth.concealed), default=0.0) <= STRONG:
         return None
@@ -272,7 +275,7 @@ def _removed(truth: CaseTruth, found: DiagnosisResult | None) -> float | None:
 
 
 def _covered(truth: CaseTruth, found: DiagnosisResult | None) -> Iterable[bool]:
-    """Of every parameter that means the same in the library: whether its interval holds the truth."""
+    """For every parameter that has the same meaning in the library: whether its 95 % interval contains the truth."""
     named = {e.name: e for e in found.effects} if found is not None else {}
     for hidden in truth.concealed:
         effect = named.get(hidden.effect or "")

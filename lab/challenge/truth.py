@@ -1,4 +1,4 @@
-"""What a concealed camera hides, and the seal on it: a salted hash that binds the truth before anything was diagnosed."""
+"""The truth of a concealed camera, and its seal: a salted hash that fixes the truth before anything is diagnosed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from lab.errors import InputError
 from sim.parameters import Frozen
 
-#: Seeds below are for tuning, from here on for proofs: no seed is both. Seeds of continuous checks lie above both.
+#: Seeds below are for tuning, from here on for proofs; those of the everyday tests lie above both.
 FIRST_PROOF_SEED = 1_000_000
 FIRST_FRESH_SEED = 1 << 32
 Kind = Literal["healthy", "single", "compound", "outside"]
@@ -24,8 +24,12 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class Concealed(Frozen):
-    """One concealed law. `effect`: its name in the results' list, None outside it. `parameters`: what the library's parameters should
-    come out as, where they mean the same. `noncentrality`: |L^-1 (y with it - y without)|^2 over the numbers that choice may see."""
+    """One concealed law.
+
+    `effect`: its name in the list of effects, None outside it. `parameters`: true values of the library's parameters,
+    where they have the same meaning. `noncentrality`: size of its change of the summaries, see
+    `lab.challenge.noncentrality`.
+    """
 
     name: str
     effect: str | None = None
@@ -37,8 +41,11 @@ class Concealed(Frozen):
 
 
 class CaseTruth(Frozen):
-    """Of one case. `fault`: what is stated wrongly, or went wrong on the rig. `accepts`: names that aren't wrong beside the concealed
-    ones. `recordings_sha256`: of every file of the set, so that the seal binds these, too."""
+    """The truth of one case.
+
+    `fault`: what is stated wrongly, or went wrong on the rig. `accepts`: effects that describe the case rightly
+    besides the concealed ones. `recordings_sha256`: over all files of the set, so that the seal fixes these, too.
+    """
 
     kind: Kind
     concealed: tuple[Concealed, ...] = ()
@@ -63,7 +70,7 @@ class SaltedTruth(Frozen):
 
 
 class Truths(Frozen):
-    """What is kept apart from the recordings."""
+    """The truths of a challenge, kept apart from the recordings."""
 
     format: Literal["calibench-truths"] = "calibench-truths"
     version: Literal[1] = 1
@@ -75,7 +82,7 @@ class Truths(Frozen):
 
 
 class Seals(Frozen):
-    """What stands beside the recordings: case -> SHA-256 of salt and truth. It says neither seed nor purpose."""
+    """The seals beside the recordings: case -> SHA-256 of salt and truth. They reveal neither seed nor purpose."""
 
     format: Literal["calibench-seals"] = "calibench-seals"
     version: Literal[1] = 1
@@ -83,7 +90,7 @@ class Seals(Frozen):
 
 
 def canonical(truth: CaseTruth) -> str:
-    """JSON with sorted keys and no blanks: one text for one truth."""
+    """JSON with sorted keys and no blanks, the same text for the same truth."""
     return json.dumps(truth.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
 
 
@@ -93,12 +100,12 @@ def seal(salted: SaltedTruth) -> str:
 
 
 def salted(truth: CaseTruth) -> SaltedTruth:
-    """With a fresh salt of 128 bits: the seal can't be guessed from the few truths that are likely."""
+    """A truth with a random salt of 128 bits, so that its seal can't be guessed from the few likely truths."""
     return SaltedTruth(salt=secrets.token_hex(16), truth=truth)
 
 
 def digest(folder: Path) -> str:
-    """SHA-256 over names and contents of all files of a folder, in the order of the names."""
+    """SHA-256 over names and contents of all files of a folder, in the order of their names."""
     total = hashlib.sha256()
     for file in sorted(p for p in folder.rglob("*") if p.is_file()):
         total.update(f"{file.relative_to(folder).as_posix()}\0{file.stat().st_size}\0".encode())
@@ -111,7 +118,7 @@ def purpose_of(seed: int) -> Purpose:
 
 
 def load(model: type[Model], file: Path) -> Model:
-    """A model from a JSON file; raises InputError that says what is wrong with it."""
+    """A model from a JSON file; raises InputError that names the fault."""
     try:
         return model.model_validate_json(file.read_text(encoding="utf-8"))
     except OSError as error:

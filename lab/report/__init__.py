@@ -54,17 +54,17 @@ class _Kernel:
 
     @classmethod
     def of(cls, pair: KernelPair) -> _Kernel:
-        seen, foretold = np.asarray(pair.measured, float), np.asarray(pair.predicted, float)
-        margin = trimmed_margin([seen, foretold])
-        peak = float(foretold.max())
-        # Not below 5 % of the peak: else mere noise would look like a difference.
-        limit = max(float(np.abs(seen - foretold).max()), 0.05 * peak)
+        measured_, predicted_ = np.asarray(pair.measured, float), np.asarray(pair.predicted, float)
+        margin = trimmed_margin([measured_, predicted_])
+        peak = float(predicted_.max())
+        # at least 5 % of the peak, so that noise doesn't look like a difference
+        limit = max(float(np.abs(measured_ - predicted_).max()), 0.05 * peak)
         return cls(
             label=pair.label,
             channel=pair.channel,
-            measured=kernel_picture(seen, peak, margin),
-            predicted=kernel_picture(foretold, peak, margin),
-            difference=difference_picture(seen - foretold, limit, margin),
+            measured=kernel_picture(measured_, peak, margin),
+            predicted=kernel_picture(predicted_, peak, margin),
+            difference=difference_picture(measured_ - predicted_, limit, margin),
             limit=f"{100 * limit / peak:.2g} %",
             psnr_peak=f"{pair.psnr_peak_db:.1f}",
             psnr_unit=f"{pair.psnr_unit_db:.1f}",
@@ -115,7 +115,7 @@ def _threshold_text(diagnosis: DiagnosisResult | None) -> str:
 
 
 def _chart_json(figure: dict[str, Any]) -> Markup:
-    """A figure as JSON that can't end its script element; numbers to 7 digits, which no chart shows."""
+    """A figure as JSON that can't end its script element; numbers rounded to 7 digits."""
 
     def rounded(value: Any) -> Any:
         if isinstance(value, dict):
@@ -131,7 +131,7 @@ def _chart_json(figure: dict[str, Any]) -> Markup:
 
 
 def page_environment() -> jinja2.Environment:
-    """Where the pages' templates lie, with their filters."""
+    """The templates of the pages, with their filters."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,

@@ -1,5 +1,5 @@
-"""The report's charts as Plotly figures. Colours that depend on light or dark are named "@fg", "@muted" and "@grid"; the page's
-script puts them in. Uncertainty is drawn wherever the results state one."""
+"""The report's charts as Plotly figures. Colours that differ between the light and the dark page are named "@fg", "@muted" and "@grid" and
+are replaced by the page's script. Uncertainty is drawn wherever the results state one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim.camera import Side
 
 Figure = dict[str, Any]
 Trace = dict[str, Any]
-#: Apart for all common kinds of colour vision, and legible on white and on near-black.
+#: Distinguishable with all common kinds of colour vision, and legible on white and on near-black.
 CHANNEL = {"R": "#d1495b", "G": "#2a9d57", "B": "#3d7be0", "Y": "#8a63d2", "G1": "#2a9d57", "G2": "#7fb800"}
 BEFORE, AFTER = "#e08a1e", "#1f9aa5"
 FADED = 0.22  # opacity of an uncertainty band
@@ -155,14 +155,16 @@ def linearity(noise: NoiseFit) -> Figure | None:
     return {
         "data": data,
         "layout": layout(
-            220, xaxis=axis("signal above dark, DN", rangemode="tozero"), yaxis=axis("off the line, %", zeroline=True)
+            220,
+            xaxis=axis("signal above dark, DN", rangemode="tozero"),
+            yaxis=axis("deviation from the line, %", zeroline=True),
         ),
     }
 
 
 def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Shapes and annotations of the bands in which the curves part from the maker's: a strip along the top for each channel, with the
-    difference in percent."""
+    """Shapes and annotations of the bands in which a curve differs from the maker's: a strip along the top for each channel, with the
+    difference in per cent."""
     shapes: list[dict[str, Any]] = []
     notes: list[dict[str, Any]] = []
     channels = list(spectral.quantum_efficiency)
@@ -191,8 +193,8 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
 
 
 def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Side) -> Figure:
-    """Quantum efficiency with its band (one standard uncertainty, expanded by the fit's coverage factor) and the maker's, times the
-    factor between them where one was found; where the two part."""
+    """Quantum efficiency with its band (standard deviation times the fit's coverage factor), the maker's curve, times the fitted factor between
+    the two where there is one, and the bands in which they differ."""
     data: list[Trace] = []
     scale = spectral.maker_scale or 1.0
     for channel, values in spectral.quantum_efficiency.items():
@@ -259,7 +261,7 @@ def _panel_title(number: int, text: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Overlay:
-    """One channel's measured curve with its predictions: by the baseline, and with what was found where anything was."""
+    """One channel's measured curve and its predictions: the baseline's and, where effects were named, the improved model's."""
 
     channel: str
     x: Sequence[float]
@@ -282,7 +284,7 @@ def validated_overlays(checks: Sequence[Check]) -> dict[str, list[Overlay]]:
 
 
 def explained_overlays(curves: Sequence[ResidualCurve], measurement: str = "slanted_edge") -> dict[str, list[Overlay]]:
-    """Panel title -> curves of one measurement as the diagnosis has them, the held-out ones where there are both."""
+    """Panel title -> curves of one measurement from the diagnosis; where a curve exists twice, the held-out one."""
     chosen: dict[tuple[str, str], ResidualCurve] = {}
     for curve in curves:
         key = (curve.label, curve.channel)
@@ -298,12 +300,12 @@ def explained_overlays(curves: Sequence[ResidualCurve], measurement: str = "slan
 
 
 def _legend(name: str, **look: Any) -> Trace:
-    """An entry of the legend that draws nothing."""
+    """A legend entry without data."""
     return {"type": "scatter", "name": name, "x": [None], "y": [None], "hoverinfo": "skip"} | look
 
 
 def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3) -> Figure | None:
-    """Measured MTF (points) over the baseline's prediction (dashed) and, where effects were named, theirs (solid)."""
+    """Measured MTF (points), the baseline's prediction (dashed), and the improved model's (solid) where effects were named."""
     if not panels:
         return None
     columns = min(columns, len(panels))
@@ -325,7 +327,7 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
         data.append(_legend(f"{channel} measured", mode="markers", marker={"color": CHANNEL.get(channel, "#888888")}))
     data.append(_legend("baseline", mode="lines", line={"color": "@fg", "width": 1.3, "dash": "dash"}))
     if any(overlay.explained is not None for overlay in everything):
-        data.append(_legend("with what was found", mode="lines", line={"color": "@fg", "width": 1.8}))
+        data.append(_legend("improved model", mode="lines", line={"color": "@fg", "width": 1.8}))
 
     def add(overlay: Overlay, y: Sequence[float], on: dict[str, str], **trace: Any) -> None:
         data.append({"type": "scatter", "x": list(overlay.x), "y": list(y), "showlegend": False} | on | trace)
@@ -355,7 +357,7 @@ def transfer_overlays(panels: Mapping[str, Sequence[Overlay]], columns: int = 3)
 
 
 def patch_comparison(patches: Sequence[PatchComparison]) -> Figure:
-    """Measured against predicted, and below it how far off each patch is in per cent, with its uncertainty."""
+    """Measured against predicted patches, and below it their difference in per cent with bars of one standard deviation."""
     data: list[Trace] = []
     top = max(max(patch.measured_dn, patch.predicted_dn) for patch in patches)
     for channel in dict.fromkeys(patch.channel for patch in patches):
@@ -409,7 +411,7 @@ def patch_comparison(patches: Sequence[PatchComparison]) -> Figure:
 
 
 def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
-    """Where the baseline fails: significance by measurement and axis, one row for each side and measurement."""
+    """Significance of the baseline's mismatches by axis, one row for each side and measurement."""
     if not diagnosis.mismatches:
         return None
     rows = list(dict.fromkeys((item.side, item.measurement) for item in diagnosis.mismatches))
@@ -460,7 +462,7 @@ def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
 
 
 def _range(curve: ResidualCurve) -> list[float]:
-    """Range of the ordinate: what was measured and explained, and of the baseline only as much as leaves that legible."""
+    """Range of the ordinate: all of the measurement and of the improved model; the baseline is cut off where it would compress these."""
     seen = np.concatenate([curve.measured, curve.after])
     low, high = float(seen.min()), float(seen.max())
     span = max(high - low, 1e-12 * max(abs(high), 1.0))
@@ -470,14 +472,14 @@ def _range(curve: ResidualCurve) -> list[float]:
 
 
 def _named_ticks(curve: ResidualCurve) -> dict[str, Any]:
-    """Where x only numbers the points: their names."""
+    """Tick labels with the points' names, where x only numbers them."""
     if not curve.names:
         return {}
     return {"tickvals": list(curve.x), "ticktext": list(curve.names), "tickangle": -45, "tickfont": {"size": 9}}
 
 
 def residual_curve(curve: ResidualCurve) -> Figure:
-    """One measurement with the baseline and with what was found, and below it what is left, in standard deviations."""
+    """One measurement with both models' predictions, and below it the residuals in standard deviations."""
     std = np.maximum(np.asarray(curve.measured_std), 1e-12)
     seen = np.asarray(curve.measured)
     data: list[Trace] = [
@@ -493,7 +495,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
     ]
     for name, values, colour, dash in (
         ("baseline", curve.before, BEFORE, "dash"),
-        ("with what was found", curve.after, AFTER, "solid"),
+        ("improved model", curve.after, AFTER, "solid"),
     ):
         data.append(
             {
@@ -543,7 +545,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
 
 
 def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
-    """chi2 per number on captures that the diagnosis has not seen, before and after; 1 is what noise leaves."""
+    """chi2 / n of both models on held-out captures; noise alone gives 1."""
     held = diagnosis.held_out
     if held is None or held.n == 0:
         return None
@@ -552,7 +554,7 @@ def held_out_bars(diagnosis: DiagnosisResult) -> Figure | None:
             {
                 "type": "bar",
                 "orientation": "h",
-                "y": ["baseline", "with what was found"],
+                "y": ["baseline", "improved model"],
                 "x": [held.chi2_before / held.n, held.chi2_after / held.n],
                 "marker": {"color": [BEFORE, AFTER]},
                 "text": [f"{held.chi2_before / held.n:.2f}", f"{held.chi2_after / held.n:.2f}"],

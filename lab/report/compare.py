@@ -1,4 +1,4 @@
-"""The page of two calibrations compared: what changed, how far beyond its uncertainty, and how the cameras project otherwise."""
+"""The page of two calibrations compared: what changed, how significantly, and how the projections differ."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def most_significant(comparison: ComparisonResult) -> tuple[Change, ...]:
 
 
 def significances(comparison: ComparisonResult) -> Figure | None:
-    """By how many standard deviations each number differs, with the limit that an unchanged rig passes as rarely as is stated."""
+    """Significance of each difference in standard deviations, with the limit of the stated false-alarm rate."""
     rows = most_significant(comparison)[::-1]
     if not rows:
         return None
@@ -69,11 +69,11 @@ def significances(comparison: ComparisonResult) -> Figure | None:
 
 
 def projection_vectors(item: ProjectionChange) -> Figure:
-    """Where B projects what A does, over the frame, as lines from A's place, enlarged by a round number."""
+    """Differences of projection over the frame as enlarged lines, from A to B."""
     x, y = np.meshgrid(item.x_px, item.y_px)
     at = np.stack([x.ravel(), y.ravel()], axis=1)
     shape = (item.y_px[-1] + 1, item.x_px[-1] + 1)
-    traces = lines_of_vectors(at, np.array(item.vectors_px, float).reshape(-1, 2), shape, "B less A")
+    traces = lines_of_vectors(at, np.array(item.vectors_px, float).reshape(-1, 2), shape, "B − A")
     return {"data": traces, "layout": frame_layout(shape)}
 
 

@@ -1,4 +1,4 @@
-"""The diagnosis on the page: heat maps of all places that were looked at, residual pictures, what could have been seen."""
+"""The diagnosis on the page: heat maps of all places looked at, residual images, smallest detectable effects."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from lab.report.pictures import difference_picture
 from sim.camera import Side
 from sim.effects.library import effects as library
 
-#: Standard deviations at which a residual picture's colours end.
+#: Range of a residual image's colours, standard deviations.
 PICTURE_LIMIT = 6.0
-#: Above this quantile of noise alone, a chi2 is marked.
+#: A chi2 above this quantile of its distribution under noise alone is marked.
 MARKED_QUANTILE = 0.999
 CURVES_A_SIDE = 8
-#: Significance at which the heat maps' colour ends: beyond, more is no news.
+#: Range of the heat maps' colours.
 DEEPEST_SIGMA = 12.0
 
 
 def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[str, Any]:
-    """What `diagnosis.html` draws beside the result itself."""
+    """Variables of `diagnosis.html` besides the result itself."""
     if diagnosis is None:
         return {}
     threshold = diagnosis.threshold
     return {
         "place_map": place_maps(diagnosis, sides),
-        "residual_pictures": [_Pair.of(picture) for picture in diagnosis.pictures],
+        "residual_pictures": [_ResidualImages.of(picture) for picture in diagnosis.pictures],
         "picture_limit": f"{PICTURE_LIMIT:g}",
         "visibility": _visibility(diagnosis.visibility),
         "detectable": f"{detectable(threshold):.0f}" if threshold is not None else "",
@@ -41,12 +41,12 @@ def context(diagnosis: DiagnosisResult | None, sides: Sequence[Side]) -> dict[st
 
 
 def mood(chi2: float, n: int) -> str:
-    """The class of a chi2's cell: marked where noise alone leaves less in 99.9 % of all cases."""
+    """CSS class of a chi2's cell: marked above the 99.9 % quantile."""
     return "open" if n and chi2 > special.chdtri(n, 1.0 - MARKED_QUANTILE) else ""
 
 
 def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) -> list[ResidualCurve]:
-    """Of every measurement the curve that the baseline misses most, of held-out captures where there are any; worst first."""
+    """The curve of every measurement that the baseline fits worst, of held-out captures where there are any; worst first."""
 
     def missed(curve: ResidualCurve) -> float:
         std = np.maximum(np.asarray(curve.measured_std), 1e-12)
@@ -62,7 +62,7 @@ def worst_of_each(curves: Sequence[ResidualCurve], most: int = CURVES_A_SIDE) ->
 
 
 def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[str, Figure]]:
-    """Heat maps of significance by measurement and axis, one a side and model: the baseline, and with the named effects where any are."""
+    """Heat maps of significance by measurement and axis, one for each side and model (baseline, and improved model where effects were named)."""
     maps = []
     for side in sides:
         mine = [place for place in diagnosis.places if place.side == side]
@@ -70,7 +70,7 @@ def place_maps(diagnosis: DiagnosisResult, sides: Sequence[Side]) -> list[tuple[
             continue
         maps.append((f"{side}, baseline", _place_map(mine, after=False)))
         if any(side in effect.sides for effect in diagnosis.effects):
-            maps.append((f"{side}, with the named effects", _place_map(mine, after=True)))
+            maps.append((f"{side}, improved model", _place_map(mine, after=True)))
     return maps
 
 
@@ -128,7 +128,7 @@ def _place_map(places: Sequence[ExaminedPlace], *, after: bool) -> Figure:
 
 
 def _short(sigma: float) -> str:
-    """To fit its cell."""
+    """A significance in at most four characters."""
     return f"{sigma:.1f}" if sigma < 9.95 else f"{sigma:.0f}" if sigma < 99.5 else "99+"
 
 
@@ -136,8 +136,8 @@ def _short(sigma: float) -> str:
 
 
 @dataclass(frozen=True)
-class _Pair:
-    """One frame's residuals before and after, as pictures."""
+class _ResidualImages:
+    """One frame's residual images by both models."""
 
     side: Side
     kind: str
@@ -149,7 +149,7 @@ class _Pair:
     rms_after: str
 
     @classmethod
-    def of(cls, picture: ResidualPicture) -> _Pair:
+    def of(cls, picture: ResidualPicture) -> _ResidualImages:
         before, after = np.asarray(picture.before), np.asarray(picture.after)
         return cls(
             side=picture.side,
@@ -163,12 +163,12 @@ class _Pair:
         )
 
 
-# --- what could have been seen -----------------------------------------------------------------------------------------------
+# --- smallest detectable effects -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """One effect's cells of the table."""
+class _Detectable:
+    """One effect's cells in the table of detectable effects."""
 
     smallest: str
     nearest: str | None
@@ -176,9 +176,9 @@ class _Seen:
     told_apart: float
 
 
-def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Seen]]:
-    """Effect -> side -> what stands in the table; in the order of the names."""
-    table: dict[str, dict[Side, _Seen]] = {}
+def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Detectable]]:
+    """Effect -> side -> cells of the table, in the order of the names."""
+    table: dict[str, dict[Side, _Detectable]] = {}
     for item in sorted(items, key=lambda item: item.effect):
         units = {name: quantity.unit for name, quantity in library()[item.effect].quantities().items()}
         sizes = [
@@ -186,6 +186,6 @@ def _visibility(items: Sequence[Visibility]) -> dict[str, dict[Side, _Seen]]:
             f"{SHOWN_UNITS.get(units[name], '' if units[name] == '1' else units[name])}".strip()
             for name, value in item.smallest.items()
         ]
-        text = ", ".join(sizes) or "its place matters, not its size"
-        table.setdefault(item.effect, {})[item.side] = _Seen(text, item.nearest, item.cosine, item.told_apart)
+        text = ", ".join(sizes) or "not a matter of size"
+        table.setdefault(item.effect, {})[item.side] = _Detectable(text, item.nearest, item.cosine, item.told_apart)
     return table

@@ -114,7 +114,7 @@ def data_sheets(recordings: RecordingSet, fit: FitResult) -> Iterator[EmvaSheet]
 
 
 def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:
-    """The figures that at least one plane has, with standard uncertainties."""
+    """The quantities that at least one plane has, with standard deviations."""
     for field, (quantity, symbol, unit, factor) in TABLE.items():
         texts = []
         for plane in found.values():
@@ -132,7 +132,7 @@ def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:
 
 
 def _channel_rows(noise: NoiseFit) -> Iterator[EmvaRow]:
-    """The joint fit's figures of each colour by itself."""
+    """The joint fit's quantities by colour."""
     for field, (name, unit) in NOISE.items():
         if field not in ChannelNoise.model_fields:
             continue

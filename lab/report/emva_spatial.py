@@ -27,13 +27,13 @@ HIGH_PASS_PX = 5  # side of the box whose mean is subtracted from the bright ima
 
 @dataclass(frozen=True)
 class _MeanImages:
-    """Mean images of one plane's stacks, float, and the temporal variance left in each."""
+    """Mean images of one plane's stacks, DN, and the temporal variance that remains in each."""
 
     dark: FloatArray
     bright: FloatArray | None
     dark_left_dn2: float
     bright_left_dn2: float
-    dark_step_dn: float  # between the values that a mean of the dark stack's images can have
+    dark_step_dn: float  # step between possible values of the dark stack's mean
 
 
 def spatial_plots(recordings: RecordingSet, side: Side, own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
@@ -51,7 +51,7 @@ def spatial_plots(recordings: RecordingSet, side: Side, own: Emva1288, plane: st
         yield _spectrogram("PRNU", bright, left, "%")
     yield _histogram("DSNU", dark / gain, images.dark_left_dn2 / gain**2, "e", images.dark_step_dn / gain)
     if bright is not None:
-        # The box's own mean takes 1/25 of a pixel's noise along.
+        # subtracting the mean of n = 25 pixels leaves 1 - 1/n of the noise variance
         high = bright - cv2.blur(bright, (HIGH_PASS_PX, HIGH_PASS_PX), borderType=cv2.BORDER_REFLECT)
         yield _histogram("PRNU", high, left * (1.0 - HIGH_PASS_PX**-2), "%")
     yield _profiles("DSNU", images.dark, "DN")
@@ -60,7 +60,7 @@ def spatial_plots(recordings: RecordingSet, side: Side, own: Emva1288, plane: st
 
 
 def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane: str) -> _MeanImages | None:
-    """The stacks that the spatial figures come from, read again."""
+    """The image stacks that the spatial figures were computed from."""
     darks = [c for c in recordings.captures("dark", side) if c.exposure_s == points.stack_dark_exposure_s]
 
     def light(flat: FlatCapture) -> float:
@@ -89,14 +89,14 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
 
 def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Frequencies (cycles/px) and rms amplitude of an image's rows: the root of the mean power spectrum over the rows, scaled so
-    that a white pattern of standard deviation s has s at every frequency. The mean of each row is left out (frequency 0)."""
+    that a white pattern of standard deviation s has s at every frequency. Frequency 0 is left out."""
     length = image.shape[1]
     power = np.mean(np.abs(np.fft.rfft(image - image.mean(), axis=1)) ** 2, axis=0) / length
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)
 
 
 def _smoothed(values: FloatArray, most: int = MOST_POINTS) -> FloatArray:
-    """At most `most` values: means (of power, for spectra: squares) would hide lines, so the largest of each run."""
+    """At most `most` values: the largest of each run, as means would hide lines of a spectrum."""
     if values.size <= most:
         return values
     run = -(-values.size // most)
@@ -113,7 +113,10 @@ def _spectrogram(name: str, image: FloatArray, left: float, unit: str) -> EmvaPl
         data.append(
             curve(text, floats(np.linspace(frequency[0], frequency[-1], amplitude.size)), floats(amplitude), colour)
         )
-    for text, value, dash in ((f"{name}1288", whole, "solid"), ("left of temporal noise", float(np.sqrt(left)), "dot")):
+    for text, value, dash in (
+        (f"{name}1288", whole, "solid"),
+        ("residual temporal noise", float(np.sqrt(left)), "dot"),
+    ):
         if value > 0:
             data.append(curve(text, [0.0, 0.5], [value, value], "@fg", dash))
     return EmvaPlot(
@@ -127,13 +130,13 @@ def _spectrogram(name: str, image: FloatArray, left: float, unit: str) -> EmvaPl
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
-        "A white pattern is flat at its standard deviation; peaks are periodic patterns, a rise to the left is shading.",
+        "A white pattern is flat at its standard deviation; peaks are periodic patterns, a rise towards low frequencies is shading.",
     )
 
 
 def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float = 0.0) -> EmvaPlot:
-    """Logarithmic histogram, with the normal law of the same spread, and the accumulated one of moduli. `step`: between the values
-    that there are; a bin holds a whole number of them."""
+    """Logarithmic histogram with the normal distribution of the same standard deviation, and the cumulative histogram of absolute deviations.
+    `step`: between possible values; a bin holds a whole number of them."""
     rest = (image - image.mean()).ravel()
     reach = 1.05 * float(np.abs(rest).max()) or 1.0
     width = 2.0 * reach / HISTOGRAM_BINS
@@ -142,7 +145,7 @@ def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float
     first = rest.min() - 0.5 * min(step, width) if step > 0 else -reach
     counts, edges = np.histogram(rest, first + width * np.arange(np.ceil((reach - first) / width) + 1))
     middle = (edges[:-1] + edges[1:]) / 2.0
-    spread = float(rest.std()) or 1e-12  # all alike: one bin
+    spread = float(rest.std()) or 1e-12  # all equal: one bin
     law = rest.size * (edges[1] - edges[0]) * np.exp(-0.5 * (middle / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
     moduli = np.sort(np.abs(rest))[::-1]
     steps = np.unique(np.geomspace(1, moduli.size, 160).astype(int)) - 1
@@ -154,9 +157,9 @@ def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float
             "data": [
                 markers("pixels", floats(middle[shown]), floats(counts[shown].astype(float)), AFTER)
                 | {"marker": {"size": 4, "color": AFTER}},
-                curve("normal law of the same spread", floats(middle[drawn]), floats(law[drawn]), "@fg"),
+                curve("normal distribution, same standard deviation", floats(middle[drawn]), floats(law[drawn]), "@fg"),
                 curve(
-                    "share of pixels further out",
+                    "share of pixels beyond",
                     floats(moduli[steps]),
                     floats(100.0 * (steps + 1.0) / moduli.size),
                     BEFORE,
@@ -166,20 +169,20 @@ def _histogram(name: str, image: FloatArray, left: float, unit: str, step: float
             ],
             "layout": layout(
                 320,
-                xaxis=axis(f"off the mean, {unit}", domain=[0.0, 0.47]),
+                xaxis=axis(f"deviation from the mean, {unit}", domain=[0.0, 0.47]),
                 yaxis=axis("pixels", type="log", range=[-0.3, float(np.log10(max(counts.max(), 2))) + 0.3]),
-                xaxis2=axis(f"modulus, {unit}", domain=[0.58, 1.0], anchor="y2", rangemode="tozero"),
+                xaxis2=axis(f"absolute deviation, {unit}", domain=[0.58, 1.0], anchor="y2", rangemode="tozero"),
                 yaxis2=axis("share of pixels, %", type="log", anchor="x2"),
                 margin={"l": 56, "r": 14, "t": 46, "b": 44},
             ),
         },
-        f"Of the mean image{', its 5 × 5 means taken out' if name == 'PRNU' else ''}; {measured(float(np.sqrt(left)), None, unit)} of the spread is "
-        "what is left of temporal noise. Defects stand apart from the normal law.",
+        f"Mean image{', high-passed by 5 × 5 means' if name == 'PRNU' else ''}; residual temporal noise {measured(float(np.sqrt(left)), None, unit)}. "
+        "Defective pixels lie outside the normal distribution.",
     )
 
 
 def _profiles(name: str, image: FloatArray, unit: str) -> EmvaPlot:
-    """Middle line, mean, smallest and largest of rows and columns."""
+    """Profiles along rows and columns: middle line, mean, minimum and maximum."""
     data: list[Trace] = []
     for number, turned in enumerate((image, image.T)):
         on = {"xaxis": f"x{number + 1}" if number else "x", "yaxis": "y2" if number else "y", "showlegend": number == 0}

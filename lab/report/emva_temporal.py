@@ -52,7 +52,7 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
                 yaxis=axis("σ²<sub>y</sub> − σ²<sub>y.dark</sub>, DN²", range=[0.0, 1.15 * float(excess.max())]),
             ),
         },
-        "Temporal variance against mean, both less dark. Solid: the line through the origin to 70 % of saturation; dotted: beyond.",
+        "Temporal variance against mean, dark subtracted. Solid: the line through the origin, fitted to 70 % of saturation; dotted: beyond.",
     )
     if own.responsivity_dn_per_photon is not None:
         slope = own.responsivity_dn_per_photon
@@ -75,7 +75,7 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
                     yaxis=axis("μ<sub>y</sub> − μ<sub>y.dark</sub>, DN", rangemode="tozero"),
                 ),
             },
-            "Mean less dark against photons, with the line through the origin to 70 % of saturation.",
+            "Mean minus dark against photons, with the line through the origin, fitted to 70 % of saturation.",
         )
     yield _snr(own, light, signal, colour)
     yield from _linearity(own, light, signal, colour)
@@ -83,12 +83,12 @@ def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
 
 
 def _snr(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str) -> EmvaPlot:
-    """SNR of each level; the linear model's; that with nonuniformity; and an ideal sensor's."""
+    """SNR against light: measured, of the linear model, with nonuniformity, and of an ideal sensor."""
     points, gain = own.points, own.system_gain_dn_per_e
     photons = own.quantum_efficiency is not None
     efficiency = own.quantum_efficiency if own.quantum_efficiency is not None else 1.0
     x = light if photons else signal / gain
-    # Beyond saturation the noise vanishes, and SNR says nothing.
+    # beyond saturation the noise vanishes, and SNR has no meaning
     seen = (signal > 0) & (np.array(points.variance_dn2) > 0)
     if own.saturation_capacity_e is not None:
         seen &= (
@@ -166,11 +166,11 @@ def _linearity(own: Emva1288, light: FloatArray, signal: FloatArray, colour: str
                 340,
                 xaxis=axis(_light_axis(points), rangemode="tozero", anchor="y2"),
                 yaxis=axis("signal, DN", rangemode="tozero", domain=[0.45, 1.0]),
-                yaxis2=axis("off the line, %", domain=[0.0, 0.34], zeroline=True),
+                yaxis2=axis("deviation, %", domain=[0.0, 0.34], zeroline=True),
             ),
         },
-        f"Above: mean less dark with the line that minimises relative deviations; below: the deviations. "
-        f"LE {measured(own.linearity_error_percent, own.linearity_error_percent_std, '%')} is their mean modulus.",
+        f"Above: mean minus dark with the line that minimises relative deviations; below: the deviations. "
+        f"LE {measured(own.linearity_error_percent, own.linearity_error_percent_std, '%')} is their mean absolute value.",
     )
 
 
@@ -204,7 +204,7 @@ def _dark_current(own: Emva1288, colour: str) -> Iterator[EmvaPlot]:
 
 
 def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
-    """What the joint fit adds: read noise of single pixels, dark current against temperature."""
+    """Plots of the joint fit: read noise of single pixels, dark current against temperature."""
     spread = noise.read_noise_distribution
     if spread is not None:
         edges = np.array(spread.noise_e)
@@ -227,7 +227,7 @@ def joint_fit_plots(noise: NoiseFit) -> Iterator[EmvaPlot]:
             },
             f"Over {spread.degrees_of_freedom} degrees of freedom a pixel; median {spread.median_e:.3g} e, 99 % below "
             f"{spread.percentile_99_e:.3g} e. The pixels' true variances differ by "
-            f"{measured(spread.spread_percent, spread.spread_percent_std, '%')}, their own scatter taken out; {spread.noisy_pixels} noisy pixels.",
+            f"{measured(spread.spread_percent, spread.spread_percent_std, '%')}, sampling error subtracted; {spread.noisy_pixels} noisy pixels.",
             of_plane=False,
         )
     law = noise.dark_current_temperature

@@ -20,20 +20,20 @@ NOISE = {
     "dsnu_e": ("DSNU", "e"),
     "prnu_percent": ("PRNU", "%"),
     "linearity_error_percent": ("linearity error", "%"),
-    "response_bend_percent": ("response bend at saturation", "%"),
-    "brighter_fatter_percent": ("noise missing at saturation", "%"),
-    "neighbour_covariance_percent": ("noise shared with neighbours", "%"),
+    "response_bend_percent": ("response curvature at saturation", "%"),
+    "brighter_fatter_percent": ("variance loss at saturation", "%"),
+    "neighbour_covariance_percent": ("noise covariance with neighbours", "%"),
     "quantum_efficiency": ("quantum efficiency", "1"),
 }
 
 
-#: Units as they are shown, where names can't spell them.
+#: Units whose printed form differs from their form in names.
 SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "percent": "%"}
 
 
 @dataclass(frozen=True)
-class Figure:
-    """One number with its standard uncertainty (None: not stated), and what the maker says (None: nothing)."""
+class KeyFigure:
+    """One quantity with its standard deviation (None: not stated) and the maker's value (None: not stated)."""
 
     name: str
     unit: str
@@ -44,12 +44,12 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """Value and uncertainty with the unit, and what belongs to it: `0.383 ± 0.008 at 610 nm`."""
+        """Value and standard deviation with unit and note: `0.383 ± 0.008 at 610 nm`."""
         return f"{measured(self.value, self.std, self.unit)} {self.note}".rstrip()
 
 
 def measured(value: float, std: float | None = None, unit: str = "") -> str:
-    """`value ± std unit`, the uncertainty to two digits and the value to the same place; four digits where there is none."""
+    """`value ± std unit`, the standard deviation to two digits and the value to the same place; without one, the value to four digits."""
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         number = f"{value:.4g}"
     else:
@@ -64,8 +64,8 @@ def measured(value: float, std: float | None = None, unit: str = "") -> str:
     return number if unit in ("", "1") else f"{number} {SHOWN_UNITS.get(unit, unit)}"
 
 
-def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[Figure]:
-    """What the photon transfer gave, beside the maker's word."""
+def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
+    """Results of the photon transfer, with the maker's values."""
     for field, (name, unit) in NOISE.items():
         value = getattr(noise, field)
         if value is None:
@@ -73,7 +73,7 @@ def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[
         stated = getattr(camera, field, None) if field != "quantum_efficiency" else None
         at_nm = noise.quantum_efficiency_wavelength_nm if field == "quantum_efficiency" else None
         note = f"at {at_nm:g} nm" if at_nm is not None else ""
-        yield Figure(name, unit, value, getattr(noise, f"{field}_std"), stated, note)
+        yield KeyFigure(name, unit, value, getattr(noise, f"{field}_std"), stated, note)
 
 
 def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, float, int] | None:
@@ -84,7 +84,7 @@ def mtf50_range(curves: tuple[MtfCurve, ...], channel: str) -> tuple[float, floa
     return (min(found), max(found), len(found)) if found else None
 
 
-def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[Figure]:
+def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
     """All key figures of one camera."""
     if fit.noise is not None:
         yield from noise_figures(fit.noise, camera)
@@ -93,42 +93,42 @@ def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[
             peak = max(range(len(curve)), key=lambda k: curve[k])
             std = fit.spectral.quantum_efficiency_std.get(channel)
             at = fit.spectral.wavelength_nm[peak]
-            yield Figure(f"QE peak {channel}", "1", curve[peak], std[peak] if std else None, note=f"at {at:g} nm")
+            yield KeyFigure(f"QE peak {channel}", "1", curve[peak], std[peak] if std else None, note=f"at {at:g} nm")
     for channel in ("R", "G", "B", "Y"):
         if (span := mtf50_range(fit.mtf, channel)) is not None:
             lowest, highest, number = span
             middle, half = (lowest + highest) / 2, (highest - lowest) / 2
             note = f"(middle and half range of {number} edges)" if number > 1 else ""
-            yield Figure(f"MTF50 {channel}", "cy/px", middle, half or None, note=note)
+            yield KeyFigure(f"MTF50 {channel}", "cy/px", middle, half or None, note=note)
     if fit.geometry is not None:
         yield from geometry_figures(fit.geometry)
 
 
-def geometry_figures(geometry: GeometryFit) -> Iterator[Figure]:
-    """Pinhole and distortion."""
+def geometry_figures(geometry: GeometryFit) -> Iterator[KeyFigure]:
+    """Pinhole camera matrix and distortion."""
     matrix, matrix_std = geometry.camera_matrix, geometry.camera_matrix_std
     for name, row, col in (("focal length x", 0, 0), ("focal length y", 1, 1), ("centre x", 0, 2), ("centre y", 1, 2)):
-        yield Figure(name, "px", matrix[row][col], matrix_std[row][col] if matrix_std else None)
+        yield KeyFigure(name, "px", matrix[row][col], matrix_std[row][col] if matrix_std else None)
     for number, value in enumerate(geometry.distortion):
         name = ("k1", "k2", "p1", "p2", "k3")[number] if number < 5 else f"distortion {number}"
-        yield Figure(name, "1", value, geometry.distortion_std[number] if geometry.distortion_std else None)
-    yield Figure("reprojection rms", "px", geometry.rms_px)
+        yield KeyFigure(name, "1", value, geometry.distortion_std[number] if geometry.distortion_std else None)
+    yield KeyFigure("reprojection rms", "px", geometry.rms_px)
 
 
-def stereo_figures(stereo: StereoFit) -> Iterator[Figure]:
+def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
     """Baseline, translation and rotation of the pair."""
-    yield Figure("stereo baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
+    yield KeyFigure("stereo baseline", "mm", stereo.baseline_mm, stereo.baseline_mm_std)
     for name, value, number in zip("xyz", stereo.translation_mm, range(3), strict=True):
         std = stereo.translation_mm_std
-        yield Figure(f"stereo translation {name}", "mm", value, std[number] if std else None)
+        yield KeyFigure(f"stereo translation {name}", "mm", value, std[number] if std else None)
     for name, value, number in zip("xyz", rotation_vector_mrad(stereo.rotation), range(3), strict=True):
         turns = stereo.rotation_std_rad
-        yield Figure(f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
-    yield Figure("stereo rms", "px", stereo.rms_px)
+        yield KeyFigure(f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
+    yield KeyFigure("stereo rms", "px", stereo.rms_px)
 
 
 def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tuple[float, float, float]:
-    """Axis times angle (mrad) of a rotation matrix, for the small turns of a stereo pair."""
+    """Rotation vector (axis times angle, mrad) of a rotation matrix, for the small rotations of a stereo pair."""
     cosine = min(1.0, max(-1.0, (rotation[0][0] + rotation[1][1] + rotation[2][2] - 1) / 2))
     angle = math.acos(cosine)
     scale = 500.0 if angle < 1e-8 else 500.0 * angle / math.sin(angle)
@@ -139,10 +139,10 @@ def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tu
     )
 
 
-def by_side(fit: FitResult, cameras: dict[Side, DataSheet]) -> list[tuple[str, dict[Side, Figure]]]:
-    """Rows of the table of key figures, name -> figure of each side; what one side lacks keeps its place in the order."""
+def by_side(fit: FitResult, cameras: dict[Side, DataSheet]) -> list[tuple[str, dict[Side, KeyFigure]]]:
+    """Rows of the table of key figures: name -> figure of each side, in the order of the first side that has it."""
     names: list[str] = []
-    rows: dict[str, dict[Side, Figure]] = {}
+    rows: dict[str, dict[Side, KeyFigure]] = {}
     for side, camera_fit in fit.cameras.items():
         place = 0
         for figure in camera_figures(camera_fit, cameras.get(side)):

@@ -1,5 +1,4 @@
-"""The report's geometry: where the views were and what they leave, how well the cameras project, lateral colour, depth, and
-the rectified pair."""
+"""The report's geometry: coverage, reprojection residuals, projection uncertainty, lateral colour, depth uncertainty, rectified pair."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from lab.report.pictures import png_data_uri
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
-ARROWS = 0.025  # of the frame's width: how long the residual that 95 % don't reach is drawn
+ARROWS = 0.025  # of the frame's width: drawn length of the 95 % quantile of the residuals
 SCALES = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
 VIEW_COLOURS = ("#3d7be0", "#d1495b", "#2a9d57", "#e08a1e", "#8a63d2", "#1f9aa5", "#b5651d", "#c154a5")
 UNCERTAINTY = [[0.0, "#f2f7fb"], [0.25, "#a8cfe3"], [0.5, "#4f9bc4"], [0.75, "#20639b"], [1.0, "#0b2c52"]]
@@ -56,7 +55,7 @@ def frame_layout(shape: tuple[float, float]) -> dict[str, Any]:
 
 
 def coverage(geometry: GeometryFit) -> Figure | None:
-    """Where in the frame each view's corners stand, and the outline of each view."""
+    """Corners of each view in the frame, with their convex hull."""
     if not geometry.residuals:
         return None
     data: list[Trace] = []
@@ -95,7 +94,7 @@ def coverage(geometry: GeometryFit) -> Figure | None:
 
 
 def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, float], name: str) -> list[Trace]:
-    """Vectors (n, 2) at places (n, 2) of a frame of `shape` (rows, cols), all x, y in px, as lines, enlarged by a round number."""
+    """Vectors (n, 2) at positions (n, 2) in a frame of `shape` (rows, cols), x and y in px, drawn as lines enlarged by a round number."""
     usual = max(float(np.percentile(np.linalg.norm(vector, axis=1), 95)), 1e-9)
     wanted = ARROWS * shape[1] / usual
     scale = max([one for one in SCALES if one <= wanted], default=SCALES[0])
@@ -125,7 +124,7 @@ def lines_of_vectors(at: FloatArray, vector: FloatArray, shape: tuple[float, flo
 
 
 def residual_vectors(geometry: GeometryFit) -> Figure | None:
-    """Every corner's residual, seen less predicted, as a line, enlarged by a round number."""
+    """Reprojection residuals of all corners, measured minus predicted, as enlarged lines."""
     if not geometry.residuals:
         return None
     at = np.array([(x, y) for view in geometry.residuals for x, y in zip(view.x_px, view.y_px, strict=True)])
@@ -137,7 +136,7 @@ def residual_vectors(geometry: GeometryFit) -> Figure | None:
 def _map(
     x: tuple[float, ...], y: tuple[float, ...], z: list[list[float | None]], unit: str, tick: str, height: int = 0
 ) -> Figure:
-    """A map over the frame with contours, coloured by the logarithm where it spans more than a factor of eight."""
+    """A contour map over the frame, on a logarithmic colour scale where it spans more than a factor of eight."""
     shape = (y[-1] + 1, x[-1] + 1)
     known = np.array([value for row in z for value in row if value is not None])
     low, high = float(known.min()), float(known.max())
@@ -170,13 +169,13 @@ def _map(
 
 
 def projection_map(uncertainty: ProjectionUncertainty) -> Figure:
-    """Standard uncertainty of the projection over the frame."""
+    """Standard deviation of the projection over the frame."""
     rows: list[list[float | None]] = [list(row) for row in uncertainty.projection_px_std]
     return _map(uncertainty.x_px, uncertainty.y_px, rows, "px", ".2g")
 
 
 def depth_map(depth: DepthUncertainty) -> Figure | None:
-    """Standard uncertainty of a depth over the left camera's frame."""
+    """Standard deviation of a depth over the left camera's frame."""
     rows = [list(row) for row in depth.total_mm_std]
     if not any(value is not None for row in rows for value in row):
         return None
@@ -184,8 +183,7 @@ def depth_map(depth: DepthUncertainty) -> Figure | None:
 
 
 def lateral_colour(channels: tuple[ChannelGeometry, ...]) -> Figure | None:
-    """How far red and blue lie outside of green, over the distance from the principal point, with a band of two standard
-    uncertainties."""
+    """Radial shift of red and blue relative to green over the distance from the principal point, with a band of two standard deviations."""
     drawn = [channel for channel in channels if channel.radius_px]
     if not drawn:
         return None
@@ -198,7 +196,7 @@ def lateral_colour(channels: tuple[ChannelGeometry, ...]) -> Figure | None:
             {
                 "type": "scatter",
                 "mode": "lines",
-                "name": f"{channel.channel} less G, {channel.corners} corners",
+                "name": f"{channel.channel} − G, {channel.corners} corners",
                 "x": list(channel.radius_px),
                 "y": shift.tolist(),
                 "line": {"color": colour, "width": 2},
@@ -215,16 +213,19 @@ def lateral_colour(channels: tuple[ChannelGeometry, ...]) -> Figure | None:
 
 
 def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
-    """What else a fit found, as rows for a table."""
+    """Further results of a fit as rows of a table."""
     rows: list[tuple[str, str]] = []
     if geometry.corner_px_std is not None:
-        noise = f", {geometry.corner_noise_px:.4f} px by the pictures' noise" if geometry.corner_noise_px else ""
-        rows.append(("scatter of a corner's coordinate", f"{geometry.corner_px_std:.4f} px{noise}"))
+        noise = f", {geometry.corner_noise_px:.4f} px expected from image noise" if geometry.corner_noise_px else ""
+        rows.append(("standard deviation of a corner's coordinate", f"{geometry.corner_px_std:.4f} px{noise}"))
     own = geometry.cross_validation
     if own is not None:
-        error = f"model off by {own.model_error_px:.3f} px" if own.model_error_px > 0 else "no error of the model seen"
+        error = f"model error {own.model_error_px:.3f} px" if own.model_error_px > 0 else "no model error"
         rows.append(
-            ("two halves of the views", f"{own.difference_px:.4f} px apart, {own.expected_px:.4f} px expected: {error}")
+            (
+                "cross-validation of two halves of the views",
+                f"{own.difference_px:.4f} px difference, {own.expected_px:.4f} px expected: {error}",
+            )
         )
     for warp in geometry.board_warp:
         parts = [
@@ -241,7 +242,7 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
         if channel.radius_px:
             shift = measured(channel.radial_shift_px[-1], channel.radial_shift_px_std[-1], "px")
             at = f"at {channel.radius_px[-1]:.0f} px from the principal point"
-            rows.append((f"lateral colour, {channel.channel} less G", f"{shift} {at}"))
+            rows.append((f"lateral colour, {channel.channel} − G", f"{shift} {at}"))
     rows += [
         (
             f"distortion {' '.join(model.coefficients)}",
@@ -253,7 +254,7 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
 
 
 def rectified_picture(recordings: RecordingSet, stereo: StereoFit, width_px: int = 1200) -> tuple[str, str] | None:
-    """One pose as both cameras saw it, rectified, side by side with lines along the rows; and the pose's name."""
+    """Both cameras' images of one pose, rectified, side by side with lines along the rows; and the pose's name."""
     try:
         sides: tuple[Side, Side] = ("left", "right")
         left, right = ({capture.pose: capture for capture in recordings.captures("charuco", side)} for side in sides)
@@ -282,7 +283,7 @@ def rectified_picture(recordings: RecordingSet, stereo: StereoFit, width_px: int
 
 
 def context(geometry: GeometryFit | None) -> dict[str, Any]:
-    """What the page says of one camera, besides its key figures."""
+    """Variables of the page for one camera, besides its key figures."""
     if geometry is None:
         return {}
     return {
@@ -303,21 +304,21 @@ def charts_by_side(fits: Mapping[Side, GeometryFit | None]) -> list[tuple[str, d
 
     known = next((fit.projection for fit in fits.values() if fit is not None and fit.projection), ())
     found = [
-        ("Where the boards were", of(coverage), "Corners and outline of each view, in the frame."),
-        ("Residuals, seen less predicted", of(residual_vectors), ""),
+        ("Coverage by the boards", of(coverage), "Corners of each view in the frame, and their convex hull."),
+        ("Reprojection residuals, measured − predicted", of(residual_vectors), ""),
     ]
     for place, one in enumerate(known):
         where = "at infinity" if one.distance_mm is None else "at the boards' distance"
-        caption = "One standard uncertainty in the worst direction; the motion that the same corners can't tell from the intrinsics is taken out."
+        caption = "Standard deviation in the worst direction; the rigid motion that the corners can't separate from the intrinsics is removed."
         found.append(
             (f"Uncertainty of the projection, {where}", of(at(place)), caption if place == len(known) - 1 else "")
         )
-    found.append(("Lateral colour", of(lambda fit: lateral_colour(fit.channels)), "Bands: two standard uncertainties."))
+    found.append(("Lateral colour", of(lambda fit: lateral_colour(fit.channels)), "Bands: two standard deviations."))
     return found
 
 
 def stereo_context(recordings: RecordingSet, stereo: StereoFit | None) -> dict[str, Any]:
-    """What the page shows of the pair: depth maps and a rectified pose."""
+    """Variables of the page for the pair: depth maps and a rectified pose."""
     if stereo is None:
         return {"depth": [], "rectified": None, "row_rms_px": None, "rejected": ()}
     return {

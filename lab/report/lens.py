@@ -20,7 +20,7 @@ from sim.optics.system import OpticalSystem
 from sim.optics.table import LensTable
 from sim.spectrum import FloatArray
 
-#: Apart for all common kinds of colour vision, and legible on white and on near-black.
+#: Distinguishable with all common kinds of colour vision, and legible on white and on near-black.
 FIELD_COLOURS = ("#3d7be0", "#2a9d57", "#d1495b")
 GLASS_FILL = "rgba(102,178,240,0.22)"
 MOSAIC_FIELDS = 5
@@ -28,7 +28,7 @@ _RAYS_A_FIELD = 7
 
 
 def _profile(surfaces: rt.Surfaces, i: int, height: float, count: int = 61) -> tuple[FloatArray, FloatArray]:
-    """(z, y) of a surface's section in its own frame, as far out as the surface exists."""
+    """(z, y) of a surface's section in its own frame, where the surface exists."""
     ys = np.linspace(-height, height, count)
     sags = np.array([rt.sag(surfaces, i, float(y * y)) for y in ys])
     known = sags[:, 1] > 0
@@ -128,7 +128,7 @@ def _curve(name: str, x: list[float], y: list[float], colour: str, **more: Any) 
 
 
 def _spectral(table: LensTable) -> list[tuple[int, str]]:
-    """Places of a short, a middle and a long wavelength of the table, with the colour that they are drawn in."""
+    """Indices of a short, a middle and a long wavelength of the table, with their colours."""
     wanted = (450.0, 550.0, 650.0)
     if not table.wavelength_nm[0] <= wanted[0] < wanted[-1] <= table.wavelength_nm[-1]:
         wanted = tuple(np.linspace(table.wavelength_nm[0], table.wavelength_nm[-1], 3).tolist())
@@ -165,7 +165,7 @@ def distortion(result: LensResult) -> Figure:
 
 
 def lateral_colour(table: LensTable) -> Figure:
-    """Height of a wavelength's centroid above the middle wavelength's, against the field angle."""
+    """Centroid height of each wavelength relative to the middle wavelength, against the field angle."""
     angle = table.field_deg[:, 1].tolist()
     chosen = _spectral(table)
     middle = table.centroid_um[chosen[len(chosen) // 2][0], :, 1]
@@ -175,7 +175,7 @@ def lateral_colour(table: LensTable) -> Figure:
     ]
     return {
         "data": traces,
-        "layout": layout(320, xaxis=axis("field angle, deg"), yaxis=axis("centroid's shift in y, µm")),
+        "layout": layout(320, xaxis=axis("field angle, deg"), yaxis=axis("centroid shift in y, µm")),
     }
 
 
@@ -202,7 +202,7 @@ def mtf_against_field(result: LensResult) -> Figure:
 
 
 def encircled(table: LensTable) -> Figure:
-    """Share of the light that the window of the table holds, against the field angle."""
+    """Share of the light within the table's window, against the field angle."""
     angle = table.field_deg[:, 1].tolist()
     traces = [
         _curve(f"{table.wavelength_nm[i]:.0f} nm", angle, (100 * table.encircled_share[i]).tolist(), colour)
@@ -210,12 +210,12 @@ def encircled(table: LensTable) -> Figure:
     ]
     return {
         "data": traces,
-        "layout": layout(320, xaxis=axis("field angle, deg"), yaxis=axis("light in the window, %", range=[0, 102])),
+        "layout": layout(320, xaxis=axis("field angle, deg"), yaxis=axis("encircled energy, %", range=[0, 102])),
     }
 
 
 def _mosaic(table: LensTable) -> list[dict[str, Any]]:
-    """Rows of the PSF mosaic: a wavelength's pictures from the centre to the corner, each to its own peak."""
+    """Rows of the PSF mosaic: pictures of one wavelength from centre to corner, each scaled to its own peak."""
     count = len(table.field_deg)
     chosen = sorted({round(k * (count - 1) / (MOSAIC_FIELDS - 1)) for k in range(MOSAIC_FIELDS)})
     return [
@@ -249,7 +249,7 @@ def render_lens(traced: TracedPrescription) -> str:
         ("working f-number", f"{result.working_f_number:.4f}"),
         ("object", "at infinity" if result.object_distance_mm is None else mm(result.object_distance_mm)),
         ("back focus, from the last surface", mm(result.back_focus_mm)),
-        ("image moved from the file's place by", mm(result.image_shift_mm)),
+        ("image shift from the file's position", mm(result.image_shift_mm)),
         ("entrance pupil, diameter", mm(result.entrance_pupil_mm)),
         ("entrance pupil, from the first surface", mm(result.entrance_pupil_position_mm)),
         ("exit pupil, diameter", mm(result.exit_pupil_mm)),

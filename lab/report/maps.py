@@ -21,7 +21,7 @@ from lab.report.pictures import map_picture, png
 MAPS = {
     "offset_dn": ("Offset", "DN"),
     "dark_dn_per_s": ("Dark current", "DN/s"),
-    "gain": ("Gain, shading taken out", "of the neighbourhood"),
+    "gain": ("Gain, shading removed", "of the neighbourhood"),
 }
 
 
@@ -46,7 +46,7 @@ def _files(maps: PixelMaps) -> Iterator[tuple[str, bytes]]:
     yield "defective.npy", _npy(maps.defective)
     # A single pixel of a large picture isn't seen: each is drawn 3 px wide.
     yield "defective.png", png(cv2.dilate(255 * maps.defective.astype(np.uint8), np.ones((3, 3), np.uint8)))
-    stated["defective"] = {"shows": "Pixels out of line in the longest dark", "pixels": int(maps.defective.sum())}
+    stated["defective"] = {"shows": "Defective pixels in the longest dark", "pixels": int(maps.defective.sum())}
     yield "maps.json", (json.dumps(stated, indent=1) + "\n").encode()
 
 

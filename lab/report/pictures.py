@@ -29,7 +29,7 @@ def png_data_uri(image: NDArray[np.uint8]) -> str:
 
 
 def kernel_picture(kernel: ArrayLike, peak: float, margin: int = 0) -> str:
-    """A kernel in colours from 0 to `peak` (root scale, so that the tails show), `margin` cells cut off at each border."""
+    """A kernel in colours from 0 to `peak` on a square-root scale, `margin` cells cut off at each border."""
     values = np.asarray(kernel, float)
     if margin:
         values = values[margin:-margin, margin:-margin]
@@ -96,7 +96,7 @@ def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, 
 
 
 def frame_picture(frame: NDArray[np.uint16], camera: DataSheet, width_px: int = 480) -> str:
-    """A frame as a viewer wants it: one pixel per Bayer cell, black subtracted, channels scaled alike to their 99.5 %."""
+    """A frame for display: one pixel per Bayer cell, black subtracted, each channel scaled to its 99.5 % quantile."""
     split: dict[str, Any] = planes(frame.astype(np.float32) - float(camera.black_level_dn or 0.0), camera.cfa)
     if camera.cfa == "MONO":
         colours = np.stack([split["Y"]] * 3, axis=-1)

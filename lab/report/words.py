@@ -10,7 +10,7 @@ from lab.report.figures import measured
 #: Verdict -> (what stands on the badge, its mood, the headline).
 VERDICTS = {
     "no_mismatch": ("no mismatch", "good", "The baseline model explains these recordings."),
-    "explained": ("explained", "told", "The baseline model leaves physics out, and it has a name."),
+    "explained": ("explained", "told", "The baseline model leaves physics out; the named effects account for it."),
     "partly_explained": (
         "partly explained",
         "open",
@@ -25,7 +25,7 @@ VERDICTS = {
 
 
 def headline(diagnosis: DiagnosisResult | None) -> tuple[str, str, str]:
-    """(badge, mood, sentence) of a diagnosis, or of there being none."""
+    """(badge, mood, sentence) of a diagnosis, or of none."""
     if diagnosis is None:
         return "not diagnosed", "open", "The recordings were calibrated; they were not diagnosed."
     return VERDICTS[diagnosis.verdict]
@@ -48,14 +48,14 @@ def parameter_text(name: str, value: ParameterValue) -> str:
 
 
 def effect_sentence(effect: NamedEffect) -> str:
-    """What was left out on which side, how sure that is, and its size."""
+    """An effect's name, side, probability and parameters."""
     where = " and ".join(effect.sides)
     sizes = "; ".join(parameter_text(name, value) for name, value in effect.parameters.items())
     return f"{effect_name(effect.name).capitalize()} ({where}, probability {effect.probability:.3g}): {sizes}."
 
 
 def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """The report in a few sentences, the verdict's own first."""
+    """The report in a few sentences, those of the verdict first."""
     if diagnosis is not None:
         yield from (effect_sentence(effect) for effect in diagnosis.effects)
         if diagnosis.unexplained:
@@ -67,11 +67,11 @@ def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: Diag
             side for side in fit.cameras if side not in named and not any(m.side == side for m in diagnosis.mismatches)
         ]
         if named and clean:
-            yield f"The {' and '.join(clean)} camera conceals nothing that these recordings would show."
+            yield f"The {' and '.join(clean)} camera shows no mismatch in these recordings."
         held = diagnosis.held_out
         if held is not None and held.chi2_after < held.chi2_before:
             yield (
-                f"On {len(held.captures)} captures that no part of this has seen, χ² falls from {held.chi2_before:.0f} to "
+                f"On {len(held.captures)} held-out captures χ² falls from {held.chi2_before:.0f} to "
                 f"{held.chi2_after:.0f} over {held.n} numbers."
             )
     for side, camera in fit.cameras.items():
@@ -118,8 +118,8 @@ CHECK_NAMES = {"colorchecker": "ColorChecker", "mtf": "MTF", "psf": "PSF"}
 
 
 def check_sentence(check: Check) -> str:
-    """What one comparison of the baseline's prediction with the measurement says."""
+    """One comparison of the baseline's prediction with the measurement."""
     return (
-        f"{CHECK_NAMES[check.name]} ({check.side}, {check.capture}): {check.rms_relative_percent:.2g} % rms off the "
+        f"{CHECK_NAMES[check.name]} ({check.side}, {check.capture}): {check.rms_relative_percent:.2g} % rms from the "
         f"baseline's prediction, {_within(check)}."
     )

@@ -1,6 +1,7 @@
-"""Plates and coatings before the sensor, and the lens's stray light: birefringent low-pass filter, cover glass, infrared cut, veil.
+"""Plates and coatings before the sensor, and veiling glare: birefringent low-pass filter, cover glass, infrared cut
+filter.
 
-The effects of these names act through these functions; a camera that is known to have such a part lists the effect.
+The effects of these names act through these functions. A camera that is known to have such a part lists the effect.
 """
 
 from __future__ import annotations
@@ -35,8 +36,10 @@ def birefringent_displacement_um(thickness_mm: float, wavelength_nm: ArrayLike =
 
 
 def birefringent_spots(displacement_x_um: float, displacement_y_um: float) -> tuple[FloatArray, FloatArray]:
-    """What becomes of a point: positions (n, 2) in um as (x, y), and shares (n,). One plate gives two spots `displacement` apart,
-    two plates, with a quarter-wave plate between them, four."""
+    """Images of a point: positions (n, 2) in um as (x, y), and shares of the light (n,).
+
+    One plate gives two spots `displacement` apart; two plates, with a quarter-wave plate between them, give four.
+    """
     ends_x, ends_y = (
         np.array([-0.5, 0.5]) * d if d != 0.0 else np.zeros(1) for d in (displacement_x_um, displacement_y_um)
     )
@@ -48,13 +51,13 @@ def birefringent_spots(displacement_x_um: float, displacement_y_um: float) -> tu
 def birefringent_otf(
     fx_cy_per_um: ArrayLike, fy_cy_per_um: ArrayLike, displacement_x_um: float, displacement_y_um: float
 ) -> FloatArray:
-    """Transfer of those spots: cos(pi fx dx) cos(pi fy dy), null first at f = 1 / (2 d)."""
+    """Transfer function of those spots: cos(pi fx dx) cos(pi fy dy), first zero at f = 1 / (2 d)."""
     fx, fy = np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float)
     return np.asarray(np.cos(np.pi * fx * displacement_x_um) * np.cos(np.pi * fy * displacement_y_um))
 
 
 def plate_focus_shift_um(thickness_mm: float, index: float) -> float:
-    """How far a plane-parallel plate before the sensor moves the paraxial focus away from the lens: t (1 - 1/n)."""
+    """Shift of the paraxial focus, away from the lens, by a plane-parallel plate before the sensor: t (1 - 1/n)."""
     return thickness_mm * 1e3 * (1.0 - 1.0 / index)
 
 
@@ -67,8 +70,11 @@ def plate_spherical_um(thickness_mm: float, index: float, f_number: float) -> fl
 
 
 def plate_wavefront(thickness_mm: float, index: float, f_number: float, *, refocused: bool = True) -> Wavefront:
-    """Path error of a plate that the lens wasn't computed with. `refocused`: the sensor stands in the new paraxial focus; else where
-    it stood, so that t (1 - 1/n) of defocus comes on top (negative: the focus lies behind the sensor)."""
+    """Path error of a plate that the lens wasn't designed for.
+
+    `refocused`: the sensor stands in the new paraxial focus. Else it stands where it was, which adds t (1 - 1/n) of
+    defocus (negative: the focus lies behind the sensor).
+    """
     shift = 0.0 if refocused else -plate_focus_shift_um(thickness_mm, index)
     return seidel(
         spherical_um=plate_spherical_um(thickness_mm, index, f_number), defocus_um=shift / (8.0 * f_number**2)
@@ -101,7 +107,7 @@ VEIL_UM = 1e5
 
 
 def veil_otf(fx_cy_per_um: ArrayLike, fy_cy_per_um: ArrayLike, share: float, std_um: float = VEIL_UM) -> FloatArray:
-    """Transfer of a lens that spreads `share` of the light by a normal distribution, as it stands evenly over the frame: 1 at zero
-    frequency, 1 - share at all that a frame holds."""
+    """Transfer function of veiling glare: `share` of the light spread by a normal distribution so wide that it is
+    uniform over the frame. It is 1 at zero frequency and 1 - share at all frequencies that a frame resolves."""
     f2 = np.asarray(fx_cy_per_um, float) ** 2 + np.asarray(fy_cy_per_um, float) ** 2
     return np.asarray(1.0 - share + share * np.exp(-2.0 * np.pi**2 * std_um**2 * f2))

@@ -1,8 +1,8 @@
-"""Transfer functions on a pixel grid: samples of one pixel fold every frequency into -1/2..1/2 cy/px.
+"""Transfer functions on a pixel grid: sampling at one sample a pixel folds all frequencies into -1/2..1/2 cy/px.
 
-A picture of even squares, one to the pixel, that a lens images and pixels of the same pitch collect, is a discrete convolution.
-Its kernel's Fourier transform is the sum over all integers a, b of OTF(fx + a, fy + b) aperture(...) sinc(fx + a) sinc(fy + b):
-exact, where drawing on finer samples leaves an error and takes more memory.
+A picture of uniform squares, one a pixel, imaged by a lens and collected by pixels of the same pitch, is a discrete
+convolution. The Fourier transform of its kernel is the sum over all integers a, b of OTF(fx + a, fy + b) aperture(...)
+sinc(fx + a) sinc(fy + b). This is exact, where drawing on finer samples has an error and needs more memory.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ def folded(
     fill_factor: float,
     cutoff_cy_per_px: float,
 ) -> FloatArray | ComplexArray:
-    """The folded transfer on the frequencies of a real FFT of `shape`, (rows, cols // 2 + 1).
+    """The folded transfer function at the frequencies of a real FFT of `shape`, (rows, cols // 2 + 1).
 
-    `transfer(fx, fy)` takes frequencies in cy/px that broadcast, and is next to nothing beyond `cutoff_cy_per_px`.
+    `transfer(fx, fy)` takes frequencies in cy/px that broadcast, and is negligible beyond `cutoff_cy_per_px`.
     """
     fy, fx = fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :]
     orders = _orders(cutoff_cy_per_px)

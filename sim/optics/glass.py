@@ -113,7 +113,8 @@ def refractive_index(
 
 
 def indices(prescription: Prescription, wavelength_nm: ArrayLike) -> FloatArray:
-    """(wavelengths, surfaces + 1): the index before the first surface and behind each one; the image lies in what is before it."""
+    """Refractive indices before the first surface and behind each one, (wavelengths, surfaces + 1); the image lies in
+    the medium before it."""
     w = np.asarray(wavelength_nm, float)
     behind = [np.ones_like(w)]
     for number, surface in enumerate(prescription.surfaces, start=1):
@@ -125,7 +126,7 @@ def indices(prescription: Prescription, wavelength_nm: ArrayLike) -> FloatArray:
 
 
 def substitutions(prescription: Prescription) -> tuple[str, ...]:
-    """A line for every glass that stands for another: nothing is replaced in silence."""
+    """One line for every glass that was replaced by another."""
     lines = []
     for number, surface in enumerate(prescription.surfaces, start=1):
         if surface.glass is None or surface.glass.model:

@@ -1,4 +1,4 @@
-"""How much light reaches the sensor: the image's irradiance on axis, and its fall-off by law, by table or as a flat shows it."""
+"""Irradiance of the image on the axis, and its fall-off over the field: by law, by table, or from a flat field."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ class CosineFourth(Frozen):
 
 
 class RadialIllumination(Frozen):
-    """A lens maker's curve: `relative_illumination` at `radius_mm` from the optical axis, monotone cubic between, held beyond.
+    """A lens maker's curve: `relative_illumination` at `radius_mm` from the optical axis, monotone cubic between,
+    constant beyond.
 
-    In place of cos^4, which it holds. Radii ascend from 0, where the value is 1.
+    It replaces cos^4, which it includes. Radii ascend from 0, where the value is 1.
     """
 
     kind: Literal["radial"] = "radial"
@@ -58,8 +59,11 @@ class RadialIllumination(Frozen):
 
 
 class MeasuredIllumination(Frozen):
-    """A map over the frame, as a flat of an even source shows it: `values` on an even grid from the first to the last pixel's
-    centre each way, cubic between, and divided by its value on the optical axis. In place of cos^4, which it holds."""
+    """A map over the frame, measured on a flat field of a uniform source.
+
+    `values` lie on an even grid from the first to the last pixel's centre in each direction, with cubic interpolation,
+    and are divided by their value on the optical axis. The map replaces cos^4, which it includes.
+    """
 
     kind: Literal["measured"] = "measured"
     values: tuple[tuple[float, ...], ...]
@@ -117,7 +121,7 @@ class MeasuredIllumination(Frozen):
         return RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))
 
     def at(self, down: FloatArray, across: FloatArray) -> FloatArray:
-        """The map at shares 0..1 of the frame's height and width, which broadcast; held beyond them."""
+        """The map at fractions 0..1 of the frame's height and width, which broadcast; constant beyond."""
         down, across = np.clip(down, 0.0, 1.0), np.clip(across, 0.0, 1.0)
         if down.ndim == across.ndim == 2 and down.shape[1] == 1 and across.shape[0] == 1:
             return np.asarray(self._surface(down[:, 0], across[0]))
@@ -141,7 +145,8 @@ def optical_axis_px(camera: CameraModel) -> tuple[float, float]:
 
 
 def from_axis_um(x_um: ArrayLike, y_um: ArrayLike, camera: CameraModel) -> tuple[FloatArray, FloatArray, float]:
-    """Places on the sensor, um from its centre (x along columns, y along rows), as um from the optical axis; and half the diagonal."""
+    """Sensor positions relative to the optical axis (um), given relative to the sensor's centre (x along columns, y
+    along rows); and half the diagonal."""
     row0, col0 = optical_axis_px(camera)
     pitch = camera.pixel_pitch_um
     x = np.asarray(x_um, float) - (col0 - 0.5 * (camera.cols - 1)) * pitch
@@ -158,7 +163,8 @@ def sin_theta(camera: CameraModel, row: ArrayLike, col: ArrayLike) -> FloatArray
 
 
 def relative_illumination(camera: CameraModel, row: ArrayLike, col: ArrayLike) -> FloatArray:
-    """Light relative to the optical axis, for points in px that broadcast: as `Lens.illumination` says, cos^4 unless stated."""
+    """Light relative to the optical axis at points in px that broadcast: by `Lens.illumination`, by cos^4 where that
+    isn't stated."""
     row0, col0 = optical_axis_px(camera)
     row, col = np.asarray(row, float), np.asarray(col, float)
     law = camera.lens.illumination

@@ -1,10 +1,12 @@
-"""How a lens images a point: diffraction, an aberrated pupil, a measured point spread or transfer function, a traced lens.
+"""How a lens images a point: diffraction, an aberrated pupil, a measured point spread or transfer function, a traced
+lens.
 
-Each model has `transfer`, its optical transfer function at one wavelength (for a lens that isn't the same everywhere: that of
-the axis), and `cutoff_cy_per_um`, beyond which that is 0. A further path error over the pupil, `aberration`, adds to the model's
-own where that has a pupil; where it has none it acts as on a perfect lens, whose ratio then multiplies the transfer. Frequencies are cy/um on the sensor, fx along columns (to the right), fy
-along rows (down). The models are told apart by `kind`; all but the traced lens hold their numbers in themselves, so that they
-go to JSON or TOML and back.
+Each model has `transfer`, its optical transfer function at one wavelength (on the axis, where it varies over the
+field), and `cutoff_cy_per_um`, beyond which that is 0. A further path error over the pupil, `aberration`, adds to the
+model's own where the model has a pupil. Where it has none, the transfer function is multiplied by the ratio by which
+the aberration would change a perfect lens's. Frequencies are cy/um on the sensor, fx along columns (to the right), fy
+along rows (down). The models are distinguished by `kind`. All but the traced lens contain their numbers, so that they
+can be written as JSON or TOML.
 """
 
 from __future__ import annotations
@@ -47,13 +49,13 @@ class DiffractionLimited(Frozen):
         f_number: float,
         aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
-        """(2 / pi) (arccos s - s sqrt(1 - s^2)), s = f wavelength f_number; of the broadcast shape of the frequencies."""
+        """(2 / pi) (arccos s - s sqrt(1 - s^2)), s = f wavelength f_number; frequencies broadcast."""
         if aberration.terms:
             return pupil_otf(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
         return diffraction_otf(np.hypot(fx_cy_per_um, fy_cy_per_um), wavelength_nm, f_number)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
-        """Frequency beyond which nothing is passed: 1 / (wavelength f_number)."""
+        """Frequency above which the transfer function is 0: 1 / (wavelength f_number)."""
         return diffraction_cutoff_cy_per_um(wavelength_nm, f_number)
 
 
@@ -105,7 +107,7 @@ class ZernikePupil(Frozen):
         return total
 
     def wavefront(self, wavelength_nm: float, f_number: float) -> Wavefront:
-        """Path error over the pupil at one wavelength, colours' focus and place with it."""
+        """Path error over the pupil at one wavelength, with the focus and image shifts of that wavelength."""
         total = self._base
         if self.focus_shift_um:
             shift = float(np.interp(wavelength_nm, self.colour_wavelength_nm, self.focus_shift_um))
@@ -128,17 +130,17 @@ class ZernikePupil(Frozen):
         return pupil_otf(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, path)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
-        """Frequency beyond which nothing is passed: 1 / (wavelength f_number)."""
+        """Frequency above which the transfer function is 0: 1 / (wavelength f_number)."""
         return diffraction_cutoff_cy_per_um(wavelength_nm, f_number)
 
 
 class MeasuredPsf(Frozen):
-    """A point spread function of the lens alone (without the pixel's aperture), by samples of a band-limited curve.
+    """A point spread function of the lens alone (without the pixel's aperture), as samples of a band-limited function.
 
-    `psf` is (wavelengths, rows, columns): light a sample, >= 0, sum 1 within 1e-3 at each wavelength. One wavelength stands for
-    all; else linear between, held beyond. Rows run down, columns to the right; the light stands in the middle of the window
-    (at sample (n - 1) / 2 each way). Beyond half a cycle a sample the transfer is 0: a pitch wider than wavelength x f_number / 2
-    loses detail.
+    `psf` (wavelengths, rows, columns): light a sample, >= 0, sum 1 within 1e-3 at each wavelength. A single wavelength
+    holds for all; several are interpolated linearly, constant beyond. Rows run down, columns to the right. The image
+    point is the centre of the window, sample (n - 1) / 2 in each direction. Above half a cycle a sample the transfer
+    function is 0: a pitch wider than wavelength x f_number / 2 loses detail.
     """
 
     shift_variant: ClassVar[bool] = False
@@ -177,7 +179,7 @@ class MeasuredPsf(Frozen):
         f_number: float,
         aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
-        """Fourier sum of the samples, 1 at f = 0, of the broadcast shape of the frequencies. `f_number` doesn't matter."""
+        """Fourier sum of the samples, 1 at f = 0; frequencies broadcast. `f_number` isn't used."""
         samples = np.tensordot(_shares(self.wavelength_nm, wavelength_nm), self._samples, 1)
         value = _fourier_sum(samples, self.sample_pitch_um, fx_cy_per_um, fy_cy_per_um)
         return value * pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
@@ -188,12 +190,13 @@ class MeasuredPsf(Frozen):
 
 
 class MeasuredOtf(Frozen):
-    """An optical transfer function of the lens alone, by samples: linear between frequencies, 0 beyond the highest.
+    """An optical transfer function of the lens alone, as samples: linear between frequencies, 0 above the highest.
 
-    `modulus` is (wavelengths, fy, fx), 1 at zero frequency within 1e-3; `phase_rad` alike, or empty for none (light moved by d um
-    has the phase -2 pi f d). `frequency_x_cy_per_um` ascends from 0; `frequency_y_cy_per_um` ascends from 0 (alike in all four
-    quadrants, no phase) or through it; where it is empty, the transfer is alike in all directions, `modulus` (wavelengths, 1, f).
-    One wavelength stands for all; else linear between, held beyond.
+    `modulus` (wavelengths, fy, fx) is 1 at zero frequency within 1e-3; `phase_rad` has the same shape, or is empty for
+    none (light shifted by d um has the phase -2 pi f d). `frequency_x_cy_per_um` ascends from 0.
+    `frequency_y_cy_per_um` ascends from 0 (the same in all four quadrants, no phase) or from below 0. Where it is
+    empty the transfer function is isotropic, `modulus` (wavelengths, 1, f). A single wavelength holds for all; several
+    are interpolated linearly, constant beyond.
     """
 
     shift_variant: ClassVar[bool] = False
@@ -249,7 +252,7 @@ class MeasuredOtf(Frozen):
         f_number: float,
         aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
-        """The samples looked up, of the broadcast shape of the frequencies; the conjugate at -f. `f_number` doesn't matter."""
+        """The interpolated samples, the complex conjugate at -f; frequencies broadcast. `f_number` isn't used."""
         value = np.tensordot(_shares(self.wavelength_nm, wavelength_nm), self._samples, 1)
         ratio = pupil_ratio(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
         fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float))
@@ -268,10 +271,11 @@ class MeasuredOtf(Frozen):
 
 
 class TracedLens(Frozen):
-    """A lens traced from its prescription, that images differently over the field. Its frames are blurred by `sim.optics.superposition`.
+    """A lens traced from its prescription, whose image varies over the field. Its frames are blurred by
+    `sim.optics.superposition`.
 
-    A dump names the table by its `content_hash` alone (many megabytes of samples don't belong into a camera file): trace the
-    prescription again, or `LensTable.load` the table, to come back from it. Two such lenses are equal where their tables' hashes are.
+    A dump holds only the table's `content_hash` (the samples take many megabytes): trace the prescription again, or
+    `LensTable.load` the table. Two such lenses are equal where their tables' hashes are.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -301,11 +305,11 @@ class TracedLens(Frozen):
         f_number: float,
         aberration: Wavefront = NONE,
     ) -> FloatArray | ComplexArray:
-        """OTF of the field point next to the axis, about its chief ray; 1 at f = 0, linear in wavelength between the table's,
-        held beyond them. `f_number` doesn't matter: the table has its own.
+        """OTF of the field point closest to the axis, about its chief ray; 1 at f = 0, linear between the table's
+        wavelengths, constant beyond. `f_number` isn't used: the table has its own.
 
-        What the table's window doesn't hold, 1 - `encircled_share`, is taken to lie around it as an aperture's rim scatters
-        it, falling with 1/r^3: a veil that contrast is lower by, except at the lowest frequencies.
+        Light outside the table's window, 1 - `encircled_share`, is taken to fall as 1/r^3 around it, as an edge of the
+        aperture diffracts it. It lowers the contrast at all but the lowest frequencies.
         """
         table = self.table
         axis = int(np.argmin(np.sum(table.field_deg**2, axis=1)))
@@ -342,7 +346,7 @@ def _check_wavelengths(wavelength_nm: tuple[float, ...], *, empty: bool = False)
 def _check_cube(
     name: str, cube: tuple[tuple[tuple[float, ...], ...], ...], planes: int, shape: tuple[int, int] | None = None
 ) -> None:
-    """`planes` planes of rows of one length, as many as `shape` says."""
+    """Raises ValueError unless the values are `planes` planes of equal rows, of the stated shape."""
     shapes = {(len(plane), len(row)) for plane in cube for row in plane}
     if len(cube) != planes or len(shapes) != 1 or (0 in next(iter(shapes))):
         raise ValueError(
@@ -353,7 +357,7 @@ def _check_cube(
 
 
 def _shares(wavelength_nm: FloatArray | tuple[float, ...], at_nm: float) -> FloatArray:
-    """How much each given wavelength counts at one: linear between, held beyond them."""
+    """Weights of the given wavelengths at another one: linear interpolation, constant beyond."""
     place = float(np.interp(at_nm, wavelength_nm, np.arange(len(wavelength_nm))))
     return np.maximum(0.0, 1.0 - np.abs(np.arange(len(wavelength_nm)) - place))
 
@@ -380,10 +384,11 @@ def _fourier_sum(samples: FloatArray, pitch_um: float, fx: FloatArray, fy: Float
 
 
 def _beyond(fx: FloatArray, fy: FloatArray, half_um: float) -> FloatArray:
-    """Transfer of light laid out as 1/r^3 outside a square of half-width `half_um`, as an aperture's rim diffracts it; 1 at f = 0.
+    """Transfer function of light that falls as 1/r^3 outside a square of half-width `half_um`, as an edge of the
+    aperture diffracts it; 1 at f = 0.
 
-    In each direction from the square's rim outwards integral_1^inf cos(a t) / t^2 dt = cos a - a (pi/2 - Si a), a = 2 pi f_along rim;
-    over the directions a sum.
+    Along each direction from the square's border outwards, integral_1^inf cos(a t) / t^2 dt = cos a - a (pi/2 - Si a)
+    with a = 2 pi f_along border; summed over the directions.
     """
     phi = np.pi * (np.arange(96) + 0.5) / 96
     cos, sin = np.cos(phi), np.sin(phi)

@@ -77,9 +77,9 @@ class PupilRays:
 def interpolated(
     traced: Sequence[PupilRays], wavelength_nm: Sequence[float] | FloatArray, index: Sequence[float]
 ) -> list[PupilRays]:
-    """The rays at other wavelengths than the traced ones, which lie at the same places of the open pupil.
+    """The rays at wavelengths that weren't traced, at the same relative positions in the open pupil.
 
-    Lagrange's polynomial through all of `traced` in 1 / wavelength^2; a traced wavelength gives its own rays.
+    Lagrange's polynomial through all of `traced` in 1 / wavelength^2; a traced wavelength returns its own rays.
     """
     names = ("x_mm", "y_mm", "cosine_x", "cosine_y", "path_mm", "jacobian", "area", "rim_cosine_x", "rim_cosine_y")
     nodes = np.array([rays.wavelength_nm for rays in traced]) ** -2.0

@@ -1,4 +1,5 @@
-"""Compiled real ray tracing through sequential surfaces, with the derivatives of every ray by its place in the entrance pupil."""
+"""Compiled real ray tracing through sequential surfaces, with the derivatives of every ray by its position in the
+entrance pupil."""
 
 from __future__ import annotations
 
@@ -218,7 +219,7 @@ def _step(x: float, y: float, dir_l: float, dir_m: float, dir_n: float, shape: A
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _turn(r: Any, a: float, b: float, c: float) -> Any:
-    """A vector of the old frame in the new one."""
+    """A vector of the old frame expressed in the new one."""
     return (
         r[0, 0] * a + r[1, 0] * b + r[2, 0] * c,
         r[0, 1] * a + r[1, 1] * b + r[2, 1] * c,
@@ -228,7 +229,7 @@ def _turn(r: Any, a: float, b: float, c: float) -> Any:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _carried(p: Any, d: Any, t: float, direction: Any, gradient: Any) -> Any:
-    """A ray's derivative carried by t onto a surface with that gradient: it stays on the surface."""
+    """A ray's derivative after propagation by t to a surface of the given gradient."""
     qx, qy, qz = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     across = gradient[0] * direction[0] + gradient[1] * direction[1] + gradient[2] * direction[2]
     dt = -(gradient[0] * qx + gradient[1] * qy + gradient[2] * qz) / across
@@ -389,9 +390,10 @@ def trace_rays(surfaces: Any, index: Any, field: Any, px: Any, py: Any) -> Any:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def aim(surfaces: Any, index: Any, field: Any, px: float, py: float) -> Any:
-    """The place in the entrance pupil's plane whose ray passes the stop's centre, from a start near it: (x, y, found).
+    """The point of the entrance pupil's plane whose ray passes the centre of the stop, from a start near it: (x, y,
+    found).
 
-    Newton's method with the ray's own derivatives, steps halved until the ray arrives and comes nearer.
+    Newton's method with the ray's own derivatives; steps are halved until the ray arrives and comes closer.
     """
     out = np.zeros(ROW)
     trial = np.zeros(ROW)
@@ -426,9 +428,11 @@ def aim(surfaces: Any, index: Any, field: Any, px: float, py: float) -> Any:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def rim(surfaces: Any, index: Any, field: Any, px: float, py: float, angle: Any, guess: float) -> Any:  # noqa: PLR0912
-    """Distance from an open place of the pupil to its rim in the given directions, where rays begin to be clipped or lost.
+    """Distance from an open point of the pupil to its border in the given directions, where rays begin to be clipped
+    or lost.
 
-    A bracket grown from `guess`, then false position (Illinois) while both ends are traced, and halving where one is lost.
+    The bracket grows from `guess`; then false position (Illinois) while both ends are traced, and bisection where one
+    is lost.
     """
     out = np.zeros(ROW)
     nowhere = np.zeros((0, 3))

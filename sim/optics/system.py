@@ -47,8 +47,9 @@ class FirstOrder:
 class OpticalSystem:
     """A prescription ready to be traced: indices looked up, stop sized, image placed.
 
-    The stop is as large as the real ray on the axis at the primary wavelength through the rim of the paraxial entrance
-    pupil makes it (the paraxial ray, where the file asks for paraxial aiming); every other field and wavelength fills that stop (ray aiming).
+    The stop's radius is the height at which the real marginal ray on the axis, at the primary wavelength, meets it
+    (the paraxial ray where the file asks for paraxial aiming). All other fields and wavelengths fill that stop (ray
+    aiming).
     """
 
     def __init__(self, prescription: Prescription, focus: Focus = "file") -> None:
@@ -206,7 +207,7 @@ class OpticalSystem:
         )
 
     def _compare_with_file(self) -> None:
-        """A line for each of the file's own values that the traced lens doesn't have."""
+        """Warn of each value that the file states and that the traced lens doesn't have."""
         first, prescription = self.first_order, self.prescription
         stated = [("focal length", prescription.stated_focal_length_mm, first.focal_length_mm, "mm", 2e-3)]
         if prescription.aperture_kind == "f_number":
@@ -231,7 +232,7 @@ class OpticalSystem:
         return self.field((0.0, 0.0))
 
     def field(self, tangent: tuple[float, float]) -> FloatArray:
-        """What the tracer needs of the field point whose light goes along (tan x, tan y, 1) at the entrance pupil."""
+        """The tracer's description of a field point whose light travels along (tan x, tan y, 1) at the entrance pupil."""
         tx, ty = tangent
         distance = self.prescription.object_distance_mm
         if distance is None:
@@ -241,7 +242,7 @@ class OpticalSystem:
         return np.array([1.0, -tx * reach, -ty * reach, -distance, self._pupil_position])
 
     def trace(self, tangent: tuple[float, float], wavelength_nm: float, px: ArrayLike, py: ArrayLike) -> FloatArray:
-        """Rows (`sim.optics.rays`) of the rays of a field point through places (mm) of the entrance pupil's plane."""
+        """Rows (`sim.optics.rays`) of the rays of a field point through points (mm) of the entrance pupil's plane."""
         return np.asarray(
             rt.trace_rays(
                 self.surfaces,
@@ -255,7 +256,7 @@ class OpticalSystem:
     def aim(
         self, tangent: tuple[float, float], wavelength_nm: float, start: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[float, float] | None:
-        """Place in the entrance pupil's plane of the ray through the stop's centre, or None where there is none."""
+        """Point in the entrance pupil's plane of the ray through the stop's centre, or None where there is none."""
         x, y, found = rt.aim(self.surfaces, self.index(wavelength_nm), self.field(tangent), start[0], start[1])
         return (float(x), float(y)) if found else None
 
@@ -267,7 +268,8 @@ class OpticalSystem:
         return None if at is None else self.trace(tangent, wavelength_nm, at[0], at[1])[0]
 
     def _best_focus(self) -> float:
-        """How far behind the file's image the wavefront on the axis at the reference wavelength is flattest, mm.
+        """Distance (mm) behind the file's image at which the wavefront on the axis, at the reference wavelength, is
+        flattest.
 
         Moving the image by d changes the path of a ray of direction cosine N by -n d N: a least-squares fit.
         """
@@ -285,8 +287,8 @@ class OpticalSystem:
     def open_centre(
         self, tangent: tuple[float, float], wavelengths_nm: Sequence[float], start: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[float, float] | None:
-        """A place of the entrance pupil that is open at all of the wavelengths: the chief ray's where it is, else where there
-        is most room; None where no light comes through."""
+        """A point of the entrance pupil that is open at all of the wavelengths: the chief ray's where that is open,
+        else the point with the largest clearance; None where no light comes through."""
         field = self.field(tangent)
         middle = wavelengths_nm[len(wavelengths_nm) // 2]
         at = self.aim(tangent, middle, start)
@@ -301,11 +303,11 @@ class OpticalSystem:
     def pupil(
         self, tangent: tuple[float, float], wavelength_nm: float, span: float, centre: tuple[float, float] | None = None
     ) -> PupilRays | None:
-        """The open pupil of a field point, laid out in rays, or None where no light comes through.
+        """The open pupil of a field point as a set of rays, or None where no light comes through.
 
-        Polar about `centre` (`open_centre` where it isn't given): Gauss-Legendre nodes out to the rim, which is found for
-        each of equally spaced directions. `span` is the largest difference of phase (rad) between
-        the pupil's centre and its rim that is to be summed: as many nodes are taken as it needs.
+        Polar about `centre` (by default `open_centre`): the border is found along equally spaced directions, with
+        Gauss-Legendre nodes out to it. `span` is the largest phase difference (rad) between the pupil's centre and its
+        border that is to be summed: it sets the number of nodes.
         """
         index, field = self.index(wavelength_nm), self.field(tangent)
         if centre is None:
@@ -373,10 +375,10 @@ class OpticalSystem:
         return np.abs(sagittal), np.abs(tangential)
 
     def ideal_height_mm(self, tangent: float) -> float:
-        """Where a lens without distortion has the image of a field point at the reference wavelength, mm.
+        """Image height of a field point at the reference wavelength in a lens without distortion, mm.
 
-        The real chief ray next to the axis, scaled with the tangent: f tan(theta) in the focal plane, and where the file's
-        image lies beside that, the scale of the image there.
+        The real chief ray close to the axis, scaled with the tangent: f tan(theta) in the focal plane, and the local
+        image scale where the file's image lies elsewhere.
         """
         small = 1e-4
         row = self.chief((0.0, small), self.reference_nm)
@@ -386,7 +388,7 @@ class OpticalSystem:
         return float((row[rt.Y] - axis[rt.Y]) / small * tangent)
 
     def _light(self, field: FloatArray, px: FloatArray, py: FloatArray) -> FloatArray:
-        """What a unit of the entrance pupil's plane takes in: that of a plane wave, or d(L, M) of a Lambertian object point."""
+        """Light per area of the entrance pupil's plane: 1 for a plane wave, d(L, M) for a Lambertian object point."""
         if field[0] == 0.0:
             return np.ones(px.size)
         reach = field[4] - field[3]
@@ -401,7 +403,8 @@ class OpticalSystem:
     def _open_place(
         self, index: FloatArray, field: FloatArray, near: tuple[float, float] | None
     ) -> tuple[float, float] | None:
-        """The place of the pupil with the most room about it, from a coarse look: where the chief ray is clipped."""
+        """The point of the pupil with the largest clearance, from a coarse search: for fields whose chief ray is
+        clipped."""
         x0, y0 = near or (0.0, 0.0)
         grid = np.linspace(-2.0, 2.0, 61) * self.pupil_radius_mm
         px, py = (values.ravel() for values in np.meshgrid(x0 + grid, y0 + grid))
@@ -447,7 +450,8 @@ class OpticalSystem:
         return tangent
 
     def starts(self, tangents: Sequence[tuple[float, float]], wavelength_nm: float) -> list[tuple[float, float] | None]:
-        """Places of the chief rays of a row of field points, each found from the one before; None from the first lost one on."""
+        """Pupil points of the chief rays of a row of field points, each found from the one before; None from the first
+        lost one on."""
         found: list[tuple[float, float] | None] = []
         start: tuple[float, float] = (0.0, 0.0)
         previous = (0.0, 0.0)
@@ -468,10 +472,10 @@ class OpticalSystem:
         return found
 
     def works(self, tangents: Sequence[tuple[float, float]], wavelengths_nm: Sequence[float]) -> tuple[int, str]:
-        """How many of a row of field points from the centre out work, and what ends them.
+        """Number of field points of a row, from the centre outwards, that the lens images, and what ends them.
 
-        A field point works where the chief ray reaches the image, farther from the first one's than the one before, and some light comes
-        through, at every one of the wavelengths.
+        A field point is imaged where, at every wavelength, the chief ray reaches the image, farther out than that of
+        the point before, and some light comes through.
         """
         count, reason = len(tangents), ""
         for w in wavelengths_nm:
@@ -505,7 +509,7 @@ def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _centred(prescription: Prescription) -> Prescription:
-    """The lens without its shifts and tilts: what its first-order quantities are those of."""
+    """The lens without its decentres and tilts, to which first-order quantities belong."""
     if prescription.centred:
         return prescription
     surfaces = tuple(

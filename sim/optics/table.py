@@ -1,4 +1,4 @@
-"""What a traced lens does, as a table over wavelength and field; kept on disk by the hash of what it was made from."""
+"""A traced lens as a table over wavelength and field, cached on disk by the hash of its input."""
 
 from __future__ import annotations
 

@@ -31,12 +31,13 @@ Progress = Callable[[str, float], None]
 
 
 class TableSettings(Frozen):
-    """What a lens table is computed at.
+    """Sampling of a lens table.
 
-    `fields` field points from the centre to the corner along y, in equal steps of tan(theta) (of theta beyond 60 deg), or
-    `grid` x `grid` of them where the lens isn't centred and `line` doesn't ask for the line all the same. `maximum_field_deg` is the corner, None: the file's largest field.
-    `sample_pitch_um` None: as fine as the smallest wavelength's diffraction needs. `focus` says whether the image lies where
-    the file has it or where the wavefront on the axis is best.
+    `fields` field points from the centre to the corner along y, in equal steps of tan(theta) (of theta beyond 60 deg);
+    or `grid` x `grid` of them where the lens isn't centred, unless `line` asks for the line. `maximum_field_deg` is
+    the corner, None: the file's largest field. `sample_pitch_um` None: as fine as diffraction at the shortest
+    wavelength needs. `focus`: whether the image lies where the file has it, or where the wavefront on the axis is
+    flattest.
     """
 
     wavelength_nm: tuple[float, ...] = TABLE_WAVELENGTHS_NM
@@ -50,7 +51,7 @@ class TableSettings(Frozen):
 
 
 def content_hash(prescription: Prescription, settings: TableSettings) -> str:
-    """Hash of all that a table depends on: the prescription, the settings and the way of computing."""
+    """Hash of everything that a table depends on: the prescription, the settings and the version of the computation."""
     parts = [prescription.model_dump(mode="json"), settings.model_dump(mode="json"), TABLE_VERSION]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
 
@@ -58,7 +59,7 @@ def content_hash(prescription: Prescription, settings: TableSettings) -> str:
 def lens_table(
     prescription: Prescription, settings: TableSettings | None = None, progress: Progress | None = None
 ) -> LensTable:
-    """Trace a lens and lay down what it does: see `LensTable`. PrescriptionError where it makes no image."""
+    """Trace a lens and compute its `LensTable`. PrescriptionError where it makes no image."""
     settings = settings or TableSettings()
     return OpticalTable(OpticalSystem(prescription, settings.focus), settings).table(progress)
 
@@ -66,7 +67,7 @@ def lens_table(
 def cached_table(
     prescription: Prescription, folder: Path, settings: TableSettings | None = None, progress: Progress | None = None
 ) -> LensTable:
-    """The table of a lens from the cache folder, or computed and kept there: a damaged file is computed again."""
+    """The table of a lens from the cache folder; computed and stored there where it is missing or damaged."""
     settings = settings or TableSettings()
     stored = load_cached(folder, content_hash(prescription, settings))
     if stored is not None:
@@ -77,7 +78,7 @@ def cached_table(
 
 
 class OpticalTable:
-    """The field points and the sampling of a lens table, and its computation."""
+    """Field points and sampling of a lens table, and its computation."""
 
     def __init__(self, system: OpticalSystem, settings: TableSettings) -> None:
         self.system, self.settings = system, settings
@@ -108,14 +109,14 @@ class OpticalTable:
         return [math.tan(math.atan(outermost) * i / (count - 1)) for i in range(count)]
 
     def _spokes(self) -> list[tuple[float, float]]:
-        """Directions in which the field has to work out to its edge."""
+        """Directions along which the field is checked out to its edge."""
         if self._line_only:
             return [(0.0, 1.0)]
         corner = math.sqrt(0.5)
         return [(corner * a, corner * b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
 
     def _field_points(self) -> list[tuple[float, float]]:
-        """The table's field points, limited to where the lens works."""
+        """The table's field points, limited to those that the lens images."""
         settings, outermost = self.settings, self._outermost()
         if min(settings.fields, settings.grid) < 2 and outermost > 0:
             raise PrescriptionError("a table needs two field points at least; ask for more")
@@ -129,7 +130,7 @@ class OpticalTable:
         return [(tx, ty) for ty in line for tx in line]
 
     def _limited(self, outermost: float, spoke: tuple[float, float], wavelengths_nm: list[float]) -> float:
-        """How far out along a direction the lens works, `outermost` at most; found by halving."""
+        """Largest tangent along a direction that the lens images, `outermost` at most; found by bisection."""
 
         def points(end: float) -> list[tuple[float, float]]:
             return [(spoke[0] * t, spoke[1] * t) for t in self._line(end, self.settings.fields)]
@@ -154,7 +155,7 @@ class OpticalTable:
         return low
 
     def _pitch(self) -> float:
-        """Samples as fine as the image of the shortest wavelength can be, wavelength N / 2, in steps of 0.05 um."""
+        """Sample pitch: wavelength N / 2 at the shortest wavelength, rounded down to steps of 0.05 um."""
         finest = 0.5e-3 * self.wavelengths[0] * self.system.first_order.working_f_number
         return max(0.05 * math.floor(finest / 0.05), 0.05)
 
@@ -223,7 +224,7 @@ class OpticalTable:
         return int(np.argmin([math.hypot(*tangent) for tangent in self.tangents]))
 
     def _starts(self) -> list[tuple[float, float]]:
-        """Where the chief rays of the field points pass the entrance pupil's plane, found from the centre outwards."""
+        """Pupil points of the field points' chief rays, found from the centre outwards."""
         system = self.system
         if self._line_only:
             found = system.starts(self.tangents, system.reference_nm)
@@ -258,9 +259,9 @@ class OpticalTable:
     ) -> list[PupilRays]:
         """The pupil at every wavelength of the table.
 
-        Rays are traced at a few wavelengths and interpolated between them: at the same place of the open pupil everything
-        about a ray is as smooth in 1 / wavelength^2 as the indices are. Where that doesn't give the solid angles that were
-        traced (another aperture clips at one end of the spectrum than at the other), every wavelength is traced.
+        Rays are traced at a few wavelengths and interpolated between them: at a fixed relative position in the open
+        pupil, rays are as smooth in 1 / wavelength^2 as the indices are. Where the interpolated solid angles differ
+        from traced ones (different apertures clip at the two ends of the spectrum), every wavelength is traced.
         """
         traced = [self._pupil(tangent, w, centre, span) for w in self._nodes]
         if len({rays.area.size for rays in traced}) == 1 and len({rays.rim_cosine_x.size for rays in traced}) == 1:
@@ -273,7 +274,8 @@ class OpticalTable:
 
 
 def _spectral_nodes(wavelengths: FloatArray) -> list[float]:
-    """Wavelengths to trace at, the ends among them: Chebyshev's extrema in 1 / wavelength^2, or all where there are few."""
+    """Wavelengths that are traced, the ends among them: Chebyshev's extrema in 1 / wavelength^2, or all where there
+    are few."""
     if wavelengths.size <= _SPECTRAL_NODES:
         return [float(w) for w in wavelengths]
     low, high = wavelengths[-1] ** -2.0, wavelengths[0] ** -2.0

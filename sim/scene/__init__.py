@@ -1,4 +1,4 @@
-"""Scenes: what stands in front of a camera, and how it is drawn without aliasing."""
+"""Scenes in front of a camera, drawn without aliasing."""
 
 from sim.scene.scenes import (
     Darkness,

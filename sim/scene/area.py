@@ -1,6 +1,6 @@
-"""Compiled loops of drawing by area: means of cells, and convex polygons, over the squares of a grid.
+"""Compiled loops that draw by area: means of cells and convex polygons over the squares of a grid.
 
-Import it where it's used, not at the top of a module: the compiler's library takes a while to load.
+Import it where it is used, not at the top of a module: the compiler's library takes a while to load.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _mean_whole(pattern, u, v, u_across, u_down, v_across, v_down, surround):  #
 
 @njit(cache=True)
 def _mean_parts(pattern, u, v, u_across, u_down, v_across, v_down, lit, surround):  # type: ignore[no-untyped-def]
-    """The same of cells that hold their value from u0 to u1, v0 to v1 only (`lit`), and `surround` elsewhere."""
+    """The same for cells that have their value from u0 to u1, v0 to v1 only (`lit`), and `surround` elsewhere."""
     wide, high = 0.5 * (abs(u_across) + abs(u_down)), 0.5 * (abs(v_across) + abs(v_down))
     total = surround
     first, last = int(np.floor(u - wide)), int(np.floor(u + wide))
@@ -138,13 +138,13 @@ def mapped_means(pattern, u, v, divide, lit, surround, out):  # type: ignore[no-
 
 @njit(cache=True, inline="always")
 def _within(place, limit):  # type: ignore[no-untyped-def]
-    """Held to 0..limit; what is no number is 0, as it must not become an index."""
+    """Clip to 0..limit; NaN becomes 0, as it must not be used as an index."""
     return min(place, limit) if place > 0.0 else 0.0
 
 
 @njit(cache=True, inline="always")
 def _integral(table, v, u):  # type: ignore[no-untyped-def]
-    """Of the pattern from its corner to (u, v) within it, by its table of summed areas."""
+    """Integral of the pattern from its corner to (u, v) within it, from its summed-area table."""
     i, j = min(int(v), table.shape[0] - 2), min(int(u), table.shape[1] - 2)
     down, across = v - i, u - j
     upper = table[i, j] * (1.0 - across) + table[i, j + 1] * across
@@ -154,8 +154,10 @@ def _integral(table, v, u):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def aligned_means(table, u, v, wide, high):  # type: ignore[no-untyped-def]
-    """Means over squares along the cells, `wide` x `high` of them, about pattern points `u`, `v`; nil outside the pattern, of which
-    `table` (rows + 1, cols + 1) holds the summed areas. A square may hold any number of cells."""
+    """Means over rectangles of `wide` x `high` cells about pattern points `u`, `v`; 0 outside the pattern.
+
+    `table` (rows + 1, cols + 1) is the pattern's summed-area table. A rectangle may hold any number of cells.
+    """
     rows, cols = table.shape[0] - 1.0, table.shape[1] - 1.0
     out = np.empty(u.shape)
     for i in range(u.shape[0]):
@@ -191,8 +193,8 @@ def means_down(values, edges, begin, end, surround):  # type: ignore[no-untyped-
 
 @njit(cache=True)
 def tapered_rings(down, across, down2, across2, start, end, out):  # type: ignore[no-untyped-def]
-    """1/2 + 1/2 Re(down across) out of the complex factors by row and column, fading to 1/2 from distance `start` to `end`;
-    `down2`, `across2` are the squares of row's and column's distances from the centre."""
+    """1/2 + 1/2 Re(down across) from complex factors by row and column, tapering to 1/2 between the distances `start`
+    and `end`; `down2`, `across2` are squared distances of rows and columns from the centre."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             distance2 = down2[i] + across2[j]
@@ -207,8 +209,8 @@ def tapered_rings(down, across, down2, across2, start, end, out):  # type: ignor
 
 @njit(cache=True)
 def _clip(points, count, axis, limit, sign, kept):  # type: ignore[no-untyped-def]
-    """The part of a convex polygon (its first `count` points) where sign x (coordinate - limit) > 0, into `kept`; how many
-    points it has (Sutherland and Hodgman 1974)."""
+    """The part of a convex polygon (its first `count` points) where sign x (coordinate - limit) > 0, written to
+    `kept`; returns its number of points (Sutherland and Hodgman 1974)."""
     n = 0
     for k in range(count):
         p, q = k - 1 if k else count - 1, k
@@ -235,11 +237,12 @@ def _area(points, count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def add_polygon(corners, row0, col0, step, factor, out):  # type: ignore[no-untyped-def]
-    """Add factor x share of every square inside a convex polygon of `corners` [row, col], exactly, to `out`.
+    """Add factor x (share of every square inside a convex polygon of `corners` [row, col]), exactly, to `out`.
 
-    Square [i, j] is `step` wide with its middle at (row0 + i step, col0 + j step). A row of squares cuts a strip out of the
-    polygon; as its left side is a convex function of the row and its right one a concave one, the squares between both
-    sides' places at the strip's two ends lie inside wholly; the few others are cut one by one.
+    Square [i, j] is `step` wide with its centre at (row0 + i step, col0 + j step). A row of squares cuts a strip out
+    of the polygon. The left border is a convex function of the row and the right one a concave one, so that squares
+    between both borders' positions at the strip's two ends lie completely inside; only the few others are clipped one
+    by one.
     """
     most = corners.shape[0] + 8
     strip, other, cut = np.empty((most, 2)), np.empty((most, 2)), np.empty((most, 2))

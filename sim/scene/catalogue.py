@@ -1,7 +1,7 @@
-"""The scenes that have a name: one declaration each, read by the command line and the documentation.
+"""The named scenes: one declaration each, read by the command line and the documentation.
 
-A scene's sizes are in px of an ideal pinhole camera that looks at a plane straight on (`View`); what the lens then does to it,
-distortion included, is the lens's.
+Sizes are in px of an ideal pinhole camera perpendicular to a plane (`View`). What the lens then does, distortion
+included, is a property of the lens.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class View:
 
     @property
     def px_per_mm(self) -> float:
-        """Camera px to a mm of the scene's plane."""
+        """Camera px per mm of the scene's plane."""
         return 1e3 * self.magnification / self.pixel_pitch_um
 
     @property
@@ -83,12 +83,12 @@ class View:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """[row, col] of the frame's middle, where the axis goes through."""
+        """[row, col] of the frame's centre, on the optical axis."""
         return 0.5 * (self.rows - 1), 0.5 * (self.cols - 1)
 
     @property
     def geometry(self) -> Geometry:
-        """The pinhole, as OpenCV writes it."""
+        """The pinhole camera in OpenCV's form."""
         focal_px = 1e3 * self.focal_length_mm * (1.0 + self.magnification) / self.pixel_pitch_um
         row, col = self.centre
         return Geometry(camera_matrix=((focal_px, 0.0, col), (0.0, focal_px, row), (0.0, 0.0, 1.0)))
@@ -105,13 +105,13 @@ class View:
         return min(self.rows / rows, self.cols / cols)
 
     def corner_mm(self, rows: float, cols: float, cell_px: float) -> tuple[float, float, float]:
-        """Place of the upper left corner of such a pattern in the camera's frame (x to the right, y down, z away)."""
+        """Position of the upper left corner of such a pattern in the camera's frame (x to the right, y down, z away)."""
         cell_mm = cell_px / self.px_per_mm
         return -0.5 * cols * cell_mm, -0.5 * rows * cell_mm, self.distance_mm
 
 
 class Declared(Frozen):
-    """Base of all declarations: a subclass's fields are its parameters, each with its `Quantity`."""
+    """Base class of all declarations: a subclass's fields are its parameters, each with its `Quantity`."""
 
     name: ClassVar[str]
     shows: ClassVar[str]
@@ -138,10 +138,10 @@ class Declared(Frozen):
 
 
 class NamedScene(Declared):
-    """A scene that a name and its parameters say all of."""
+    """A scene that is defined by a name and its parameters."""
 
     def place(self, view: View, white: Spectrum) -> Scene:
-        """The scene before a camera. `white`: radiance of a perfect white diffuser in the scene's place, or of light at full."""
+        """The scene before a camera. `white`: radiance of a perfect white diffuser at the scene, or of full light."""
         raise NotImplementedError
 
 
@@ -376,7 +376,7 @@ TEXELS_PER_SQUARE = 56
 def charuco_texture(
     squares: tuple[int, int], marker_share: float = 0.75, dictionary: str = "DICT_5X5_1000"
 ) -> NDArray[np.uint8]:
-    """A ChArUco board of `squares` (rows, cols) as it's printed, 0 or 1, `TEXELS_PER_SQUARE` texels to a square (OpenCV)."""
+    """A printed ChArUco board of `squares` (rows, cols), 0 or 1, `TEXELS_PER_SQUARE` texels a square (OpenCV)."""
     named = getattr(cv2.aruco, dictionary, None)
     if named is None:
         raise ValueError(f"dictionary {dictionary!r} is not one of OpenCV's: name one such as DICT_5X5_1000")
@@ -387,8 +387,8 @@ def charuco_texture(
 
 
 def _cells_to_cover(view: View, cell_px: float) -> tuple[int, int]:
-    """Rows and columns of cells that reach past the frame by a quarter of it and 32 px all round, so that neither blur nor a
-    lens that draws things in brings in the surround."""
+    """Rows and columns of cells that extend beyond the frame by a quarter of it and 32 px on all sides, so that
+    neither blur nor barrel distortion shows the surround."""
     down, across = (2 * int(np.ceil((0.75 * n + 32.0) / cell_px)) for n in (view.rows, view.cols))
     return down, across
 
@@ -420,12 +420,12 @@ def scene_by_name(
     distance_mm: float = 1000.0,
     parameters: Mapping[str, object] | None = None,
 ) -> Scene:
-    """The scene of that name before a camera.
+    """The named scene before a camera.
 
-    `illuminant`: radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser in the scene's place (`sim.scene.light.illuminant`);
-    what is fully light has it. `parameters`: those of the scene's declaration in `SCENES`; the rest is left at its default.
-    `View.of(camera, distance_mm).magnification` is the magnification that goes with it. Raises ValueError, in one line, for an
-    unknown name or parameter, or a value outside its bounds.
+    `illuminant`: radiance (W sr^-1 m^-2 nm^-1) of a perfect white diffuser at the scene
+    (`sim.scene.light.illuminant`); full light has it. `parameters`: those of the scene's declaration in `SCENES`;
+    others keep their defaults. `View.of(camera, distance_mm).magnification` is the magnification that belongs to it.
+    Raises ValueError, in one line, for an unknown name or parameter, or a value outside its bounds.
     """
     if name not in SCENES:
         raise ValueError(f"scene {name!r} is not known: name one of {', '.join(SCENES)}, or a file")

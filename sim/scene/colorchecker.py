@@ -39,15 +39,16 @@ def grid(chart: str = "ColorChecker24") -> tuple[int, int]:
 
 @cache
 def reflectances(chart: str = "ColorChecker24") -> dict[str, Spectrum]:
-    """Patch name -> reflectance (0..1) of a chart, row by row: in the order of `PATCHES`, or A1 B1 ... N1 A2 ... N10 of the SG.
+    """Patch name -> reflectance (0..1) of a chart, row by row: in the order of `PATCHES`, or A1 B1 ... N1 A2 ... N10
+    of the SG.
 
-    ColorChecker24: measured; colour-science, "BabelColor Average" (380..730 nm by 10), the mean of 30 charts (Pascale 2006).
-    Ohta's curves (1997) are of one chart, 3 % rms beside this mean.
+    ColorChecker24: measured; colour-science, "BabelColor Average" (380..730 nm in steps of 10), the mean of 30 charts
+    (Pascale 2006). Ohta's curves (1997) are of a single chart, 3 % rms from this mean.
 
-    ColorCheckerSG: not measured, but recovered from colours, as no spectra of the SG's 140 patches are at hand: the curves have
-    exactly the XYZ that X-Rite publishes (charts after November 2014, D50, 2 degrees) and the shape that measured materials of
-    such a colour have (see `recovered`). They are metamers: on the 24 patches whose curves are known, recovery in this
-    way leaves 0.04 rms of reflectance. Don't calibrate a spectral response with them.
+    ColorCheckerSG: not measured but recovered from colours, as no spectra of the SG's 140 patches are available. The
+    curves have exactly the XYZ that X-Rite publishes (charts after November 2014, D50, 2 degrees), and the shape of
+    measured materials of such a colour (see `recovered`). They are metamers: on the 24 patches with known curves, this
+    recovery has an error of 0.04 rms of reflectance. Don't calibrate a spectral response with them.
 
     Beyond their ends the end values hold. Raises ValueError for a chart that isn't known.
     """
@@ -65,11 +66,13 @@ def reflectances(chart: str = "ColorChecker24") -> dict[str, Spectrum]:
 
 
 def recovered(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths (nm) and reflectances (n, wavelengths) of surfaces with CIE 1931 `xyz` (n, 3) under D50, Y of white 1.
+    """Wavelengths (nm) and reflectances (n, wavelengths) of surfaces with CIE 1931 `xyz` (n, 3) under D50, Y of white
+    1.
 
-    Otsu, Yamamoto and Hachisuka (2018), principal components of 1269 measured Munsell and other papers in clusters of colour
-    (colour-science), then the closest bounded curve in slope that has the XYZ: least sum of (difference of the correction's
-    neighbours)^2 with 0 <= reflectance <= 1, XYZ met to 1e-5. Raises ValueError for XYZ that no reflectance has.
+    Otsu, Yamamoto and Hachisuka (2018): principal components of 1269 measured Munsell and other papers, clustered by
+    colour (colour-science). Then the closest bounded curve with the XYZ: least sum of squared differences between
+    neighbouring values of the correction, subject to 0 <= reflectance <= 1, XYZ met to 1e-5. Raises ValueError for XYZ
+    that no reflectance has.
     """
     colour = colour_science()
     shape = colour.SpectralShape(380, 730, 10)

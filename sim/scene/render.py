@@ -1,6 +1,6 @@
-"""Drawing scenes by area: the share of every sample's square that each light covers. Nothing is point-sampled.
+"""Scenes drawn by area: the share of every sample's square that each light covers. Nothing is point-sampled.
 
-A scene is a ground that covers everything and a few other lights, each with a picture of where it covers the ground.
+A scene is a ground that covers everything, and a few other lights, each with its coverage of the ground.
 """
 
 from __future__ import annotations
@@ -61,8 +61,10 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One light and where it is: `coverage` on the part `window` of a grid, 0 elsewhere. It's a share 0..1 over a ground that
-    shines; over a ground of no light it's any factor >= 0."""
+    """One light and its coverage: `coverage` in the part `window` of a grid, 0 elsewhere.
+
+    It is a share 0..1 over a ground that emits light; over a dark ground it is any factor >= 0.
+    """
 
     light: LitSurface
     window: Window
@@ -71,7 +73,7 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A scene on a grid. `ground` covers what the layers leave; the layers' coverages add up to 1 at most."""
+    """A scene on a grid. `ground` covers what the layers leave free; the layers' coverages add up to 1 at most."""
 
     ground: LitSurface
     layers: tuple[Layer, ...]
@@ -111,8 +113,8 @@ def draw(scene: Scene, grid: Grid) -> Drawing:
 def half_plane(distance: FloatArray, slope_x: FloatArray | float, slope_y: FloatArray | float) -> FloatArray:
     """Share of unit squares on the positive side of the line g = 0, exactly.
 
-    `distance` is g at the squares' centres, g = distance + slope_x x + slope_y y with x, y in -1/2..1/2: the distribution
-    function of the sum of two uniform variables of widths a = |slope_x|, b = |slope_y|.
+    `distance` is g at the squares' centres, g = distance + slope_x x + slope_y y with x, y in -1/2..1/2. The share is
+    the distribution function of the sum of two uniform variables of widths a = |slope_x|, b = |slope_y|.
     """
     a, b = np.abs(slope_x), np.abs(slope_y)
     far = np.broadcast_to(0.5 * (a + b), np.shape(distance))
@@ -129,12 +131,12 @@ def half_plane(distance: FloatArray, slope_x: FloatArray | float, slope_y: Float
 
 
 def cells(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> FloatArray:
-    """A pattern of cells (values 0..1) seen through a warp: the mean of `pattern`, and of `surround` outside it, over every
-    sample's square.
+    """A pattern of cells (values 0..1) seen through a warp: the mean of `pattern`, and of `surround` outside it, over
+    every sample's square.
 
-    A square that lies across a cell's border is split by exact area (`half_plane`), one that holds a cell's corner by the
-    product of two such shares. Squares larger than a cell are divided until they aren't. Raises ValueError for a pattern
-    that isn't 2-D or has values outside 0..1.
+    A square across a cell's border is split by exact area (`half_plane`), one that contains a cell's corner by the
+    product of two such shares. Squares larger than a cell are subdivided. Raises ValueError for a pattern that isn't
+    2-D or has values outside 0..1.
     """
     pattern = np.asarray(pattern, float)
     if pattern.ndim != 2 or pattern.size == 0:
@@ -148,8 +150,8 @@ def cells(pattern: FloatArray, warp: Warp, grid: Grid, surround: float) -> Float
 def cell_means(
     pattern: FloatArray, warp: Warp, grid: Grid, surround: float, lit: tuple[float, float, float, float] | None = None
 ) -> FloatArray:
-    """`cells` for cells of any finite value. `lit` (u0, u1, v0, v1): the part of every cell that holds its value, the rest
-    of it holding `surround`; None: all of it."""
+    """`cells` for cells of any finite value. `lit` (u0, u1, v0, v1): the part of every cell that has its value, the
+    rest having `surround`; None: all of it."""
     if warp.upright:
         return _upright_means(pattern, warp, grid, surround, lit)
     from sim.scene.area import mapped_means, project_means  # here: the compiler's library takes a while to load
@@ -185,7 +187,7 @@ def cell_means(
 def _upright_means(
     pattern: FloatArray, warp: Warp, grid: Grid, surround: float, lit: tuple[float, float, float, float] | None
 ) -> FloatArray:
-    """`cell_means` where rows stay rows and columns columns: exact means along columns, then along rows, of cells of any size."""
+    """`cell_means` where the pattern isn't rotated: exact means along columns, then along rows, of cells of any size."""
     from sim.scene.area import means_down
 
     h = np.asarray(warp.homography) / warp.homography[2][2]
@@ -201,7 +203,7 @@ MOST_DIVISIONS = 16
 
 
 def _footprint(shape: tuple[int, ...], warp: Warp, grid: Grid) -> float:
-    """The largest extent, in cells, of a sample's square, over those parts of the pattern that the grid sees."""
+    """Largest extent, in cells, of a sample's square, over the parts of the pattern that the grid sees."""
     rows, cols = shape
     u, v = np.meshgrid(np.linspace(0.0, cols, 9), np.linspace(0.0, rows, 9))
     row, col = warp.to_camera(u, v)
@@ -223,7 +225,8 @@ NO_LIGHT = Spectrum(wavelength_nm=(300.0, 1100.0), value=(0.0, 0.0))
 
 
 def _bands(scene: SpectralImage, grid: Grid) -> Drawing:
-    """One layer a band on a dark ground: the light is the band's triangle over wavelength, the "coverage" its radiance."""
+    """One layer for each band on a dark ground: the light is the band's triangle over wavelength, the "coverage" its
+    radiance."""
     planes = np.moveaxis(scene.radiance, 2, 0)
     lights = [(light, None) for light in scene.bands()]
     if scene.to_camera is not None or planes[0].shape != (grid.rows, grid.cols):
@@ -248,7 +251,7 @@ def _bands(scene: SpectralImage, grid: Grid) -> Drawing:
 
 
 def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
-    """Black's leakage and one layer a primary on a dark ground; all fall off with the angle of view."""
+    """Leakage of black and one layer for each primary on a dark ground; all fall off with the viewing angle."""
     warp = scene.warp()
     screen = scene.screen
     pictures: list[tuple[Spectrum, FloatArray, tuple[float, float, float, float] | None]] = []
@@ -270,7 +273,7 @@ def _screen(scene: ScreenImage, grid: Grid) -> Drawing:
 
 
 def _edges(scene: KnifeEdge, grid: Grid) -> FloatArray:
-    """Every sample belongs to the nearest region's edge, whose line cuts it by exact area."""
+    """Every sample belongs to the edge of the nearest region, whose line cuts it by exact area."""
     row, col = grid.axes_px()
     if len(scene.regions) == 1:
         return _light_side(scene.regions[0], grid)
@@ -283,7 +286,7 @@ def _edges(scene: KnifeEdge, grid: Grid) -> FloatArray:
 
 
 def _posed_edges(scene: PosedEdges, grid: Grid) -> FloatArray:
-    """Every sample is cut by the line that its edge is there, by exact area."""
+    """Every sample is cut by the edge's line at that position, by exact area."""
     owner, away = scene.distances(*grid.axes_px())
     lit = np.empty(grid.shape)
     for index, distance in enumerate(away):
@@ -294,7 +297,7 @@ def _posed_edges(scene: PosedEdges, grid: Grid) -> FloatArray:
 
 
 def _light_side(edge: EdgeRegion, grid: Grid) -> FloatArray:
-    """Share of every sample on an edge's light side: that part of the grid is a polygon."""
+    """Share of every sample on the light side of an edge, whose part of the grid is a polygon."""
     row, col = grid.axes_px()
     half = 0.5 / grid.oversample
     top, bottom, left, right = row[0] - half, row[-1] + half, col[0] - half, col[-1] + half
@@ -314,8 +317,11 @@ def _light_side(edge: EdgeRegion, grid: Grid) -> FloatArray:
 
 
 def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
-    """cos(pi k (x^2 + y^2)) = Re exp(i pi k x^2) exp(i pi k y^2): its mean over a square is a product of two Fresnel integrals,
-    exactly; the taper near the rim, which is smooth, is taken at the square's centre."""
+    """cos(pi k (x^2 + y^2)) = Re exp(i pi k x^2) exp(i pi k y^2).
+
+    Its mean over a square is a product of two Fresnel integrals, exactly; the taper near the border, which is smooth,
+    is taken at the square's centre.
+    """
     from sim.scene.area import tapered_rings
 
     if scene.highest_cy_per_px > 0.5 * grid.oversample:
@@ -336,7 +342,7 @@ def _zone_plate(scene: ZonePlate, grid: Grid) -> FloatArray:
 
 
 def _star(scene: SiemensStar, grid: Grid) -> FloatArray:
-    """Triangles from the centre, each cut exactly."""
+    """Triangles from the centre, each clipped exactly."""
     from sim.scene.area import add_polygon
 
     lit = np.zeros(grid.shape)
@@ -365,7 +371,7 @@ def _ramp(scene: Ramp, grid: Grid) -> FloatArray:
 
 
 def _points(scene: PointArray, grid: Grid) -> FloatArray:
-    """Square holes; one narrower than a sample is spread over a sample's width, with its own energy and middle."""
+    """Square holes; one narrower than a sample is spread over a sample's width, with its energy and centroid."""
     step = 1.0 / grid.oversample
     wide = max(scene.side_px, step)
     lit = np.zeros(grid.shape)

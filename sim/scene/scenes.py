@@ -1,7 +1,7 @@
-"""What stands in front of a camera. A scene is frozen data in the camera's pixel coordinates; `sim.scene.render` draws it.
+"""Scenes in front of a camera, as frozen data in its pixel coordinates; `sim.scene.render` draws them.
 
-Radiances are W sr^-1 m^-2 nm^-1. Points are [row, col] in px with [0, 0] at the centre of the top-left pixel. `kind` is the
-capture's kind as the recording-set format names it: effects on the rig may depend on it.
+Radiances are W sr^-1 m^-2 nm^-1. Points are [row, col] in px with [0, 0] at the centre of the top-left pixel. `kind`
+is the capture's kind in the recording-set format; effects of the rig may depend on it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Corners = tuple[tuple[float, float], tuple[float, float], tuple[float, float], t
 
 @runtime_checkable
 class Scene(Protocol):
-    """Any scene: what it adds is its `kind`."""
+    """Any scene, identified by its `kind`."""
 
     @property
     def kind(self) -> str: ...
@@ -45,12 +45,13 @@ class UniformField:
 
 @dataclass(frozen=True)
 class ReflectanceChart:
-    """A flat chart of diffuse patches on a frame of 3 % reflectance, lit evenly: ColorChecker24 or ColorCheckerSG.
+    """A flat chart of diffuse patches on a frame of 3 % reflectance, uniformly lit: ColorChecker24 or ColorCheckerSG.
 
-    `corners`: outer corners [row, col] of the patch grid, in the order dark skin, bluish green, black, white (SG: A1, N1, N10,
-    A10; for an upright chart: top left, top right, bottom right, bottom left). `illuminant_radiance`: of a perfect white diffuser in the chart's
-    place. `gap`: share of the distance of neighbouring patches that the frame between them takes. `geometry`: of a lens that distorts; the
-    corners are then where a pinhole would have them, and every patch's corners are distorted.
+    `corners`: outer corners [row, col] of the patch grid, in the order dark skin, bluish green, black, white (SG: A1,
+    N1, N10, A10; for an upright chart: top left, top right, bottom right, bottom left). `illuminant_radiance`: of a
+    perfect white diffuser at the chart. `gap`: share of the pitch of the patches that the frame between them takes.
+    `geometry`: of a lens with distortion; the corners are then those in a pinhole camera, and every patch's corners
+    are distorted.
     """
 
     corners: Corners
@@ -85,8 +86,8 @@ class EdgeRegion:
 
 @dataclass(frozen=True)
 class KnifeEdge:
-    """Straight edges between dark and light, one in each region. A pixel outside all regions belongs to the nearest one, so
-    that every edge goes on well past its region."""
+    """Straight edges between dark and light, one in each region. A pixel outside all regions belongs to the nearest
+    one, so that every edge extends well beyond its region."""
 
     regions: tuple[EdgeRegion, ...]
     dark_radiance: Spectrum
@@ -94,7 +95,7 @@ class KnifeEdge:
     kind: str = "slanted_edge"
 
     def owner(self, row: FloatArray, col: FloatArray) -> NDArray[np.intp]:
-        """Index of the region that rules each point, the nearest one."""
+        """Index of the region that each point belongs to, the nearest one."""
         if not self.regions:
             raise ValueError("a knife edge with no region shows nothing: give at least one edge region")
         away = []
@@ -216,11 +217,11 @@ class PosedEdges(Posed):
 
 @dataclass(frozen=True)
 class ZonePlate:
-    """Rings of ever finer pitch: level 1/2 + 1/2 cos(pi k r^2), k = highest_cy_per_px / radius_px, so that the local frequency
-    is k r: it rises in proportion to the distance r from `centre` [row, col], to `highest_cy_per_px` at `radius_px`.
+    """Rings of decreasing pitch: level 1/2 + 1/2 cos(pi k r^2), k = highest_cy_per_px / radius_px.
 
-    Level 0 is `dark_radiance`, 1 `light_radiance`; outside the radius it's 1/2. Over the outermost share `taper` of the radius
-    the contrast goes to 0 as a raised cosine, so that the rim has no edge.
+    The local frequency k r rises in proportion to the distance r from `centre` [row, col], to `highest_cy_per_px` at
+    `radius_px`. Level 0 is `dark_radiance`, 1 `light_radiance`; outside the radius it is 1/2. Over the outermost share
+    `taper` of the radius the contrast falls to 0 as a raised cosine, so that the border is no edge.
     """
 
     centre: tuple[float, float]
@@ -240,9 +241,11 @@ class ZonePlate:
 
 @dataclass(frozen=True)
 class SiemensStar:
-    """`spokes` light triangles on dark, all from `centre` [row, col], their outer corners on the circle of `radius_px`. Between
-    them the dark is as wide: half of every circle within is light, at spokes / (2 pi r) cy/px at a distance of r px.
-    The first spoke begins `turn_deg` from the right, clockwise."""
+    """`spokes` light triangles on dark from `centre` [row, col], their outer corners on the circle of `radius_px`.
+
+    Dark sectors between them have the same width: half of every circle within is light, at spokes / (2 pi r) cy/px at
+    a radius of r px. The first spoke begins `turn_deg` from the right, clockwise.
+    """
 
     centre: tuple[float, float]
     radius_px: float
@@ -266,8 +269,9 @@ class SiemensStar:
 
 @dataclass(frozen=True)
 class Ramp:
-    """Level 0 (`dark_radiance`) to 1 (`light_radiance`) over `length_px` about `centre` [row, col], rising towards `angle_deg` (0:
-    to the right, 90: down). Linear with `steps` 0; else so many equal bands of levels 0, 1 / (steps - 1), ..., 1."""
+    """Level 0 (`dark_radiance`) to 1 (`light_radiance`) over `length_px` about `centre` [row, col], rising towards
+    `angle_deg` (0: to the right, 90: down). Linear with `steps` 0; else that number of equal bands of levels 0, 1 /
+    (steps - 1), ..., 1."""
 
     centre: tuple[float, float]
     length_px: float
@@ -285,8 +289,8 @@ class Ramp:
 
 @dataclass(frozen=True)
 class PointArray:
-    """Square holes of `side_px` at `points` ([row, col] of their middles), `light_radiance` in `dark_radiance`. The light of a
-    hole, radiance x side_px^2, is drawn exactly, however small the hole."""
+    """Square holes of `side_px` at `points` ([row, col] of their centres), `light_radiance` in `dark_radiance`. The
+    light of a hole, radiance x side_px^2, is drawn exactly, however small the hole."""
 
     points: tuple[tuple[float, float], ...]
     side_px: float
@@ -304,8 +308,8 @@ class PointArray:
 class ScreenImage(Posed):
     """A picture of digital codes on a screen at a pose: what any `Screen` shows of any image.
 
-    `codes` (rows, cols, 3) uint8, red, green, blue; a code fills one pixel of the screen, `pixel_mm` wide, in the plane
-    of `Posed`. Around the picture it's dark: a screen ends where its picture ends.
+    `codes` (rows, cols, 3) uint8, red, green, blue; a code fills one pixel of the screen, `pixel_mm` wide, in the
+    plane of `Posed`. It is dark around the picture, as a screen ends there.
     """
 
     screen: Screen
@@ -328,8 +332,8 @@ class ScreenImage(Posed):
         return self.plane_warp(self.pixel_mm)
 
     def cosine(self, row: FloatArray, col: FloatArray) -> FloatArray:
-        """Cosine of the angle between the screen's normal and the ray to the camera, (row.size, col.size), at the screen's points
-        seen at ascending camera `row` x `col` (px)."""
+        """Cosine of the angle between the screen's normal and the ray to the camera, (row.size, col.size), at the
+        screen points seen at ascending camera `row` x `col` (px)."""
         turn = np.asarray(self.rotation, float)
         eye = -turn.T @ np.asarray(self.translation_mm, float)  # the camera in the screen's frame
         warp = self.warp()
@@ -346,9 +350,9 @@ class SpectralImage:
     """A picture with a spectrum in every sample: a multispectral cube.
 
     `radiance` (rows, cols, bands), W sr^-1 m^-2 nm^-1, float32 or float64, finite and >= 0, at `wavelength_nm` (nm,
-    ascending, two or more); between the bands it's linear, beyond them zero, as a `Spectrum` is. Sample [i, j] is an even
-    square that covers u = j..j+1, v = i..i+1 of `to_camera`; None: sample [i, j] fills the camera's pixel [i, j]. Around
-    the picture it's dark. Raises ValueError that names the quantity, the value and the remedy.
+    ascending, two or more); linear between the bands, zero beyond them, as a `Spectrum` is. Sample [i, j] is a uniform
+    square that covers u = j..j+1, v = i..i+1 of `to_camera`; None: sample [i, j] fills the camera's pixel [i, j]. It
+    is dark around the picture. Raises ValueError that names the quantity, the value and the remedy.
     """
 
     wavelength_nm: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""A screen: how digital codes become light. Three primaries, each with its gamma, on a black that leaks."""
+"""A screen: conversion of digital codes to light by three primaries, each with its gamma, and a leaking black."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Three = tuple[float, float, float]
 
 
 class SubPixels(Frozen):
-    """Upright stripes of red, green and blue beside each other, each centred in its third of the screen's pixel."""
+    """Upright stripes of red, green and blue side by side, each centred in its third of the screen's pixel."""
 
     width: Annotated[float, Quantity("1", "a stripe's width over the pixel's", lower=0.01, upper=1 / 3)] = 0.28
     height: Annotated[float, Quantity("1", "a stripe's height over the pixel's", lower=0.01, upper=1.0)] = 0.9
@@ -38,13 +38,13 @@ class SubPixels(Frozen):
 
 
 class Screen(Frozen):
-    """Radiance along the normal = black + sum over red, green, blue of primary x drive, drive = ((c - b) / (1 - b))^gamma for a
-    code c = code / 255 above the black code b, 0 below (the gain-offset-gamma model, Berns 1996). Towards the angle
-    theta off the normal, all of it is multiplied by cos(theta)^falloff_exponent.
+    """A screen's radiance along its normal: black + sum over red, green, blue of primary x drive.
 
+    drive = ((c - b) / (1 - b))^gamma for a code c = code / 255 above the black code b, 0 below (gain-offset-gamma
+    model, Berns 1996). At the angle theta from the normal all of it is multiplied by cos(theta)^falloff_exponent.
     `primaries`: radiance (W sr^-1 m^-2 nm^-1) of each at full drive, mean over the pixel, whatever the sub-pixels;
-    `black_radiance`: what is left at code 0. Between full drive and none nothing depends on gamma: a pattern of 0 and 255
-    is a `ScreenPattern` between black and white.
+    `black_radiance`: radiance at code 0. Full drive and none don't depend on gamma: a pattern of 0 and 255 is a
+    `ScreenPattern` between black and white.
     """
 
     primaries: tuple[Spectrum, Spectrum, Spectrum]

@@ -1,4 +1,4 @@
-"""From a flat pattern to the camera: a homography, then the lens's distortion."""
+"""Mapping of a flat pattern to the camera: a homography, then the lens's distortion."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[flo
 class Warp:
     """Pattern coordinates (u to the right, v down, in cells; cell [i, j] covers u = j..j+1, v = i..i+1) to camera px.
 
-    `homography` takes (u, v, 1) to a pinhole's (x, y, w): x = col, y = row after division by w. With `geometry`, the lens's
-    Brown distortion follows: x is undone by the camera matrix, distorted, and projected again.
+    `homography` maps (u, v, 1) to a pinhole's (x, y, w): x = col, y = row after division by w. With `geometry`, the
+    lens's Brown distortion follows: the camera matrix is inverted, the point distorted, and projected again.
     """
 
     homography: Matrix
@@ -40,7 +40,7 @@ class Warp:
 
     @classmethod
     def from_corners(cls, width: float, height: float, corners: ArrayLike, geometry: Geometry | None = None) -> Self:
-        """The homography that takes the pattern's corners (0, 0), (width, 0), (width, height), (0, height) to the four
+        """The homography that maps the pattern's corners (0, 0), (width, 0), (width, height), (0, height) to the four
         `corners`, [row, col] in undistorted camera px."""
         source = np.array([(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)])
         target = np.asarray(corners, float)[:, ::-1]
@@ -53,12 +53,12 @@ class Warp:
 
     @property
     def straight(self) -> bool:
-        """Whether the homography is all there is."""
+        """Whether there is no distortion."""
         return self.geometry is None or not any(self.geometry.distortion)
 
     @property
     def upright(self) -> bool:
-        """Whether the pattern's rows are the camera's rows and its columns the camera's columns, in their order."""
+        """Whether rows and columns of the pattern are rows and columns of the camera, in the same order."""
         (a, b, _), (c, d, _), (e, f, w) = self.homography
         return self.straight and b == c == e == f == 0.0 and a * w > 0 and d * w > 0
 
@@ -83,9 +83,11 @@ class Warp:
     def mapper(
         self, rows: tuple[float, float], cols: tuple[float, float]
     ) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-        """A function from ascending camera `row` and `col` (px, within `rows` and `cols`) to pattern (u, v) on their grid.
+        """A function from ascending camera `row` and `col` (px, within `rows` and `cols`) to pattern (u, v) on their
+        grid.
 
-        The lens's distortion is smooth: it's undone on nodes some 8 px apart and interpolated by cubic splines (1e-5 px).
+        The lens's distortion is smooth: it is inverted on nodes some 8 px apart and interpolated by cubic splines
+        (1e-5 px).
         """
         back = np.linalg.inv(np.asarray(self.homography))
         if self.straight:
@@ -121,7 +123,7 @@ def _check_distortion(geometry: Geometry) -> None:
 
 
 def distort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
-    """Pinhole px (x = col, y = row) to px behind the lens: OpenCV's k1 k2 p1 p2 k3."""
+    """Pinhole px (x = col, y = row) to distorted px: OpenCV's k1 k2 p1 p2 k3."""
     _check_distortion(geometry)
     k = np.asarray(geometry.camera_matrix, float)
     yn = (np.asarray(y, float) - k[1, 2]) / k[1, 1]
@@ -131,7 +133,7 @@ def distort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray,
 
 
 def undistort(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
-    """The inverse of `distort`: Newton's method with the exact Jacobian's numerical twin, to 1e-10 of the focal length."""
+    """The inverse of `distort`: Newton's method with a numerical Jacobian, to 1e-10 of the focal length."""
     _check_distortion(geometry)
     k = np.asarray(geometry.camera_matrix, float)
     yd = (np.asarray(y, float) - k[1, 2]) / k[1, 1]

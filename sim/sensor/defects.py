@@ -1,4 +1,4 @@
-"""Which pixels of a sensor are unlike the others: fixed by a seed, the same in every frame."""
+"""Defective pixels of a sensor: fixed by a seed, the same in every frame."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ def defective_pixels(shape: tuple[int, ...], share: float, seed: int) -> NDArray
     return chosen
 
 
-#: Below this relative standard deviation all defective pixels are alike.
+#: Below this relative standard deviation all defective pixels are equal.
 ALIKE = 0.02
 
 
 @lru_cache(maxsize=8)
 def defect_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float = 1.0) -> FloatArray:
-    """(shape): variables of mean 1 and standard deviation `spread` in `defective_pixels`, gamma distributed (1: exponential), 0 elsewhere."""
+    """(shape): variables of mean 1 and standard deviation `spread` at `defective_pixels`, gamma distributed (1:
+    exponential), 0 elsewhere."""
     sizes = np.zeros(shape)
     chosen = defective_pixels(shape, share, seed)
     drawn = np.random.default_rng([seed, 2]).exponential(1.0, chosen.size)
@@ -44,8 +45,8 @@ def defect_sizes(shape: tuple[int, ...], share: float, seed: int, spread: float 
 
 @lru_cache(maxsize=256)
 def size_nodes(spread: float, count: int = 24) -> tuple[FloatArray, FloatArray]:
-    """(weights, sizes), (count,) each, of the distribution that `defect_sizes` draws from: means over parts of it, thinner ones
-    towards the tail; weights sum to 1, weighted sizes too."""
+    """(weights, sizes), (count,) each, of the distribution of `defect_sizes`: means over parts of it, narrower ones
+    towards the tail. The weights and the weighted sizes sum to 1."""
     if spread < ALIKE:
         return np.ones(1), np.ones(1)
     k = spread**-2

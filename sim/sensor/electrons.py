@@ -29,11 +29,17 @@ F = TypeVar("F", bound=np.floating[Any])
 
 @dataclass(frozen=True)
 class ReadOut:
-    """What effects make of the read-out. `response`: mean or noisy electrons -> electrons, point by point; `noise_e2`: (mean
-    electrons, their shot noise's variance) -> variance; `added`: (frame's shape, generator) -> electrons that one frame's
-    read-out adds, which broadcast to that shape, of mean `added_e` and variance `added_e2`; `codes`: DN before rounding -> DN;
-    `neighbours`: mean electrons -> correlation of the shot noise with each of four neighbours; `processing`: kernel of a filter
-    of each colour's DN before they are rounded. `offset_dn` is added to the black level. Defaults: a linear one."""
+    """Changes of the read-out by effects; by default a linear read-out.
+
+    response      mean or noisy electrons -> electrons, point by point
+    noise_e2      (mean electrons, variance of their shot noise) -> variance
+    added         (shape of the frame, generator) -> electrons that one frame's read-out adds, which broadcast to that shape, of mean `added_e`
+                  and variance `added_e2`
+    codes         DN before rounding -> DN
+    neighbours    mean electrons -> correlation of the shot noise with each of four neighbours
+    processing    kernel of a filter of each colour's DN before rounding
+    offset_dn     added to the black level
+    """
 
     response: Callable[[FloatArray], FloatArray] | None = None
     noise_e2: Callable[[FloatArray, FloatArray], FloatArray] | None = None
@@ -51,9 +57,9 @@ LINEAR = ReadOut()
 
 @dataclass(frozen=True, eq=False)
 class FixedPattern:
-    """What one camera's pixels keep from frame to frame: relative deviation of the response `prnu`, deviation of the dark
-    signal `dsnu_e` (electrons, the same at every exposure), both (rows, cols), and offsets of the columns `column_e` (cols,)
-    or None, all of mean 0."""
+    """What one camera's pixels keep from frame to frame, all of mean 0: relative deviation of the response `prnu` and
+    deviation of the dark signal `dsnu_e` (electrons, the same at every exposure), both (rows, cols), and column
+    offsets `column_e` (cols,) or None."""
 
     prnu: FloatArray
     dsnu_e: FloatArray
@@ -86,7 +92,7 @@ def gain_dn_per_e(camera: CameraModel, gain_db: float) -> float:
 
 
 def capacity_e(camera: CameraModel, gain_db: float = 0.0) -> float:
-    """Electrons at which a pixel saturates: at its full well, or at the converter's end where that comes first."""
+    """Electrons at which a pixel saturates: its full well, or the converter's upper end where that comes first."""
     gain = gain_dn_per_e(camera, gain_db)
     return min(camera.full_well_e, (camera.white_level_dn - camera.black_level_dn) / gain)
 
@@ -94,13 +100,14 @@ def capacity_e(camera: CameraModel, gain_db: float = 0.0) -> float:
 def clipped_moments(
     mean: FloatArray, variance: FloatArray, lower: float, upper: float, skewness: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of a variable after clipping to [lower, upper] (either may be infinite): normal, but for a small
-    `skewness` g.
+    """Mean and variance of a variable after clipping to [lower, upper] (either may be infinite): normal, but for a
+    small `skewness` g.
 
-    With standardised limits a and b, density phi and distribution Phi of the normal law: E z = a Phi(a) + b (1 - Phi(b)) -
-    phi(b) + phi(a), E z^2 = a^2 Phi(a) + b^2 (1 - Phi(b)) + Phi(b) - Phi(a) - b phi(b) + a phi(a), and to first order in g (a
-    density times 1 + g (z^3 - 3 z) / 6) on top g (a phi(a) - b phi(b)) / 6 and g ((1 + a^2) phi(a) - (1 + b^2) phi(b)) / 3.
-    Values more than eight standard deviations from the limits are returned as they came.
+    With standardised limits a and b, density phi and distribution function Phi of the normal distribution: E z = a
+    Phi(a) + b (1 - Phi(b)) - phi(b) + phi(a), E z^2 = a^2 Phi(a) + b^2 (1 - Phi(b)) + Phi(b) - Phi(a) - b phi(b) + a
+    phi(a). A density times 1 + g (z^3 - 3 z) / 6 adds, to first order in g, g (a phi(a) - b phi(b)) / 6 and g ((1 +
+    a^2) phi(a) - (1 + b^2) phi(b)) / 3. Values more than eight standard deviations from the limits are returned
+    unchanged.
     """
     mean, variance, skewness = np.broadcast_arrays(
         np.asarray(mean, float), np.asarray(variance, float), np.asarray(skewness, float)
@@ -302,7 +309,7 @@ def sample_from(
 def _added_electrons(
     shape: tuple[int, ...], camera: CameraModel, rng: np.random.Generator, read_out: ReadOut
 ) -> Float32Array | None:
-    """What one frame's read-out adds beside every pixel's own read noise: the rows' noise and the effects' own."""
+    """Electrons that one frame's read-out adds besides every pixel's own read noise: row noise, and noise of effects."""
     total: FloatArray | None = None
     if camera.row_noise_e > 0:
         total = rng.standard_normal((*shape[:-1], 1)) * camera.row_noise_e
@@ -313,7 +320,7 @@ def _added_electrons(
 
 
 def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generator, read_out: ReadOut) -> Float32Array:
-    """Electrons as they are read: shot noise, full well, response and read noise."""
+    """Electrons after shot noise, full well, response and read noise."""
     charge = draw_electrons(mean, rng)
     if read_out.noise_e2 is not None:
         wanted = np.maximum(read_out.noise_e2(mean.astype(float), mean.astype(float)), 0.0)
@@ -336,15 +343,15 @@ CROSS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
 def passed_on(correlation: FloatArray | float) -> FloatArray:
-    """The share g of each neighbour's departure that a pixel takes over, given the correlation r that this leaves between two
-    alike: r = 2 g / (1 + 4 g^2)."""
+    """Share g of each neighbour's deviation that a pixel takes over, given the correlation r that results between two
+    equal ones: r = 2 g / (1 + 4 g^2)."""
     r = np.clip(np.asarray(correlation, float), 0.0, 0.49)
     return np.asarray(2.0 * r / (2.0 + 2.0 * np.sqrt(1.0 - 4.0 * r * r)))
 
 
 def shared_departures(departure: NDArray[F], mean: NDArray[F], correlation: FloatArray) -> FloatArray:
-    """Departures (rows, cols) of Poisson variables of given means after every pixel has taken over a share of its neighbours',
-    of the same variances as before: d_i + g_i sum d_j, over sqrt(1 + g_i^2 sum v_j / v_i)."""
+    """Deviations (rows, cols) of Poisson variables of given means after every pixel has taken over a share of its
+    neighbours', with unchanged variances: d_i + g_i sum d_j, over sqrt(1 + g_i^2 sum v_j / v_i)."""
     share = passed_on(correlation)
     spread = convolve(np.asarray(mean, float), CROSS, mode="mirror") / np.maximum(mean, 1e-12)
     taken = departure + share * convolve(departure, CROSS, mode="mirror")
@@ -352,7 +359,7 @@ def shared_departures(departure: NDArray[F], mean: NDArray[F], correlation: Floa
 
 
 def filtered(frame: NDArray[F], kernel: FloatArray, cfa: Cfa) -> NDArray[F]:
-    """Each colour's plane of a frame (rows, cols) run through one filter; mirrored about the outermost pixels."""
+    """Each colour's plane of a frame (rows, cols) convolved with one kernel; mirrored about the outermost pixels."""
     out = np.array(frame)
     for plane in planes(out, cfa).values():
         plane[...] = convolve(plane, kernel, mode="mirror")

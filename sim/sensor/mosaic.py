@@ -1,4 +1,4 @@
-"""The colour-filter mosaic: which pixel is of which channel, taking planes out of a frame and putting channels in."""
+"""The colour-filter mosaic: the channel of each pixel, planes of a frame, and frames from channels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def step(cfa: Cfa) -> int:
 
 
 def phases(cfa: Cfa) -> dict[str, list[tuple[int, int]]]:
-    """Channel -> [(row0, col0), ...]: where in the mosaic's period the channel's pixels stand, read from pixel [0, 0].
+    """Channel -> [(row0, col0), ...]: positions of the channel's pixels in the mosaic's period, from pixel [0, 0].
 
     R and B have one phase, G two (first the one on the red rows); MONO: `{"Y": [(0, 0)]}`. A phase's pixels are
     `frame[row0::step, col0::step]` with `step(cfa)`.
@@ -47,8 +47,8 @@ def planes(frame: NDArray[Scalar], cfa: Cfa) -> dict[str, NDArray[Scalar]]:
 
 
 def assemble(channels: Mapping[str, NDArray[Scalar]], cfa: Cfa) -> NDArray[Scalar]:
-    """One frame from full images of each channel (`R`, `G`, `B` or `Y`, all (rows, cols)): every pixel takes the value of
-    its own channel. The inverse of taking planes, on the channel's own pixels."""
+    """One frame from full images of each channel (`R`, `G`, `B` or `Y`, all (rows, cols)): every pixel takes the value
+    of its own channel. On these pixels it is the inverse of `planes`."""
     places = phases(cfa)
     missing = [channel for channel in places if channel not in channels]
     if missing:

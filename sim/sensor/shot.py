@@ -1,4 +1,5 @@
-"""Shot noise: Poisson variables, exact at every mean, for arrays of means. Apart from its neighbours as numba is slow to import."""
+"""Shot noise: Poisson variables, exact at every mean, for arrays of means. A module of its own, as numba is slow to
+import."""
 
 # mypy: disallow-untyped-decorators=False
 
@@ -24,11 +25,12 @@ _COUNTS, _GUIDE = 64, 256
 
 
 def draw_poisson(mean: Float32Array, rng: np.random.Generator) -> Float32Array:
-    """Poisson variables (float32, shape of `mean`) with means >= 0.
+    """Poisson variables (float32, shape of `mean`) of means >= 0.
 
-    From a mean of 10: Ahrens and Dieter's algorithm PD (ACM Trans. Math. Softw. 8, 163, 1982), which takes the whole part of a
-    normal variable and corrects the few that have to be: exact to rounding, 19 ns each (numpy's own, 30 to 55). Below: the sum
-    of a variable of the mean's whole part, from a table of its distribution function, and one of the rest.
+    From a mean of 10: Ahrens and Dieter's algorithm PD (ACM Trans. Math. Softw. 8, 163, 1982), which takes the whole
+    part of a normal variable and corrects the few that need it: exact to rounding, 19 ns each (numpy's own, 30 to 55).
+    Below: the sum of a variable of the mean's whole part, from a table of its distribution function, and one of the
+    remainder.
     """
     flat = np.array(mean, np.float32).ravel()
     drawn = np.empty_like(flat)
@@ -67,7 +69,7 @@ def _fill(
 
 @njit(cache=True)
 def _few(mu: float, u: float, v: float, share: FloatArray, guide: NDArray[np.int64]) -> int:
-    """Mean below 10, from two uniform variables."""
+    """A variable of mean below 10, from two uniform variables."""
     whole = int(mu)
     count = guide[whole, int(u * _GUIDE)]
     while u >= share[whole, count]:
@@ -85,7 +87,8 @@ def _few(mu: float, u: float, v: float, share: FloatArray, guide: NDArray[np.int
 
 @njit(cache=True)
 def _corrected(mu: float, s: float, k: int, u: float, rng: np.random.Generator) -> int:
-    """Steps P, Q, E and H of PD: accept the candidate, or draw from the double exponential hat over what the normal lacks."""
+    """Steps P, Q, E and H of PD: accept the candidate, or draw from a double exponential hat over the difference to
+    the normal density."""
     if k >= 0:
         log_p, p, log_n, n = _densities(mu, s, k)
         if n * (1.0 - u) <= p * math.exp(log_p - log_n):
