@@ -49,7 +49,7 @@ def test_the_page_says_what_the_result_says() -> None:
     text = " ".join(page.words)
     assert "2 of 3 changed" in text and "3.9 sigma" in text and "1 % of all comparisons" in text
     assert "noise read noise e" in text and "7.2" in text and "worst of 26" in text
-    assert "0.0500 px rms apart" in text and "-1.200" in text
+    assert "0.0500 px rms difference" in text and "-1.200" in text
     assert "only A has it" in text
     assert "before<b>.json" in text  # as text, not as an element
     assert not [address for address in page.addresses if not address.startswith("data:")]
@@ -76,7 +76,7 @@ def test_vectors_stand_on_the_grid_and_are_enlarged_as_said() -> None:
 def test_nothing_in_common_still_makes_a_page_and_a_bad_place_one_line(tmp_path: Path) -> None:
     empty = RESULT.model_copy(update={"changes": (), "projection": ()})
     file = write_comparison(tmp_path / "new", empty)
-    assert "nothing that both calibrations state" in file.read_text(encoding="utf-8")
+    assert "No quantity is stated with an uncertainty by both" in file.read_text(encoding="utf-8")
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="can't be written"):
         write_comparison(tmp_path / "file", empty)

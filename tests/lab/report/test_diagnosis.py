@@ -36,7 +36,7 @@ def test_the_map_has_every_measurement_and_its_worst_place() -> None:
 def test_a_second_map_shows_what_named_effects_leave() -> None:
     named = NamedEffect(name="defocus", probability=1.0, sides=("left",), parameters={}, statement="")
     maps = place_maps(RESULT.model_copy(update={"effects": (named,)}), ("left",))
-    assert [title for title, _ in maps] == ["left, baseline", "left, with the named effects"]
+    assert [title for title, _ in maps] == ["left, baseline", "left, improved model"]
     assert maps[1][1]["layout"]["annotations"] == []
 
 
@@ -63,7 +63,7 @@ def test_tables_and_pictures_are_ready_for_the_page() -> None:
     )
     made = context(RESULT.model_copy(update={"visibility": (seen, shape), "pictures": (picture,)}), ("left", "right"))
     assert made["visibility"]["defocus"]["right"].smallest == "defocus 2.3 µm"
-    assert made["visibility"]["infrared_cut_filter"]["right"].smallest == "its place matters, not its size"
+    assert made["visibility"]["infrared_cut_filter"]["right"].smallest == "not a matter of size"
     assert (made["residual_pictures"][0].rms_before, made["residual_pictures"][0].rms_after) == ("3.00", "1.00")
     assert made["residual_pictures"][0].before.startswith("data:image/png;base64,")
     assert context(None, ("left",)) == {}

@@ -81,7 +81,7 @@ def test_a_sheet_with_photons_has_the_standards_table_and_plots() -> None:
     ]
     assert "1 pixels are hot" in sheet.defects
     assert "row 10, column 20" in sheet.defects
-    assert [title for title, _, _ in sheet.maps] == ["Offset", "Dark current", "Gain, shading taken out"]
+    assert [title for title, _, _ in sheet.maps] == ["Offset", "Dark current", "Gain, shading removed"]
 
 
 def test_a_sheet_without_photons_says_so() -> None:

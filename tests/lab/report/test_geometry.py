@@ -82,7 +82,7 @@ def test_facts_tell_the_warp_the_halves_and_the_models(rig):
     _, (left, _), _ = rig
     rows = dict(facts(left))
     assert "bend x" in rows["warp of the board (9 x 12 squares of 25 mm, none)"]
-    assert "px apart" in rows["two halves of the views"]
+    assert "px difference" in rows["cross-validation of two halves of the views"]
     assert sum(name.startswith("distortion") for name in rows) == 3
     assert sum("chosen" in text for text in rows.values()) == 1
 

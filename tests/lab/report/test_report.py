@@ -86,9 +86,9 @@ def test_every_anchor_leads_somewhere(small_set: Callable[..., RecordingSet], ma
 
 def test_page_says_what_the_results_say(page: Page) -> None:
     for words in (
-        "The baseline model leaves physics out, and it has a name.",
+        "The baseline model leaves physics out; the named effects account for it.",
         "Optical low pass filter (left, probability 0.994): displacement x 2.104 ± 0.051 µm",
-        "The right camera conceals nothing that these recordings would show.",
+        "The right camera shows no mismatch in these recordings.",
         "0.18..0.41 cy/px, all channels",
         "χ² falls from 9120 to 480 over 468 numbers",
         "defocus (0.006)",
