@@ -280,6 +280,7 @@ class Effect(Schema):
     reference: str
     sentence: str
     parameters: tuple[Parameter, ...]
-    shown_by: tuple[str, ...] = Field(description="kinds of capture that can show it")
+    measurements: tuple[str, ...] = Field(description="measurements of a diagnosis that show it; none: nothing does")
+    shown_by: tuple[str, ...] = Field(description="kinds of capture that these measurements come from")
     rivals: tuple[str, ...] = Field(description="effects that can look the same in some captures")
     invariances: tuple[str, ...] = Field(description="what it doesn't depend on")

@@ -11,6 +11,7 @@ from api.keys import Permission, StoredKey
 from api.schemas import Effect, Me, Parameter
 from api.security import Demand
 from api.service import READ
+from lab.diagnose.visibility import visibility
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect as EffectType
 from sim.effects.library import effects
@@ -45,14 +46,16 @@ def list_parameters() -> list[Parameter]:
 
 
 def _effect(effect: type[EffectType]) -> Effect:
+    shown = visibility().get(effect.name)
     return Effect(
         name=effect.name,
         stage=", ".join(effect.stages()),
         reference=effect.reference,
         sentence=effect.sentence,
         parameters=tuple(_parameter(name, quantity) for name, quantity in effect.quantities().items()),
-        shown_by=tuple(sorted(effect.shown_by)),
-        rivals=tuple(sorted(effect.rivals)),
+        measurements=shown.measurements if shown else (),
+        shown_by=shown.capture_kinds if shown else (),
+        rivals=shown.rivals if shown else (),
         invariances=tuple(sorted(effect.invariances)),
     )
 

@@ -132,14 +132,17 @@ def effects(
     name: Annotated[str, typer.Argument(metavar="[NAME]", help="one effect, with all that it declares")] = "",
 ) -> None:
     """The library of effects: what a diagnosis can name, and what a camera file can have."""
+    from lab.diagnose.visibility import visibility
     from sim.effects import library
 
     if not name:
         table = Table(box=None, pad_edge=False)
-        for heading in ("effect", "acts in", "parameters"):
+        for heading in ("effect", "acts in", "captures that show it", "parameters"):
             table.add_column(heading)
         for kind in library.effects().values():
-            table.add_row(kind.name, ", ".join(kind.stages()), escape(" ".join(kind.quantities())))
+            shown = visibility().get(kind.name)
+            captures = " ".join(shown.capture_kinds) if shown else ""
+            table.add_row(kind.name, ", ".join(kind.stages()), captures or "none", escape(" ".join(kind.quantities())))
         out.print(table)
         return
     try:
@@ -156,9 +159,11 @@ def effects(
         absent = "-" if quantity.absent is None else f"{quantity.absent:g}"
         table.add_row(field, quantity.unit, *limits, usual, absent, escape(quantity.meaning))
     out.print(table)
+    shown = visibility().get(kind.name)
     for heading, told in (
-        ("shown by", sorted(kind.shown_by)),
-        ("can look like", sorted(kind.rivals)),
+        ("measurements that show it", shown.measurements if shown else ()),
+        ("captures that show it", shown.capture_kinds if shown else ()),
+        ("can look like", shown.rivals if shown else ()),
         ("doesn't depend on", sorted(kind.invariances)),
         ("after", [kind.reference]),
     ):

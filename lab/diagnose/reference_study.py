@@ -14,7 +14,7 @@ import numpy as np
 
 from lab.formats.recording_set import Manifest, RecordingSet
 from sim.camera import CameraModel, Geometry, Lens, Side, StereoRig
-from sim.forward import Exposure, dark_electrons, electron_rate, expected_electrons, read_out
+from sim.frame import Exposure, dark_electrons, expected_electrons, read_out
 from sim.scene.scenes import (
     Darkness,
     EdgeRegion,
@@ -28,6 +28,7 @@ from sim.scene.scenes import (
 from sim.scene.warp import Warp
 from sim.sensor import electrons as sensor
 from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import electron_rate
 
 ROWS, COLS, PITCH_UM, FOCAL_LENGTH_MM = 240, 320, 4.0, 3.0
 WAVELENGTH_NM = np.arange(380.0, 1001.0)
@@ -182,13 +183,13 @@ class _Drawing:
             zip(("checkerboard", "bernoulli"), targets.values(), strict=True)
         )
         files = dict(zip(("checkerboard", "bernoulli"), targets, strict=True))
-        where = {"screen": {"pose": "p0", "cell_camera_px": CELL_PX, "radiance": self.noted(light)}}
+        where: dict[str, Any] = {"screen": {"pose": "p0", "cell_camera_px": CELL_PX, "radiance": self.noted(light)}}
         exposure_s = self.exposure_for(light, 0.7)
         for kind, pattern in shown.items():
             high, wide = pattern.shape
             to_camera = Warp.of(((CELL_PX, 0, 0.5 * (COLS - 1 - wide * CELL_PX)), (0, CELL_PX, 0.5 * (ROWS - 1 - high * CELL_PX)), (0, 0, 1)))  # fmt: skip
             scene = ScreenPattern(pattern, to_camera, light.scaled(SCREEN_BLACK), light, kind)
-            more = {"target": files[kind]} if kind in files else {}
+            more: dict[str, Any] = {"target": files[kind]} if kind in files else {}
             self.take(kind, scene, exposure_s, 3, **where, **more)
 
     def boards(self) -> None:

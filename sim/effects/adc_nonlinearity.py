@@ -24,7 +24,6 @@ class AdcNonlinearity(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart"})
     sentence: ClassVar[str] = (
         "The converter's bits have wrong weights: levels jump at fixed codes, and histograms have gaps or spikes there."
     )

@@ -17,11 +17,7 @@ class AmbientLight(Effect):
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, measuring set-up"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband", "flat", "chart"})
     shapes: ClassVar[frozenset[str]] = frozenset({"red_over_blue"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {"veiling_glare", "black_level_drift", "exposure_offset", "nonlinearity", "stray_light"}
-    )
     sentence: ClassVar[str] = (
         "Light of the room reaches the sensor: all lit captures carry a signal that grows with the exposure and not with the source."
     )

@@ -21,8 +21,6 @@ class AmplifierGlow(Effect):
     reference: ClassVar[str] = "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, luminescence"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"dark_current_temperature"})
     shapes: ClassVar[frozenset[str]] = frozenset({"reach_mm"})
     sentence: ClassVar[str] = (
         "The output stage glows: dark frames brighten with the exposure towards one corner, whatever is in front of the lens."

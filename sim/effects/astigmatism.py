@@ -17,18 +17,6 @@ class Astigmatism(Effect):
     reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "coma",
-            "defocus",
-            "field_curvature",
-            "optical_low_pass_filter",
-            "vibration_blur",
-            "charge_diffusion",
-            "spherical_aberration",
-        }
-    )
     sentence: ClassVar[str] = (
         "The lens is astigmatic: horizontal and vertical detail come to focus in different planes, so that their contrasts differ."
     )

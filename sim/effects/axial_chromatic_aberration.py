@@ -25,8 +25,6 @@ class AxialChromaticAberration(Effect):
     reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on chromatic aberration"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"defocus", "spherical_aberration", "charge_diffusion"})
     sentence: ClassVar[str] = (
         "The lens doesn't focus all colours in one plane: some channels are sharper than others, and which ones they are changes "
         "with the focus."

@@ -41,11 +41,8 @@ class Effect(Frozen):
     invariances: ClassVar[frozenset[str]] = frozenset()
     #: Parameters that shape the effect without sizing it (a filter's edge): a score takes them from the prototype as they are.
     shapes: ClassVar[frozenset[str]] = frozenset()
-    #: Kinds of capture that can show it (`dark`, `flat`, `narrowband`, `slanted_edge`, ...); none: a part that a camera is known to
-    #: have, which acts like another effect and so is never looked for.
-    shown_by: ClassVar[frozenset[str]] = frozenset()
-    #: Names of effects that can look the same in some set of captures.
-    rivals: ClassVar[frozenset[str]] = frozenset()
+    #: Whether a diagnosis looks for it. False: a part that a camera is known to have, or a term of the diagnosis itself.
+    is_candidate: ClassVar[bool] = True
     #: One sentence for the report: what physics was left out and how that shows.
     sentence: ClassVar[str]
 

@@ -18,10 +18,6 @@ class BlackLevelDrift(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "level", "orientation"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat", "narrowband", "chart"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {"ambient_light", "dark_current_temperature", "exposure_offset", "nonlinearity", "stray_light", "veiling_glare"}
-    )
     sentence: ClassVar[str] = (
         "The black level drifts: all captures carry an additional offset that grows with time or temperature and not with light."
     )

@@ -20,7 +20,6 @@ class Blooming(Effect):
     reference: ClassVar[str] = "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, blooming"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"white", "slanted_edge", "bernoulli"})
     sentence: ClassVar[str] = (
         "Overfull pixels run over: bright streaks stand above and below saturated places, along the columns alone."
     )

@@ -26,8 +26,6 @@ class BrighterFatter(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"inter_pixel_capacitance", "nonlinearity", "on_chip_smoothing"})
     sentence: ClassVar[str] = (
         "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is on its line, and what is missing is common to neighbours."
     )

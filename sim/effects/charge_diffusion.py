@@ -26,19 +26,6 @@ class ChargeDiffusion(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"wavelength_power"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "axial_chromatic_aberration",
-            "defocus",
-            "optical_low_pass_filter",
-            "spherical_aberration",
-            "pixel_aperture",
-            "crosstalk",
-            "vibration_blur",
-            "astigmatism",
-        }
-    )
     sentence: ClassVar[str] = (
         "Charge diffuses to neighbouring pixels before it is collected: contrast falls as a bell curve of spatial frequency, "
         "alike in all directions, at all f-numbers, and never less in red than in blue."

@@ -19,8 +19,6 @@ class ColumnNoise(Effect):
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, spatial and temporal variances of rows and columns"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"row_noise"})
     sentence: ClassVar[str] = (
         "Columns have offsets of their own: the same stripes stand in every frame, dark or bright."
     )

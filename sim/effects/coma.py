@@ -21,8 +21,6 @@ class Coma(Effect):
     reference: ClassVar[str] = "V. Mahajan, Optical Imaging and Aberrations, part II, section 4.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"astigmatism", "spherical_aberration"})
     sentence: ClassVar[str] = (
         "The lens has coma: points have a tail to one side, so that edges are lopsided along one direction and even across it."
     )

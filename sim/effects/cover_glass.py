@@ -20,6 +20,7 @@ class CoverGlass(Effect):
     """
 
     name: ClassVar[str] = "cover_glass"
+    is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "V. Mahajan, Optical Imaging and Aberrations, part I, section 5.8"
     form_tolerance: ClassVar[float] = 0.06
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})

@@ -23,21 +23,6 @@ class Crosstalk(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time", "field"})
     shapes: ClassVar[frozenset[str]] = frozenset({"row_excess", "corner_share"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart", "slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "charge_diffusion",
-            "defocus",
-            "optical_low_pass_filter",
-            "pixel_aperture",
-            "spherical_aberration",
-            "vibration_blur",
-            "stray_light",
-            "on_chip_smoothing",
-            "green_imbalance",
-            "inter_pixel_capacitance",
-        }
-    )
     sentence: ClassVar[str] = (
         "Charge or light leaks into neighbouring pixels: each colour answers where only its neighbours should, and contrast falls."
     )

@@ -17,8 +17,6 @@ class DarkCurrentTemperature(Effect):
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, dark current and doubling temperature"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "orientation"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"amplifier_glow", "black_level_drift"})
     sentence: ClassVar[str] = (
         "The sensor's temperature changed: dark charge, mean and noise together, grows with the exposure and doubles every few degrees."
     )

@@ -22,8 +22,6 @@ class Decentre(Effect):
     reference: ClassVar[str] = "D. C. Brown, Photogramm. Eng. 32, 444 (1966)"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco", "checkerboard"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"distortion"})
     sentence: ClassVar[str] = (
         "An element of the lens is off centre: corners lie off across the radius as well as along it, on one side of the frame "
         "more than on the other."

@@ -17,20 +17,6 @@ class Defocus(Effect):
     reference: ClassVar[str] = "H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955)"
     form_tolerance: ClassVar[float] = 0.04
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "axial_chromatic_aberration",
-            "field_curvature",
-            "spherical_aberration",
-            "charge_diffusion",
-            "optical_low_pass_filter",
-            "astigmatism",
-            "crosstalk",
-            "pixel_aperture",
-            "vibration_blur",
-        }
-    )
     sentence: ClassVar[str] = (
         "The sensor is not in the image plane: contrast falls alike in all directions, with the shape of a defocused pupil, "
         "and would come back on stopping down."

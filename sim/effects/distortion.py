@@ -27,8 +27,6 @@ class Distortion(Effect):
     reference: ClassVar[str] = "D. C. Brown, Photogramm. Eng. 37, 855 (1971)"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco", "checkerboard"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"decentre"})
     sentence: ClassVar[str] = (
         "The lens distorts otherwise than the geometry says: straight lines bend, and corners lie off along the radius."
     )

@@ -18,8 +18,6 @@ class ExposureOffset(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "wavelength", "field", "level", "orientation", "time"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity", "source_drift", "ambient_light", "black_level_drift"})
     sentence: ClassVar[str] = (
         "The exposure is off by a constant time: the share of signal that is missing or too much grows as exposures get short."
     )

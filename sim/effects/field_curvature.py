@@ -22,8 +22,6 @@ class FieldCurvature(Effect):
     reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on aberrations"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"defocus", "astigmatism"})
     sentence: ClassVar[str] = (
         "The plane of focus is bowed or tilted against the sensor: the image is sharp in some places and out of focus in others."
     )

@@ -22,8 +22,6 @@ class Ghost(Effect):
     reference: ClassVar[str] = "E. Oleszko et al., Computer Graphics Forum 36, 165 (2017)"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"bernoulli", "chart"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"veiling_glare"})
     sentence: ClassVar[str] = (
         "Light that the sensor sends back is reflected again by the lens: a weak copy of the scene lies over it, turned by half a "
         "turn about the axis."

@@ -20,8 +20,6 @@ class GreenImbalance(Effect):
     )
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "white"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"crosstalk"})
     sentence: ClassVar[str] = (
         "The two greens differ: in even light green pixels on red rows and on blue rows have different signals, in one ratio at all levels."
     )

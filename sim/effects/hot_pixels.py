@@ -21,8 +21,6 @@ class HotPixels(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "wavelength", "field", "level", "orientation", "time"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"random_telegraph_noise"})
     shapes: ClassVar[frozenset[str]] = frozenset({"share_ppm", "relative_spread"})
     sentence: ClassVar[str] = (
         "A few pixels are hot: always the same ones, they collect dark charge that grows with the exposure and stands far above the rest."

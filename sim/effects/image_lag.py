@@ -21,7 +21,6 @@ class ImageLag(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "level", "orientation"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
     sentence: ClassVar[str] = (
         "Charge stays behind: a frame holds a share of the one before it, so that a dark frame after a bright one shows its ghost."
     )

@@ -26,10 +26,6 @@ class InfraredCutFilter(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"cut_wavelength_nm", "width_nm", "steepening"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband", "chart"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {"wavelength_offset", "source_bandwidth", "second_order_light", "stray_light"}
-    )
     sentence: ClassVar[str] = (
         "An infrared-cut filter stands before the sensor: all channels lose their red end at the same wavelength."
     )

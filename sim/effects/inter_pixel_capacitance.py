@@ -16,8 +16,6 @@ class InterPixelCapacitance(Crosstalk):
 
     name: ClassVar[str] = "inter_pixel_capacitance"
     reference: ClassVar[str] = "A. C. Moore, Z. Ninkov, W. J. Forrest, Optical Engineering 45, 076402 (2006)"
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart", "slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"crosstalk", "on_chip_smoothing", "brighter_fatter"})
     sentence: ClassVar[str] = (
         "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is common to neighbours at all levels of light, but not in the dark."
     )

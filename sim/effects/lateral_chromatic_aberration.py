@@ -25,8 +25,6 @@ class LateralChromaticAberration(Effect):
     reference: ClassVar[str] = "ISO 19084:2015"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco", "slanted_edge", "checkerboard", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset()
     sentence: ClassVar[str] = (
         "The lens images colours at different scales: towards the corners red and blue detail lies further out or in than green."
     )

@@ -40,7 +40,7 @@ def effect(name: str) -> type[Effect]:
 
 def candidates() -> tuple[type[Effect], ...]:
     """The effects that a diagnosis looks for."""
-    return tuple(kind for kind in effects().values() if kind.shown_by)
+    return tuple(kind for kind in effects().values() if kind.is_candidate)
 
 
 #: Any camera with a mosaic: which laws an effect adds doesn't depend on it.

@@ -24,7 +24,6 @@ class LightFlicker(Effect):
     reference: ClassVar[str] = "IEEE Std 1789-2015, modulation of current in high-brightness LEDs"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "white"})
     shapes: ClassVar[frozenset[str]] = frozenset({"frequency_hz", "line_time_us"})
     sentence: ClassVar[str] = (
         "The light flickers: dark and bright bands move over the rows from frame to frame, and vanish at exposures of whole periods."

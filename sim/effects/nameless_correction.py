@@ -26,6 +26,7 @@ class NamelessCorrection(Effect):
     """
 
     name: ClassVar[str] = "nameless_correction"
+    is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "M. C. Kennedy and A. O'Hagan, J. R. Statist. Soc. B 63, 425 (2001)"
     form_tolerance: ClassVar[float] = 0.2
     sentence: ClassVar[str] = (

@@ -20,9 +20,7 @@ class NonUniformIllumination(Effect):
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, homogeneity of the source"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
     shapes: ClassVar[frozenset[str]] = frozenset({"bow"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"vignetting", "vignetting_decentre"})
     sentence: ClassVar[str] = (
         "The illumination is not uniform: flat fields slope across the frame, alike in all channels."
     )

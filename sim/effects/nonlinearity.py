@@ -22,19 +22,6 @@ class Nonlinearity(Effect):
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, linearity"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband", "chart"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "exposure_offset",
-            "source_drift",
-            "black_level_drift",
-            "ambient_light",
-            "brighter_fatter",
-            "veiling_glare",
-            "radiometer_nonlinearity",
-            "screen_gamma",
-        }
-    )
     sentence: ClassVar[str] = (
         "The response bends: the signal a photon leaves depends on the level, alike in all channels and exposures."
     )

@@ -29,7 +29,6 @@ class OnChipFilter(Effect):
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"corner_share"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli", "flat", "dark"})
 
     @abstractmethod
     def detail(self) -> tuple[float, float]:

@@ -15,7 +15,6 @@ class OnChipSharpening(OnChipFilter):
 
     name: ClassVar[str] = "on_chip_sharpening"
     reference: ClassVar[str] = "ISO 12233:2023, annex on sharpening"
-    rivals: ClassVar[frozenset[str]] = frozenset({"pixel_aperture"})
     sentence: ClassVar[str] = (
         "The camera sharpens on the chip: contrast rises above what optics and pixel allow, and the noise of neighbouring pixels is opposed, bright or dark."
     )

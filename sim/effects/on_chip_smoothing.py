@@ -15,9 +15,6 @@ class OnChipSmoothing(OnChipFilter):
 
     name: ClassVar[str] = "on_chip_smoothing"
     reference: ClassVar[str] = "ISO 15739:2023, annex on noise filtering"
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {"brighter_fatter", "crosstalk", "inter_pixel_capacitance", "pixel_aperture"}
-    )
     sentence: ClassVar[str] = (
         "The camera smooths on the chip: contrast falls alike at all apertures, and neighbouring pixels have noise in common, bright or dark."
     )

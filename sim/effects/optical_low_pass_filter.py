@@ -28,18 +28,6 @@ class OpticalLowPassFilter(Effect):
     reference: ClassVar[str] = "Walker-Pavlopoulos plate displacement; J. Greivenkamp, Appl. Opt. 29, 676 (1990)"
     form_tolerance: ClassVar[float] = 0.01
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "defocus",
-            "charge_diffusion",
-            "vibration_blur",
-            "pixel_aperture",
-            "astigmatism",
-            "crosstalk",
-            "spherical_aberration",
-        }
-    )
     sentence: ClassVar[str] = (
         "A birefringent anti-alias filter splits each ray into displaced copies: contrast falls as a cosine of spatial "
         "frequency, alike in all colours and at all f-numbers, along rows and columns apart."

@@ -23,6 +23,7 @@ class OtherFNumber(Effect):
     """
 
     name: ClassVar[str] = "other_f_number"
+    is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "J. W. Goodman, Introduction to Fourier Optics, chapter 6"
     form_tolerance: ClassVar[float] = 0.03
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})

@@ -23,19 +23,6 @@ class PixelAperture(Effect):
     )
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "charge_diffusion",
-            "on_chip_sharpening",
-            "on_chip_smoothing",
-            "optical_low_pass_filter",
-            "defocus",
-            "crosstalk",
-            "vibration_blur",
-            "spherical_aberration",
-        }
-    )
     sentence: ClassVar[str] = (
         "The pixel's aperture differs from the stated one: contrast at high frequencies differs alike in all colours and at all f-numbers."
     )

@@ -25,8 +25,6 @@ class RadiometerNonlinearity(Effect):
     form_tolerance: ClassVar[float] = 0.04
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"growth"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity"})
     sentence: ClassVar[str] = (
         "The radiometer isn't linear: the sensitivity that is measured follows the level of the light and not its wavelength, alike in all channels."
     )

@@ -22,8 +22,6 @@ class RandomTelegraphNoise(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"hot_pixels"})
     shapes: ClassVar[frozenset[str]] = frozenset({"share_percent", "relative_spread"})
     sentence: ClassVar[str] = (
         "A few pixels blink: always the same ones jump between two levels, with far more temporal noise than their neighbours."

@@ -19,8 +19,6 @@ class RowNoise(Effect):
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, spatial and temporal variances of rows and columns"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"dark", "flat"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"column_noise"})
     shapes: ClassVar[frozenset[str]] = frozenset({"correlation"})
     sentence: ClassVar[str] = (
         "Rows are read with a disturbance of their own: row means scatter far more than single pixels would make them."

@@ -30,8 +30,6 @@ class ScreenGamma(Effect):
         {"f_number", "exposure", "wavelength", "level", "orientation", "time"}
     )
     shapes: ClassVar[frozenset[str]] = frozenset({"rim_px"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"checkerboard", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity"})
     sentence: ClassVar[str] = (
         "The screen's light isn't in proportion to what it is asked for: the greys at the rims of cells are off, and lit cells look "
         "smaller or larger than drawn."

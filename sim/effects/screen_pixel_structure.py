@@ -21,8 +21,6 @@ class ScreenPixelStructure(Effect):
     reference: ClassVar[str] = "I. Amidror, The Theory of the Moire Phenomenon, Springer 2009"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"white"})
-    rivals: ClassVar[frozenset[str]] = frozenset()
     sentence: ClassVar[str] = (
         "The screen's own pixels are resolved: a fine grid lies over everything that it shows, and over nothing else."
     )

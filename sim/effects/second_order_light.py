@@ -19,8 +19,6 @@ class SecondOrderLight(Effect):
     reference: ClassVar[str] = "C. Palmer, Diffraction Grating Handbook, free spectral range and order sorting"
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"infrared_cut_filter", "wavelength_offset", "stray_light"})
     sentence: ClassVar[str] = (
         "The monochromator lets its second order through: from twice the shortest wavelength on, channels that see half of it answer."
     )

@@ -22,8 +22,6 @@ class SourceBandwidth(Effect):
     reference: ClassVar[str] = "E. and R. Stearns, Color Res. Appl. 13, 257 (1988)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"infrared_cut_filter", "wavelength_offset"})
     sentence: ClassVar[str] = (
         "The narrowband light is wider than stated: the sensitivities' peaks come out lower and their valleys higher."
     )

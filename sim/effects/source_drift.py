@@ -22,9 +22,7 @@ class SourceDrift(Effect):
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, irradiation"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "orientation"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
     shapes: ClassVar[frozenset[str]] = frozenset({"settling_min"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"nonlinearity", "exposure_offset"})
     sentence: ClassVar[str] = "The source drifts: signals follow the time of the capture and not the level."
 
     drift_percent_per_min: Annotated[

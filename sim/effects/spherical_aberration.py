@@ -17,20 +17,6 @@ class SphericalAberration(Effect):
     reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "axial_chromatic_aberration",
-            "coma",
-            "defocus",
-            "charge_diffusion",
-            "optical_low_pass_filter",
-            "crosstalk",
-            "astigmatism",
-            "pixel_aperture",
-            "vibration_blur",
-        }
-    )
     sentence: ClassVar[str] = (
         "The lens has spherical aberration: a sharp core with a halo, alike in all directions, that stopping down removes."
     )

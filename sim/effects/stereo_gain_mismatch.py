@@ -22,8 +22,6 @@ class StereoGainMismatch(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"exposure", "wavelength", "field", "level", "orientation", "time"}
     )
-    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco", "white", "chart"})
-    rivals: ClassVar[frozenset[str]] = frozenset()
     sentence: ClassVar[str] = (
         "In the same scene the right camera answers otherwise, beside the left one, than both do to uniform light: by one factor "
         "over the whole scene."

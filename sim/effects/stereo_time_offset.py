@@ -16,8 +16,6 @@ class StereoTimeOffset(Effect):
     reference: ClassVar[str] = "P. Furgale, J. Rehder and R. Siegwart, IROS 2013"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"charuco"})
-    rivals: ClassVar[frozenset[str]] = frozenset()
     sentence: ClassVar[str] = (
         "The right camera captures at another time than the left one: boards that move lie off their place in proportion to their "
         "speed."

@@ -19,17 +19,6 @@ class StrayLight(Effect):
     reference: ClassVar[str] = "Y. Zong et al., Appl. Opt. 45, 1111 (2006)"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "ambient_light",
-            "black_level_drift",
-            "veiling_glare",
-            "crosstalk",
-            "infrared_cut_filter",
-            "second_order_light",
-        }
-    )
     sentence: ClassVar[str] = (
         "The monochromator leaks light of all wavelengths: channels answer where they should be blind, in proportion to the lamp."
     )

@@ -19,10 +19,6 @@ class VeilingGlare(Effect):
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"halo_share", "halo_reach"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"chart", "checkerboard", "bernoulli", "slanted_edge"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {"ambient_light", "black_level_drift", "ghost", "nonlinearity", "stray_light"}
-    )
     sentence: ClassVar[str] = (
         "Light scattered in the lens veils the frame: dark patches and dark squares are raised by a share of the light around them, "
         "while uniform fields stay as they are."

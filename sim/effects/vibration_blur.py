@@ -21,18 +21,6 @@ class VibrationBlur(Effect):
     reference: ClassVar[str] = "J. Hadar, I. Dror, N. Kopeika, Opt. Eng. 33, 566 (1994)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"slanted_edge", "bernoulli"})
-    rivals: ClassVar[frozenset[str]] = frozenset(
-        {
-            "optical_low_pass_filter",
-            "astigmatism",
-            "defocus",
-            "charge_diffusion",
-            "crosstalk",
-            "pixel_aperture",
-            "spherical_aberration",
-        }
-    )
     sentence: ClassVar[str] = (
         "The image moved during the exposure: contrast falls along one direction and is whole across it."
     )

@@ -24,9 +24,7 @@ class Vignetting(Effect):
     reference: ClassVar[str] = "ISO 17957:2015"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
     shapes: ClassVar[frozenset[str]] = frozenset({"exponent"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"non_uniform_illumination", "vignetting_decentre"})
     sentence: ClassVar[str] = (
         "The lens vignettes: flat fields fall towards the corners more than the cosine law says, alike in all channels."
     )

@@ -22,8 +22,6 @@ class VignettingDecentre(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"centre_x", "centre_y", "exponent"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"flat", "narrowband"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"vignetting", "non_uniform_illumination"})
     sentence: ClassVar[str] = (
         "The lens vignettes about a point beside the sensor's middle: flat fields fall off around another place than the centre, alike in all channels."
     )

@@ -18,8 +18,6 @@ class WavelengthOffset(Effect):
     reference: ClassVar[str] = "CIE 214:2014"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation"})
-    shown_by: ClassVar[frozenset[str]] = frozenset({"narrowband"})
-    rivals: ClassVar[frozenset[str]] = frozenset({"infrared_cut_filter", "source_bandwidth", "second_order_light"})
     sentence: ClassVar[str] = (
         "The wavelength scale is shifted: the measured sensitivities follow the maker's curves beside themselves, on rising and falling slopes with opposite sign."
     )

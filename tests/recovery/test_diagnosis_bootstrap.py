@@ -10,7 +10,7 @@ from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.measurements.blocks import measurement_model
 from mocks.former import ConcealedCamera, Plan
-from sim.effects.library import effects
+from sim.effects.library import candidates
 
 DRAWS = 24
 
@@ -23,7 +23,7 @@ def test_the_threshold_holds_on_images(seed: int, cfa: str) -> None:
     recordings = recordings_of(ConcealedCamera(seed, cfa=cfa, rows=96, cols=128), Plan())
     model, _ = measurement_model(recordings, "left")
     assert model is not None
-    known = [e for e in effects().values() if e.shown_by]
+    known = candidates()
     threshold = signatures(model, model.camera, (), known).threshold(np.random.default_rng(0), 0.99, 400)
     draws = healthy_draws(recordings, "left", model, DRAWS, np.random.default_rng(seed))
     tops = sorted(d.top_score for d in draws)

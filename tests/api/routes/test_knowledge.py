@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lab.diagnose.visibility import visibility
 from sim.camera import CameraModel
 from sim.effects.library import effects
 from sim.parameters import declared
@@ -23,8 +24,11 @@ def test_effects_are_those_of_the_library(shared: Running) -> None:
         assert [one["name"] for one in told] == list(effects())
         for one in told:
             effect = effects()[one["name"]]
-            assert one["reference"] == effect.reference and set(one["shown_by"]) == effect.shown_by
-            assert set(one["rivals"]) == effect.rivals
+            shown = visibility()[one["name"]]
+            assert one["reference"] == effect.reference
+            assert tuple(one["measurements"]) == shown.measurements
+            assert tuple(one["shown_by"]) == shown.capture_kinds
+            assert tuple(one["rivals"]) == shown.rivals
             assert [p["name"] for p in one["parameters"]] == list(effect.quantities())
         assert client.get("/api/v1/effects/optical_low_pass_filter").json() in told
         assert client.get("/api/v1/effects/magic").status_code == 404
