@@ -1,6 +1,6 @@
 """An instrument's blocking calls in threads of their own, each with a time-out.
 
-A driver that breaks its promise to come back can't hang a session then.
+A driver that never returns can't hang a session then.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ STOP_S = 15.0
 
 
 def in_thread(call: Callable[[], T]) -> Future[T]:
-    """Run a blocking call in a daemon thread: one that never returns must not keep the process from ending."""
+    """Run a blocking call in a daemon thread, so that a call which never returns doesn't keep the process alive."""
     future: Future[T] = Future()
-    # From here on it can't be cancelled, as little as the call can: whoever gives up on it just doesn't look any more.
+    # The call can't be cancelled, so the future must not be, either: it has to accept a late result.
     future.set_running_or_notify_cancel()
 
     def work() -> None:
@@ -38,7 +38,7 @@ def in_thread(call: Callable[[], T]) -> Future[T]:
 
 
 class Status:
-    """A `bluesky.protocols.Status` of a blocking call, failed with `NoAnswer` if it isn't back within `timeout_s`."""
+    """A `bluesky.protocols.Status` of a blocking call, which fails with `NoAnswer` after `timeout_s`."""
 
     def __init__(self, who: str, call: Callable[[], object], timeout_s: float) -> None:
         self._lock = threading.Lock()
@@ -87,7 +87,7 @@ class Status:
 
 
 async def bounded(who: str, call: Callable[[], object], timeout_s: float = STOP_S) -> None:
-    """Await a blocking call, for so long at most."""
+    """Await a blocking call for `timeout_s` at most. Raises NoAnswer then."""
     try:
         await asyncio.wait_for(asyncio.wrap_future(in_thread(call)), timeout_s)
     except TimeoutError as error:

@@ -43,7 +43,7 @@ class Device:
         self.name = name
 
     def readings(self) -> dict[str, float | str]:
-        """What the device adds to an event, by key; the type of a value never changes."""
+        """What the device adds to an event, by key. A key's value always has the same type."""
         raise NotImplementedError
 
     def read(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class ShutterDevice(Device):
         await self.stop()
 
     def resume(self) -> None:
-        """Nothing: a step sets the bench anew after a pause, and opens the shutter if it needs it."""
+        """Nothing: after a pause, each step sets the bench and opens the shutter if it needs light."""
 
     def readings(self) -> dict[str, float | str]:
         return {"shutter_open": float(bool(self.value))}
@@ -187,14 +187,14 @@ class ScreenDevice(Device):
         await self.stop()
 
     def resume(self) -> None:
-        """Nothing: a step shows its pattern anew after a pause."""
+        """Nothing: after a pause, each step shows its pattern."""
 
     def readings(self) -> dict[str, float | str]:
         return {"pattern": (self.value.path or "") if self.value else ""}
 
 
 class RadiometerDevice(Device):
-    """The spectroradiometer. Prepared with the path of the spectrum to come, triggered to measure it."""
+    """The spectroradiometer. Prepared with the path of the next spectrum, and triggered to measure it."""
 
     def __init__(self, radiometer: Spectroradiometer, write: WriteSpectrum) -> None:
         super().__init__("spectroradiometer")
@@ -277,7 +277,7 @@ class CamerasDevice(Device):
             try:
                 together = capture_together(list(self.cameras.values()))
             except NoAnswer:
-                # A frame lost on a busy bus isn't a broken camera: nothing of it was kept, so once more is safe.
+                # A frame may get lost on a busy bus. Nothing of it was kept, so a second try is safe.
                 together = capture_together(list(self.cameras.values()))
             frames = dict(zip(self.cameras, together, strict=True))
             for side, frame in frames.items():

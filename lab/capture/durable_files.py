@@ -21,7 +21,7 @@ def npy_bytes(array: NDArray[Any]) -> bytes:
 
 
 def write_durably(path: Path, content: bytes) -> None:
-    """Write a file completely or not at all, and see it onto the disk: temporary name, fsync, rename, fsync of the folder."""
+    """Write a file completely or not at all, and flush it to the disk: temporary name, fsync, rename, fsync of the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("wb") as file:
@@ -37,14 +37,14 @@ def write_durably(path: Path, content: bytes) -> None:
 
 
 class Lock:
-    """Held by one process at a time, and let go of by the system when that process ends, however it ends."""
+    """A lock on a file, held by one process at a time. The system releases it when that process ends, even by kill -9."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file: int | None = None
 
     def acquire(self, patience_s: float = 0.2) -> bool:
-        """Whether the lock is ours now; tries for `patience_s`, for a mere look at a lock holds it for a moment."""
+        """Try to take the lock for `patience_s`; whether it succeeded. It has to try, as `is_held` holds the lock for a moment."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
         until = time.monotonic() + patience_s
@@ -61,13 +61,13 @@ class Lock:
                 return True
 
     def release(self) -> None:
-        """Let go; doing it twice is fine."""
+        """Release the lock, if it is held."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
 
     def is_held(self) -> bool:
-        """Whether anyone holds it, us included."""
+        """Whether any process holds it, this one included."""
         if self._file is not None:
             return True
         if not self.path.exists():

@@ -61,7 +61,7 @@ class Instruments:
         return tuple(device for device in every if device is not None)
 
     def connect(self) -> dict[str, Identity]:
-        """Reach every instrument and bring it into its safe state; who they are, by name. Raises DeviceError."""
+        """Connect to every instrument and bring it into its safe state; the identities by name. Raises DeviceError."""
         found: dict[str, Identity] = {}
         for name, driver in self.drivers.all.items():
             try:
@@ -85,9 +85,9 @@ class Instruments:
         return found
 
     def make_safe(self) -> list[str]:
-        """Close the shutter, darken the screen, stop all motion: every instrument at once, each for `STOP_S` at most.
+        """Close the shutter, darken the screen, stop all motion: every instrument at once, within `STOP_S`.
 
-        What didn't obey is returned, one line each.
+        Returns one line for each instrument that failed to.
         """
         stopping = {name: in_thread(driver.stop) for name, driver in self.drivers.all.items()}
         complaints = []
@@ -102,7 +102,7 @@ class Instruments:
         return complaints
 
     def close(self) -> None:
-        """Let go of all lines. Never raises."""
+        """Close all connections. Never raises."""
         closing = [in_thread(driver.close) for driver in self.drivers.all.values()]
         until = time.monotonic() + STOP_S
         for future in closing:

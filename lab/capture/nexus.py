@@ -26,7 +26,7 @@ def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
 
 
 def _chunk(frame: NDArray[np.uint16]) -> bytes:
-    """A frame as HDF5's shuffle and gzip filters would leave it; zlib lets other threads run, HDF5's own filters don't."""
+    """A frame as HDF5's shuffle and gzip filters encode it. HDF5's own filters would block other threads; zlib doesn't."""
     shuffled = np.ascontiguousarray(frame.astype("<u2").view(np.uint8).reshape(-1, 2).T)
     return zlib.compress(shuffled.tobytes(), _GZIP_LEVEL)
 
@@ -39,7 +39,7 @@ def write_nexus(
     files: Sequence[StoredFile],
     progress: Callable[[str, float], None] | None,
 ) -> dict[str, int]:
-    """Write the NeXus-layout file; the place of every frame in its side's stack is returned.
+    """Write the NeXus-layout file; returns the index of every frame in its side's stack.
 
     `/entry/instrument/SIDE` is an NXdetector whose `data` stacks that side's frames in the order in which they were taken;
     `/entry/spectra` and `/entry/targets` hold the rest, `/entry/manifest` the manifest as JSON.

@@ -1,4 +1,4 @@
-"""What the store tells of sessions, captures, results and files."""
+"""Records of the store: sessions, captures, results, files and steps."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class CaptureInfo(_Record):
 
 
 class ResultInfo(_Record):
-    """A stored result; `document` as `spec/results.md` has it."""
+    """A stored result; `document` as `docs/results.md` has it."""
 
     id: str
     job_id: str | None
@@ -79,7 +79,7 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """A step of the journal with what came of it; `finished` None: still to do."""
+    """A step of the journal and its result; `finished` None: still to do."""
 
     step: Step
     finished: datetime | None

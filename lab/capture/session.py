@@ -1,4 +1,4 @@
-"""Run a session on a station: every step once, whatever comes between.
+"""Run a session on a station: every step exactly once, through interruptions.
 
 bluesky's RunEngine runs the plan; the journal in the registry says which steps are done. A run that ended early (Ctrl-C, an
 instrument that failed, kill -9, a power cut) is resumed by running the session again: finished steps are not taken again, and
@@ -42,7 +42,7 @@ from sim.parameters import Frozen
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-# A library's place: whoever wants bluesky's log configures it; its last resort would write tracebacks over progress bars.
+# Without a handler, bluesky's errors would go to stderr as tracebacks, across the progress bar.
 logging.getLogger("bluesky").addHandler(logging.NullHandler())
 # The RunEngine announces pauses and aborts on stdout, which belongs to the command line.
 bluesky.run_engine.__dict__["print"] = lambda *words, **_: log.debug(" ".join(map(str, words)))
@@ -54,7 +54,7 @@ PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
 
 
 class Progress(Frozen):
-    """Where a session stands. `done` of `total` steps are in the journal; `what` is under way; times in s."""
+    """Progress of a session: `done` of `total` steps are in the journal, `what` is the current one; times in s."""
 
     session: str
     state: Literal["connecting", "running", "paused", "packing", "interrupted", "failed", "finished"]
@@ -87,8 +87,10 @@ class _Pace:
 
 
 class _Writes:
-    """Lets a run write until it is over. An abort doesn't end the threads that wait for instruments: one that comes back
-    late must not touch the files and steps of the run after."""
+    """Allows writes until the run is over.
+
+    An abort doesn't end the threads that wait for instruments. One that returns late must not write into the next run's files.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -102,7 +104,7 @@ class _Writes:
             return write()
 
     def close(self) -> None:
-        """Wait for what is being written, and let nothing more through."""
+        """Wait for the current write, and refuse all later ones."""
         with self._lock:
             self._over = True
 
@@ -110,8 +112,8 @@ class _Writes:
 class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
-    `station`: the one that the session began on, unless its instruments have moved to other addresses since. `on_progress`
-    is called from a thread of the run; what it raises ends the run.
+    `station`: None for the station that the session began on; another one where its instruments have new addresses.
+    `on_progress` is called from a thread of the run. An exception that it raises ends the run.
     """
 
     def __init__(
@@ -150,7 +152,7 @@ class CaptureSession:
         on_progress: Callable[[Progress], None] | None = None,
         connect: Callable[[Station], Drivers] = drivers_of,
     ) -> CaptureSession:
-        """Register a new session, by default of everything that the station can do; `run` it then.
+        """Register a new session, by default of everything that the station can do. `run` starts it.
 
         Raises InputError if the station lacks what the plan needs.
         """
@@ -171,7 +173,7 @@ class CaptureSession:
     # --- from other threads ------------------------------------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Pause when the step under way is done: the shutter closes, the screen goes dark, all lines stay open."""
+        """Pause after the current step: the shutter closes, the screen goes dark, all connections stay open."""
         with self._control:
             engine = self._engine
         if engine is not None and engine.state == "running":
@@ -185,7 +187,7 @@ class CaptureSession:
             self._control.notify_all()
 
     def abort(self, reason: str = "aborted") -> None:
-        """End the run now. The step under way is dropped, finished ones stay; running the session again goes on from there."""
+        """End the run now. The current step is dropped, finished ones stay, and `run` continues from there."""
         with self._control:
             if self._ended_by is None:
                 self._ended_by = reason
@@ -239,7 +241,7 @@ class CaptureSession:
         self._tell("interrupted", self._ended_by or "")
 
     def _capture(self) -> None:
-        """Connect, run the plan, and leave everything safe."""
+        """Connect, run the plan, and bring all instruments into their safe state."""
         self._tell("connecting", "connecting to the instruments")
         self._writes = _Writes()
         instruments = Instruments(
@@ -281,7 +283,7 @@ class CaptureSession:
                     )
 
     def _drive(self, instruments: Instruments) -> None:
-        """Run the plan on a RunEngine of its own, through pauses, to its end."""
+        """Run the plan to its end on a RunEngine of its own, across pauses."""
         engine = RunEngine({}, context_managers=[], during_task=_Wakeful())
         documents = self.store.folder(self.id) / "documents.jsonl"
         engine.subscribe(lambda name, document: _append(documents, name, document))
@@ -313,7 +315,7 @@ class CaptureSession:
                 go = engine.resume
         except BaseException:
             if self._ended_by is not None:
-                return  # what an abort breaks off is no failure of its own
+                return  # the abort itself caused this exception
             raise
         finally:
             with self._control:
@@ -334,7 +336,7 @@ class CaptureSession:
                 if entry.finished is not None:
                     results[step.id] = entry.result
                     continue
-                yield Msg("checkpoint")  # where a pause takes hold: between steps
+                yield Msg("checkpoint")  # a pause takes effect here, between steps
                 if self._ended_by is not None:
                     break
                 self._tell("running", step.what, step.sequence, [other.step for other in entries[at:]])
@@ -388,7 +390,7 @@ class CaptureSession:
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[threading.Event]:
-        """In the main thread, Ctrl-C and SIGTERM end the run in good order; elsewhere signals aren't ours."""
+        """In the main thread, Ctrl-C and SIGTERM abort the run. In other threads, signals aren't handled."""
         asked = threading.Event()
         if threading.current_thread() is not threading.main_thread():
             yield asked
@@ -408,8 +410,11 @@ class CaptureSession:
 
 
 class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
-    """Waits for a plan's end, waking now and then: Python runs signal handlers in the main thread alone, and a signal that
-    the kernel hands to another thread doesn't wake this one from a wait without an end."""
+    """Waits for a plan's end and wakes every `WAKE_S`.
+
+    Python runs signal handlers in the main thread only. A signal that the kernel delivers to another thread doesn't wake the main
+    thread from an unlimited wait.
+    """
 
     def block(self, blocking_event: threading.Event) -> None:
         while not blocking_event.wait(WAKE_S):
@@ -427,7 +432,7 @@ def _append(file: Path, name: str, document: dict[str, Any]) -> None:
 
 
 def _plain(error: BaseException, complaints: list[str]) -> BaseException:
-    """What went wrong as one of our errors, with what didn't get safe."""
+    """The error as an InputError or a DeviceError, with the instruments that didn't reach their safe state."""
     while isinstance(error, FailedStatus) and error.__cause__ is not None:
         error = error.__cause__
     unsafe = [line for line in complaints if line not in str(error)]

@@ -24,7 +24,7 @@ PACK = "session.nxs"
 
 @dataclass(frozen=True)
 class StoredPlace:
-    """SHA-256 of a file, and where its frame lies in the packed session; None: the session isn't packed."""
+    """SHA-256 of a file, and the index of its frame in the packed session; None: it isn't packed."""
 
     sha256: str
     side: str | None

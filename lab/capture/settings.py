@@ -1,4 +1,4 @@
-"""Where data are kept and where work is done, from the environment."""
+"""Where data are kept and where jobs run, from the environment."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
 class Settings(BaseSettings):
-    """Where data are kept and where work is done; from the environment, `CALIBENCH_DATA` and so on."""
+    """Where data are kept and where jobs run: the environment's `CALIBENCH_DATA`, `CALIBENCH_DATABASE_URL`, `CALIBENCH_SCHEDULER`."""
 
     model_config = SettingsConfigDict(env_prefix="CALIBENCH_")
 

@@ -107,7 +107,7 @@ class Station(Frozen):
 
 
 def _with_curves(tables: Any, folder: Path) -> Any:
-    """CSV paths of quantum efficiencies replaced by the curves in them."""
+    """The tables with CSV paths of quantum efficiencies replaced by their curves."""
     if not isinstance(tables, dict) or not isinstance(tables.get("cameras"), dict):
         return tables
     for side, camera in tables["cameras"].items():
@@ -134,7 +134,7 @@ def _complaints(error: ValidationError) -> Iterator[str]:
 
 
 def read_station(path: str | Path) -> Station:
-    """The station in a TOML file. Raises InputError with one line that names every key that can't be used."""
+    """The station in a TOML file. Raises InputError, one line that names every wrong key."""
     file = Path(path)
     try:
         tables = tomllib.loads(file.read_text(encoding="utf-8"))

@@ -55,7 +55,7 @@ from sim.spectrum import Spectrum
 
 
 class Store:
-    """The data folder and its registry. May be shared by threads; other processes open their own.
+    """The data folder and its registry. Threads may share one; each process opens its own.
 
     Every method raises InputError where a session, capture or result that it is asked for doesn't exist.
     """
@@ -81,7 +81,7 @@ class Store:
         return cls(chosen.data, chosen.database_url)
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the database."""
         self._engine.dispose()
 
     @contextlib.contextmanager
@@ -92,7 +92,7 @@ class Store:
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[Session]:
-        """A database session whose changes are kept together, or not at all."""
+        """A database session whose changes are committed together, or not at all."""
         with self._write.begin() as session:
             yield session
 
@@ -103,7 +103,7 @@ class Store:
         return self.root / "sessions" / session_id
 
     def lock(self, session_id: str) -> Lock:
-        """Held by whoever runs a session."""
+        """The lock of the process that runs a session."""
         return Lock(self.folder(session_id) / ".lock")
 
     def create_session(
@@ -116,7 +116,7 @@ class Store:
         name: str = "",
         notes: str = "",
     ) -> str:
-        """Register a session with all its steps; nothing is taken yet. The id is returned."""
+        """Register a session with all its steps; nothing is captured yet. Returns its id."""
         created = now()
         session_id = f"{created:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         files: list[StoredFile] = []
@@ -178,8 +178,11 @@ class Store:
         )
 
     def _now(self, read: SessionInfo) -> SessionInfo:
-        """What was read, unless it says that the session runs and no process holds its lock: then it is read again, because
-        the process may have said how it ended in between, and is "interrupted" if it ended without a word."""
+        """The state as it is now.
+
+        A session that was read as running, but whose lock is free, is read again: its process may have ended in between. It is
+        "interrupted" if that process didn't record how it ended.
+        """
         if read.state not in ("running", "paused") or self.lock(read.id).is_held():
             return read
         with self.reading() as db:
@@ -215,7 +218,7 @@ class Store:
             return [Run.model_validate(run) for run in self._row(db, session_id).runs]
 
     def set_state(self, session_id: str, state: SessionState, error: str | None = None, run: Run | None = None) -> None:
-        """Say where a session stands; `run` is added to its provenance."""
+        """Record the state of a session; `run` is added to its provenance."""
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.state, row.error = state, error
@@ -243,7 +246,7 @@ class Store:
         files: Sequence[StoredFile] = (),
         captures: Sequence[Capture] = (),
     ) -> bool:
-        """Link everything a step took and mark it done, in one transaction. False if it was done before: nothing changes."""
+        """Link all files and captures of a step and mark it done, in one transaction. False, and no change, if it was done before."""
         with self.transaction() as db:
             row = db.scalars(
                 sa.select(StepRow).where(StepRow.session_id == session_id, StepRow.step_id == step_id).with_for_update()
@@ -269,7 +272,7 @@ class Store:
         return True
 
     def sweep(self, session_id: str) -> list[str]:
-        """Remove the files of a session that no finished step links: what a crash left. Only under the session's lock."""
+        """Remove the files that no finished step links, as a crash leaves them; their paths. Needs the session's lock."""
         with self.reading() as db:
             linked = set(db.scalars(sa.select(FileRow.path).where(FileRow.session_id == session_id)))
         folder = self.folder(session_id)
@@ -290,15 +293,15 @@ class Store:
         return StoredFile(role, path, hashlib.sha256(content).hexdigest(), len(content), side)
 
     def write_frame(self, session_id: str, path: str, side: Side, frame: NDArray[np.uint16]) -> StoredFile:
-        """A frame onto the disk; link it with `finish_step`."""
+        """Write a frame; `finish_step` links it."""
         return self._put(session_id, "frame", path, npy_bytes(np.ascontiguousarray(frame, np.uint16)), side)
 
     def write_spectrum(self, session_id: str, path: str, spectrum: Spectrum) -> StoredFile:
-        """A spectrum onto the disk; link it with `finish_step`."""
+        """Write a spectrum; `finish_step` links it."""
         return self._put(session_id, "spectrum", path, format_spectrum(spectrum).encode())
 
     def write_target(self, session_id: str, path: str, cells: NDArray[np.uint8]) -> StoredFile:
-        """A pattern onto the disk."""
+        """Write a screen's pattern."""
         return self._put(session_id, "target", path, npy_bytes(np.ascontiguousarray(cells, np.uint8)))
 
     def files(self, session_id: str) -> list[StoredFile]:
@@ -330,7 +333,7 @@ class Store:
         return self.recording_set(capture.session_id).frame(CAPTURES.parse(capture.document))
 
     def recording_set(self, session_id: str) -> RecordingSet:
-        """A session as a recording set: what was taken so far, or all of it."""
+        """The captures of a session so far as a recording set."""
         with self.reading() as db:
             row = self._row(db, session_id)
             documents = db.scalars(
@@ -353,10 +356,10 @@ class Store:
     # --- closing ---------------------------------------------------------------------------------------------------------
 
     def close_session(self, session_id: str, progress: Callable[[str, float], None] | None = None) -> Path:
-        """Pack a session whose steps are all done into one NeXus-layout file, and take away the files of its frames.
+        """Pack a session whose steps are all done into one NeXus-layout file, and remove the files of its frames.
 
-        The packed frames are read back and compared by their SHA-256 before anything is removed. Doing it twice is fine.
-        Raises InputError while steps are to do.
+        The packed frames are read back and compared by their SHA-256 before anything is removed. A second call changes nothing.
+        Raises InputError while steps are still to do.
         """
         info = self.session(session_id)
         if info.steps_done < info.steps:
@@ -397,7 +400,7 @@ class Store:
     # --- results ---------------------------------------------------------------------------------------------------------
 
     def add_result(self, kind: str, source: str, document: Mapping[str, Any], job_id: str | None = None) -> str:
-        """Keep a result; its id is returned."""
+        """Store a result; returns its id."""
         result_id = secrets.token_hex(8)
         with self.transaction() as db:
             db.add(
@@ -440,7 +443,7 @@ class Store:
             raise InputError(f"an API key called {name!r} exists; choose another name or remove it") from error
 
     def remove_key(self, name: str) -> None:
-        """Take an API key away."""
+        """Remove an API key."""
         with self.transaction() as db:
             row = db.get(KeyRow, name)
             if row is None:
@@ -455,5 +458,5 @@ def _file_row(session_id: str, file: StoredFile) -> FileRow:
 
 
 def _aware(at: datetime) -> datetime:
-    """SQLite forgets the time zone; ours is always UTC."""
+    """The time with its zone, UTC, which SQLite doesn't keep."""
     return at if at.tzinfo is not None else at.replace(tzinfo=UTC)

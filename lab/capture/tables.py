@@ -57,7 +57,7 @@ class StepRow(Base):
 
 
 class FileRow(Base):
-    """A file of a session, immutable. `pack_index`: where a frame lies in the packed session."""
+    """A file of a session, immutable. `pack_index`: index of a frame in the packed session."""
 
     __tablename__ = "files"
     __table_args__ = (sa.UniqueConstraint("session_id", "path"),)
@@ -139,13 +139,13 @@ def open_engine(url: str) -> sa.Engine:
 
     @sa.event.listens_for(engine, "connect")
     def _pragmas(connection: Any, record: Any) -> None:
-        connection.isolation_level = None  # BEGIN is ours, below
+        connection.isolation_level = None  # `_begin` sends BEGIN
         for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=30000"):
             connection.execute(f"PRAGMA {pragma}").close()
 
     @sa.event.listens_for(engine, "begin")
     def _begin(connection: sa.Connection) -> None:
-        # A writer that began by reading would fail, not wait, where another wrote in between.
+        # A transaction that reads first and then writes fails, and doesn't wait, if another process wrote in between.
         writes = connection.get_execution_options().get("writes")
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 

@@ -36,7 +36,7 @@ class Taken:
 
 
 def arrange(step: Step, instruments: Instruments) -> Plan[None]:
-    """Set the bench as the step wants it, moving only what stands otherwise. Raises InputError for what isn't there."""
+    """Set the bench for the step, moving only what differs. Raises InputError for a missing instrument."""
     setting = step.setting
     group = "arrange"
     if setting.target is not None:
@@ -59,7 +59,7 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
         if instruments.screen.value != pattern:
             yield from bps.abs_set(instruments.screen, pattern, group=group)
     yield from bps.wait(group=group)
-    # Only now: opening the shutter before the grating has arrived would light the target with other wavelengths.
+    # Last: before the grating has arrived, the light has another wavelength.
     if instruments.shutter is not None and setting.wavelength_nm is not None and not instruments.shutter.value:
         yield from bps.abs_set(instruments.shutter, True, wait=True)
 
@@ -74,10 +74,10 @@ def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
 def find_exposure(
     wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float]
 ) -> Plan[tuple[dict[Side, float], dict[Side, float]]]:
-    """Exposures (s) and the levels they gave, camera by camera, by test frames that aren't kept.
+    """Exposures (s) and their levels, camera by camera, from test frames that aren't kept.
 
-    A frame that is saturated or unlit only says in which direction to go; any other tells the exposure by proportion. A
-    camera that reaches a limit of the station keeps the limit.
+    After a saturated or unlit frame, the exposure is divided by 5 or multiplied by 10; after any other, it is scaled to the wanted
+    level. A camera that reaches a limit of the station stays there.
     """
     limits = instruments.limits
 
@@ -113,7 +113,7 @@ def _stuck(
     exposure_s: Mapping[Side, float],
     levels: Mapping[Side, float],
 ) -> bool:
-    """Whether a shorter exposure left a bright frame as bright: it is saturated, wherever the data sheet ends the range."""
+    """Whether a shorter exposure left a bright frame as bright: then it is saturated, below the data sheet's range."""
     if before is None or levels[side] < 0.3:
         return False
     shortened = exposure_s[side] / before[0][side]
@@ -123,8 +123,8 @@ def _stuck(
 def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> Plan[Taken]:
     """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id.
 
-    A wavelength whose light the spectroradiometer refuses to measure is left out, with the reason in the result; any other
-    refusal is a DeviceError, for later steps rely on the spectrum.
+    A step with captures whose light the spectroradiometer refuses to measure is left out, with the reason in its result. In a step
+    without captures the refusal is a DeviceError, as later steps use the spectrum.
     """
     yield from arrange(step, instruments)
     files: list[StoredFile] = []
@@ -165,7 +165,7 @@ def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str
 
 
 def _start(instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:
-    """Where a search for an exposure starts: at what the latest search found, else at 10 ms."""
+    """Start of a search for an exposure: the result of the latest search, else 10 ms."""
     found = [result["exposure_s"] for result in results.values() if "exposure_s" in result]
     return {side: float(found[-1][side]) if found else 0.01 for side in instruments.cameras.cameras}
 

@@ -1,5 +1,5 @@
-"""A camera in a TOML file: every parameter of the camera model under its own name, which ends in its unit; comments come from the
-parameters' declarations.
+"""A camera in a TOML file: every parameter of the camera model under its own name, which ends in its unit. The comments are
+the parameters' declarations.
 
     rows = 960  # px: rows of the frame (1 ..)
     [quantum_efficiency]      # a table of samples each, or the name of a CSV file
@@ -11,7 +11,7 @@ parameters' declarations.
     name = "veiling_glare"
     share_percent = 1.5
 
-Files that it names lie beside it, or where their path says, seen from the camera file's folder.
+Paths in it are relative to the camera file's folder.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from sim.spectrum import Spectrum
 
 FORMAT, VERSION = "calibench-camera", 1
 HEADER = "# A camera for calibench: each key is a parameter, and ends in its unit. docs/reference/simulate.md says what they do."
-#: Keys of the file that aren't the camera model's.
+#: Keys of the file that don't belong to the camera model.
 OWN_KEYS = ("format", "version", "name", "effects")
 CURVES = ("quantum_efficiency", "quantum_efficiency_std")
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a camera file holds: the model, the effects that act in it, and for a traced lens the prescription it came from."""
+    """The content of a camera file: the model, the effects that act in it, and the prescription of a traced lens."""
 
     name: str
     camera: CameraModel
@@ -206,7 +206,7 @@ def _validated(file: Path, at: str, model: type[BaseModel], values: Mapping[str,
 
 
 def _known(model: type[BaseModel], where: Sequence[str]) -> list[str]:
-    """Keys of the table that a wrong one stood in."""
+    """The keys that the table `where` may have."""
     if where[:1] == ["lens"]:
         return (
             [*Lens.model_fields]
@@ -248,7 +248,7 @@ def _check_levels(file: Path, camera: CameraModel) -> None:
 
 
 def _first(error: Exception) -> str:
-    """What went wrong, in one line."""
+    """The first message of an error, on one line."""
     text = (
         str(error) if not isinstance(error, ValidationError) else error.errors()[0]["msg"].removeprefix("Value error, ")
     )
@@ -259,8 +259,11 @@ def _first(error: Exception) -> str:
 
 
 def write_camera(file: Path, content: CameraFile) -> None:
-    """Write a camera file that `read_camera` reads back to the same camera, exactly. Measured point spread and transfer
-    functions go into an .npz file beside it, and so does a traced lens's table where no prescription is known."""
+    """Write a camera file that `read_camera` reads back to exactly the same camera.
+
+    Measured point-spread and transfer functions go into an .npz file beside it; so does the table of a traced lens without a
+    prescription.
+    """
     text = "\n".join(_lines(file, content)) + "\n"
     with replacing(file) as partial:
         partial.write_text(text, encoding="utf-8")
@@ -337,7 +340,7 @@ def _imaging_lines(file: Path, content: CameraFile) -> Iterator[str]:
 
 
 def _parameters(model: BaseModel, skip: Sequence[str] = ()) -> Iterator[str]:
-    """One line a field: its key, its value, and in a comment what its declaration says. What isn't set is a comment."""
+    """One line for each field: key, value, and its declaration as a comment. A field that isn't set is a comment as a whole."""
     known = declared(type(model))
     for key in type(model).model_fields:
         if key in skip:
@@ -382,8 +385,11 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
 
 
 def default_camera() -> CameraFile:
-    """A plausible RGB machine-vision camera: 1280 x 960 px of 3.45 um, 12 bit, global shutter, f/4 and 8 mm, in the manner of data
-    sheets of 1/3 inch sensors of that pixel; its curves, with an infrared cut filter at 650 nm, are typical shapes, no maker's."""
+    """A plausible RGB machine-vision camera: 1280 x 960 px of 3.45 um, 12 bit, global shutter, f/4, 8 mm.
+
+    Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared cut filter at 650 nm, have typical
+    shapes and are of no particular maker.
+    """
     wavelength_nm = np.arange(380.0, 721.0, 10.0)
 
     def curve(peak: float, centre_nm: float, short_nm: float, long_nm: float) -> Spectrum:

@@ -1,4 +1,4 @@
-"""Raw frames as files that others read: .npy, 16-bit TIFF, DNG. Completely or not at all: an existing file is replaced at the end.
+"""Raw frames as .npy, 16-bit TIFF or DNG files. A file is written completely or not at all; an existing one is replaced at the end.
 
 A DNG holds the codes as they are, uncompressed, with mosaic, black and white level, and a colour matrix from the camera's own
 quantum efficiency; a MONO frame is its `LinearRaw` of one sample. (Adobe, Digital Negative Specification 1.7.1.)
@@ -36,8 +36,10 @@ D65 = 21
 
 
 class RawMetadata(Frozen):
-    """What a file says of its frame beside the camera's own parameters. `neutral`: codes above black of a white surface, by
-    channel, to any common factor; none: those of daylight (D65)."""
+    """What a file tells of its frame, besides the camera's parameters.
+
+    `neutral`: codes above black of a white surface by channel, up to a common factor; empty: those in daylight (D65).
+    """
 
     exposure_s: Annotated[float, Quantity("s", "exposure", lower=0.0)]
     gain_db: Annotated[float, Quantity("dB", "analogue gain")] = 0.0
@@ -48,7 +50,7 @@ class RawMetadata(Frozen):
 
 @contextlib.contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """A file beside `file` to write to; it takes its place where the block ends well, and is gone where it doesn't.
+    """A temporary file beside `file`. It replaces `file` when the block succeeds, and is removed when it fails.
 
     Raises InputError where the folder can't be written to.
     """
@@ -204,8 +206,7 @@ def _tag(code: int, kind: int, value: Any) -> tuple[int, int, int, Any]:
 def colour_matrix(camera: CameraModel) -> FloatArray:
     """From CIE XYZ to this camera's R, G, B under D65 (3, 3), as DNG's ColorMatrix1 wants it: white has a greatest code of 1.
 
-    Least squares over the ColorChecker's 24 patches, each camera channel being the electrons that quantum efficiency makes of
-    the patch's light, over the white's. Raises ValueError for a MONO camera, which has no colours.
+    Least squares over the 24 patches of the ColorChecker. A camera channel is the electrons from the patch over those from white. Raises ValueError for a MONO camera, which has no colours.
     """
     if camera.cfa == "MONO":
         raise ValueError("a MONO camera has no colour matrix: ask for one of a camera with R, G and B")
@@ -225,7 +226,7 @@ def _colour_matrix(efficiency: tuple[Spectrum, ...]) -> FloatArray:
 
 
 def electrons_of(light: Spectrum, efficiency: Spectrum, reflectance: Spectrum | None = None) -> float:
-    """What is proportional to the electrons of `light` (W per nm) on a channel, reflected by a patch."""
+    """A number proportional to the electrons of a channel from `light` (W per nm) that a patch reflects."""
     curves = [light, efficiency, *([reflectance] if reflectance is not None else [])]
     wavelength_nm, weight = quadrature(curves)
     seen = photons_from_energy(wavelength_nm, light.at(wavelength_nm)) * efficiency.at(wavelength_nm)

@@ -23,7 +23,7 @@ from sim.scene.catalogue import SCENES, Cube, PictureOnScreen, View, scene_by_na
 from sim.scene.light import at_luminance, illuminant
 from sim.spectrum import FloatArray, Spectrum, energy_from_photons
 
-#: Luminance of a perfect white diffuser where none is asked for.
+#: Default luminance of a perfect white diffuser.
 LUMINANCE_CD_M2 = 100.0
 
 PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
@@ -44,7 +44,7 @@ ENVI_UNITS = {
     "reflectance": (REFLECTANCE, 1.0),
 }
 
-#: Samples of a cube, or of a picture, above which a file is taken for a mistake: 4 GiB as float64.
+#: Most samples of a cube or a picture; more are taken for a mistake. 4 GiB as float64.
 MOST_SAMPLES = 2**29
 
 
@@ -89,7 +89,7 @@ def light(name: str, luminance_cd_m2: float | None = None) -> Spectrum:
 
 def read_picture(file: Path) -> NDArray[np.uint8]:
     """8-bit codes (rows, cols, 3), red green blue, of a PNG, TIFF, JPEG or BMP. Grey becomes three equal codes, 16 bit is
-    rounded to 8; transparency is refused, as what lies behind isn't known."""
+    rounded to 8; transparency is refused, as the background isn't known."""
     if not file.is_file():
         raise InputError(f"{file}: no such file; give one of {' '.join(PICTURES)}")
     with _about(file):
@@ -150,7 +150,7 @@ def scene(
     """A scene before a camera: one of `sim.scene.catalogue.SCENES` by its name, or a picture or a cube by its file.
 
     `white`: radiance of a perfect white diffuser there. A picture's screen takes its luminance for its own white; a cube of
-    radiance has its own light. InputError for what is neither.
+    radiance has its own light. Raises InputError for anything else.
     """
     try:
         if name in SCENES:
@@ -175,7 +175,7 @@ def scene(
 
 @contextmanager
 def _about(file: Path) -> Iterator[None]:
-    """Errors within become an InputError that begins with the file."""
+    """Turn errors of the block into an InputError that begins with the file."""
     try:
         yield
     except (InputError, ValueError) as error:
@@ -242,7 +242,7 @@ def _envi_samples(file: Path) -> tuple[dict[str, Any], NDArray[Any]]:
         header, shape = dict(opened.metadata), tuple(int(n) for n in getattr(opened, "shape", ()))
     except Exception as error:
         raise InputError(f"can't be read as ENVI ({_reason(error)}); correct the header") from None
-    # The library takes anything else for a guess of its own.
+    # For any other value the library would guess.
     for key, known in (("byte order", ("0", "1")), ("interleave", ("bsq", "bil", "bip"))):
         if str(header.get(key)).lower() not in known:
             raise InputError(f"{key} is '{header.get(key)}', not one of {', '.join(known)}; correct the header")

@@ -11,15 +11,15 @@ from sim.spectrum import Spectrum
 
 
 def parse_spectrum(text: str) -> Spectrum:
-    """A spectrum from CSV text with the header `wavelength_nm,value`; InputError without the path.
+    """A spectrum from CSV text with the header `wavelength_nm,value`. Its InputError leaves the path to the caller.
 
-    Blank lines and a byte-order mark are let pass. Wavelengths must ascend strictly, every number be finite.
+    Blank lines and a byte-order mark are ignored. Wavelengths must ascend strictly, and all numbers must be finite.
     """
     return parse_curve(text, ("value",))[1]
 
 
 def parse_curve(text: str, columns: tuple[str, ...]) -> tuple[str, Spectrum]:
-    """As `parse_spectrum`, with any of `columns` as the second column's name; which one it was, and the curve."""
+    """(name of the second column, curve): as `parse_spectrum`, with one of `columns` as that name."""
     try:
         lines = csv.reader(io.StringIO(text.removeprefix("\ufeff"), newline=None))
         rows = [row for row in lines if any(cell.strip() for cell in row)]

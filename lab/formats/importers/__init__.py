@@ -1,6 +1,6 @@
 """Importers: other formats as recording sets. Each turns a path into a `RecordingSet` whose frames are decoded when asked for;
-`lab.formats.recording_set.write` checks it and puts it on disk, completely or not at all. What an importer had to leave out, assume or
-couldn't learn stands in the set's `warnings` and `notes`."""
+`lab.formats.recording_set.write` checks it and puts it on disk, completely or not at all. The set's `warnings` and `notes` say what an
+importer left out, assumed or didn't find."""
 
 from __future__ import annotations
 

@@ -2,11 +2,11 @@
 
 The descriptor's lines, in the form that the reference sets of the EMVA 1288 working group share: `v` release of the standard;
 `n` bits, width, height; `b` exposure (ns), photons a pixel: a bright level; `d` exposure (ns): a dark level; `i` path: one
-image of the level above it; `#` a comment. Whatever the file is called; paths with either slash, in any case of letters. The
-spatial stacks are levels like the others, with more images.
+image of the level above it; `#` a comment. The file may have any name. Paths may have either slash and any
+case of letters. The spatial stacks are levels like the others, with more images.
 
-What it doesn't say: the wavelength of the light, the pixel's pitch, the lens. A `camera.toml` beside it may (the keys of a
-recording set's camera, and `wavelength_nm`); else they stay unknown, and the warnings say what follows from that.
+A descriptor doesn't give the wavelength of the light, the pixel pitch and the lens. A `camera.toml` beside it can: it has the
+keys of a recording set's camera, and `wavelength_nm`. Without it they stay unknown, and the warnings say what that prevents.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LARGEST_DESCRIPTOR_BYTES = 8 << 20
 
 @dataclass
 class Level:
-    """One exposure: bright with its photons (None where not stated), or dark; and the images taken of it."""
+    """One exposure, bright or dark: its photons per pixel (None: not stated) and its images."""
 
     bright: bool
     exposure_s: float
@@ -40,7 +40,7 @@ class Level:
 
 @dataclass
 class Descriptor:
-    """What a descriptor file says."""
+    """The content of a descriptor file."""
 
     release: str | None = None
     bits: int | None = None
@@ -92,7 +92,7 @@ def _numbers(words: list[str], least: int, line: int, what: str) -> list[float]:
         try:
             values.append(float(word.strip(",;") or "nan"))
         except ValueError:
-            break  # a word after the numbers (a pixel format) does no harm
+            break  # a word after the numbers (a pixel format) is ignored
     if len(values) < least or not all(np.isfinite(values)) or any(value < 0 for value in values):
         raise InputError(f"line {line}: '{' '.join(words)}' isn't {what}; write these numbers")
     return values
@@ -107,7 +107,7 @@ def _text(file: Path) -> str:
 
 
 def find_descriptor(path: Path) -> Path:
-    """The descriptor: `path` itself, or the one text file in the folder (else one folder deeper) that is one."""
+    """The descriptor: `path` itself, or the only descriptor among the text files in the folder, else one folder deeper."""
     if path.is_file():
         return path
 
@@ -132,7 +132,7 @@ def find_descriptor(path: Path) -> Path:
 
 
 class _Images:
-    """Finds the images that a descriptor lists, as the machines it was written on would have."""
+    """Finds the images that a descriptor lists, whatever their slashes and case of letters."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
@@ -145,7 +145,7 @@ class _Images:
                 self.by_stem.setdefault(relative.rsplit(".", 1)[0], file)
 
     def find(self, listed: str) -> Path | None:
-        """The file behind a listed path; another image format of the same name will do. None: not there."""
+        """The file at a listed path, or one of the same name in another image format; None: there is none."""
         path = re.sub(r"/+", "/", listed.replace("\\", "/")).lower().removeprefix("./")
         return self.by_name.get(path) or self.by_stem.get(path.rsplit(".", 1)[0])
 

@@ -1,4 +1,4 @@
-"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, camera raws, .npy; decoded when asked for."""
+"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, camera raws, .npy. They are decoded on access."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def decoded(file: Path) -> NDArray[Any]:
 
 
 def _damage(data: bytes) -> str | None:
-    """Why PNG or JPEG data aren't whole: the decoder would fill what is missing with zeros and say nothing."""
+    """Why PNG or JPEG data are incomplete. The decoder would silently fill the missing part with zeros."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         at = 8
         while at + 12 <= len(data):
@@ -77,8 +77,10 @@ def _grey(image: NDArray[Any]) -> Frame:
 
 
 class ImageFiles(FolderFiles):
-    """A folder whose frames are images: `images` has the file behind each frame's path in the recording set. Values are
-    shifted down by `shift` bits. The files are decoded when asked for, and never copied as they are."""
+    """A folder whose frames are images. `images`: the file of each frame by its path in the recording set.
+
+    Values are shifted down by `shift` bits. The files are decoded on access and aren't copied byte by byte.
+    """
 
     def __init__(self, root: Path, images: Mapping[str, Path], shift: int = 0) -> None:
         super().__init__(root)

@@ -5,8 +5,8 @@ members of `screen` as `screen.pose`, `screen.cell_camera_px`, `screen.radiance`
 (`region`: `92 156 292 356`; `corners`: eight numbers). An empty cell is an unknown value. `side` may be left out (left), and
 `id` too (the file's name). Spectra (CSV) and targets (.npy) are named as in a recording set, relative to the folder.
 
-`camera.toml` has the keys of a recording set's camera, at the top for one camera, or in `[left]` and `[right]`; `rows`, `cols`
-and `bit_depth` are taken from the images where it doesn't say.
+`camera.toml` has the keys of a recording set's camera, at the top for one camera, or in `[left]` and `[right]`. Without `rows`,
+`cols` and `bit_depth`, these are taken from the images.
 
 A board without markers is a `charuco` capture with `dictionary` `none`. The stereo pairs of OpenCV's samples, for example
 (6 x 9 inner corners, so 7 x 10 squares; how long they were exposed isn't known), with `cfa = "MONO"` in `[left]` and in

@@ -1,7 +1,6 @@
 """The recording set: the folder format in which recordings come in from outside and go out again.
 
-`read` looks at everything once, up front, and names all that is wrong with a folder, one line each. `write` puts a folder
-there completely or not at all. The kinds of capture are in `lab.capture_kinds`.
+`read` checks a whole folder and reports all problems at once, one line each. `write` writes a folder completely or not at all. The kinds of capture are in `lab.capture_kinds`.
 """
 
 from lab.formats.recording_set.checks import inspect

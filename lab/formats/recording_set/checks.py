@@ -1,4 +1,4 @@
-"""The look through a whole recording set, up front: every problem and every oddity, one line each."""
+"""Checks of a whole recording set: every problem and every warning, one line each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
 from sim.camera import Side
 
-#: A narrowband light's centre this far and a quarter of its bandwidth off the wavelength set is remarked on.
+#: A warning is given where a narrowband light's centre is off the wavelength set by more than this plus a quarter of its bandwidth.
 OFF_NAME_NM = 3.0
 
 
@@ -44,7 +44,7 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
 
 
 def _check_frames(recordings: RecordingSet, found: Findings) -> None:
-    """Every frame, loaded once."""
+    """Load every frame once; find damaged frames, saturated flats and clipped captures."""
     flats: dict[Side, list[FlatLevel]] = defaultdict(list)
     clipped_of: dict[tuple[Side, str], list[str]] = defaultdict(list)
     for capture in recordings.manifest.captures:
@@ -58,7 +58,7 @@ def _check_frames(recordings: RecordingSet, found: Findings) -> None:
             continue
         clipped = clipped_share(frame, camera)
         if isinstance(capture, FlatCapture):
-            with suppress(InputError):  # a spectrum that can't be used is named with the spectra
+            with suppress(InputError):  # a spectrum that can't be used is reported with the spectra
                 flats[capture.side].append(flat_level(recordings, capture, frame, clipped))
         elif max(clipped.values()) > CLIPPED_LIMIT:
             clipped_of[capture.side, capture.kind].append(capture.id)
@@ -138,14 +138,17 @@ def _check_spectra_and_targets(recordings: RecordingSet, found: Findings) -> Non
 
 
 def _lights_off_their_names(recordings: RecordingSet) -> Iterator[str]:
-    """One line on the narrowband lights whose measured centre, over what exceeds half of the maximum, isn't the wavelength set."""
+    """One line that names the narrowband lights whose measured centre isn't the wavelength set.
+
+    The centre is the mean wavelength of the samples above half of the maximum, weighted by the radiance.
+    """
     off: dict[str, str] = {}
     for capture in recordings.manifest.captures:
         if not isinstance(capture, NarrowbandCapture) or capture.radiance in off:
             continue
         try:
             wavelength, value = recordings.spectrum(capture.radiance).arrays
-        except InputError:  # named with the spectra
+        except InputError:  # reported with the spectra
             continue
         if value.max() > 0:
             share = value / value.max()
@@ -161,9 +164,9 @@ def _lights_off_their_names(recordings: RecordingSet) -> Iterator[str]:
 
 
 def inspect(recordings: RecordingSet) -> tuple[list[str], list[str]]:
-    """(problems, warnings) of a recording set, one line each: everything that `read` refuses and everything it remarks.
+    """(problems, warnings) of a recording set, one line each. `read` refuses a set with problems.
 
-    Looks at every frame, spectrum and target once.
+    Every frame, spectrum and target is read once.
     """
     found = Findings(warnings=list(_unknown_keys(f"{recordings.source}: manifest", recordings.manifest)))
     _check_cameras(recordings, found)

@@ -1,4 +1,4 @@
-"""Clipped pixels: which share of a frame's channels they are, and whether a saturated flat belongs to an exposure ladder."""
+"""Clipped pixels: their share of each channel, and whether a saturated flat is the top of an exposure ladder."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from lab.formats.recording_set.frame_files import Frame
 from lab.formats.recording_set.manifest import DataSheet
 from lab.formats.recording_set.recordings import RecordingSet
 
-#: More than this share of a channel's pixels clipped: the capture says nothing of that channel's level.
+#: Share of clipped pixels above which a channel's level isn't measured.
 CLIPPED_LIMIT = 0.5
-#: A saturated flat belongs to an exposure ladder when that many unsaturated levels lie below it ...
+#: Least number of unsaturated levels below a saturated flat for it to be the top of an exposure ladder.
 LADDER_LEVELS = 3
-#: ... and these foretell at least this share of the white level for it (lamps and sensors aren't exactly linear).
+#: Least share of the flat's signal that these levels must predict for it. Below 1, as lamps and sensors aren't exactly linear.
 LADDER_REACH = 0.85
 
 
 @dataclass(frozen=True)
 class FlatLevel:
-    """What the check of saturated flats keeps of one flat: means and clipped shares by channel."""
+    """Level of one flat: mean and clipped share of each channel."""
 
     id: str
     where: str
     gain_db: float | None
-    light: float  # proportional to the photons, on the scale of that name
+    light: float  # proportional to the photons; comparable between flats of the same `scale`
     scale: str
     mean_dn: dict[str, float]
     clipped: dict[str, float]
 
 
 def channel_planes(frame: Frame, camera: DataSheet) -> dict[str, list[Frame]]:
-    """Each channel's planes: both green phases for `G`, the whole frame for `Y`."""
+    """The planes of each channel: two for `G`, the whole frame for `Y`."""
     step = 1 if camera.cfa == "MONO" else 2
     planes: dict[str, list[Frame]] = defaultdict(list)
     for row in range(step):
@@ -47,10 +47,10 @@ def channel_planes(frame: Frame, camera: DataSheet) -> dict[str, list[Frame]]:
 
 
 def clipped_share(frame: Frame, camera: DataSheet) -> dict[str, float]:
-    """Share of each channel's pixels that are clipped: at the white level, or all at one value above half of the range.
+    """Share of each channel's pixels at the channel's highest code, if that is above half of the range, else at the white level.
 
-    A sensor whose full well lies below the converter's range saturates short of `white_level_dn`: photon noise never puts
-    half of the pixels on the highest value, so a channel that does is clipped as well.
+    The highest code counts because a sensor whose full well lies below the converter's range saturates below `white_level_dn`.
+    Photon noise never puts half of the pixels on one code, so a share above `CLIPPED_LIMIT` means saturation in both cases.
     """
     black = camera.black_level_dn or 0.0
     middle = black + (camera.saturation_dn - black) / 2
@@ -63,7 +63,7 @@ def clipped_share(frame: Frame, camera: DataSheet) -> dict[str, float]:
 
 
 def _light(recordings: RecordingSet, flat: FlatCapture) -> tuple[float, str]:
-    """The light of a flat on a scale, and the scale's name: flats are comparable on one scale only."""
+    """The light of a flat, and the name of its scale: photons, exposure times radiance, or exposure alone."""
     if flat.photons_per_pixel is not None:
         return flat.photons_per_pixel, f"photons at {flat.wavelength_nm}"
     if flat.radiance is None:
@@ -84,8 +84,8 @@ def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clippe
 def _why_not_a_ladder(level: FlatLevel, channel: str, levels: list[FlatLevel], black: float) -> str | None:
     """Why the clipped `channel` of a flat isn't the top of an exposure ladder, with the remedy; None where it is.
 
-    EMVA 1288 needs exposures up to and beyond saturation, so a clipped flat is right where at least `LADDER_LEVELS`
-    unclipped levels of the same gain and light lie below it, their slope foretells that it clips, and its repeats clip too.
+    EMVA 1288 asks for exposures up to and beyond saturation. A clipped flat is accepted where at least `LADDER_LEVELS` unclipped
+    levels of the same gain and light lie below it, their slope predicts that it clips, and its repeats clip too.
     """
     unclipped = [
         other
@@ -100,12 +100,12 @@ def _why_not_a_ladder(level: FlatLevel, channel: str, levels: list[FlatLevel], b
         return f"expose shorter, or add {LADDER_LEVELS} unsaturated levels below it"
     slope = float(np.median([(other.mean_dn[channel] - black) / other.light for other in below[-LADDER_LEVELS:]]))
     if slope * level.light < LADDER_REACH * (level.mean_dn[channel] - black):
-        return f"but the flats below it foretell {black + slope * level.light:.0f} DN; recapture it"
+        return f"but the flats below it predict {black + slope * level.light:.0f} DN; recapture it"
     return None
 
 
 def saturated_flats(levels: list[FlatLevel], camera: DataSheet) -> Iterator[str]:
-    """One line for each flat that is clipped without being the top of an exposure ladder."""
+    """One line for each clipped flat that isn't the top of an exposure ladder."""
     for level in levels:
         for channel, share in level.clipped.items():
             if share <= CLIPPED_LIMIT:

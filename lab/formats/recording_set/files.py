@@ -144,6 +144,3 @@ class JoinedFiles:
     def where(self, path: str) -> str:
         files, its = self._of(path)
         return files.where(its)
-
-
-#: Keys of captures whose values name files or poses, which another set may name alike.

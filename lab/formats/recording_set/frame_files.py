@@ -20,7 +20,7 @@ RAWS = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", 
 
 
 def locate(root: Path, path: str) -> Path:
-    """The file that a manifest's `path` names, or an InputError: missing, absolute, or outside `root`."""
+    """The file at a manifest's `path`. Raises InputError for a path that is absolute, missing, or outside `root`."""
     pure = PurePosixPath(path)
     if not path or "\\" in path or pure.is_absolute() or (len(path) > 1 and path[1] == ":"):
         raise InputError("not a path relative to the folder with '/'; move the file into the folder and name it so")
@@ -41,7 +41,7 @@ def locate(root: Path, path: str) -> Path:
 def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
     """A two-dimensional .npy of `dtype` in either byte order."""
     try:
-        # Mapped, so that a damaged header that announces terabytes doesn't allocate them.
+        # Mapped: a damaged header may announce terabytes, which must not be allocated.
         mapped = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:
         raise InputError(f"damaged .npy ({one_line(error)}); write it again or recapture") from error
@@ -76,7 +76,7 @@ def _load_tif(file: Path) -> NDArray[Any]:
 
 
 def _load_raw(file: Path, shape: tuple[int, int] | None = None) -> NDArray[Any]:
-    """The mosaic of a camera raw: the visible area, or the whole one where only that has the wanted `shape`."""
+    """The mosaic of a camera raw: its visible area, or the whole sensor where only that has `shape`."""
     try:
         with rawpy.imread(str(file)) as raw:
             visible, whole = raw.raw_image_visible, raw.raw_image
@@ -90,7 +90,7 @@ def _load_raw(file: Path, shape: tuple[int, int] | None = None) -> NDArray[Any]:
 
 
 def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
-    """One frame from an .npy, .tif/.tiff or camera-raw file: uint16 (rows, cols) as stored. InputError without the path."""
+    """One frame from an .npy, .tif/.tiff or camera-raw file: uint16 (rows, cols) as stored. Its InputError leaves the path to the caller."""
     suffix = file.suffix.lower()
     if suffix == ".npy":
         return _load_npy(file, np.uint16)
@@ -102,7 +102,7 @@ def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
 
 
 def load_target(file: Path) -> Target:
-    """A screen's pattern from an .npy file: uint8 (rows, cols) of 0 and 1. InputError without the path."""
+    """A screen's pattern from an .npy file: uint8 (rows, cols) of 0 and 1. Its InputError leaves the path to the caller."""
     if file.suffix.lower() != ".npy":
         raise InputError(f"a target can't be {file.suffix or 'without an ending'}; give .npy (uint8)")
     return checked_target(_load_npy(file, np.uint8))

@@ -1,7 +1,7 @@
 """The manifest's keys, name by name, and its JSON text.
 
-An unknown key is kept and reported; an unknown kind of capture is reported and skipped. Anything else that is wrong is a
-problem, one line each, and all problems are told at once.
+An unknown key is kept and reported; an unknown kind of capture is reported and skipped. All other errors are
+problems, one line each, and are reported together.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class RecordingError(InputError):
 
 @dataclass
 class Findings:
-    """What a look through a recording set finds: problems, for which it is refused, and warnings."""
+    """Findings of the checks: `problems`, for which a set is refused, and `warnings`."""
 
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -88,7 +88,7 @@ class Findings:
 
 
 def manifest_json(manifest: Manifest) -> str:
-    """A manifest as JSON text: the keys that were given, unknown ones too."""
+    """A manifest as JSON text, with the keys that were given, unknown ones included."""
     kept = manifest.model_dump(mode="json", exclude_unset=True)
     head = {key: getattr(manifest, key) for key in ("format", "version", "name", "notes")}
     return json.dumps(head | kept, indent=1, ensure_ascii=False) + "\n"
@@ -135,7 +135,7 @@ def _usable_captures(listed: list[Any], where: str, sides: Container[str], found
 
 
 def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
-    """The manifest in JSON `text`, and warnings on what was skipped. RecordingError with one line for each problem."""
+    """The manifest in JSON `text`, and warnings for what was skipped. Raises RecordingError, one line for each problem."""
     try:
         raw = json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
@@ -149,7 +149,7 @@ def parse_manifest(text: str, where: str) -> tuple[Manifest, list[str]]:
     listed, cameras = raw.get("captures"), raw.get("cameras")
     captures: list[Capture] = []
     if isinstance(listed, list):
-        # Where the cameras themselves are wrong, that is said once, below.
+        # Errors in the cameras themselves are reported below, once.
         sides = cameras if isinstance(cameras, dict) and cameras else get_args(Side)
         captures = _usable_captures(listed, where, sides, found)
         raw["captures"] = ()

@@ -1,4 +1,4 @@
-"""Reading a folder as a recording set, looked through completely."""
+"""Reading a folder as a recording set."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lab.formats.recording_set.recordings import RecordingSet
 
 
 def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None = None) -> RecordingSet:
-    """The recording set in the folder `path`, looked through completely.
+    """The recording set in the folder `path`, completely checked.
 
-    Raises RecordingError (an InputError) with one line for everything that can't be used; what is merely odd (unknown
-    keys, skipped kinds) stands in `.warnings`.
+    Raises RecordingError (an InputError) with one line for everything that can't be used. Unknown keys, skipped kinds and the
+    like stand in `.warnings`.
     """
     root = Path(path)
     if root.name == "manifest.json" and root.is_file():
@@ -35,6 +35,6 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
         progress(f"looking through {len(manifest.captures)} captures")
     problems, warnings = inspect(recordings)
     if problems:
-        raise RecordingError([*skipped, *problems])  # whoever mends the folder wants to hear of all of it
+        raise RecordingError([*skipped, *problems])  # a skipped capture may be the cause of a problem
     recordings.warnings = (*skipped, *warnings)
     return recordings

@@ -122,7 +122,7 @@ class RecordingSet:
         raise InputError(f"{self.source}: no capture '{id}'; the manifest lists {len(self.manifest.captures)} others")
 
     def frame(self, capture: Capture) -> Frame:
-        """Raw DN of a capture: uint16 (rows, cols), read-only. InputError where the file is not what the manifest says."""
+        """Raw DN of a capture: uint16 (rows, cols), read-only. Raises InputError where the file contradicts the manifest."""
         with self._lock:
             if capture.frame in self._cache:
                 self._cache.move_to_end(capture.frame)
@@ -144,7 +144,7 @@ class RecordingSet:
         return frame
 
     def let_go(self) -> None:
-        """Free the frames that are kept for being read again."""
+        """Free the cached frames."""
         with self._lock:
             self._cache.clear()
             self._held = 0
@@ -168,7 +168,7 @@ class RecordingSet:
         return self._files.file(path)
 
     def where(self, path: str) -> str:
-        """How messages call what the manifest names `path`."""
+        """How messages call the file that the manifest names `path`."""
         return self._files.where(path)
 
 

@@ -37,7 +37,7 @@ def _write_into(recordings: RecordingSet, root: Path) -> None:
         written.add(capture.frame)
         file, there = place(capture.frame), recordings.file(capture.frame)
         if there is not None:
-            shutil.copyfile(there, file)  # the bytes themselves, whatever the container
+            shutil.copyfile(there, file)  # byte by byte, whatever the format
             continue
         frame = recordings.frame(capture)
         if file.suffix == ".npy":

@@ -518,7 +518,7 @@ def test_full_well_short_of_the_white_level_is_the_end_of_a_ladder_too(folder: P
     assert read(folder).warnings == ()
 
 
-def test_saturated_where_the_ladder_foretells_less(folder: Path) -> None:
+def test_saturated_where_the_ladder_predicts_less(folder: Path) -> None:
     saturate(folder, flats_of(folder, "left")[:2], exposure_s=0.009)
     lines = problems(folder)
     assert len(lines) == 2
