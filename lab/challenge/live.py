@@ -56,7 +56,7 @@ SIZES: dict[str, str] = {
     "inter_pixel_capacitance": "left:share_percent=2",
     "lateral_chromatic_aberration": "left:slope_um=2.5",
     "light_flicker": "both:modulation_percent=8,frequency_hz=100,line_time_us=20",
-    "nameless_correction": "left:strength=1",
+    "model_discrepancy": "left:strength=1",
     "non_uniform_illumination": "both:gradient_x_percent=4",
     "nonlinearity": "left:quadratic_percent=3",
     "on_chip_sharpening": "left:strength=0.3",
@@ -109,7 +109,7 @@ WARM_UP_C = {"dark_current_temperature": 6.0}
 #: Effects that a diagnosis doesn't look for: it is right with no name, or with the name of what does the same.
 NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
     "cover_glass": frozenset({"spherical_aberration"}),
-    "nameless_correction": frozenset(),
+    "model_discrepancy": frozenset(),
     "other_f_number": frozenset(),
 }
 

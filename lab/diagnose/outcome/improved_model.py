@@ -18,7 +18,7 @@ from lab.formats.results import FitResult
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
-from sim.effects.nameless_correction import NamelessCorrection
+from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.spectrum import FloatArray, Spectrum
 
 Applied = Literal["transfer", "sensitivity", "illumination", "response", "noise"]
@@ -148,7 +148,7 @@ def _factor(
 
 def _correction(
     kind: Applied, block: Block, x: FloatArray, factor: FloatArray, camera: CameraModel
-) -> NamelessCorrection:
+) -> ModelDiscrepancy:
     """The factor on its stage, in that stage's unit."""
     gain = camera.conversion_gain_dn_per_e
     if kind == "transfer":
@@ -162,8 +162,8 @@ def _correction(
     return _of("signal_e", (x - camera.black_level_dn) / gain, factor)
 
 
-def _of(along: Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"], x: FloatArray, factor: FloatArray) -> NamelessCorrection:  # fmt: skip
-    return NamelessCorrection(along=along, at=tuple(x.tolist()), factor=tuple(factor.tolist()), strength=1.0)
+def _of(along: Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"], x: FloatArray, factor: FloatArray) -> ModelDiscrepancy:  # fmt: skip
+    return ModelDiscrepancy(along=along, at=tuple(x.tolist()), factor=tuple(factor.tolist()), strength=1.0)
 
 
 def _scaled(curve: Spectrum, factor: float) -> Spectrum:

@@ -23,7 +23,7 @@ from lab.predict.simulate import SimulateOptions, simulate
 from mocks.former import ConcealedCamera, Plan
 from mocks.former import laws as concealed_laws
 from sim.effects.base import Effect
-from sim.effects.nameless_correction import NamelessCorrection
+from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.point import TRANSFER, Blur
 from sim.uniform import Uniform
 
@@ -109,7 +109,7 @@ def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
     improved, corrections = improved_model(SET, "left", None, content, model, (), (gap,))
     assert [(c.measurement, c.kind) for c in corrections] == [("slanted_edge", "transfer")]
     (one,) = improved.effects
-    assert isinstance(one, NamelessCorrection)
+    assert isinstance(one, ModelDiscrepancy)
     follows = np.real(Blur(content.camera, (one,)).beside_lens(550.0, FREQUENCY, 0 * FREQUENCY)) - 1.0 - ripple
     assert np.abs(follows[FREQUENCY < 0.6]).max() < 3 * NOISE / np.sqrt(2) / np.exp(-1.2)
     mended = MeasurementModel((replace(block, predict=lambda acting: block.predict((one, *acting))),), content.camera)
@@ -139,4 +139,4 @@ def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str,
     model = MeasurementModel((other,), content.camera)
     gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
     improved, _ = improved_model(SET, "left", None, content, model, (), (gap,))
-    assert [e.along for e in improved.effects if isinstance(e, NamelessCorrection)] == [along]
+    assert [e.along for e in improved.effects if isinstance(e, ModelDiscrepancy)] == [along]

@@ -1,4 +1,4 @@
-"""A correction without a name: what recordings show beside the model, and no effect of the library accounts for."""
+"""A model discrepancy: a smooth departure of recordings from the model that no effect of the library accounts for."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim.stages import Charge, Image, Signal
 Along = Literal["frequency_cy_per_um", "radius_um", "signal_e", "variance_signal_e"]
 
 
-class NamelessCorrection(Effect):
+class ModelDiscrepancy(Effect):
     """A factor 1 + strength (f(x) - 1) on one stage: f linear between `at`, held beyond.
 
     `along` says on what, and what x is: `frequency_cy_per_um`, on the transfer function, alike in all directions; `radius_um`, on
@@ -25,13 +25,13 @@ class NamelessCorrection(Effect):
     the mean signal. It describes and predicts; it explains nothing, so that a diagnosis never looks for it.
     """
 
-    name: ClassVar[str] = "nameless_correction"
+    name: ClassVar[str] = "model_discrepancy"
     is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "M. C. Kennedy and A. O'Hagan, J. R. Statist. Soc. B 63, 425 (2001)"
     form_tolerance: ClassVar[float] = 0.2
     sentence: ClassVar[str] = (
         "Recordings depart from the model here by more than their noise, and no effect of the library says why: a smooth factor "
-        "without a name stands for it."
+        "describes it."
     )
 
     along: Annotated[Along, Field(description="stage and axis")] = "frequency_cy_per_um"
@@ -41,7 +41,7 @@ class NamelessCorrection(Effect):
     )
     factor: Annotated[tuple[float, ...], Field(description="factor at each of them, above 0")] = (1.0, 0.9)
     strength: Annotated[
-        float, Quantity("1", "share of the correction that acts", lower=0.0, upper=2.0, prior=(0.0, 1.0), absent=0.0)
+        float, Quantity("1", "share of the discrepancy that acts", lower=0.0, upper=2.0, prior=(0.0, 1.0), absent=0.0)
     ] = 0.0
 
     @model_validator(mode="after")
