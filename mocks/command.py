@@ -29,7 +29,18 @@ from mocks.lamp import Lamp, LampClock
 from mocks.pr655 import PhotoResearch
 from mocks.specbos1211 import Specbos1211
 from mocks.stage import Stage, Targets
-from mocks.wire import AddressError, Endpoint, Fault, FaultSpecError, Grammar, Light, Pty, Tcp, parse_faults, serve
+from mocks.wire import (
+    AddressError,
+    Endpoint,
+    Fault,
+    FaultSpecError,
+    Grammar,
+    MeasuredLight,
+    Pty,
+    Tcp,
+    parse_faults,
+    serve,
+)
 
 if TYPE_CHECKING:
     from mocks.bench import Bench
@@ -43,7 +54,7 @@ CONCEAL_VARIABLE = "CALIBENCH_CONCEAL"
 WARMEST_C = 40.0
 
 
-class Place(Light, Targets, Screen, Protocol):
+class Place(MeasuredLight, Targets, Screen, Protocol):
     """All that the mocks here act on: a bench, or a lamp alone."""
 
 

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mocks.wire import LONGEST_LINE, Grammar, Light, Reply
+from mocks.wire import LONGEST_LINE, Grammar, MeasuredLight, Reply
 
 SYSTEM, NOT_UNDERSTOOD, BAD_PARAMETER, NOT_ALLOWED, NOT_PRESENT, ALREADY_THERE, NO_HOME, LABEL_TOO_LONG = (
     *(0, 1, 2, 3),
@@ -56,7 +56,7 @@ class Cornerstone260(Grammar):
 
     fault_code = SYSTEM
 
-    def __init__(self, light: Light, serial_number: str = "0427") -> None:
+    def __init__(self, light: MeasuredLight, serial_number: str = "0427") -> None:
         super().__init__(light.clock)
         self._light = light
         self._serial_number = serial_number

@@ -13,7 +13,7 @@ import threading
 from collections import deque
 
 from mocks.usb_device import Cancelled, Stalled, UsbDevice, UsbEndpoint, UsbIdentity, UsbInterface
-from mocks.wire import Light
+from mocks.wire import MeasuredLight
 
 BULK_OUT, BULK_IN = 0x02, 0x82
 DEV_DEP_MSG_OUT, REQUEST_DEV_DEP_MSG_IN = 1, 2
@@ -35,7 +35,7 @@ _UNKNOWN, _BAD_DATA, _OUT_OF_RANGE = '-113, "Undefined header"', '-104, "Data ty
 class Cornerstone260B(UsbDevice):
     """The instrument; `light` feels its grating, slits, filter wheel and shutter."""
 
-    def __init__(self, light: Light, serial_number: str = "CB-260B-01") -> None:
+    def __init__(self, light: MeasuredLight, serial_number: str = "CB-260B-01") -> None:
         super().__init__(
             UsbIdentity(0x1FDE, 0x0014, (0, 0, 0), "Newport Corporation", "CS260B", serial_number),
             (UsbInterface(0, (0xFE, 0x03, 0x01), (UsbEndpoint(BULK_OUT), UsbEndpoint(BULK_IN))),),

@@ -12,16 +12,16 @@ import re
 import numpy as np
 
 from mocks.lamp import tristimulus
-from mocks.wire import LONGEST_LINE, Grammar, Light, Reply
+from mocks.wire import LONGEST_LINE, Grammar, MeasuredLight, Reply
 from sim.spectrum import FloatArray
 
 INVALID_COMMAND, INVALID_VALUE, TOO_LOW, TOO_HIGH, NOTHING_MEASURED = -500, -519, -304, -306, -305
 _MEANING = {
     INVALID_COMMAND: "Invalid command",
     INVALID_VALUE: "Invalid exposure value",
-    TOO_LOW: "Light intensity too low",
-    TOO_HIGH: "Light intensity too high",
-    NOTHING_MEASURED: "Light intensity unmeasurable",
+    TOO_LOW: "MeasuredLight intensity too low",
+    TOO_HIGH: "MeasuredLight intensity too high",
+    NOTHING_MEASURED: "MeasuredLight intensity unmeasurable",
 }
 _SPEEDS = ("slow", "normal", "fast", "2x fast")
 
@@ -31,7 +31,7 @@ class ColorimetryResearch(Grammar):
 
     fault_code = TOO_LOW
 
-    def __init__(self, light: Light, model: str = "CR-300", serial_number: str = "A00427") -> None:
+    def __init__(self, light: MeasuredLight, model: str = "CR-300", serial_number: str = "A00427") -> None:
         super().__init__(light.clock)
         self._light = light
         self._model = model

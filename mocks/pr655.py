@@ -12,7 +12,7 @@ import re
 import numpy as np
 
 from mocks.lamp import tristimulus
-from mocks.wire import LONGEST_LINE, Grammar, Light, Reply
+from mocks.wire import LONGEST_LINE, Grammar, MeasuredLight, Reply
 from sim.spectrum import PHOTON_ENERGY_J_NM, FloatArray
 
 NOT_CONSTANT, OVERLOAD, CANNOT_SYNC, WEAK_LIGHT, SYNC, AUTO_SYNC, TIMED_OUT = -1, -2, -3, -8, -9, -10, -12
@@ -26,7 +26,7 @@ class PhotoResearch(Grammar):
 
     fault_code = WEAK_LIGHT
 
-    def __init__(self, light: Light, model: str = "PR-655", serial_number: str = "65501234") -> None:
+    def __init__(self, light: MeasuredLight, model: str = "PR-655", serial_number: str = "65501234") -> None:
         super().__init__(light.clock)
         self._light = light
         self._model = model

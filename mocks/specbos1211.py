@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mocks.lamp import tristimulus
-from mocks.wire import LONGEST_LINE, Grammar, Light, Reply
+from mocks.wire import LONGEST_LINE, Grammar, MeasuredLight, Reply
 from sim.spectrum import Spectrum
 
 ACK, BEL, NAK, ESCAPE = b"\x06", b"\x07", b"\x15", 0x1B
@@ -52,7 +52,7 @@ class Specbos1211(Grammar):
     line_end = b"\r"
     fault_code = OVER_EXPOSED
 
-    def __init__(self, light: Light, serial_number: str = "1211427") -> None:
+    def __init__(self, light: MeasuredLight, serial_number: str = "1211427") -> None:
         super().__init__(light.clock)
         self._light = light
         self._serial_number = serial_number

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from mocks.usb_device import Cancelled, Stalled, UsbDevice, UsbEndpoint, UsbIdentity, UsbInterface
-from mocks.wire import Light
+from mocks.wire import MeasuredLight
 
 OUT, SPECTRUM_IN, UNUSED_IN, ANSWER_IN = 0x01, 0x82, 0x86, 0x81
 PIXELS = 2048
@@ -54,7 +54,7 @@ def calibration_csv() -> str:
 class Usb2000Plus(UsbDevice):
     """The instrument; `light` is what it looks at, `seed` that of its noise."""
 
-    def __init__(self, light: Light, serial_number: str = "USB2+F00001", seed: int = 2000) -> None:
+    def __init__(self, light: MeasuredLight, serial_number: str = "USB2+F00001", seed: int = 2000) -> None:
         endpoints = (UsbEndpoint(OUT), UsbEndpoint(SPECTRUM_IN), UsbEndpoint(UNUSED_IN), UsbEndpoint(ANSWER_IN))
         super().__init__(
             UsbIdentity(0x2457, 0x101E, (0, 0, 0), "Ocean Optics Inc.", "USB2000+", serial_number),

@@ -41,7 +41,7 @@ class MockClock(Protocol):
     def sleep(self, seconds: float) -> None: ...
 
 
-class Light(Protocol):
+class MeasuredLight(Protocol):
     """What the optical instruments do to a light path, and see of it: `mocks.bench.Bench`, or `mocks.lamp.Lamp` alone."""
 
     @property

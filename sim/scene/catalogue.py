@@ -154,7 +154,7 @@ def _dark(white: Spectrum, contrast: float) -> Spectrum:
     return white.scaled((1.0 - contrast) / (1.0 + contrast))
 
 
-class Uniform(NamedScene):
+class UniformScene(NamedScene):
     name: ClassVar[str] = "uniform"
     shows: ClassVar[str] = "even light that fills the frame"
 
