@@ -397,7 +397,7 @@ def _cells_to_cover(view: View, cell_px: float) -> tuple[int, int]:
 SCENES: dict[str, type[NamedScene]] = {
     item.name: item
     for item in (
-        Uniform,
+        UniformScene,
         ColorChecker24,
         ColorCheckerSG,
         SlantedEdge,
