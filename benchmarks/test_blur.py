@@ -1,4 +1,4 @@
-"""Edges and kernels with known truth: bias, scatter and CPU time beside the peers', the original report's table, a photograph.
+"""Edges and kernels with known truth: bias, standard deviation and CPU time beside the peers', the original report's table, a photograph.
 
 Peers: the slanted edge as ISO 12233:2005 has it (`peers/iso12233.py`), the objective of Mosleh et al. (`peers/mosleh.py`); the
 Cramer-Rao bound of a free line spread of +-4 px, and of a free kernel. Prints the tables of docs/explanation/accuracy.md, "MTF" and "PSF".
@@ -179,7 +179,7 @@ def test_corner_errors() -> None:
             + " | ".join(f"{v:.1f}" for v in means[:3])
             + f" | {means[3]:.2f} | {means[4]:.2f} | {means[5]:.1f} |"
         )
-        # the goal is 1 dB; the scatter of three draws' difference is 0.3 dB
+        # the goal is 1 dB; the difference of three draws has a standard deviation of 0.3 dB
         assert means[3] < 1.3
 
 

@@ -203,7 +203,7 @@ def value_of(fit: NoiseFit, path: str) -> tuple[float | None, float | None]:
 
 
 def table(name: str, fits: list[NoiseFit], truths: dict[str, float], draws: int) -> list[str]:
-    """Print coverage by figure; give those out of 93..97 % by more than so many draws scatter, and their mean where it is out."""
+    """Print coverage by figure; give those out of 93..97 % by more than the standard deviation of so many draws, and their mean where it is out."""
     print(f"\n{name}, {draws} draws\n| figure | truth | mean | rms error | mean stated | 2-sigma coverage, % |")
     print("| --- | --- | --- | --- | --- | --- |")
     out, all_covered = [], []

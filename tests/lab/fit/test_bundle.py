@@ -1,4 +1,4 @@
-"""The bundle adjustment against known cameras: what it finds, and whether its covariance is the scatter of repeated solves."""
+"""The bundle adjustment against known cameras: what it finds, and whether its covariance is that of repeated solves."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_jacobian_is_that_of_the_residuals():
         np.testing.assert_allclose(exact, numeric, atol=1e-5 * max(1.0, np.abs(exact).max()))
 
 
-def test_covariance_of_a_pair_is_the_scatter_of_repeated_solves():
+def test_covariance_of_a_pair_is_that_of_repeated_solves():
     """30 sets of corners; the rig and the first camera's focal length and centre."""
     runs, stated = [], []
     free = np.array([free_intrinsics(MODELS[1])] * 2)
@@ -98,6 +98,6 @@ def test_covariance_of_a_pair_is_the_scatter_of_repeated_solves():
         stated.append([*std[16:22], *std[:4]])
     assert found.names[16] == "turn_x_rad"
     ratio = np.std(runs, axis=0, ddof=1) / np.mean(stated, axis=0)
-    # a standard deviation of 30 values scatters by 1 / sqrt(58) = 13 %; four of these, for ten figures
+    # a standard deviation of 30 values is uncertain by 1 / sqrt(58) = 13 %; four of these, for ten figures
     np.testing.assert_allclose(ratio, 1.0, atol=0.52)
     assert np.all(np.abs(np.mean(runs, axis=0)) < 4 * np.mean(stated, axis=0) / np.sqrt(30))

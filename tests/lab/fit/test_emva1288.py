@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,7 @@ def frame(rng: np.random.Generator, light: float, exposure_s: float, pattern: np
     return np.clip(np.rint(BLACK + GAIN * (charge + READ * rng.standard_normal(SHAPE))), 0, 4095).astype(np.uint16)
 
 
+@functools.cache
 def recorded(seed: int = 1, repeats: int = 2) -> tuple[EmvaInput, dict[str, dict[float, np.ndarray]]]:
     rng = np.random.default_rng(seed)
     pattern = 0.01 * rng.standard_normal(SHAPE)

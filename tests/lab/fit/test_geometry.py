@@ -39,10 +39,10 @@ def test_corner_is_found_where_it_is():
         )
         assert trusted[0]
         found.append(points[0] - 20 - place)
-    scatter = np.std(found)
+    std_px = np.std(found)
     # noise / (contrast slope) over about 4 window-lengths of edge pixels: 0.02 / 0.4 / sqrt(36) = 0.008 px
-    assert scatter < 0.012
-    assert np.abs(np.mean(found, axis=0)).max() < 4 * scatter / np.sqrt(60)
+    assert std_px < 0.012
+    assert np.abs(np.mean(found, axis=0)).max() < 4 * std_px / np.sqrt(60)
 
 
 def test_intrinsics_of_a_bayer_camera_are_recovered_within_their_uncertainty(charuco_fits, truth):
@@ -104,7 +104,7 @@ def test_a_displaced_view_is_left_out(boards):
 
 
 def test_too_few_views_are_not_determined(boards):
-    with pytest.raises(NotDetermined, match="3 are needed"):
+    with pytest.raises(NotDetermined, match="2 views of the board can be used, 3 are needed"):
         fit_geometry(boards(poses=2, sides=("left",)), "left")
 
 
@@ -128,22 +128,17 @@ def edited(recordings: RecordingSet, frames=None, **keys) -> RecordingSet:
 )
 def test_wrong_words_about_the_board_are_refused(boards, keys, reason):
     with pytest.raises(NotDetermined, match=reason):
-        fit_geometry(edited(boards(poses=3, sides=("left",)), **keys), "left")
+        fit_geometry(edited(boards(poses=1, sides=("left",)), **keys), "left")
 
 
 def test_a_mirrored_picture_is_recognised(boards):
-    mirrored = edited(boards(poses=3, sides=("left",)), frames=lambda frame: frame[:, ::-1])
+    mirrored = edited(boards(poses=1, sides=("left",)), frames=lambda frame: frame[:, ::-1])
     with pytest.raises(NotDetermined, match="mirrored"):
         fit_geometry(mirrored, "left")
 
 
-def test_one_view_is_not_enough(boards):
-    with pytest.raises(NotDetermined, match="1 views of the board can be used, 3 are needed"):
-        fit_geometry(boards(poses=1, sides=("left",)), "left")
-
-
 def test_parallel_views_do_not_determine_the_focal_length():
-    facing = [(np.eye(3), np.array([-150.0 + 40 * k, -100.0 + 15 * k, 700.0])) for k in range(6)]
+    facing = [(np.eye(3), np.array([-150.0 + 40 * k, -100.0 + 15 * k, 700.0])) for k in range(3)]
     with pytest.raises(NotDetermined, match="all views are parallel"):
         calibrate_robustly(seen(np.random.default_rng(0), facing), SHAPE)
 
@@ -182,7 +177,7 @@ def test_a_view_of_something_else_is_left_out_and_named():
 def test_a_model_that_overfits_is_refused():
     """Six views of twelve noisy corners in the middle of the frame: the coefficients beyond k1 predict unseen views worse."""
     refused = 0
-    for draw in range(4):
+    for draw in range(2):
         views = seen(np.random.default_rng(draw), poses(6, squares=(4, 5)), noise_px=0.3, squares=(4, 5))
         models = calibrate_robustly(views, SHAPE).models
         chosen = next(model for model in models if model.chosen)

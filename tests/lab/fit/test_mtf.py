@@ -62,7 +62,7 @@ def test_undersampled_blur_keeps_its_curve_beyond_nyquist():
     np.testing.assert_allclose(found.mtf, gaussian_mtf(0.3, found.frequency_cy_per_px), atol=3e-4)
 
 
-def test_scatter_is_as_predicted_and_near_the_bound():
+def test_standard_deviation_is_as_predicted_and_near_the_bound():
     rng = np.random.default_rng(11)
     mean = edge(400, 5.0, 0.55)
     found = [edge_mtf(noisy(mean, rng)) for _ in range(30)]
@@ -71,12 +71,12 @@ def test_scatter_is_as_predicted_and_near_the_bound():
     # Cramer-Rao bound of this noise with a free line spread of +-4 px: 0.256 % (hats of 0.25 px, levels free)
     assert predicted < 1.1 * 0.00256
     assert abs(relative.mean()) < 3 * predicted / np.sqrt(30) + 2e-4
-    # a standard deviation from 30 values scatters by 1 / sqrt(58) = 13 %: three of these
+    # a standard deviation of 30 values is uncertain by 1 / sqrt(58) = 13 %: three of these
     assert 0.6 < relative.std(ddof=1) / predicted < 1.4
 
 
 @pytest.mark.parametrize("dark_dn", [0.06, 0.5])
-def test_scatter_is_as_predicted_where_the_dark_side_stands_still(dark_dn):
+def test_standard_deviation_is_as_predicted_where_the_dark_side_has_one_code(dark_dn):
     """Eight bits, 120 DN of contrast, 50 e/DN: noise of 0.05 to 0.15 DN on the dark side leaves one code there, or two. 40 edges, so
     that a sum of squares has a standard deviation of 0.22; held to 4 of them above, as rounding's error is no normal one."""
     rng = np.random.default_rng(31)

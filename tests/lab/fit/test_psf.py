@@ -20,13 +20,13 @@ from lab.capture_kinds.checkerboard import CheckerboardCapture
 from lab.capture_kinds.screen import ScreenState
 from lab.capture_kinds.white import WhiteCapture
 from lab.errors import NotDetermined
-from lab.fit.psf import estimate_kernel
-from lab.fit.psf.levelled_captures import screen_pictures
+from lab.fit.psf import estimate_kernel, recordings
+from lab.fit.psf.levelled_captures import ScreenPictures, screen_pictures
 from lab.fit.psf.normal_equations import normal_equations
 from lab.fit.psf.photograph import photographed_kernel
 from lab.fit.psf.radial_symmetry import radial_symmetry
-from lab.fit.psf.recordings import fit_psf_field
-from lab.fit.psf.screen_kernel import ScreenKernel, measure_kernels
+from lab.fit.psf.recordings import PsfFit, fit_psf_field
+from lab.fit.psf.screen_kernel import ScreenField, ScreenKernel, measure_field, measure_kernels
 from lab.fit.psf.screen_registration import register, target_corners
 from lab.fit.psf.simplex import on_simplex
 from lab.fit.psf.target_displacement import displacement
@@ -187,7 +187,7 @@ def test_corner_errors_of_three_tenths_of_a_pixel_are_taken_out():
     wrong = [
         np.linalg.norm(np.abs(np.fft.fft2(f.kernel)) - np.abs(np.fft.fft2(kernel))) for f in (placed, joint, believed)
     ]
-    # 1 dB is 1.12; a single draw scatters by as much
+    # 1 dB is 1.12; single draws differ by as much
     assert wrong[1] < 1.25 * wrong[0]
     assert wrong[2] > 4.0 * wrong[1]
 
@@ -389,8 +389,29 @@ def screen_recordings(electrons=9000.0, seed=5, **changed):
 
 
 @pytest.fixture(scope="module")
-def screen():
+def screen() -> RecordingSet:
     return screen_recordings()
+
+
+@pytest.fixture(scope="module")
+def pictures(screen) -> ScreenPictures:
+    """The levelled pictures of `screen`."""
+    return screen_pictures(screen, "left")[0]
+
+
+@pytest.fixture(scope="module")
+def fitted(screen) -> tuple[PsfFit, ScreenField]:
+    """The kernels of `screen` as results, and as they were measured for them."""
+    measured = []
+
+    def recorded(*arguments, **keys):
+        measured.append(measure_field(*arguments, **keys))
+        return measured[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recordings, "measure_field", recorded)
+        fit = fit_psf_field(screen, "left", patches=3)
+    return fit, measured[0]
 
 
 def pixel_gaussian(sigma_px, support):
@@ -402,8 +423,7 @@ def pixel_gaussian(sigma_px, support):
     return kernel / kernel.sum()
 
 
-def test_registration_finds_the_screen_to_a_hundredth_of_a_pixel(screen):
-    pictures = screen_pictures(screen, "left")[0]
+def test_registration_finds_the_screen_to_a_hundredth_of_a_pixel(pictures):
     warp = register(pictures.checkerboard, pictures.bernoulli, BOARD, PATTERN, 4.0)
     row, col = np.meshgrid(np.arange(40, 160, 10.0), np.arange(40, 210, 10.0), indexing="ij")
     found = warp.cells(np.column_stack([col.ravel(), row.ravel()]))
@@ -413,8 +433,7 @@ def test_registration_finds_the_screen_to_a_hundredth_of_a_pixel(screen):
     assert gap_px.std() < 0.02
 
 
-def test_registration_works_where_the_screen_is_larger_than_the_frame(screen):
-    pictures = screen_pictures(screen, "left")[0]
+def test_registration_works_where_the_screen_is_larger_than_the_frame(pictures):
     part = np.s_[40:170, 50:230]
     warp = register(pictures.checkerboard[part], pictures.bernoulli[part], BOARD, PATTERN, 4.0)
     y, x = cells(100.0, 140.0)
@@ -430,8 +449,8 @@ def test_corners_of_a_target():
         target_corners(PATTERN)
 
 
-def test_kernels_of_all_channels_are_the_gaussians(screen):
-    kernels = fit_psf_field(screen, "left", patches=0).kernels
+def test_kernels_of_all_channels_are_the_gaussians(fitted):
+    kernels = fitted[0].kernels
     assert [k.channel for k in kernels] == ["R", "G", "B"]
     for found in kernels:
         kernel = np.array(found.psf)
@@ -444,9 +463,8 @@ def test_kernels_of_all_channels_are_the_gaussians(screen):
         assert np.sqrt(np.mean(pull**2)) < 2
 
 
-def test_a_predicted_kernel_goes_through_the_same_estimator(screen):
-    pictures = screen_pictures(screen, "left")[0]
-    found = measure_kernels(pictures, "GRBG")["G"]
+def test_a_predicted_kernel_goes_through_the_same_estimator(fitted):
+    found = fitted[1].kernels["G"]
     size = len(found.fine.kernel)
     x = (np.arange(size) - size // 2) / 2
     grid = np.linspace(-0.25, 0.25, 101)
@@ -458,8 +476,8 @@ def test_a_predicted_kernel_goes_through_the_same_estimator(screen):
     assert np.linalg.norm(predicted - truth) / np.linalg.norm(truth) < 0.01
 
 
-def test_parts_of_the_pattern_have_kernels_of_their_own(screen):
-    found = fit_psf_field(screen, "left", patches=3)
+def test_parts_of_the_pattern_have_kernels_of_their_own(fitted):
+    found = fitted[0]
     assert len(found.parts) == 9
     for part in found.parts:
         kernel = np.array(part.psf)
@@ -473,8 +491,7 @@ def test_parts_of_the_pattern_have_kernels_of_their_own(screen):
 
 
 @pytest.mark.slow
-def test_a_finer_grid_gives_the_same_kernel(screen):
-    pictures = screen_pictures(screen, "left")[0]
+def test_a_finer_grid_gives_the_same_kernel(pictures):
     two, four = (measure_kernels(pictures, "GRBG", 5, oversample)["G"] for oversample in (2, 4))
     assert four.fine.kernel.shape == (21, 21)
     # the two differ by what the noise and the grids make: 1 % each

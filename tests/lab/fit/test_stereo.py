@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,9 +46,10 @@ def test_poses_of_one_camera_alone_are_no_pairs(charuco_boards, charuco_fits):
         fit_stereo(apart, charuco_fits["left"], charuco_fits["right"])
 
 
-def drawn_pairs(rng: np.random.Generator, noise_px: float = 0.1, count: int = 10):
+@functools.cache
+def drawn_pairs(noise_px: float = 0.1):
     """Views of both cameras of `projected`, and their fits."""
-    at = poses(count)
+    rng, at = np.random.default_rng(0), poses(10)
     sides = [seen(rng, at, noise_px=noise_px, side=side) for side in ("left", "right")]
     calibrations = [calibrate_robustly(views, SHAPE) for views in sides]
     pairs = [StereoPair(one, two) for one, two in zip(calibrations[0].views, calibrations[1].views, strict=True)]
@@ -56,7 +58,7 @@ def drawn_pairs(rng: np.random.Generator, noise_px: float = 0.1, count: int = 10
 
 def test_depth_of_the_map_is_that_of_the_formula():
     """Two parallel cameras: sigma_Z = Z^2 / (f B) times the disparity's uncertainty, sqrt 2 of a corner's, plus calibration."""
-    pairs, left, right = drawn_pairs(np.random.default_rng(0))
+    pairs, left, right = drawn_pairs()
     fit = fit_pairs(pairs, left, right, (SHAPE, SHAPE), depths_mm=(500.0, 1000.0))
     for depth in fit.depth:
         total = np.array(depth.total_mm_std, dtype=float)
@@ -71,7 +73,7 @@ def test_depth_of_the_map_is_that_of_the_formula():
 
 def test_rectified_pairs_have_equal_rows():
     """Maps from the fit, applied to both cameras' corners: rows agree to the corners' noise, and columns differ by f B / Z."""
-    pairs, left, right = drawn_pairs(np.random.default_rng(1), noise_px=0.05)
+    pairs, left, right = drawn_pairs(noise_px=0.05)
     fit = fit_pairs(pairs, left, right, (SHAPE, SHAPE))
     # rows differ by sqrt 2 of a corner's noise, magnified by about the ratio of focal lengths
     assert fit.rectification.row_rms_px == pytest.approx(np.sqrt(2) * 0.05, rel=0.15)
@@ -90,7 +92,7 @@ def test_rectified_pairs_have_equal_rows():
 
 
 def test_a_mirrored_camera_makes_no_rig():
-    pairs, left, right = drawn_pairs(np.random.default_rng(2))
+    pairs, left, right = drawn_pairs()
     mirrored = [replace(p.right, image_px=np.array([SHAPE[1] - 1.0, 0.0]) + p.right.image_px * [-1, 1]) for p in pairs]
     with pytest.raises(NotDetermined, match="no rig explains the pairs"):
         fit_pairs([StereoPair(p.left, m) for p, m in zip(pairs, mirrored, strict=True)], left, right, (SHAPE, SHAPE))
@@ -98,7 +100,7 @@ def test_a_mirrored_camera_makes_no_rig():
 
 def test_a_pair_that_is_not_one_is_left_out():
     """One pose under another's name."""
-    pairs, left, right = drawn_pairs(np.random.default_rng(3))
+    pairs, left, right = drawn_pairs()
     wrong = StereoPair(pairs[3].left, replace(pairs[3].right, image_px=pairs[3].right.image_px + np.array([4.0, 1.0])))
     fit = fit_pairs([*pairs[:3], wrong, *pairs[4:]], left, right, (SHAPE, SHAPE))
     assert fit.pairs == len(pairs) - 1
