@@ -1,1 +1,1 @@
-"""From measurements to probabilities: evidence, score, search, refit, decision."""
+"""From measurements to names: measurement model, location, scores, search, weighing, naming."""

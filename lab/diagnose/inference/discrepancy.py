@@ -1,7 +1,7 @@
 """Model discrepancy: what no effect accounts for, as a smooth Gaussian process along a measurement's axis (Kennedy and O'Hagan, 2001).
 
 Kernel: a^2 s_i s_j exp(-(x_i - x_j)^2 / (2 l^2)) for numbers of one group, 0 between groups; s is the block's scale. Amplitude a, length l and
-grouping (which channels and conditions share one process) are chosen from a grid.
+grouping (which channels and conditions share one draw) are chosen from a grid.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LENGTHS, PREDICTIVE_LENGTHS = (0.5, 1.0, 2.0), (0.5, 1.0, 2.0, 4.0)
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """A process for one block: its log posterior odds over none, its amplitude, correlation length, grouping in words, and kernel."""
+    """A discrepancy of one block: its log posterior odds over none, its amplitude, correlation length, grouping in words, and kernel."""
 
     index: int
     log_odds: float
@@ -39,7 +39,7 @@ class Discrepancy:
 def likeliest_discrepancy(
     model: MeasurementModel, gaussian: Gaussian, index: int, policy: DecisionPolicy
 ) -> Discrepancy:
-    """The process of one block that maximises the marginal likelihood of the seen numbers, or none where that is likelier.
+    """The discrepancy of one block that maximises the marginal likelihood of the seen numbers, or none where that is likelier.
     `gaussian`: the distribution of the seen numbers without it."""
     return max(_fitted(model, gaussian, index, LENGTHS, policy), key=lambda d: d.log_odds)
 
@@ -47,14 +47,14 @@ def likeliest_discrepancy(
 def predictive_discrepancy(
     model: MeasurementModel, gaussian: Gaussian, index: int, policy: DecisionPolicy
 ) -> Discrepancy:
-    """The process of one block that best predicts captures which it hasn't seen, or none where none does.
+    """The discrepancy of one block that best predicts captures which it hasn't seen, or none where none does.
 
-    Captures are left out in turn (cross-validation); of the processes with positive log odds, the one of the least chi2 over what was left out
-    is taken, if that beats no process by twice `discrepancy_log_odds`. Longer lengths, and points by themselves, are tried besides.
+    Captures are left out in turn (cross-validation); of the discrepancies with positive log odds, the one of the least chi2 over what was left
+    out is taken, if that beats none by twice `discrepancy_log_odds`. Longer lengths, and points by themselves, are tried besides.
     Where mostly repeats of seen numbers are held out, leaving captures out asks for more than is needed: cross-validation then decides
-    only between processes within `equal_discrepancy_log_odds` of the likeliest. With a single set of captures, the likeliest is taken.
+    only between discrepancies within `equal_discrepancy_log_odds` of the likeliest. With a single set of captures, the likeliest is taken.
 
-    What was left out is judged by the covariance without the process, so that larger variances gain nothing.
+    What was left out is judged by the covariance without the discrepancy, so that larger variances gain nothing.
     """
     block, seen = model.blocks[index], model.seen[model.slices[index]]
     none = _none(block, index)
@@ -66,8 +66,8 @@ def predictive_discrepancy(
     residual = model.value[model.slices[index]][seen] - gaussian.mean[gaussian.slices[index]]
     covariance = gaussian.block_covariance(index)
 
-    def left_out_chi2(process: Discrepancy) -> float:
-        kernel = process.kernel[np.ix_(seen, seen)]
+    def left_out_chi2(one: Discrepancy) -> float:
+        kernel = one.kernel[np.ix_(seen, seen)]
         total = 0.0
         for out in parts:
             kept = ~out
@@ -111,7 +111,7 @@ def _fitted(
     *,
     points: bool = False,
 ) -> Iterator[Discrepancy]:
-    """No process; and for every length and grouping the one of the likeliest amplitude. `points`: every point by itself, too."""
+    """None; and for every length and grouping the one of the likeliest amplitude. `points`: every point by itself, too."""
     block, at = model.blocks[index], model.slices[index]
     seen = model.seen[at]
     residual = model.value[at][seen] - gaussian.mean[gaussian.slices[index]]
@@ -147,7 +147,7 @@ def _fitted(
 
 
 def _groupings(block: Block) -> dict[str, NDArray[np.intp]]:
-    """The ways in which numbers share a process: in words, and each number's group (m,)."""
+    """The ways in which numbers share a draw: in words, and each number's group (m,)."""
     channel = np.unique([label.channel for label in block.labels], return_inverse=True)[1]
     condition = np.unique([label.condition for label in block.labels], return_inverse=True)[1]
     both = np.unique(condition * len(channel) + channel, return_inverse=True)[1]
@@ -176,5 +176,5 @@ def _kernel_factor(x: FloatArray, length: float) -> FloatArray:
 
 
 def _by_group(factor: FloatArray, group: NDArray[np.intp]) -> FloatArray:
-    """The factor's columns once for every group, zero outside it: independent processes of the groups."""
+    """The factor's columns once for every group, zero outside it: independent draws of the groups."""
     return np.concatenate([np.where((group == g)[:, None], factor, 0.0) for g in range(int(group.max()) + 1)], axis=1)

@@ -27,7 +27,7 @@ PIXELS, REPEATS, FILLED = 2e4, 4, 0.6
 #: Standard deviations that don't average out: of a variance, relative, beside its noise; of a transfer function, where no edge tells.
 VARIANCE_STD, EDGE_STD = 0.003, 0.004
 #: Prior standard deviation of a level that is a nuisance parameter, relative: so wide that it says nothing.
-FREE_STD = 10.0
+NUISANCE_STD = 10.0
 #: Length of a session (s), over which drifts show.
 SESSION_S = 3600.0
 
@@ -74,8 +74,8 @@ def _lamp(recordings: RecordingSet, side: Side) -> Spectrum:
     return Spectrum.of((380.0, 780.0), (0.01, 0.01))
 
 
-def _exposed(camera: CameraModel, light: Spectrum, kind: str = "flat") -> float:
-    """Exposure (s) that fills the brightest channel's wells to `FILLED`."""
+def _filling_exposure_s(camera: CameraModel, light: Spectrum, kind: str = "flat") -> float:
+    """Exposure (s) that fills the brightest channel to `FILLED` of the full well; 0 where no channel sees the light."""
     brightest = max(electron_rate(camera, c, light, (), kind) for c in camera.channels)
     return FILLED * camera.full_well_e / brightest if brightest > 0 else 0.0
 
@@ -94,7 +94,7 @@ def _narrowband(camera: CameraModel) -> Iterator[Design]:
     """Light of one wavelength, every 5 nm."""
     for centre in np.arange(400.0, 721.0, 5.0):
         light = Spectrum.of((centre - 10.0, centre, centre + 10.0), (0.0, 1e-3, 0.0))
-        exposure = _exposed(camera, light, "narrowband")
+        exposure = _filling_exposure_s(camera, light, "narrowband")
         if exposure <= 0:
             continue
 
@@ -103,12 +103,12 @@ def _narrowband(camera: CameraModel) -> Iterator[Design]:
 
         signal = predict(Hypothesis("", (), camera))
         noise = (signal + camera.read_noise_e**2) / (PIXELS * REPEATS)
-        loose = np.square(signal) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
+        floor = np.square(signal) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
         around = {"from_nm": float(centre - 5.0), "to_nm": float(centre + 5.0), "step_nm": 2.5}
         yield Design(
             f"narrowband light at {centre:g} nm",
             predict,
-            np.diag(noise + loose + (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2),
+            np.diag(noise + floor + (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2),
             CapturePlan((NarrowbandSequence.model_validate(around),)),
         )
 
@@ -118,7 +118,7 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
     frequency = np.arange(1, 17) * 0.05
     block = next((b for b in model.blocks if b.measurement == "slanted_edge"), None)
     std = np.full(frequency.shape, EDGE_STD)
-    if block is not None:  # of the best edge there was, frequency by frequency
+    if block is not None:  # the smallest standard deviation of any recorded edge at each frequency
         x, variance = np.array([label.x for label in block.labels]), np.diag(block.covariance)
         places = np.unique(x)
         std = np.interp(frequency, places, [float(np.sqrt(variance[x == place].min())) for place in places])
@@ -129,10 +129,10 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
     }
     for stops, at in ((1.0, ""), (2.0, " at twice the f-number")):
         for name, light in lights.items():
-            sighted = [c for c in camera.channels if electron_rate(camera, c, light) > 0]
+            channels_lit = [c for c in camera.channels if electron_rate(camera, c, light) > 0]
 
             def predict(
-                h: Hypothesis, stops: float = stops, light: Spectrum = light, channels: list[str] = sighted
+                h: Hypothesis, stops: float = stops, light: Spectrum = light, channels: list[str] = channels_lit
             ) -> FloatArray:
                 lens = h.camera.lens.model_copy(update={"f_number": stops * h.camera.lens.f_number})
                 stopped = h.camera.model_copy(update={"lens": lens})
@@ -140,18 +140,19 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
                     [np.real(optical_transfer(stopped, c, light, fx, fy, h.effects)).ravel() for c in channels]
                 )
 
-            n = len(sighted) * fx.size
-            plain = stops == 1.0 and light is lamp
-            plan = CapturePlan((EdgeSequence(frames=2 * REPEATS),)) if plain else None
+            n = len(channels_lit) * fx.size
+            is_usual = stops == 1.0 and light is lamp
+            plan = CapturePlan((EdgeSequence(frames=2 * REPEATS),)) if is_usual else None
             if n:
                 words = f"slanted edges at 5, 50, 95 and 140 degrees in {name}{at}"
                 yield Design(words, predict, np.diag(np.square(np.tile(std, n // len(std)))), plan)
 
 
 def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
-    """Flats at many levels: by the exposure, or by the light at one exposure. Mean and variance; their scales are free."""
+    """Flats at many levels: by the exposure, or by the light at one exposure. Means and variances. Nuisance parameters: gain, read noise,
+    black level, and the light in each channel."""
     shares = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92]) / FILLED
-    full = _exposed(camera, lamp)
+    full = _filling_exposure_s(camera, lamp)
     if full <= 0:
         return
     dimmed = [Spectrum.of(*(lamp.arrays[0], share * lamp.arrays[1])) for share in shares]
@@ -178,21 +179,21 @@ def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
         )
         covariance = np.diag(np.square(std))
         zero = np.zeros_like(mean)
-        free = [np.concatenate([zero, mean]), np.concatenate([zero, np.ones_like(mean)])]  # gain and read noise
-        free += [np.concatenate([np.ones_like(mean), zero])]  # black level
+        jacobian = [np.concatenate([zero, mean]), np.concatenate([zero, np.ones_like(mean)])]  # gain and read noise
+        jacobian += [np.concatenate([np.ones_like(mean), zero])]  # black level
         for channel in np.split(np.arange(len(mean)), len(camera.channels)):  # the light
             rate = np.zeros(2 * len(mean))
             rate[channel] = mean[channel]
-            free.append(rate)
-        covariance += FREE_STD**2 * sum(np.outer(column, column) for column in free)
+            jacobian.append(rate)
+        covariance += NUISANCE_STD**2 * sum(np.outer(column, column) for column in jacobian)
         by_exposure = all(light is lamp for light, _ in steps)
         sequence = FlatSequence(levels=tuple((FILLED * shares).round(3).tolist()), frames=2 * REPEATS)
         yield Design(words, predict, covariance, CapturePlan((sequence,)) if by_exposure else None)
 
 
 def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
-    """The same flat again and again: the lamp's level is free, what becomes of it isn't."""
-    full = _exposed(camera, lamp)
+    """The same flat again and again; the lamp's level is a nuisance parameter, its change with time isn't."""
+    full = _filling_exposure_s(camera, lamp)
     times = np.linspace(0.0, SESSION_S, 13)
     if full <= 0:
         return
@@ -206,12 +207,12 @@ def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
     yield Design(
         "the same flat every five minutes for an hour",
         predict,
-        np.diag(noise + np.square(2.0 * LAMP_FLOOR * mean)) + FREE_STD**2 * levels,
+        np.diag(noise + np.square(2.0 * LAMP_FLOOR * mean)) + NUISANCE_STD**2 * levels,
     )
 
 
 def _darks(camera: CameraModel) -> Iterator[Design]:
-    """Dark frames by exposure, by time and by temperature; black level and dark current are free."""
+    """Dark frames by exposure, by time and by temperature; black level and dark current are nuisance parameters."""
     gain, reference = camera.conversion_gain_dn_per_e, camera.dark_current_reference_c
     times = np.linspace(0.0, SESSION_S, 13)
     ladders = {
@@ -233,14 +234,14 @@ def _darks(camera: CameraModel) -> Iterator[Design]:
 
         seconds = np.array([s for s, _, _ in steps])
         covariance = np.eye(len(steps)) * (2 * BLACK_FLOOR_DN) ** 2
-        covariance += FREE_STD**2 * (np.ones_like(covariance) + np.outer(seconds, seconds))
+        covariance += NUISANCE_STD**2 * (np.ones_like(covariance) + np.outer(seconds, seconds))
         exposures = "from 1 ms" in words
         plan = CapturePlan((DarkSequence(exposures_s=tuple(seconds.round(4).tolist()), frames=REPEATS),))
         yield Design(words, predict, covariance, plan if exposures else None)
 
 
 def _again(model: MeasurementModel) -> Iterator[Design]:
-    """Every measurement once more, as it was."""
+    """Every measurement once more, with the same captures."""
     for block, at in zip(model.blocks, model.slices, strict=True):
 
         def predict(h: Hypothesis, at: slice = at) -> FloatArray:

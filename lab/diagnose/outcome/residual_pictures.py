@@ -1,8 +1,8 @@
 """Residual pictures: a held-out frame of each kind, measured less predicted, before and after the named effects.
 
-The frame is drawn by the one forward model (`lab.predict.replay`). What a model leaves free, the light's level, is put where the frame has
-it, channel by channel. A cell of the picture is the mean of its pixels' residuals over its scatter: the frame's noise and, as that
-doesn't average out over frames, PRNU; so that noise alone is of size 1.
+The forward model draws the mean frame (`lab.predict.replay`); the light's level, a nuisance parameter, is fitted channel by channel. A cell of
+a picture is the sum of its pixels' residuals over its standard deviation, sqrt(sum variance), with shot noise, read noise, PRNU and rounding: of
+noise alone, cells have variance 1.
 """
 
 from __future__ import annotations
@@ -28,39 +28,40 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 KINDS = ("flat", "slanted_edge", "chart")
-#: Cells of a picture, at most.
+#: Largest number of cells of a picture.
 ROWS, COLS = 48, 64
 
 
 def residual_pictures(
     recordings: RecordingSet, side: Side, model: MeasurementModel, improved: CameraFile
 ) -> Iterator[ResidualPicture]:
-    """One of each kind that there is and that tells what stood before the camera; the baseline has the effects that it always had."""
+    """One picture of each kind that was captured and that can be replayed, held out where possible. Before: with the baseline's own effects."""
     replay = Replay(recordings, side, improved.camera)
     held_out = set(model.captures(True))
-    stages = model.always, tuple(improved.effects)  # the same where nothing was found
+    both = model.always, tuple(improved.effects)
     for kind in KINDS:
         captures = [c for c in replay.captures if c.kind == kind]
         if not captures:
             continue
-        capture = max(captures, key=lambda c: (c.id in held_out, _usable(recordings, c, improved.camera)))
+        capture = max(captures, key=lambda c: (c.id in held_out, _brightness(recordings, c, improved.camera)))
         try:
-            drawn = {effects: _residual(recordings, replay, capture, effects) for effects in {*stages}}
+            drawn = {effects: _residual(recordings, replay, capture, effects) for effects in {*both}}
         except (NotDetermined, ValueError):
             continue
-        before, after = (drawn[effects] for effects in stages)
+        before, after = (drawn[effects] for effects in both)
         yield ResidualPicture(
             side=side, kind=kind, capture=capture.id, held_out=capture.id in held_out, before=_rows(before), after=_rows(after)
         )  # fmt: skip
 
 
-def _usable(recordings: RecordingSet, capture: Capture, camera: CameraModel) -> float:
-    """How bright a frame is, unless it is clipped."""
+def _brightness(recordings: RecordingSet, capture: Capture, camera: CameraModel) -> float:
+    """A frame's 99.9 % quantile (DN); -1 where it is clipped."""
     high = float(np.quantile(recordings.frame(capture), 0.999))
     return -1.0 if high >= 0.97 * camera.white_level_dn else high
 
 
 def _residual(recordings: RecordingSet, replay: Replay, capture: Capture, effects: Sequence[Effect]) -> FloatArray:
+    """Cells of the frame less its prediction under the effects, each channel scaled to the frame's level."""
     camera = replay.camera
     frame = recordings.frame(capture).astype(float)
     offset = camera.black_level_dn + camera.conversion_gain_dn_per_e * camera.dark_current_e_per_s * capture.exposure_s
@@ -79,16 +80,16 @@ def _residual(recordings: RecordingSet, replay: Replay, capture: Capture, effect
         gain * signal + (gain * camera.read_noise_e) ** 2 + (camera.prnu_percent / 100.0 * signal) ** 2 + 1.0 / 12.0
     )
     region = _region(capture, frame.shape)
-    known = np.hypot(PATCH_STD, PATCH_COLOUR_STD) if isinstance(capture, ChartCapture) else 0.0
+    patch_std = np.hypot(PATCH_STD, PATCH_COLOUR_STD) if isinstance(capture, ChartCapture) else 0.0
     return _cells(
         np.where(judged, frame - offset - predicted, 0.0)[region],
         np.where(judged, variance, 0.0)[region],
-        np.where(judged, known * signal, 0.0)[region],
+        np.where(judged, patch_std * signal, 0.0)[region],
     )
 
 
 def _judged(capture: Capture, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Pixels of which the model says anything: of an edge its region, of a chart the patches' inner halves."""
+    """Mask of the pixels that the model predicts: an edge's region, the inner halves of a chart's patches, else all."""
     inside = np.zeros(shape, bool)
     if isinstance(capture, ChartCapture):
         for _, rows, cols, *_ in _patches(capture):
@@ -100,7 +101,7 @@ def _judged(capture: Capture, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def _region(capture: Capture, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Of an edge its middle, pixel by pixel; else the frame."""
+    """The middle of an edge, pixel by pixel; else the whole frame."""
     if not isinstance(capture, SlantedEdgeCapture):
         return slice(None), slice(None)
     row0, col0, row1, col1 = capture.region or (0, 0, *shape)
@@ -109,8 +110,9 @@ def _region(capture: Capture, shape: tuple[int, ...]) -> tuple[slice, slice]:
     return slice(row - high, row + high), slice(col - wide, col + wide)
 
 
-def _cells(residual: FloatArray, variance: FloatArray, alike: FloatArray) -> FloatArray:
-    """Sums over cells of whole mosaics, over the root of the summed variances and of what is `alike` in a cell; 0 of empty cells."""
+def _cells(residual: FloatArray, variance: FloatArray, common_std: FloatArray) -> FloatArray:
+    """Sums over cells of whole mosaics, over sqrt(sum variance + (sum common_std)^2); 0 of empty cells. `common_std`: the standard deviation of an
+    error that the pixels of a cell share."""
     high = max(-(-residual.shape[0] // ROWS), 1)
     wide = max(-(-residual.shape[1] // COLS), 1)
     high, wide = (size + size % 2 if size > 1 else size for size in (high, wide))
@@ -120,8 +122,8 @@ def _cells(residual: FloatArray, variance: FloatArray, alike: FloatArray) -> Flo
         cut = table[: rows * high, : cols * wide]
         return np.asarray(cut.reshape(rows, high, cols, wide).sum(axis=(1, 3)))
 
-    scatter = np.sqrt(total(variance) + np.square(total(alike)))
-    return np.asarray(total(residual) / np.where(scatter > 0, scatter, np.inf))
+    std = np.sqrt(total(variance) + np.square(total(common_std)))
+    return np.asarray(total(residual) / np.where(std > 0, std, np.inf))
 
 
 def _rows(table: FloatArray) -> tuple[tuple[float, ...], ...]:
