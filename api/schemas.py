@@ -258,29 +258,3 @@ class Recordings(Schema):
     cameras: tuple[Side, ...]
     captures: int
     warnings: tuple[str, ...] = ()
-
-
-class Parameter(Schema):
-    """A physical quantity as the models declare it."""
-
-    name: str
-    unit: str
-    meaning: str
-    lower: float | None
-    upper: float | None
-    prior: tuple[float, float] | None = Field(description="centre and one standard deviation; null: flat")
-    absent: float | None = Field(description="value at which an effect isn't there")
-
-
-class Effect(Schema):
-    """A physical effect that a first model leaves out."""
-
-    name: str
-    stage: str
-    reference: str
-    sentence: str
-    parameters: tuple[Parameter, ...]
-    measurements: tuple[str, ...] = Field(description="measurements of a diagnosis that show it; none: nothing does")
-    shown_by: tuple[str, ...] = Field(description="kinds of capture that these measurements come from")
-    rivals: tuple[str, ...] = Field(description="effects that can look the same in some captures")
-    invariances: tuple[str, ...] = Field(description="what it doesn't depend on")

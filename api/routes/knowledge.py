@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, HTTPException
+from fastapi import APIRouter, Depends
 
-from api.errors import answers
+from api.errors import answers, known
 from api.keys import Permission, StoredKey
-from api.schemas import Effect, Me, Parameter
+from api.schemas import Me
 from api.security import Demand
 from api.service import READ
-from lab.diagnose.visibility import visibility
+from lab.diagnose.effect_list import EffectDescription, ParameterDescription, effect_description, effect_list
 from sim.camera import CameraModel, Lens
-from sim.effects.base import Effect as EffectType
-from sim.effects.library import effects
-from sim.parameters import Quantity, declared
+from sim.parameters import declared
 
 router = APIRouter()
 
@@ -26,49 +24,21 @@ def me(key: Annotated[StoredKey, Depends(Demand(Permission.READ))]) -> Me:
     return Me(name=key.name, scope=key.scope)
 
 
-def _parameter(name: str, quantity: Quantity) -> Parameter:
-    return Parameter(
-        name=name,
-        unit=quantity.unit,
-        meaning=quantity.meaning,
-        lower=quantity.lower,
-        upper=quantity.upper,
-        prior=quantity.prior,
-        absent=quantity.absent,
-    )
-
-
 @router.get("/parameters", tags=["knowledge"], dependencies=[READ], responses=answers(401))
-def list_parameters() -> list[Parameter]:
+def list_parameters() -> list[ParameterDescription]:
     """The parameters of the camera model with unit, bounds and prior; those of its lens are called `lens.NAME`."""
-    camera = [_parameter(name, quantity) for name, quantity in declared(CameraModel).items()]
-    return camera + [_parameter(f"lens.{name}", quantity) for name, quantity in declared(Lens).items()]
-
-
-def _effect(effect: type[EffectType]) -> Effect:
-    shown = visibility().get(effect.name)
-    return Effect(
-        name=effect.name,
-        stage=", ".join(effect.stages()),
-        reference=effect.reference,
-        sentence=effect.sentence,
-        parameters=tuple(_parameter(name, quantity) for name, quantity in effect.quantities().items()),
-        measurements=shown.measurements if shown else (),
-        shown_by=shown.capture_kinds if shown else (),
-        rivals=shown.rivals if shown else (),
-        invariances=tuple(sorted(effect.invariances)),
-    )
+    camera = [ParameterDescription.of(name, quantity) for name, quantity in declared(CameraModel).items()]
+    return camera + [ParameterDescription.of(f"lens.{name}", quantity) for name, quantity in declared(Lens).items()]
 
 
 @router.get("/effects", tags=["knowledge"], dependencies=[READ], responses=answers(401))
-def list_effects() -> list[Effect]:
-    """The library that a diagnosis chooses from."""
-    return [_effect(effect) for effect in effects().values()]
+def list_effects() -> list[EffectDescription]:
+    """The library that a diagnosis chooses from; `remark` says why an effect is never named."""
+    return list(effect_list().effects)
 
 
 @router.get("/effects/{name}", tags=["knowledge"], dependencies=[READ], responses=answers(401, 404, 422))
-def get_effect(name: str) -> Effect:
+def get_effect(name: str) -> EffectDescription:
     """One effect."""
-    if name not in effects():
-        raise HTTPException(404, f"no effect {name[:60]!r}; GET /api/v1/effects lists them")
-    return _effect(effects()[name])
+    missing = f"no effect {name[:60]!r}; GET /api/v1/effects lists them"
+    return known(missing, lambda: effect_description(name))

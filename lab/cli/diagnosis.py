@@ -1,4 +1,4 @@
-"""`calibench validate`, `diagnose`, `report` and `effects`."""
+"""`calibench validate`, `diagnose` and `report`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from lab.cli.console import check_writable, err, make_folder, out, write_json
 from lab.cli.exit_codes import EXIT_CHECK
@@ -125,46 +124,3 @@ def report(
         report_file=out_file,
     )
     out.print(f"report: {run_here(request, existing_store()).report}")
-
-
-@commands.command()
-def effects(
-    name: Annotated[str, typer.Argument(metavar="[NAME]", help="one effect, with all that it declares")] = "",
-) -> None:
-    """The library of effects: what a diagnosis can name, and what a camera file can have."""
-    from lab.diagnose.visibility import visibility
-    from sim.effects import library
-
-    if not name:
-        table = Table(box=None, pad_edge=False)
-        for heading in ("effect", "acts in", "captures that show it", "parameters"):
-            table.add_column(heading)
-        for kind in library.effects().values():
-            shown = visibility().get(kind.name)
-            captures = " ".join(shown.capture_kinds) if shown else ""
-            table.add_row(kind.name, ", ".join(kind.stages()), captures or "none", escape(" ".join(kind.quantities())))
-        out.print(table)
-        return
-    try:
-        kind = library.effect(name)
-    except KeyError as unknown:
-        raise InputError(str(unknown.args[0])) from None
-    out.print(escape(f"{kind.name} ({', '.join(kind.stages())}): {kind.sentence}"))
-    table = Table(box=None, pad_edge=False)
-    for heading in ("parameter", "unit", "from", "to", "usual", "absent", "what it is"):
-        table.add_column(heading)
-    for field, quantity in kind.quantities().items():
-        usual = "any" if quantity.prior is None else "{:g} ± {:g}".format(*quantity.prior)
-        limits = ("-" if v is None else f"{v:g}" for v in (quantity.lower, quantity.upper))
-        absent = "-" if quantity.absent is None else f"{quantity.absent:g}"
-        table.add_row(field, quantity.unit, *limits, usual, absent, escape(quantity.meaning))
-    out.print(table)
-    shown = visibility().get(kind.name)
-    for heading, told in (
-        ("measurements that show it", shown.measurements if shown else ()),
-        ("captures that show it", shown.capture_kinds if shown else ()),
-        ("can look like", shown.rivals if shown else ()),
-        ("doesn't depend on", sorted(kind.invariances)),
-        ("after", [kind.reference]),
-    ):
-        out.print(escape(f"{heading}: {', '.join(told) or 'nothing'}"))

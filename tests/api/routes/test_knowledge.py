@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from lab.diagnose.visibility import visibility
+from lab.diagnose.effect_list import effect_list
 from sim.camera import CameraModel
-from sim.effects.library import effects
 from sim.parameters import declared
 from tests.api.conftest import Running
 
@@ -21,15 +20,7 @@ def test_parameters_are_those_of_the_camera_model(shared: Running) -> None:
 def test_effects_are_those_of_the_library(shared: Running) -> None:
     with shared.client("read") as client:
         told = client.get("/api/v1/effects").json()
-        assert [one["name"] for one in told] == list(effects())
-        for one in told:
-            effect = effects()[one["name"]]
-            shown = visibility()[one["name"]]
-            assert one["reference"] == effect.reference
-            assert tuple(one["measurements"]) == shown.measurements
-            assert tuple(one["shown_by"]) == shown.capture_kinds
-            assert tuple(one["rivals"]) == shown.rivals
-            assert [p["name"] for p in one["parameters"]] == list(effect.quantities())
+        assert told == effect_list().model_dump(mode="json")["effects"]
         assert client.get("/api/v1/effects/optical_low_pass_filter").json() in told
         assert client.get("/api/v1/effects/magic").status_code == 404
 

@@ -16,6 +16,7 @@ import lab.fit
 from lab import cli
 from lab.cli import bench_process, capturing, diagnosis, fitting
 from lab.diagnose import Diagnosis
+from lab.diagnose.effect_list import EffectList, effect_list
 from lab.errors import DeviceError
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import Manifest, RecordingSet
@@ -226,15 +227,18 @@ def test_diagnosis_with_a_stored_fit(
     assert "not what --json wrote" in capsys.readouterr().err
 
 
-def test_the_library_tells_what_it_declares(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["effects"]) == 0
-    listed = capsys.readouterr().out
-    assert all(name in listed for name in effects())
-    for name, kind in effects().items():
-        assert cli.main(["effects", name]) == 0
-        told = capsys.readouterr().out
-        assert kind.sentence in told
-        assert all(field in told and q.meaning in told for field, q in kind.quantities().items())
+def test_effects_tells_of_the_whole_library(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "effects.json"
+    assert cli.main(["effects", "--json", str(file)]) == 0
+    shown = capsys.readouterr().out
+    told = EffectList.model_validate_json(file.read_text())
+    assert told == effect_list()
+    assert [effect.name for effect in told.effects] == list(effects())
+    for effect in told.effects:
+        assert effect.sentence in shown
+        assert all(one.name in shown and one.meaning in shown for one in effect.parameters)
+    assert cli.main(["effects", "blooming"]) == 0
+    assert "No measurement of a diagnosis can see it" in capsys.readouterr().out
     assert cli.main(["effects", "glare"]) == 2
     assert "no effect named 'glare'; there are: adc_nonlinearity" in capsys.readouterr().err
 

@@ -1,0 +1,59 @@
+"""`calibench effects`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from lab.cli.console import check_writable, out, write_json
+from lab.cli.sources import Json
+
+if TYPE_CHECKING:
+    from lab.diagnose.effect_list import EffectDescription
+
+commands = typer.Typer()
+
+
+@commands.command()
+def effects(
+    name: Annotated[str, typer.Argument(metavar="[NAME]", help="only this effect")] = "",
+    json: Json = None,
+) -> None:
+    """The library of effects: where each acts, its parameters, which measurements can show it, and its rivals."""
+    from lab.diagnose.effect_list import EffectList, effect_description, effect_list
+
+    check_writable(json)
+    told = EffectList(effects=(effect_description(name),)) if name else effect_list()
+    if str(json) != "-":
+        for number, effect in enumerate(told.effects):
+            if number:
+                out.print()
+            _print_effect(effect)
+    write_json(told, json)
+
+
+def _print_effect(effect: EffectDescription) -> None:
+    out.print(f"[bold]{escape(effect.name)}[/] ({', '.join(effect.stages)}): {escape(effect.sentence)}")
+    if effect.remark is not None:
+        out.print(f"  [yellow]{escape(effect.remark)}[/]")
+    if effect.parameters:
+        table = Table(box=None, pad_edge=False)
+        for heading in ("  parameter", "unit", "from", "to", "usual", "absent", "what it is"):
+            table.add_column(heading)
+        for one in effect.parameters:
+            usual = "any" if one.prior is None else "{:g} ± {:g}".format(*one.prior)
+            numbers = ("-" if value is None else f"{value:g}" for value in (one.lower, one.upper))
+            absent = "-" if one.absent is None else f"{one.absent:g}"
+            table.add_row(f"  {one.name}", one.unit, *numbers, usual, absent, escape(one.meaning))
+        out.print(table)
+    for heading, items in (
+        ("measurements that can show it", effect.measurements),
+        ("captures that these rest on", effect.capture_kinds),
+        ("rivals", effect.rivals),
+        ("doesn't depend on", effect.invariances),
+        ("after", (effect.reference,)),
+    ):
+        out.print(f"  {heading}: {escape(', '.join(items)) or 'none'}")
