@@ -238,7 +238,7 @@ MEMORY = """
 import resource, sys
 import numpy as np
 sys.path.insert(0, ".")
-from benchmarks.test_forward import LAMP, traced_camera
+from benchmarks.test_frame import LAMP, traced_camera
 from sim.frame import Exposure, expected
 from sim.scene import SpectralImage
 camera = traced_camera()
