@@ -1,4 +1,4 @@
-"""What is looked at: the list of measurements, and one side's evidence made of those that its recordings allow."""
+"""What is looked at: the list of measurements, and one side's measurement model of those that its recordings allow."""
 
 from __future__ import annotations
 

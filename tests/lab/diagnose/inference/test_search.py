@@ -1,8 +1,9 @@
-"""The search over sets of effects, on small made-up evidence whose effects act in known ways."""
+"""The search over sets of effects, on small made-up models whose effects act in known ways."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from lab.diagnose.inference.decide import _with_either_sign
 from lab.diagnose.inference.gaussian import BlockCovariance
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
@@ -18,10 +20,12 @@ from lab.diagnose.measurements.summaries import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
+from sim.effects.library import candidates, effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Signal
 from sim.uniform import Uniform
+from tests.lab.diagnose.inference.made_up import contrast_model
 
 X = np.linspace(0.0, 1.0, 60)
 NOISE = 0.01
@@ -174,3 +178,14 @@ def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> N
     np.testing.assert_allclose((lower @ lower.T)[0, 1], 4.4, rtol=1e-3)  # what eigenvalues of 2.2 and 0 leave
     positive = np.array([[1.0, 0.5], [0.5, 1.0]])
     np.testing.assert_allclose(BlockCovariance(positive).lower @ BlockCovariance(positive).lower.T, positive)
+
+
+def test_what_is_added_beside_a_stronger_effect_has_to_earn_more() -> None:
+    """Half as much again as the threshold, where both act on the same measurement; a first effect earns the threshold alone."""
+    model = contrast_model(np.random.default_rng(24))
+    search = Search(model, candidates(), 18.0)
+    alone = Fit((effect("defocus")(defocus_um=3.0),), ({},), 0.0, 0.0, np.zeros((len(model.value), 0)))
+    both = replace(alone, effects=(*alone.effects, effect("charge_diffusion")(length_um=0.3)))
+    none = replace(alone, effects=())
+    assert search._added_cost(alone, none) == 0.0
+    assert search._added_cost(both, alone) == pytest.approx(0.25 * 18.0)

@@ -1,4 +1,4 @@
-"""Places, measurements and what could have been seen, on small made-up evidence; residual pictures on recordings."""
+"""Places, measurements and what could have been seen, on small made-up models; residual pictures on recordings."""
 
 from __future__ import annotations
 
