@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks.table import Row, show
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.fit.geometry.board_detection import find_board, luminance
 from lab.fit.geometry.calibration import calibrate, calibrate_robustly
 from lab.fit.geometry.pinhole import intrinsics_of
@@ -99,7 +100,7 @@ def test_corners_of_drawn_boards() -> None:
     cfa = recordings.camera("left").cfa
     off: dict[str, list[np.ndarray]] = {"ours": [], "theirs": []}
     seconds = {"ours": 0.0, "theirs": 0.0}
-    for capture, (turn, middle) in zip(recordings.captures("charuco", "left"), drawn.POSES, strict=False):
+    for capture, (turn, middle) in zip(recordings.captures(CharucoCapture, "left"), drawn.POSES, strict=False):
         rotation = cv2.Rodrigues(np.array(turn, dtype=float))[0]
         shift = np.array(middle, dtype=float) - rotation @ (np.array([8, 6, 0.0]) * 12.0)
         picture = luminance(recordings.frame(capture), cfa)
@@ -147,7 +148,7 @@ def test_public_stereo_pairs() -> None:
         found: dict[str, list[np.ndarray]] = {"left": [], "right": []}
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 1e-4)
         for side in ("left", "right"):
-            for capture in recordings.captures("charuco", side):
+            for capture in recordings.captures(CharucoCapture, side):
                 grey = recordings.frame(capture).astype(np.uint8)
                 _, corners = cv2.findChessboardCorners(grey, (9, 6))
                 refined = cv2.cornerSubPix(grey, corners, (11, 11), (-1, -1), criteria)

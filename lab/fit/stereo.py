@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView, board_points
 from lab.fit.geometry.bundle_adjustment import (
@@ -131,7 +132,7 @@ def paired_views(recordings: RecordingSet, left: GeometryFit, right: GeometryFit
 
 def _views_by_pose(recordings: RecordingSet, side: Side, fit: GeometryFit) -> dict[str, BoardView]:
     """The views that the fit of a camera rests on, by pose, without the corners that it left out."""
-    captures = {capture.id: capture for capture in recordings.captures("charuco", side)}
+    captures = {capture.id: capture for capture in recordings.captures(CharucoCapture, side)}
     found: dict[str, BoardView] = {}
     for view in fit.residuals:
         capture = captures.get(view.capture)

@@ -14,6 +14,8 @@ import numpy as np
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
+from lab.capture_kinds.chart import ChartCapture
+from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.errors import InputError
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
@@ -73,7 +75,7 @@ class _Kernel:
 
 def _without_repeats(recordings: RecordingSet, checks: list[Check]) -> list[Check]:
     """The first check of each edge: repeats of the same region at the same angle would only fill the page."""
-    places = {capture.id: (capture.region, capture.angle_deg) for capture in recordings.captures("slanted_edge")}
+    places = {capture.id: (capture.region, capture.angle_deg) for capture in recordings.captures(SlantedEdgeCapture)}
     first: dict[Any, Check] = {}
     for check in checks:
         first.setdefault(places.get(check.capture, check.capture), check)
@@ -81,7 +83,7 @@ def _without_repeats(recordings: RecordingSet, checks: list[Check]) -> list[Chec
 
 
 def _chart_item(recordings: RecordingSet, check: Check) -> dict[str, Any]:
-    captures = [capture for capture in recordings.captures("chart", check.side) if capture.id == check.capture]
+    captures = [capture for capture in recordings.captures(ChartCapture, check.side) if capture.id == check.capture]
     photo = frame_picture(recordings.frame(captures[0]), recordings.camera(check.side)) if captures else None
     return {
         "capture": check.capture,

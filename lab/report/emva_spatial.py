@@ -61,14 +61,14 @@ def spatial_plots(recordings: RecordingSet, side: Side, own: Emva1288, plane: st
 
 def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane: str) -> _MeanImages | None:
     """The image stacks that the spatial figures were computed from."""
-    darks = [c for c in recordings.captures("dark", side) if c.exposure_s == points.stack_dark_exposure_s]
+    darks = [c for c in recordings.captures(DarkCapture, side) if c.exposure_s == points.stack_dark_exposure_s]
 
     def light(flat: FlatCapture) -> float:
         return flat.photons_per_pixel if flat.photons_per_pixel is not None else flat.exposure_s
 
     flats = [
         c
-        for c in recordings.captures("flat", side)
+        for c in recordings.captures(FlatCapture, side)
         if c.exposure_s == points.stack_exposure_s and light(c) == points.stack_light
     ]
     if not darks:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import InputError, NotDetermined
 from lab.fit.geometry.board_detection import luminance
 from lab.fit.stereo import rectification_maps
@@ -257,7 +258,9 @@ def rectified_picture(recordings: RecordingSet, stereo: StereoFit, width_px: int
     """Both cameras' images of one pose, rectified, side by side with lines along the rows; and the pose's name."""
     try:
         sides: tuple[Side, Side] = ("left", "right")
-        left, right = ({capture.pose: capture for capture in recordings.captures("charuco", side)} for side in sides)
+        left, right = (
+            {capture.pose: capture for capture in recordings.captures(CharucoCapture, side)} for side in sides
+        )
         poses = [pose for pose in left if pose in right]
         if not poses:
             return None

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.neighbours import held_out_flats
 from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, Block, Effects, Label, Prediction, Study, act_on
@@ -84,7 +85,7 @@ def _dark_dn(study: Study, capture: Any) -> float:
 
 def _green_dark(study: Study) -> float:
     """Mean of the greens on red rows less that of those on blue rows in the dark, DN: columns' offsets and the like."""
-    captures = study.recordings.captures("dark", study.side)[:16]
+    captures = study.recordings.captures(DarkCapture, study.side)[:16]
     pairs = [_greens(study, np.asarray(study.recordings.frame(c), np.float32)) for c in captures]
     return float(np.mean([float(a.mean(dtype=float)) - float(b.mean(dtype=float)) for a, b in pairs])) if pairs else 0.0
 

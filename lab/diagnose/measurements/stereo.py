@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.board import views_of
@@ -57,7 +58,7 @@ class _Darks:
     """A side's signal without light, DN, by exposure: of its dark frames, or the maker's black level."""
 
     def __init__(self, study: Study, side: Side) -> None:
-        frames = study.recordings.captures("dark", side)
+        frames = study.recordings.captures(DarkCapture, side)
         t = np.array([c.exposure_s for c in frames])
         level = np.array([float(np.mean(study.recordings.frame(c))) for c in frames])
         self._slope = 0.0

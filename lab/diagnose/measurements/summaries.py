@@ -18,6 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.flat import FlatCapture
 from lab.errors import NotDetermined
 from lab.fit.rounding import unrounded
 from lab.formats.recording_set import DataSheet, RecordingSet
@@ -214,7 +215,7 @@ class Study:
         level, for a radiometer reads a lamp anew before every pass."""
         found: list[tuple[FloatArray, FloatArray]] = []
         lamps: dict[str, int] = {}
-        for capture in self.recordings.captures("flat", self.side):
+        for capture in self.recordings.captures(FlatCapture, self.side):
             if capture.radiance is None or capture.radiance in lamps:
                 continue
             wavelength, value = self.spectrum(capture.radiance).arrays

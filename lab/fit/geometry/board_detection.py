@@ -298,7 +298,7 @@ def find_boards(recordings: RecordingSet, side: Side) -> tuple[list[BoardView], 
     """Boards of all `charuco` captures of `side`, and the captures in which none was found, with the reason."""
     cfa = recordings.camera(side).cfa
     views, rejected = [], []
-    for capture in recordings.captures("charuco", side):
+    for capture in recordings.captures(CharucoCapture, side):
         try:
             views.append(find_board(luminance(recordings.frame(capture), cfa), capture))
         except NotDetermined as refused:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView, channel_corners, find_boards
 from lab.fit.geometry.bundle_adjustment import Solution, warp_prior_mm
@@ -41,7 +42,7 @@ def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
     Raises `NotDetermined` below 3 good views, where the board isn't what the captures say, or where all views are
     parallel to each other: without perspective, focal length and distance can't be separated.
     """
-    if not recordings.captures("charuco", side):
+    if not recordings.captures(CharucoCapture, side):
         raise NotDetermined("geometry", "no charuco captures")
     views, missed = find_boards(recordings, side)
     camera = recordings.camera(side)

@@ -71,7 +71,7 @@ def fit_mtf(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None)
     is that of `noise` where it was fitted, else the stated one. The angle is given in the half turn next to the
     nominal one of the capture. A capture without a usable edge is left out. Raises `NotDetermined` where none has one.
     """
-    captures = recordings.captures("slanted_edge", side)
+    captures = recordings.captures(SlantedEdgeCapture, side)
     if not captures:
         raise NotDetermined("mtf", "no slanted_edge captures")
     camera = recordings.camera(side)

@@ -50,13 +50,13 @@ def pixel_maps(recordings: RecordingSet, side: Side) -> PixelMaps:
     mean over the flats between 10 and 90 % of saturation. Raises `NotDetermined` without darks.
     """
     camera = recordings.camera(side)
-    darks = sorted(_levels(recordings.captures("dark", side)), key=lambda group: -group[0].exposure_s)
+    darks = sorted(_levels(recordings.captures(DarkCapture, side)), key=lambda group: -group[0].exposure_s)
     if not darks:
         raise NotDetermined("noise", "no darks: capture two or more at each of two exposures for maps of single pixels")
     offset, dark, defective = _dark_maps(recordings, darks, camera.cfa)
     white = camera.saturation_dn - float(np.median(offset[0]))
     total, square, weight = np.zeros(offset[0].shape), 0.0, 0.0
-    for group in _levels(recordings.captures("flat", side)):
+    for group in _levels(recordings.captures(FlatCapture, side)):
         stack = stack_of(recordings, group, defective)
         image = stack.image()
         signal = image - offset[0] - (dark[0] * group[0].exposure_s if dark is not None else 0.0)

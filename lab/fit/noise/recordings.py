@@ -34,7 +34,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     conversion gain. The method: `lab.fit.noise`.
     """
     camera = recordings.camera(side)
-    flats = recordings.captures("flat", side)
+    flats = recordings.captures(FlatCapture, side)
     if not flats:
         raise NotDetermined("noise", "no flats: capture two or more at each of several exposures up to saturation")
     if min(camera.rows, camera.cols) < MIN_SIZE_PX:
@@ -45,7 +45,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     gains = [flat.gain_db or 0.0 for flat in flats]
     gain_db = max(sorted(set(gains)), key=gains.count)
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
-    darks = [dark for dark in recordings.captures("dark", side) if (dark.gain_db or 0.0) == gain_db]
+    darks = [dark for dark in recordings.captures(DarkCapture, side) if (dark.gain_db or 0.0) == gain_db]
     dark_levels, pixels = _dark_levels(recordings, darks, camera)
     lamps = _lamps_of(recordings, flats)
     flat_levels = [

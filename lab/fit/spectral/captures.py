@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import NotDetermined
@@ -66,11 +67,11 @@ class SpectralCaptures:
         self.camera = recordings.camera(side)
         self.remarks: list[str] = []
         self.narrowband: list[NarrowbandCapture | FlatCapture] = [
-            c for c in recordings.captures("narrowband", side) if c.exposure_s > 0
+            c for c in recordings.captures(NarrowbandCapture, side) if c.exposure_s > 0
         ]
         if len({self.path(c) for c in self.narrowband}) < MIN_LIGHTS:
             # Broadband lights of known radiance: LEDs, lamps behind filters
-            flats = [f for f in recordings.captures("flat", side) if f.exposure_s > 0 and f.radiance is not None]
+            flats = [f for f in recordings.captures(FlatCapture, side) if f.exposure_s > 0 and f.radiance is not None]
             self.narrowband.extend(flats)
             if not self.narrowband:
                 raise NotDetermined(
@@ -180,7 +181,7 @@ class SpectralCaptures:
 
     def _read_darks(self) -> None:
         found: dict[tuple[float, str], list[tuple[float, float, float]]] = {}
-        for dark in self.recordings.captures("dark", self.side):
+        for dark in self.recordings.captures(DarkCapture, self.side):
             for channel, values in self._pixel_values(dark).items():
                 own = found.setdefault((dark.gain_db or 0.0, channel), [])
                 own.append(
@@ -300,7 +301,7 @@ class SpectralCaptures:
         """The signals with those of the flats of known radiance: one for each spectrum."""
         rates: dict[tuple[str, str], list[tuple[float, float]]] = {}
         used: dict[str, list[FlatCapture]] = {}
-        for flat in self.recordings.captures("flat", self.side):
+        for flat in self.recordings.captures(FlatCapture, self.side):
             if flat.radiance is not None and flat.exposure_s > 0:
                 used.setdefault(flat.radiance, []).append(flat)
         for path, flats in used.items():

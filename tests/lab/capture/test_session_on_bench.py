@@ -89,7 +89,11 @@ def test_a_session_on_the_wires_survives_kill_9_and_says_when_the_bench_dies(
     recordings = store.recording_set(session)
     problems, _ = inspect(recordings)
     assert problems == []
-    assert len(recordings.captures()) == len({c.frame for c in recordings.captures()}) == 2 * (4 + 6 + 4 + 1 + 4)
+    assert (
+        len(recordings.captures())
+        == len({c.frame for c in recordings.captures()})
+        == 2 * (4 + 6 + 4 + 1 + len(ScreenSequence.kinds()))
+    )
     for side in recordings.sides:
         camera = recordings.camera(side)
         assert camera.black_level_dn is not None

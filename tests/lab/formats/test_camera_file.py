@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lab import cli
@@ -71,6 +71,7 @@ def test_what_is_written_is_read(tmp_path: Path, content: CameraFile) -> None:
 @given(
     st.floats(0.5, 64.0), st.floats(0.0, 1e5), st.floats(1e-6, 1e3), st.integers(1, 5000), st.text(max_size=20).filter(str.isprintable)
 )  # fmt: skip
+@settings(max_examples=25)
 def test_any_number_comes_back_to_the_last_bit(
     f_number: float, noise: float, gain: float, rows: int, name: str
 ) -> None:
