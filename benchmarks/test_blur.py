@@ -38,8 +38,8 @@ from sim.scene.render import Warp
 from sim.scene.scenes import ScreenPattern
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
-from tests.lab.fit.test_mtf import edge, gaussian_mtf, gaussian_mtf50
-from tests.lab.fit.test_psf import KERNELS, blurred_target, misplaced_target, misplacement, psnr_db
+from tests.lab.fit.mtf.drawn_edges import edge, gaussian_mtf, gaussian_mtf50
+from tests.lab.fit.psf.drawn_targets import KERNELS, blurred_target, misplaced_target, misplacement, psnr_db
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 DRAWS = int(os.environ.get("CALIBENCH_BENCH_DRAWS", "40"))

@@ -14,7 +14,7 @@ from scipy.special import j1, ndtr
 
 from lab.fit.mtf import edge_mtf
 from lab.fit.psf import estimate_kernel
-from tests.lab.fit.test_psf import blurred_target, by_area, four_spots, gaussian
+from tests.lab.fit.psf.drawn_targets import blurred_target, by_area, four_spots, gaussian
 
 DRAWS = int(os.environ.get("CALIBENCH_COVERAGE_DRAWS", "200"))
 FREQUENCIES = np.arange(0.05, 1.0, 0.05)

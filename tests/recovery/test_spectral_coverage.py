@@ -20,7 +20,8 @@ from sim.frame import Exposure, sample
 from sim.scene import Darkness, UniformField
 from sim.scene.light import colour_science
 from sim.spectrum import PHOTON_ENERGY_J_NM, FloatArray, Spectrum
-from tests.lab.fit.test_spectral import DATA, model, stated
+from tests.lab.fit.spectral.known_camera import model, stated
+from tests.lab.fit.spectral.test_sensitivity import DATA
 
 DRAWS = 240
 WAVE = np.arange(370.0, 771.0, 2.0)

@@ -1,8 +1,6 @@
-"""MTF of slanted edges against truths in closed form: an edge blurred by a Gaussian is an error function of the distance."""
+"""MTF of slanted edges against truths in closed form."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,37 +8,9 @@ from scipy.special import erf, ndtr
 
 from lab.errors import NotDetermined
 from lab.fit.mtf import edge_mtf
-from lab.fit.mtf.edges_in_frame import find_edges
 from lab.fit.mtf.estimate_mtf import planes_mtf
-from lab.fit.mtf.recordings import fit_mtf
 from lab.fit.mtf.samples import Plane
-
-FULL_E = 9000.0
-
-
-def edge(size, angle_deg, sigma_px, bend_px=0.0, *, offset_px=0.3, dark=0.1, row0=0.0, col0=0.0, step=1):
-    """Unit edge, light on the right of a vertical one, exact at the samples; bent, it is a circle with that sagitta."""
-    r = row0 + step * np.arange(size)[:, None] - (size * step - 1) / 2
-    c = col0 + step * np.arange(size)[None, :] - (size * step - 1) / 2
-    a = np.radians(angle_deg)
-    d = c * np.cos(a) + r * np.sin(a) - offset_px
-    if bend_px:
-        radius = (size * step / 2) ** 2 / (2 * bend_px)
-        d = np.hypot(radius + d, -c * np.sin(a) + r * np.cos(a)) - radius
-    return dark + 0.5 * (1 + erf(d / sigma_px / np.sqrt(2)))
-
-
-def gaussian_mtf(sigma_px, frequency):
-    return np.exp(-2 * (np.pi * sigma_px * frequency) ** 2)
-
-
-def gaussian_mtf50(sigma_px):
-    return np.sqrt(2 * np.log(2)) / (2 * np.pi * sigma_px)
-
-
-def noisy(mean, rng):
-    electrons = mean * FULL_E
-    return np.round(0.4 * rng.normal(electrons, np.sqrt(electrons + 4.0)))
+from tests.lab.fit.mtf.drawn_edges import edge, gaussian_mtf, gaussian_mtf50, noisy, squares
 
 
 @pytest.mark.parametrize("bend_px", [0.0, 2.0])
@@ -222,47 +192,6 @@ def test_the_tail_of_diffraction_is_followed_beyond_the_region():
     assert found.mtf_std.max() < 0.012
 
 
-def squares(shape, boxes, sigma_px):
-    """Dark squares (row, col, half side, degrees) on light, blurred: products of normal distribution functions but for the corners."""
-    r, c = np.indices(shape, dtype=float)
-    light = np.ones(shape)
-    for row, col, half, angle_deg in boxes:
-        a = np.radians(angle_deg)
-        u, v = (r - row) * np.cos(a) + (c - col) * np.sin(a), (c - col) * np.cos(a) - (r - row) * np.sin(a)
-        across, down = (ndtr((x + half) / sigma_px) - ndtr((x - half) / sigma_px) for x in (u, v))
-        light -= 0.9 * across * down
-    return light
-
-
-@pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
-def test_edges_are_found_by_themselves(cfa):
-    light = squares((300, 420), [(100, 110, 60, 5.0), (150, 300, 70, 40.0)], 0.6)
-    raw = 64 + np.round(0.4 * np.random.default_rng(0).poisson(8000 * light))
-    found = find_edges(raw, cfa, 4095.0)
-    assert len(found) == 8
-    wanted = sorted([-5.0, -5.0, 85.0, 85.0, -40.0, -40.0, 50.0, 50.0])
-    np.testing.assert_allclose(sorted(e.angle_deg for e in found), wanted, atol=0.1)
-    for e in found:
-        row0, col0, row1, col1 = e.region
-        mtf = edge_mtf(raw[row0:row1, col0:col1] - 64)
-        assert mtf.mtf50_cy_per_px == pytest.approx(gaussian_mtf50(0.6), abs=4 * mtf.mtf50_cy_per_px_std)
-
-
-@pytest.mark.parametrize(
-    ("frame", "reason"),
-    [
-        (np.full((200, 200), 7.0), "uniform"),
-        (np.random.default_rng(0).normal(100, 3, (200, 200)), "no straight line"),
-        (np.full((200, 200), np.nan), "finite"),
-        (np.minimum(1500.0 * squares((200, 200), [(100, 100, 50, 5.0)], 0.6), 1023), "saturated"),
-    ],
-    ids=["uniform", "noise", "not finite", "saturated"],
-)
-def test_a_frame_without_an_edge_says_why(frame, reason):
-    with pytest.raises(NotDetermined, match=reason):
-        find_edges(frame, "MONO", 1023.0)
-
-
 def test_a_clipped_edge_and_a_corner_are_refused():
     rng = np.random.default_rng(3)
     with pytest.raises(NotDetermined, match="clipped at 3000"):
@@ -279,56 +208,3 @@ def test_an_edge_wider_than_its_region_and_unusable_settings_are_refused():
         edge_mtf(edge(64, 5.0, 0.6), [np.nan])
     with pytest.raises(ValueError, match="noise_std"):
         edge_mtf(edge(64, 5.0, 0.6), noise_std=0.0)
-
-
-def recordings(frames, captures, cfa="RGGB"):
-    rows, cols = next(iter(frames.values())).shape
-    camera = SimpleNamespace(
-        cfa=cfa, black_level_dn=64.0, saturation_dn=4095.0, pixel_pitch_um=1.5, rows=rows, cols=cols
-    )
-    return SimpleNamespace(
-        camera=lambda side: camera,
-        captures=lambda kind=None, side=None: captures,
-        frame=lambda capture: frames[capture.id],
-    )
-
-
-def capture(name, **more):
-    stated = {"region": (31, 20, 191, 180), "angle_deg": 95.0, "field_mm": (0.0, 0.0)}
-    return SimpleNamespace(id=name, side="left", **(stated | more))
-
-
-def test_fit_takes_every_channel_of_the_mosaic_on_its_own_grid():
-    rng = np.random.default_rng(4)
-    sigma = {"R": 0.8, "G": 0.6, "B": 0.5}
-    frame = np.zeros((200, 200))
-    for phase, channel in enumerate("RGGB"):
-        i, j = phase // 2, phase % 2
-        frame[i::2, j::2] = edge(200, 95.0, sigma[channel])[i::2, j::2]
-    raw = (64 + np.round(0.4 * rng.poisson(8000.0 * frame))).astype(np.uint16)
-    curves = fit_mtf(recordings({"edge-1": raw}, [capture("edge-1")]), "left")
-    assert [c.channel for c in curves] == ["R", "G", "B"]
-    for curve in curves:
-        assert curve.angle_deg == pytest.approx(95.0, abs=5 * curve.angle_deg_std)
-        assert curve.mtf50_cy_per_px == pytest.approx(
-            gaussian_mtf50(sigma[curve.channel]), abs=4 * curve.mtf50_cy_per_px_std
-        )
-
-
-def test_fit_refuses_a_saturated_edge():
-    raw = np.full((200, 200), 4095, np.uint16)
-    raw[:, :100] = 500
-    with pytest.raises(NotDetermined, match="saturated"):
-        fit_mtf(recordings({"edge-1": raw}, [capture("edge-1")]), "left")
-
-
-def test_fit_looks_for_edges_where_no_region_is_stated():
-    light = squares((220, 220), [(110, 110, 60, 5.0)], 0.6)
-    raw = (64 + np.round(0.4 * np.random.default_rng(0).poisson(8000 * light))).astype(np.uint16)
-    stated = capture("edge-1", region=None, angle_deg=None, field_mm=None)
-    curves = fit_mtf(recordings({"edge-1": raw}, [stated]), "left")
-    assert len(curves) == 12  # four sides, three channels
-    assert len({c.region for c in curves}) == 4
-    assert all(c.mtf10_cy_per_px is None or c.mtf10_cy_per_px > c.mtf50_cy_per_px for c in curves)
-    # 1.5 um pixels: regions lie 60 px from the middle of the frame
-    assert all(np.hypot(*c.field_mm) == pytest.approx(60 * 1.5e-3, abs=0.01) for c in curves)

@@ -1,0 +1,49 @@
+"""Views and corners that do not fit, and views that do not determine a camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lab.errors import NotDetermined
+from lab.fit.geometry.calibration import calibrate_robustly
+from tests.lab.fit.projected import SHAPE, poses, seen
+
+
+def test_parallel_views_do_not_determine_the_focal_length():
+    facing = [(np.eye(3), np.array([-150.0 + 40 * k, -100.0 + 15 * k, 700.0])) for k in range(3)]
+    with pytest.raises(NotDetermined, match="all views are parallel"):
+        calibrate_robustly(seen(np.random.default_rng(0), facing), SHAPE)
+
+
+def test_corners_that_no_camera_explains_are_refused():
+    views = seen(np.random.default_rng(0), poses(6))
+    rng = np.random.default_rng(1)
+    scrambled = [replace(view, image_px=rng.permutation(view.image_px)) for view in views]
+    with pytest.raises(NotDetermined, match=r"no camera explains the corners|no pose of the board fits"):
+        calibrate_robustly(scrambled, SHAPE)
+
+
+def test_single_stray_corners_are_left_out_and_named():
+    views = seen(np.random.default_rng(0), poses(8))
+    away = views[2].image_px.copy()
+    away[[5, 40]] += [[2.0, -1.0], [0.0, 3.0]]
+    stray = [*views[:2], replace(views[2], image_px=away), *views[3:]]
+    found = calibrate_robustly(stray, SHAPE)
+    assert [item.step for item in found.rejected_corners] == [views[2].capture.id]
+    named = found.rejected_corners[0].reason
+    assert f"{views[2].index[5]} (" in named and f"{views[2].index[40]} (" in named
+    assert found.rejected == ()
+    clean = calibrate_robustly([*views[:2], views[2].only(~np.isin(np.arange(88), [5, 40])), *views[3:]], SHAPE)
+    np.testing.assert_allclose(found.intrinsics, clean.intrinsics, rtol=1e-5)
+
+
+def test_a_view_of_something_else_is_left_out_and_named():
+    views = seen(np.random.default_rng(0), poses(8))
+    other = replace(
+        views[3], image_px=views[3].image_px + np.random.default_rng(1).normal(0, 3, views[3].image_px.shape)
+    )
+    found = calibrate_robustly([*views[:3], other, *views[4:]], SHAPE)
+    assert [item.step for item in found.rejected] == [views[3].capture.id]

@@ -1,0 +1,43 @@
+"""Lateral colour of drawn corners, and of a camera without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.fit.geometry.calibration import calibrate_robustly
+from lab.fit.geometry.corners import CornerFits
+from lab.fit.geometry.lateral_colour import channel_geometry
+from tests.lab.fit.projected import SHAPE, poses, seen
+
+
+def test_lateral_colour_of_drawn_corners():
+    """Red grown by 0.03 % and displaced by (0.02, -0.01) px beside green."""
+    rng = np.random.default_rng(6)
+    calibration = calibrate_robustly(seen(rng, poses(12), noise_px=0.02), SHAPE)
+    corners = []
+    for view in calibration.views:
+        grown = view.image_px + 3e-4 * (view.image_px - calibration.intrinsics[2:4]) + [0.02, -0.01]
+        noise = [rng.normal(0, 0.02, grown.shape) for _ in range(2)]
+        sure, std = np.ones(len(grown), bool), np.full(len(grown), 0.02)
+        corners.append(
+            {"R": CornerFits(grown + noise[0], sure, std), "G": CornerFits(view.image_px + noise[1], sure, std)}
+        )
+    red, green = channel_geometry(calibration, corners)
+    gap = np.array(red.radial_shift_px) - 3e-4 * np.array(red.radius_px)
+    assert np.all(np.abs(gap) < 4 * np.array(red.radial_shift_px_std) + 1e-6)
+    assert red.radial_shift_px[-1] > 10 * red.radial_shift_px_std[-1]
+    for k, true in enumerate((0.02, -0.01)):
+        assert abs(red.centre_shift_px[k] - true) < 4 * red.centre_shift_px_std[k]
+    assert red.camera_matrix[0][0] / green.camera_matrix[0][0] == pytest.approx(1.0003, abs=1e-4)
+
+
+def test_colours_of_a_camera_without_lateral_colour_agree(charuco_fits):
+    """Corners on each colour's own pixels: no channel may be displaced, whatever its place in the mosaic."""
+    fit = charuco_fits["left"]
+    assert [channel.channel for channel in fit.channels] == ["R", "G", "B"]
+    for channel in fit.channels:
+        if channel.channel != "G":
+            assert np.all(np.abs(channel.centre_shift_px) < 5 * np.array(channel.centre_shift_px_std))
+            assert np.abs(channel.centre_shift_px).max() < 0.02
+            assert abs(channel.radial_shift_px[-1]) < 5 * channel.radial_shift_px_std[-1]
