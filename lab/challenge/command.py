@@ -1,4 +1,4 @@
-"""`calibench challenge make` and `calibench challenge score`."""
+"""`calibench challenge make`, `score` and `calibrate`."""
 
 from __future__ import annotations
 
@@ -102,3 +102,33 @@ def score_command(
     print(found.model_dump_json(indent=1) if str(json) == "-" else table(found))
     if not found.reached:
         raise typer.Exit(EXIT_CHECK)
+
+
+@commands.command("calibrate")
+def calibrate_command(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what `challenge make` wrote")],
+    truths: Annotated[Path, typer.Option("--truths", metavar="FILE", help="the truths that `challenge make` wrote")],
+    rules: Annotated[
+        list[str], typer.Option("--rule", metavar="NAME=VALUE", help="a rule of decision at another value; repeatable")
+    ],
+    jobs: Jobs = None,
+) -> None:
+    """Score tuning cases under other rules of decision, beside the default ones; results stay in DIR for the next time."""
+    from lab.challenge.calibrate import changed_policy, comparison, refuse_proof
+    from lab.challenge.run import run_all
+    from lab.challenge.score import broken_seals, score
+    from lab.challenge.truth import Seals, Truths, load
+
+    policy = changed_policy(rules)
+    seals, opened = load(Seals, folder / "seals.json"), load(Truths, truths)
+    refuse_proof(opened)
+    cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
+    broken = broken_seals(folder, seals, opened)
+    under = {"results": None, f"results {' '.join(sorted(rules))}": policy}
+    scores = [
+        score(
+            opened, seals, run_all(folder, cases, jobs or os.cpu_count() or 1, _say, policy=one, results=where), broken
+        )
+        for where, one in under.items()
+    ]
+    print(comparison(*scores))

@@ -13,6 +13,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from lab.challenge.truth import load, store
+from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import DiagnosisResult
 from sim.parameters import Frozen
 
@@ -37,9 +38,9 @@ def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def run_case(folder: Path) -> CaseRun:
-    """Diagnose one recording set as `lab.diagnose` does."""
-    from lab.diagnose import diagnose
+def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
+    """Diagnose one recording set as `lab.diagnose` does; None: by the default policy."""
+    from lab.diagnose import examine
     from lab.formats import recording_set as recording
 
     with contextlib.suppress(OSError):  # Linux: the peak begins anew
@@ -47,7 +48,8 @@ def run_case(folder: Path) -> CaseRun:
     wall, cpu = time.perf_counter(), time.process_time()
     found, error = None, None
     try:
-        found = diagnose(recording.read(folder), at_once=False).model_copy(update={"curves": (), "source": folder.name})
+        result = examine(recording.read(folder), at_once=False, policy=policy).result
+        found = result.model_copy(update={"curves": (), "source": folder.name})
     except Exception as caught:  # whatever it is, it is this case's result
         at = traceback.extract_tb(caught.__traceback__)[-1]
         error = f"{type(caught).__name__}: {' '.join(str(caught).split())} ({Path(at.filename).name}:{at.lineno})"
@@ -57,10 +59,16 @@ def run_case(folder: Path) -> CaseRun:
 
 
 def run_all(
-    folder: Path, cases: tuple[str, ...], jobs: int, progress: Callable[[str, float], None] = lambda _text, _share: None
+    folder: Path,
+    cases: tuple[str, ...],
+    jobs: int,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    *,
+    policy: DecisionPolicy | None = None,
+    results: str = "results",
 ) -> dict[str, CaseRun]:
-    """Results by case: from DIR/results/CASE.json where it exists, else diagnosed and written there."""
-    file = {case: folder / "results" / f"{case}.json" for case in cases}
+    """Results by case: from DIR/RESULTS/CASE.json where it exists, else diagnosed and written there."""
+    file = {case: folder / results / f"{case}.json" for case in cases}
     runs = {case: load(CaseRun, file[case]) for case in cases if file[case].exists()}
     missing = [case for case in cases if case not in runs]
 
@@ -71,9 +79,9 @@ def run_all(
 
     if jobs == 1:
         for case in missing:
-            keep(run_case(folder / case))
+            keep(run_case(folder / case, policy))
     elif missing:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            for done in as_completed([pool.submit(run_case, folder / case) for case in missing]):
+            for done in as_completed([pool.submit(run_case, folder / case, policy) for case in missing]):
                 keep(done.result())
     return runs

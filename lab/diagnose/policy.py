@@ -3,8 +3,9 @@
 Odds are natural logarithms throughout ("log odds"): 2.3 is ten to one, 4.6 is a hundred to one. A score is the gain in chi2 that an
 effect's signature promises: twice its log odds.
 
-Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge, and `calibench challenge score` checks them
-together: healthy cases for false alarms, concealed effects for names and rivals, siblings outside the library for false names.
+Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge. `calibench challenge calibrate --rule NAME=VALUE` scores
+tuning cases under another value beside the default: healthy cases for false alarms, concealed effects for names and rivals, siblings
+outside the library for false names.
 docs/reference/decision-policy.md is generated from this module by docs/write_tables.py.
 """
 
@@ -16,7 +17,7 @@ from typing import Annotated, get_args, get_type_hints
 from lab.formats.results import PolicyRule
 from sim.parameters import Frozen
 
-TUNED = "tuned; checked by `calibench challenge score`"
+TUNED = "tuned: `calibench challenge calibrate`"
 
 
 @dataclass(frozen=True)
