@@ -317,8 +317,9 @@ def main(
     if unknown:
         raise InputError(f"--only {unknown[0]}: no such case; there are {', '.join(every)}")
     runs = run_all({name: case for name, case in every.items() if not only or name in only}, out)
-    if page is not None:
-        write_page(runs, page)
+    if page is not None:  # with what earlier runs left there
+        there = {name: out / "results" / f"{name}.json" for name in every}
+        write_page({name: load(LiveRun, file) for name, file in there.items() if file.exists()}, page)
     right = sum(run.outcome in ("named", "healthy") for run in runs.values())
     print(f"{right} of {len(runs)} right; results in {out / 'results'}")
 

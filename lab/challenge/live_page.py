@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
-from lab.challenge.live import NOT_LOOKED_FOR, FoundParameter, LiveRun
+from lab.challenge.live import NOT_LOOKED_FOR, FoundParameter, LiveRun, every_case
 from lab.challenge.proof import ABSTAINED, RIGHT, WRONG, placed
 from sim.effects.library import effects as library
 
@@ -34,7 +34,7 @@ def summary(runs: Mapping[str, LiveRun]) -> str:
         "healthy cameras": [run for run in runs.values() if not run.case.concealed],
         "benches to resolve": [run for run in runs.values() if run.case.resolve],
     }
-    lines = ["| | cases | outcomes |", "| --- | --- | --- |"]
+    lines = [f"{len(runs)} of {len(every_case())} cases run.", "", "| | cases | outcomes |", "| --- | --- | --- |"]
     for name, group in groups.items():
         counts = ", ".join(f"{outcome} {n}" for outcome, n in Counter(run.outcome for run in group).most_common())
         lines.append(f"| {name} | {len(group)} | {counts or '-'} |")
