@@ -282,7 +282,7 @@ class Bench:
         begin_s = self.clock.now() if start_s is None else start_s
         seen, light = self._seen(side)
         source = self._drift(begin_s + 0.5 * exposure_s)
-        if side == "right" and not isinstance(seen, UniformField):
+        if side == "right" and not (isinstance(seen, UniformField) and seen.kind != "black"):
             source *= right_over_left(camera.model, camera.acting)
         exposure = Exposure(
             seen, exposure_s, gain_db, self.sensor_temperature_c(side), elapsed_s=self._elapsed_s(begin_s)
