@@ -1,4 +1,4 @@
-"""What a lens prescription amounts to: the verb behind `calibench lens`, and its result."""
+"""`calibench lens`: first-order quantities, illumination, distortion, MTF and PSF of a lens prescription."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Progress = Callable[[str, float], None]
 
 MTF_LP_PER_MM = (30.0, 60.0, 100.0)
 MTF_WAVELENGTHS_NM = (450.0, 650.0)  # and the reference wavelength
-#: Share of the time that the transfer functions take, for the progress bar.
+#: The part of the computing time that the MTFs take, for the progress bar.
 _MTF_SHARE = 0.3
 
 
 class LensPsf(Frozen):
-    """Where one wavelength's image of a field point lies, and how much of it the table's window holds."""
+    """The image of a field point at one wavelength: its centroid, and the share of its light in the window of the lens table."""
 
     wavelength_nm: float
     encircled_share: float
@@ -81,7 +81,7 @@ class LensResult(Frozen):
 
 @dataclass(frozen=True)
 class TracedPrescription:
-    """A result with what it was computed from, for pictures."""
+    """A result with the traced table and system, for the report's pictures."""
 
     result: LensResult
     table: LensTable
@@ -89,7 +89,7 @@ class TracedPrescription:
 
 
 def parse_glasses(replacements: list[str]) -> dict[str, GlassName]:
-    """`NAME=OTHER` or `NAME=nd,Vd` as a glass by the name it stands for. InputError for anything else."""
+    """Replacement glasses by name, from NAME=OTHER or NAME=nd,Vd. Raises InputError for anything else."""
     found: dict[str, GlassName] = {}
     for text in replacements:
         name, equals, meaning = (part.strip() for part in text.partition("="))
@@ -110,7 +110,7 @@ def parse_glasses(replacements: list[str]) -> dict[str, GlassName]:
 
 
 def with_glasses(prescription: Prescription, glasses: Mapping[str, GlassName]) -> Prescription:
-    """The prescription with named glasses replaced; each replacement is a warning. InputError for a name that isn't in it."""
+    """The prescription with glasses replaced; each replacement is a warning. Raises InputError for a glass that it doesn't have."""
     present = {surface.glass.name for surface in prescription.surfaces if surface.glass is not None}
     for name in glasses:
         if name not in present:
@@ -135,11 +135,11 @@ def trace_prescription(
     glasses: Mapping[str, GlassName] | None = None,
     progress: Progress | None = None,
 ) -> TracedPrescription:
-    """Read a prescription, trace it, and tell what it amounts to at 33 wavelengths and 21 field points.
+    """Read and trace a prescription: results at 33 wavelengths and 21 field points.
 
     Raises InputError, in one line, for a file that can't be read or traced.
     """
-    from sim.optics.system import OpticalSystem  # compiled code: a second to import
+    from sim.optics.system import OpticalSystem  # imports compiled code, which takes a second
     from sim.optics.traced_table import OpticalTable, TableSettings
 
     try:

@@ -1,7 +1,8 @@
-"""The captures of a recording set again, as a model makes them: mean frames, and recordings drawn from the model.
+"""Predicts and draws the captures of a recording set by a camera model: mean frames, and whole recording sets.
 
-The one forward model of `sim` draws every frame; this module only says what stood before the camera, as the manifest and the
-recordings tell it. What a model leaves free is put where the recordings have it: an edge's place, and the level of its sides.
+The forward model of `sim` computes every frame. This module gives it the scene, which follows from the manifest and the
+recordings. Two things are taken from the recording itself, because no model predicts them: where an edge lies, and the levels of
+its two sides.
 """
 
 from __future__ import annotations
@@ -26,23 +27,23 @@ from sim.sensor import electrons as sensor
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
-#: Light of equal energy, for edges in light that nobody measured: (nm), W sr^-1 m^-2 nm^-1.
+#: Light of equal energy (nm, W sr^-1 m^-2 nm^-1), for edges whose light wasn't measured.
 _EQUAL = Spectrum.of((380.0, 780.0), (0.01, 0.01))
 
 
 class Replay:
-    """One side's captures by one camera model."""
+    """The captures of one side as a camera model predicts and draws them."""
 
     def __init__(self, recordings: RecordingSet, side: Side, camera: CameraModel) -> None:
         self.recordings, self.side, self.camera = recordings, side, camera
 
     @cached_property
     def captures(self) -> tuple[Capture, ...]:
-        """Those that can be replayed, in the manifest's order."""
+        """The captures that can be predicted, in the manifest's order."""
         return tuple(c for c in self.recordings.captures(side=self.side) if self._tells_its_scene(c))
 
     def _tells_its_scene(self, capture: Capture) -> bool:
-        """Whether the manifest tells the scene, or the recordings do (an edge's place). Screens and boards also need their pose."""
+        """Whether manifest and recordings determine the scene. For screens and boards they don't: their pose is unknown."""
         return isinstance(capture, SlantedEdgeCapture) or capture.scene(lambda path: _EQUAL) is not None
 
     @cached_property
@@ -51,12 +52,12 @@ class Replay:
         return min(times, default=None)
 
     def expected(self, capture: Capture, effects: Sequence[Effect] = ()) -> FloatArray:
-        """Mean frame (rows, cols) in DN. Raises NotDetermined where the capture doesn't tell what stood before the camera."""
+        """Mean frame (rows, cols) in DN. Raises NotDetermined where manifest and recordings don't determine the scene."""
         exposure, electrons = self._electrons(capture, effects)
         return sensor.dn_moments(electrons, self.camera, exposure.gain_db, read_out(self.camera, exposure, effects))[0]
 
     def drawn(self, rng: np.random.Generator, effects: Sequence[Effect] = ()) -> RecordingSet:
-        """The recordings again, every frame of `captures` drawn anew by one camera whose pixels have patterns of their own."""
+        """The recordings with every frame of `captures` drawn from the model, all by one camera with one drawn fixed pattern."""
         pattern = sensor.FixedPattern.draw(self.camera, rng)
         frames = {}
         mean: dict[object, tuple[Exposure, FloatArray]] = {}
@@ -97,7 +98,7 @@ class Replay:
         return scene
 
     def _edge(self, capture: SlantedEdgeCapture) -> EdgeMtf:
-        """In the channel with most pixels."""
+        """The edge as the estimator finds it in the channel with most pixels."""
         channel = "G" if "G" in self.camera.channels else self.camera.channels[0]
         return measure_edge(self.recordings, [capture], channel)
 
@@ -107,7 +108,7 @@ class Replay:
     def _levelled(
         self, capture: SlantedEdgeCapture, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
     ) -> FloatArray:
-        """Edges' two levels by channel as the recording has them: a straight line from the model's electrons to it, by least squares."""
+        """Scale an edge's two levels, channel by channel, to the recording: a line, fitted by least squares to model and recorded electrons."""
         dark = np.broadcast_to(np.asarray(dark_electrons(self.camera, exposure, effects), float), electrons.shape)
         gain = sensor.gain_dn_per_e(self.camera, exposure.gain_db)
         recorded = (self.recordings.frame(capture).astype(float) - self.camera.black_level_dn) / gain
@@ -127,7 +128,7 @@ class Replay:
 
 
 def _placed(region: tuple[int, int, int, int], edge: EdgeMtf) -> EdgeRegion:
-    """A straight edge where the estimator found it: through its middle, at its angle there."""
+    """A straight edge at the centre and the angle that the estimator found."""
     geometry = edge.geometry
     row, col = geometry.centre_px
     if geometry.transposed:

@@ -1,4 +1,4 @@
-"""One raw frame of a named scene: from scene, light and camera to a file, a preview and a record of how it was made."""
+"""`calibench simulate`: one raw frame of a named scene, with a preview and a record from which it can be made again."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ from sim.spectrum import FloatArray, Spectrum
 
 Progress = Callable[[str, float], None]
 
-#: The exposure that is taken where none is asked for: the brightest 1 % of the pixels at 70 % of what they hold.
+#: The automatic exposure: the brightest 1 % of the pixels reach 70 % of their capacity.
 BRIGHTEST_PERCENT, AUTO_SHARE = 1.0, 0.7
-#: Beyond these an automatic exposure makes no sense: something is wrong with the light.
+#: Limits of the automatic exposure (s).
 SHORTEST_S, LONGEST_S = 1e-6, 3600.0
 
 
 class SimulateOptions(Frozen):
-    """What a frame is asked for; all that, with the camera, makes the frame again."""
+    """The options of a simulated frame. Together with the camera they determine it."""
 
     scene: str
     parameters: dict[str, float] = {}
@@ -67,7 +67,7 @@ class SimulateOptions(Frozen):
 
 
 class Summary(Frozen):
-    """The frame in figures. Electrons are means before noise; the signal-to-noise ratio is that of a pixel of the mean level."""
+    """Statistics of a frame. Electrons are expected values, without noise; `snr` is the signal-to-noise ratio of a pixel at the mean level."""
 
     exposure_s: float
     automatic_exposure: bool
@@ -80,7 +80,7 @@ class Summary(Frozen):
 
 
 class SimulationRecord(Frozen):
-    """What stands beside the frame as JSON. `camera` is the model as it was, `camera_sha256` the hash of that and the effects."""
+    """The record beside the frame, as JSON. `camera_sha256` is the hash of the camera model and its effects."""
 
     format: str = "calibench-simulation"
     version: int = 1
@@ -100,7 +100,7 @@ class SimulationRecord(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A simulated frame (rows, cols) in DN, with the camera it is of, the scene's white and the record."""
+    """A simulated frame (rows, cols) in DN, its camera, the spectral radiance of the scene's white, and the record."""
 
     frame: Frame
     camera: CameraModel
@@ -111,8 +111,10 @@ class Simulation:
 def camera_for(
     camera: Path | None, lens: Path | None, cache: Path | None = None, progress: Progress | None = None
 ) -> CameraFile:
-    """The camera of a file (None: the default one), behind the lens of a prescription where one is given: then f-number and
-    focal length are that lens's. InputError for files that can't be used."""
+    """The camera of a file, or the default camera (None). With `lens`, a prescription, its f-number and focal length are that lens's.
+
+    Raises InputError for a file that can't be used.
+    """
     content = default_camera() if camera is None else read_camera(camera, cache, progress)
     if lens is None:
         return content
@@ -178,7 +180,8 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
 
 
 def _distorting(content: CameraFile) -> CameraFile:
-    """With the distortion of the camera's geometry as an effect: named scenes are placed by a pinhole. A traced lens has its own."""
+    """Add the distortion of the camera's geometry as an effect, because named scenes are projected by a pinhole. A traced lens brings its own
+    distortion."""
     camera = content.camera
     straight = camera.geometry is None or not any(camera.geometry.distortion)
     if straight or isinstance(camera.lens.imaging, TracedLens):
@@ -187,7 +190,8 @@ def _distorting(content: CameraFile) -> CameraFile:
 
 
 def automatic_exposure_s(electrons_per_s: FloatArray, camera: CameraModel, gain_db: float = 0.0) -> float:
-    """The exposure that brings the brightest 1 % of the pixels to 70 % of what they hold, to three digits."""
+    """The exposure (s, three digits) at which the brightest 1 % of the pixels reach 70 % of their capacity. Raises InputError beyond the
+    limits."""
     bright = float(np.percentile(electrons_per_s, 100.0 - BRIGHTEST_PERCENT))
     bright = bright if bright > 0 else float(electrons_per_s.max())
     seconds = AUTO_SHARE * sensor.capacity_e(camera, gain_db) / bright
@@ -270,7 +274,7 @@ def _record(
 
 
 def camera_sha256(content: CameraFile) -> str:
-    """Hash of all that a camera's frames depend on: the model, with a traced lens's content hash, and the effects."""
+    """SHA-256 of the camera model, which includes a traced lens's hash, and of its effects."""
     parts = [content.camera.model_dump_json(), *(f"{one.name} {one.model_dump_json()}" for one in content.effects)]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
@@ -279,7 +283,7 @@ def camera_sha256(content: CameraFile) -> str:
 
 
 def check_out(file: Path) -> None:
-    """Refuse a file that can't be written before the work, not after it."""
+    """Refuse a file that can't be written, before the work. Raises InputError."""
     writer_of(file)
     if file.is_dir():
         raise InputError(f"{file}: is a folder; name a file in it")
@@ -289,7 +293,7 @@ def check_out(file: Path) -> None:
 
 
 def write(simulation: Simulation, file: Path) -> SimulationRecord:
-    """The frame in `file`, the preview in NAME.preview.png and the record in NAME.json beside it; returns the record."""
+    """Write the frame to `file`, the preview to NAME.preview.png and the record to NAME.json beside it; returns the record."""
     record = simulation.record.model_copy(update={"file": file.name})
     metadata = RawMetadata(
         exposure_s=record.summary.exposure_s,
@@ -319,8 +323,8 @@ def record_file(file: Path) -> Path:
 
 
 def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:
-    """Codes of a white surface in the scene's light by channel, to a common factor; None of a MONO camera, or where a channel
-    sees nothing of the light."""
+    """Relative signal of a white surface in the scene's light, by channel; None for a MONO camera, and where a channel gets no
+    signal."""
     if camera.cfa == "MONO":
         return None
     codes = {channel: electrons_of(white, camera.quantum_efficiency[channel]) for channel in "RGB"}
@@ -328,8 +332,7 @@ def neutral(camera: CameraModel, white: Spectrum) -> dict[str, float] | None:
 
 
 def preview(frame: Frame, camera: CameraModel, white: Spectrum) -> NDArray[np.uint8]:
-    """A picture to look at (rows, cols, 3: R, G, B): demosaicked, balanced on the scene's white, in sRGB's colours and gamma. White
-    is a full pixel."""
+    """A preview (rows, cols, 3: R, G, B), demosaicked, white-balanced on the scene's white, in sRGB. White is a full pixel."""
     gain = camera.conversion_gain_dn_per_e
     span = min(camera.full_well_e * gain, camera.white_level_dn - camera.black_level_dn)
     if camera.cfa == "MONO":
@@ -360,7 +363,7 @@ def _demosaicked(frame: Frame, camera: CameraModel) -> FloatArray:
 
 
 def _to_srgb(camera: CameraModel) -> FloatArray:
-    """From balanced camera colours to linear sRGB; white stays white."""
+    """The matrix (3, 3) from balanced camera colours to linear sRGB. White stays white."""
     from_srgb = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     daylight_codes = np.array([electrons_of(daylight(), camera.quantum_efficiency[channel]) for channel in "RGB"])
     balanced = np.diag(1.0 / daylight_codes) @ colour_matrix(camera) @ from_srgb
@@ -369,7 +372,7 @@ def _to_srgb(camera: CameraModel) -> FloatArray:
 
 
 def _line(error: Exception) -> str:
-    """An error of `sim` in one line."""
+    """The message of an exception of `sim`, as one line."""
     if isinstance(error, ValidationError):
         problem = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in problem["loc"])
@@ -378,7 +381,7 @@ def _line(error: Exception) -> str:
 
 
 def options_of(values: Mapping[str, Any]) -> SimulateOptions:
-    """Options checked against their declarations; InputError in one line."""
+    """Options from their values. Raises InputError in one line for a value outside its declaration."""
     try:
         return SimulateOptions.model_validate(values)
     except ValidationError as error:
@@ -386,7 +389,7 @@ def options_of(values: Mapping[str, Any]) -> SimulateOptions:
 
 
 def parameters_of(given: Sequence[str]) -> dict[str, float]:
-    """KEY=VALUE pairs of a command line; InputError for what isn't one."""
+    """The scene's parameters from KEY=VALUE pairs. Raises InputError for anything else."""
     found = {}
     for pair in given:
         key, equals, value = pair.partition("=")
@@ -400,7 +403,7 @@ def parameters_of(given: Sequence[str]) -> dict[str, float]:
 
 
 def summary_lines(record: SimulationRecord, file: Path) -> list[str]:
-    """What is printed of a frame."""
+    """The lines that `calibench simulate` prints."""
     s, camera = record.summary, record.camera
     how = (
         f"brightest {BRIGHTEST_PERCENT:g} % at {100 * AUTO_SHARE:g} % of a full pixel"

@@ -1,6 +1,6 @@
-"""Predicted against measured, for what the fits did not use: the chart's patches, edges' transfer functions, kernels.
+"""Predicted against measured, for what the fits did not use: chart patches, edges' MTFs, and point spread functions.
 
-The model is the fitted camera with its fitted sensitivities and, if wanted, effects. Nothing of it is adjusted here.
+The model is the fitted camera, or a camera file with its effects. Nothing is fitted here.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from sim.spectrum import FloatArray
 from sim.uniform import Uniform, electron_rate
 
 PASSED_QUANTILE = 0.999
-#: Systematic parts of the comparison that the fits' uncertainties don't hold.
-LIGHT_STD = 0.01  # of the chart's light: radiometer at the chart against radiometer at the sphere, and geometry
+#: Systematic relative uncertainties (one standard deviation) that the fits' uncertainties don't include.
+LIGHT_STD = 0.01  # the chart's light: the radiometer at the chart against the radiometer at the sphere, and geometry
 MTF_FREQUENCIES = np.arange(1, 26) * 0.02
 MTF_FLOOR = 0.002
-CELL_PX = 4.0  # of a random pattern on a screen, where the recordings don't say
+CELL_PX = 4.0  # of a cell of the random pattern on a screen, where the recordings don't state it
 KERNEL_FLOOR = 0.002  # of the kernel's maximum
 
 
@@ -135,7 +135,7 @@ def _chart(
     measured = np.array([p.level for p in points]) - black
     covariance = patch_covariance(study, points, np.maximum(measured - dark * gain, 0.1))
     channel = np.array([p.channel for p in points])
-    # a fitted curve's error is much the same for all patches of a channel, the light's for all of them
+    # The error of a fitted curve is common to all patches of a channel, that of the light to all patches.
     covariance += (channel[:, None] == channel) * np.outer(spread, spread) + LIGHT_STD**2 * np.outer(
         predicted, predicted
     )
@@ -160,7 +160,7 @@ def _chart(
 
 
 def _curve_std(model: CameraModel, channel: str, wavelength_nm: FloatArray) -> float:
-    """Relative standard uncertainty of a channel's response to broad light, as if neighbouring errors were alike over 30 nm."""
+    """Relative standard deviation of a channel's response to broadband light, with errors of the curve correlated over 30 nm."""
     std, curve = model.quantum_efficiency_std.get(channel), model.quantum_efficiency[channel]
     if std is None:
         return 0.01
