@@ -54,14 +54,17 @@ def test_uniform_light_has_the_level_that_the_maker_promises(replay: Replay, rec
         assert float(replay.expected(capture).mean()) - black == pytest.approx(recorded, rel=0.15)
 
 
-def test_drawn_frames_scatter_about_the_expected_one(replay: Replay) -> None:
+def test_drawn_frames_vary_about_the_expected_one(replay: Replay) -> None:
     """The mean of a frame of n pixels within 5 sigma: photon noise and PRNU over sqrt(n), and what rounding leaves. Repeats are drawn
     of the first one's scene: another's edge lies some hundredths of a pixel beside it."""
     again = replay.drawn(np.random.default_rng(3))
     camera = replay.camera
     of_scene: dict[object, FloatArray] = {}
     for capture in replay.captures:
-        mean = of_scene.setdefault(replay._scene_key(capture, ()), replay.expected(capture))
+        scene = replay._scene_key(capture, ())
+        if scene not in of_scene:
+            of_scene[scene] = replay.expected(capture)
+        mean = of_scene[scene]
         signal = max(float(mean.mean()) - camera.black_level_dn, 1.0) / camera.conversion_gain_dn_per_e
         sigma_e = np.sqrt(
             signal + camera.read_noise_e**2 + camera.dsnu_e**2 + (camera.prnu_percent / 100 * signal) ** 2
@@ -75,13 +78,15 @@ def test_effects_act_on_replayed_frames(replay: Replay, recordings: RecordingSet
     cut = effect("infrared_cut_filter")(cut_wavelength_nm=600.0, width_nm=4.0)
     camera = replay.camera
     for capture in recordings.captures(NarrowbandCapture):
+        if 520.0 < capture.wavelength_nm < 650.0:
+            continue
         dark = (
             camera.black_level_dn + camera.conversion_gain_dn_per_e * camera.dark_current_e_per_s * capture.exposure_s
         )
         with_it, without = (float(replay.expected(capture, e).mean()) - dark for e in ((cut,), ()))
         if capture.wavelength_nm >= 650.0:
             assert with_it < 0.02 * without
-        elif capture.wavelength_nm <= 520.0:
+        else:
             assert with_it == pytest.approx(without, rel=0.01)
 
 

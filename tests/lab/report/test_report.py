@@ -14,7 +14,15 @@ import pytest
 
 from lab.errors import InputError
 from lab.formats.recording_set import DataSheet, RecordingSet
-from lab.formats.results import CameraFit, FitResult, MakerDeparture, PatchComparison, SpectralFit, Unexplained
+from lab.formats.results import (
+    CameraFit,
+    FitResult,
+    MakerDeparture,
+    PatchComparison,
+    Resolution,
+    SpectralFit,
+    Unexplained,
+)
 from lab.report import charts, provenance_of, render_report, write_report
 from lab.report.figures import by_side, measured, rotation_vector_mrad
 from lab.report.pictures import (
@@ -158,6 +166,22 @@ def test_mismatch_without_a_name(small_set: Callable[..., RecordingSet], made_up
     assert "a slow fall" in page.text
     assert page.text.count(nameless.check) == 1  # whatever the number of measurements that say so
     assert page.text.index(nameless.check) < page.text.index("a slow fall")
+
+
+def test_each_capture_that_settled_a_tie_is_told_with_what_stood_before_it(
+    small_set: Callable[..., RecordingSet], made_up: MadeUp
+) -> None:
+    recordings = small_set()
+    fit, validation, diagnosis = made_up()
+    taken = tuple(
+        Resolution(capture=f"{what} frames", session=f"s-{what}", verdict_before=verdict, effects_before=())
+        for what, verdict in (("dark", "unexplained"), ("flat", "partly_explained"))
+    )
+    settled = diagnosis.model_copy(update={"resolutions": taken})
+    page = Page(render_report(recordings, fit, validation, settled, provenance_of(recordings)))
+    assert "dark frames (session s-dark), then flat frames (session s-flat)." in page.text
+    rows = [page.text.index(f"before {one.capture}") for one in taken]
+    assert rows == sorted(rows)
 
 
 def test_text_from_outside_stays_text(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
