@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from api.keys import Permission
-from lab.capture.records import Run
+from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
@@ -149,7 +149,7 @@ class SessionDetail(Session):
 
     station: str
     progress: Progress | None = Field(description="null unless this service runs it now")
-    runs: tuple[Run, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
+    runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
 
 
 class Capture(Schema):

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.capture.records import Run, SessionInfo, StoredFile
+from lab.capture.records import RunRecord, SessionInfo, StoredFile
 from lab.formats.recording_set import RecordingSet, manifest_json
 
 _GZIP_LEVEL = 1  # of frames that are mostly noise, level 6 saves 2 % more and takes three times as long
@@ -35,7 +35,7 @@ def write_nexus(
     path: Path,
     recordings: RecordingSet,
     info: SessionInfo,
-    runs: Sequence[Run],
+    runs: Sequence[RunRecord],
     files: Sequence[StoredFile],
     progress: Callable[[str, float], None] | None,
 ) -> dict[str, int]:

@@ -58,7 +58,7 @@ class ResultInfo(_Record):
     document: dict[str, Any]
 
 
-class Run(Frozen):
+class RunRecord(Frozen):
     """Provenance of one run of a session: when, with which instruments and which versions."""
 
     started: datetime

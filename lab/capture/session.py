@@ -32,7 +32,7 @@ from drivers.instrument import Identity
 from lab.capture.blocking_calls import in_thread
 from lab.capture.instruments import Instruments
 from lab.capture.plan import CapturePlan, full_plan
-from lab.capture.records import JournalEntry, Run, SessionInfo, now
+from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.capture.take_step import Taken, take
@@ -447,11 +447,11 @@ def _plain(error: BaseException, complaints: list[str]) -> BaseException:
     return error
 
 
-def _provenance(identities: dict[str, Identity]) -> Run:
+def _provenance(identities: dict[str, Identity]) -> RunRecord:
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             versions[package] = version(package)
-    return Run(
+    return RunRecord(
         started=now(), instruments={name: vars(identity) for name, identity in identities.items()}, versions=versions
     )

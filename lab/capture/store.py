@@ -36,7 +36,7 @@ from lab.capture.records import (
     JournalEntry,
     ResultInfo,
     Role,
-    Run,
+    RunRecord,
     SessionInfo,
     SessionState,
     StoredFile,
@@ -212,12 +212,14 @@ class Store:
         with self.reading() as db:
             return Station.model_validate(self._row(db, session_id).station)
 
-    def runs(self, session_id: str) -> list[Run]:
+    def runs(self, session_id: str) -> list[RunRecord]:
         """Provenance: every run of a session, in order."""
         with self.reading() as db:
-            return [Run.model_validate(run) for run in self._row(db, session_id).runs]
+            return [RunRecord.model_validate(run) for run in self._row(db, session_id).runs]
 
-    def set_state(self, session_id: str, state: SessionState, error: str | None = None, run: Run | None = None) -> None:
+    def set_state(
+        self, session_id: str, state: SessionState, error: str | None = None, run: RunRecord | None = None
+    ) -> None:
         """Record the state of a session; `run` is added to its provenance."""
         with self.transaction() as db:
             row = self._row(db, session_id)

@@ -256,6 +256,11 @@ class Sequence(Frozen):
     targets: ClassVar[tuple[type[Target], ...]] = ()  # kinds of target that it puts before the cameras
 
     @classmethod
+    def possible(cls, station: Equipment) -> bool:
+        """Whether the station has the sequence's instruments, and a target of each of its kinds."""
+        return not station.lacks(*cls.instruments) and all(station.having(kind) for kind in cls.targets)
+
+    @classmethod
     @abstractmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
         """What a full calibration takes on this station; `quick`: fewer frames. None where the station can't take it."""
@@ -299,6 +304,21 @@ def spectrum_path(step_id: str) -> str:
 def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
     """The keys that every capture of a step has before it is taken."""
     return {"id": f"{name_of(step_id)}-{side}", "side": side, "frame": frame_path(step_id, side), "exposure_s": 0.0}
+
+
+def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measures_light: bool = True) -> Step:
+    """The step `STEM/exposure`, which finds the exposure for `level` and, with `measures_light`, measures the radiance first.
+
+    Its spectrum lies at `spectrum_path` of its id.
+    """
+    id = f"{stem}/exposure"
+    return Step(
+        id=id,
+        what=f"{what}: finding the exposure{', measuring the light' if measures_light else ''}",
+        setting=setting,
+        radiance=spectrum_path(id) if measures_light else None,
+        exposure=FindExposure(level=level),
+    )
 
 
 # --- the registry ------------------------------------------------------------------------------------------------------

@@ -10,13 +10,13 @@ from pydantic import Field
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
-    FindExposure,
     RelativeExposure,
     Sequence,
     Setting,
     SpectrumPath,
     Step,
     Target,
+    exposure_step,
     planned_keys,
     spectrum_path,
 )
@@ -60,25 +60,15 @@ class ChartSequence(Sequence):
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        if station.lacks(*cls.instruments) or not station.having(ChartTarget):
-            return None
-        return cls(frames=2 if quick else 4)
+        return cls(frames=2 if quick else 4) if cls.possible(station) else None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         name = station.one(ChartTarget)
         target = station.having(ChartTarget)[name]
         lit = Setting(target=name, wavelength_nm=0.0)
-        light = spectrum_path("colorchecker/exposure")
-        made = [
-            Step(
-                id="colorchecker/exposure",
-                what="ColorChecker: finding the exposure, measuring the light",
-                setting=lit,
-                radiance=light,
-                exposure=FindExposure(level=self.level),
-            )
-        ]
+        made = [exposure_step("colorchecker", "ColorChecker", lit, self.level)]
+        light = spectrum_path(made[0].id)
         for frame in range(1, self.frames + 1):
             id = f"colorchecker/{frame}"
             captures = []

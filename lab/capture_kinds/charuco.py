@@ -10,13 +10,13 @@ from pydantic import Field
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
-    FindExposure,
     PoseName,
     RelativeExposure,
     Sequence,
     Setting,
     Step,
     Target,
+    exposure_step,
     planned_keys,
 )
 
@@ -52,7 +52,7 @@ class StereoSequence(Sequence):
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        return None if station.lacks(*cls.instruments) or not station.having(BoardTarget) else cls()
+        return cls() if cls.possible(station) else None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
@@ -61,14 +61,7 @@ class StereoSequence(Sequence):
         for target, board in list(station.having(BoardTarget).items())[: self.poses]:
             lit = Setting(target=target, wavelength_nm=0.0)
             if not made:
-                made.append(
-                    Step(
-                        id="stereo/exposure",
-                        what="ChArUco board: finding the exposure",
-                        setting=lit,
-                        exposure=FindExposure(level=self.level),
-                    )
-                )
+                made.append(exposure_step("stereo", "ChArUco board", lit, self.level, measures_light=False))
             for frame in range(1, self.frames + 1):
                 id = f"stereo/{target}/{frame}"
                 keys = {"kind": "charuco"} | board.model_dump(exclude={"kind"})

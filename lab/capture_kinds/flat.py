@@ -10,13 +10,13 @@ from pydantic import Field
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
-    FindExposure,
     RelativeExposure,
     Sequence,
     Setting,
     SpectrumPath,
     Step,
     Target,
+    exposure_step,
     planned_keys,
     spectrum_path,
 )
@@ -63,12 +63,7 @@ class FlatSequence(Sequence):
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         lit = Setting(target=station.one(SphereTarget), wavelength_nm=0.0)
-        found = Step(
-            id="flat/exposure",
-            what="flat field: finding the exposure",
-            setting=lit,
-            exposure=FindExposure(level=self.level_found),
-        )
+        found = exposure_step("flat", "flat field", lit, self.level_found, measures_light=False)
         made = [found]
         for frame in range(1, self.frames + 1):
             light = f"flat/light/{frame}"

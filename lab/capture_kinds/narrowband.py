@@ -10,7 +10,6 @@ from pydantic import Field
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
-    FindExposure,
     Reading,
     RelativeExposure,
     Sequence,
@@ -18,6 +17,7 @@ from lab.capture_kinds.base import (
     SpectrumPath,
     Step,
     Target,
+    exposure_step,
     planned_keys,
     spectrum_path,
 )
@@ -61,14 +61,8 @@ class NarrowbandSequence(Sequence):
                 stem = f"narrowband/{wavelength_nm:g}nm"
                 lit = Setting(target=sphere, wavelength_nm=wavelength_nm, slit_um=station.limits.slit_um)
                 if turn == 1:
-                    made.append(
-                        Step(
-                            id=f"{stem}/exposure",
-                            what=f"narrowband {wavelength_nm:g} nm: finding the exposure",
-                            setting=lit,
-                            exposure=FindExposure(level=self.level),
-                        )
-                    )
+                    what = f"narrowband {wavelength_nm:g} nm"
+                    made.append(exposure_step(stem, what, lit, self.level, measures_light=False))
                 id = f"{stem}/{turn}"
                 path = spectrum_path(id)
                 made.append(

@@ -17,7 +17,6 @@ from lab.capture_kinds.base import (
     Capture,
     Cells,
     Equipment,
-    FindExposure,
     Open,
     PoseName,
     RelativeExposure,
@@ -27,6 +26,7 @@ from lab.capture_kinds.base import (
     Step,
     Target,
     TargetPath,
+    exposure_step,
     planned_keys,
     spectrum_path,
 )
@@ -86,9 +86,7 @@ class ScreenSequence(Sequence):
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        if station.lacks(*cls.instruments) or not station.having(ScreenTarget):
-            return None
-        return cls(frames=2 if quick else 4)
+        return cls(frames=2 if quick else 4) if cls.possible(station) else None
 
     @staticmethod
     def kinds() -> dict[str, type[ScreenCapture]]:
@@ -131,7 +129,6 @@ class ScreenSequence(Sequence):
         name = station.one(ScreenTarget)
         screen = station.having(ScreenTarget)[name]
         grid, shown = self.grid(station), self.patterns(station)
-        light = spectrum_path("screen/exposure")
         settings = {
             pattern: Setting(
                 target=name,
@@ -142,15 +139,8 @@ class ScreenSequence(Sequence):
             else Setting(target=name)
             for pattern, kind in self.kinds().items()
         }
-        made = [
-            Step(
-                id="screen/exposure",
-                what="screen: finding the exposure, measuring the light",
-                setting=settings["white"],
-                radiance=light,
-                exposure=FindExposure(level=self.level),
-            )
-        ]
+        made = [exposure_step("screen", "screen", settings["white"], self.level)]
+        light = spectrum_path(made[0].id)
         for pattern, kind in self.kinds().items():
             for frame in range(1, self.frames + 1):
                 id = f"screen/{pattern}/{frame}"

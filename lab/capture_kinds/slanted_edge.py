@@ -10,13 +10,13 @@ from pydantic import Field
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
-    FindExposure,
     RelativeExposure,
     Sequence,
     Setting,
     SpectrumPath,
     Step,
     Target,
+    exposure_step,
     planned_keys,
     spectrum_path,
 )
@@ -63,9 +63,7 @@ class EdgeSequence(Sequence):
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        if station.lacks(*cls.instruments) or not station.having(EdgeTarget):
-            return None
-        return cls(frames=2 if quick else 4)
+        return cls(frames=2 if quick else 4) if cls.possible(station) else None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
@@ -73,17 +71,9 @@ class EdgeSequence(Sequence):
         made: list[Step] = []
         for name, edge in station.having(EdgeTarget).items():
             lit = Setting(target=name, wavelength_nm=0.0)
-            find = f"edge/{name}/exposure"
-            light = spectrum_path(find)
-            made.append(
-                Step(
-                    id=find,
-                    what=f"slanted edge {name}: finding the exposure, measuring the light",
-                    setting=lit,
-                    radiance=light,
-                    exposure=FindExposure(level=self.level),
-                )
-            )
+            found = exposure_step(f"edge/{name}", f"slanted edge {name}", lit, self.level)
+            light = spectrum_path(found.id)
+            made.append(found)
             for frame in range(1, self.frames + 1):
                 id = f"edge/{name}/{frame}"
                 captures = []
@@ -104,7 +94,7 @@ class EdgeSequence(Sequence):
                         id=id,
                         what=f"slanted edge {name} at {edge.angle_deg:g} deg, frame {frame} of {self.frames}",
                         setting=lit,
-                        exposure=RelativeExposure(of=find),
+                        exposure=RelativeExposure(of=found.id),
                         captures=tuple(captures),
                     )
                 )

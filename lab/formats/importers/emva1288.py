@@ -28,7 +28,7 @@ LARGEST_DESCRIPTOR_BYTES = 8 << 20
 
 
 @dataclass
-class Level:
+class DescribedLevel:
     """One exposure, bright or dark: its photons per pixel (None: not stated) and its images."""
 
     bright: bool
@@ -39,20 +39,20 @@ class Level:
 
 
 @dataclass
-class Descriptor:
+class ImageDescriptor:
     """The content of a descriptor file."""
 
     release: str | None = None
     bits: int | None = None
     width: int | None = None
     height: int | None = None
-    levels: list[Level] = field(default_factory=list)
+    levels: list[DescribedLevel] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
 
-def parse_descriptor(text: str) -> Descriptor:
+def parse_descriptor(text: str) -> ImageDescriptor:
     """The descriptor in `text`; InputError with `line N: ...` where a line can't be understood."""
-    found = Descriptor()
+    found = ImageDescriptor()
     other: Counter[str] = Counter()
     for number, line in enumerate(text.removeprefix("\ufeff").splitlines(), start=1):
         words = line.split("#")[0].split() if line.lstrip()[:1] != "i" else line.split()
@@ -70,12 +70,12 @@ def parse_descriptor(text: str) -> Descriptor:
                 raise InputError(f"line {number}: {bits} bits; frames have 1 to 16: correct it")
         elif key == "b":
             exposure_ns, *photons = _numbers(rest, 1, number, "exposure (ns) and photons a pixel")
-            found.levels.append(Level(True, exposure_ns * NS, photons[0] if photons else None, number))
+            found.levels.append(DescribedLevel(True, exposure_ns * NS, photons[0] if photons else None, number))
             if len(photons) > 1:
                 other["further numbers in a line 'b'"] += 1
         elif key == "d":
             exposure_ns, *_ = _numbers(rest, 1, number, "exposure (ns)")
-            found.levels.append(Level(False, exposure_ns * NS, None, number))
+            found.levels.append(DescribedLevel(False, exposure_ns * NS, None, number))
         elif key == "i":
             if not found.levels:
                 raise InputError(f"line {number}: an image before the first level; put a line 'b' or 'd' before it")
@@ -209,7 +209,7 @@ def read_emva1288(path: Path) -> RecordingSet:
 
 
 def _shape_and_shift(
-    first: Path, descriptor: Descriptor, file: Path, warnings: list[str]
+    first: Path, descriptor: ImageDescriptor, file: Path, warnings: list[str]
 ) -> tuple[tuple[int, int], int]:
     """Rows and columns of the images, and by how many bits the values are shifted up in their 16-bit container."""
     try:
@@ -237,7 +237,7 @@ def _shape_and_shift(
 
 
 def _captures(
-    there: list[tuple[Level, str, Path]], wavelength_nm: float | None
+    there: list[tuple[DescribedLevel, str, Path]], wavelength_nm: float | None
 ) -> tuple[list[dict[str, Any]], dict[str, Path]]:
     captures: list[dict[str, Any]] = []
     frames: dict[str, Path] = {}

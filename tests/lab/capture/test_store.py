@@ -18,7 +18,7 @@ from alembic.migration import MigrationContext
 
 from lab.capture.durable_files import Lock, npy_bytes, write_durably
 from lab.capture.plan import CapturePlan
-from lab.capture.records import Run, now
+from lab.capture.records import RunRecord, now
 from lab.capture.session_files import PACK
 from lab.capture.settings import Settings
 from lab.capture.store import Store
@@ -191,7 +191,7 @@ def test_files_that_nothing_links_are_swept(store: Store) -> None:
 def test_provenance_grows_run_by_run(store: Store) -> None:
     session = started(store)
     for number in range(2):
-        run = Run(started=now(), instruments={"stage": {"model": f"m{number}"}}, versions={"python": "3"})
+        run = RunRecord(started=now(), instruments={"stage": {"model": f"m{number}"}}, versions={"python": "3"})
         store.set_state(session, "running", run=run)
     assert [run.instruments["stage"]["model"] for run in store.runs(session)] == ["m0", "m1"]
 

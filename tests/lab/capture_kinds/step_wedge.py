@@ -10,7 +10,6 @@ from pydantic import Field
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
-    FindExposure,
     Reading,
     RelativeExposure,
     Sequence,
@@ -18,6 +17,7 @@ from lab.capture_kinds.base import (
     SpectrumPath,
     Step,
     Target,
+    exposure_step,
     planned_keys,
     spectrum_path,
 )
@@ -58,23 +58,14 @@ class WedgeSequence(Sequence):
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        if station.lacks(*cls.instruments) or not station.having(WedgeTarget):
-            return None
-        return cls(frames=2 if quick else 4)
+        return cls(frames=2 if quick else 4) if cls.possible(station) else None
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
         name = station.one(WedgeTarget)
         wedge = station.having(WedgeTarget)[name]
         lit = Setting(target=name, wavelength_nm=0.0)
-        light = spectrum_path("wedge/exposure")
-        found = Step(
-            id="wedge/exposure",
-            what="step wedge: finding the exposure, measuring the light",
-            setting=lit,
-            radiance=light,
-            exposure=FindExposure(level=0.7),
-        )
+        found = exposure_step("wedge", "step wedge", lit, 0.7)
         taken = [
             Step(
                 id=f"wedge/{frame}",
@@ -86,7 +77,7 @@ class WedgeSequence(Sequence):
                         kind="step_wedge",
                         density=wedge.density,
                         regions=getattr(wedge, side).regions,
-                        radiance=light,
+                        radiance=spectrum_path(found.id),
                         **planned_keys(f"wedge/{frame}", side),
                     )
                     for side in station.sides
