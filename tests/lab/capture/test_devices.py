@@ -1,4 +1,4 @@
-"""What the devices add to the drivers: a time-out that always holds, and how bright a frame is."""
+"""Blocking calls behind a time-out, and the level of a frame."""
 
 import threading
 import time
@@ -57,7 +57,7 @@ def test_a_callback_added_late_is_called_at_once() -> None:
 
 
 def test_a_call_that_nobody_waits_for_any_more_ends_quietly() -> None:
-    """A session that is aborted cancels what it waits for; the thread goes on, and has to find a future that takes its result."""
+    """An aborted session cancels its waits. The thread goes on, and its future has to accept the late result."""
     go = threading.Event()
     future = in_thread(lambda: go.wait(10.0))
     assert not future.cancel()

@@ -1,4 +1,4 @@
-"""Sequences as data: counts, orders, ids, and what a capture says before it is taken."""
+"""Plans: number, order and ids of their steps, and the captures before they are taken."""
 
 from collections import Counter, defaultdict
 
@@ -68,7 +68,7 @@ def test_what_a_step_relies_on_comes_before_it() -> None:
 
 
 def test_ladders_cancel_a_linear_drift() -> None:
-    # On a ladder gone up and down by turns, the mean time of every rung is the same: a drift linear in time cancels.
+    # On a ladder taken upwards and downwards in turn, all rungs have the same mean time: a linear drift cancels.
     steps = FlatSequence(levels=(0.1, 0.4, 0.7, 1.0), frames=4).steps(STATION)
     times = defaultdict(list)
     for at, step in enumerate(step for step in steps if step.captures):

@@ -1,4 +1,4 @@
-"""Running sessions: every step once, through pauses, aborts, failures and kills; and nothing left open."""
+"""Sessions: every step exactly once through pauses, aborts, failures and kills, and all instruments safe at the end."""
 
 from __future__ import annotations
 
@@ -137,7 +137,9 @@ def test_a_sensor_that_saturates_below_its_data_sheet_is_not_taken_for_well_expo
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(SLOPE, "left", 1e5)
-    monkeypatch.setattr(fake_bench, "WHITE", 3490)  # 85 % of the range: neither clearly saturated nor what is wanted
+    monkeypatch.setattr(
+        fake_bench, "WHITE", 3490
+    )  # 85 % of the range: above the wanted level, below the limit for saturation
     session = begin(store, Bench(), CapturePlan((FlatSequence(levels=(0.5,), frames=1),)))
     session.run()
     found = store.journal(session.id)[0].result
@@ -153,7 +155,7 @@ def test_a_wavelength_that_the_radiometer_refuses_is_left_out_with_the_reason(st
     assert {c.wavelength_nm for c in store.recording_set(session.id).captures("narrowband")} == {400.0, 420.0}
     assert {entry.result.get("skipped") is not None for entry in store.journal(session.id)} == {False, True}
     assert sum("under-exposed" in (p.remark or "") for p in told) == 2
-    bench.refused_nm = 0.0  # but a flat's spectrum is what others rely on
+    bench.refused_nm = 0.0  # later steps use a flat's spectrum
     with pytest.raises(DeviceError, match="under-exposed"):
         begin(store, bench, LIT).run()
 
@@ -228,7 +230,7 @@ def test_pause_closes_the_shutter_and_resume_goes_on(store: Store) -> None:
     def follow(progress: Progress) -> None:
         states.append(progress.state)
         if progress.done == 6 and "paused" not in states:
-            session.pause()  # takes hold after this step
+            session.pause()  # takes effect after this step
         if progress.state == "paused":
             shutter.append((bench.opened, bench.lit, store.session(session.id).state))
             threading.Timer(0.2, session.resume).start()
@@ -245,7 +247,7 @@ def test_pause_closes_the_shutter_and_resume_goes_on(store: Store) -> None:
 
 
 def _elsewhere(call: Callable[[Progress], None], progress: Progress) -> None:
-    """Call from a thread of its own: `pause` waits for the run's loop, which is what calls back."""
+    """Call in another thread: `pause` waits for the run's loop, and this callback runs in that loop."""
     thread = threading.Thread(target=call, args=(progress,))
     thread.start()
     if progress.state == "paused":

@@ -1,4 +1,4 @@
-"""A session on the mock bench, over all its wires: a few steps of most sequences, a kill -9 in between, a bench that dies."""
+"""A session on the mock bench over its wires: a few steps of most sequences, a kill -9, and a bench that ends."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_session_on_the_wires_survives_kill_9_and_says_when_the_bench_dies(
         # Flats at a quarter, a half, three quarters of saturation: equal steps of the mean, to 3 % (linearity, dark current).
         mean = {c.id.split("-")[2]: recordings.frame(c).mean() for c in recordings.captures("flat", side)}
         assert (mean["03"] - mean["02"]) / (mean["02"] - mean["01"]) == pytest.approx(1.0, abs=0.03)
-        # The screen: what is lit by half of the cells is half as bright, to 10 % (the coins, the border of the pattern).
+        # The screen with half of its cells lit is half as bright, to 10 % (the border of the pattern).
         frames = {
             kind: recordings.frame(recordings.captures(kind, side)[0]) for kind in ("white", "black", "checkerboard")
         }  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""The station file: what it says comes out, and what can't be used is named in one line."""
+"""The station file: its content, and one line for what can't be used."""
 
 from pathlib import Path
 

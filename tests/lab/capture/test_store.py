@@ -1,4 +1,4 @@
-"""The store: captures on disk before they are linked, whole steps or none, and the packed session the same as the loose one."""
+"""The store: files on disk before their links, whole steps or none, and equal content before and after packing."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def test_a_session_without_a_process_is_interrupted(store: Store) -> None:
 
 
 def test_a_process_that_ends_while_it_is_looked_at_is_believed(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The row says that it runs; before its lock is looked at it says how it ended and lets go of the lock."""
+    """The process records its end and releases its lock after its row was read and before its lock is checked."""
     session = started(store)
     store.set_state(session, "running")
 
@@ -237,7 +237,7 @@ def test_a_session_is_a_recording_set_loose_and_packed(store: Store, tmp_path: P
     loose = store.recording_set(session)
     before = {capture.id: loose.frame(capture).copy() for capture in loose.captures()}
     pack = store.close_session(session)
-    assert store.close_session(session) == pack  # once more does no harm
+    assert store.close_session(session) == pack  # a second call changes nothing
     assert not (store.folder(session) / "frames").exists()
     info = store.session(session)
     assert (info.state, info.packed) == ("finished", True)
@@ -318,7 +318,9 @@ def test_writers_wait_for_one_another(store: Store, tmp_path: Path) -> None:
     other = sqlite3.connect(store.root / "registry.sqlite", timeout=0)
     with store.transaction() as db:
         assert db.execute(sa.text("SELECT count(*) FROM steps")).scalar() == 4
-        with pytest.raises(sqlite3.OperationalError, match="locked"):  # a reader that goes on to write holds the lock
+        with pytest.raises(
+            sqlite3.OperationalError, match="locked"
+        ):  # the transaction read first and now writes: it holds the lock
             other.execute("BEGIN IMMEDIATE")
     other.execute("BEGIN IMMEDIATE")
     other.rollback()

@@ -198,7 +198,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_fitted_camera_is_a_camera_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A ladder of MONO flats of 0.5 DN/e: gain and its uncertainty stand in the file, and what was assumed is said."""
+    """MONO flats of 0.5 DN/e: the file has the fitted gain and its uncertainty, and the assumed values are reported."""
     rng = np.random.default_rng(7)
     frames, captures = {}, []
     levels = [("dark", 0)] * 4 + [("flat", 800 * k) for k in range(1, 8) for _ in range(2)]

@@ -79,8 +79,10 @@ def test_a_raw_developer_sees_the_same_mosaic_and_levels(tmp_path: Path, cfa: Cf
 
 @pytest.mark.parametrize("patch", ["white", "orange", "cyan", "foliage"])
 def test_a_raw_developer_sees_the_colours(tmp_path: Path, patch: str) -> None:
-    """A patch under D65, developed with the file's own white and matrix, in linear sRGB beside the CIE's observer. A matrix can't
-    do better than the filters let it: 0.04 of white for these Gaussian ones."""
+    """A patch under D65, developed with the file's white and matrix, against linear sRGB of the CIE observer.
+
+    With these Gaussian filters, the residual of any matrix is up to 0.04 of white.
+    """
     camera = _camera(rows=64, cols=64)
     white = {c: electrons_of(daylight(), curve) for c, curve in camera.quantum_efficiency.items()}
     of = {c: electrons_of(daylight(), curve, reflectances()[patch]) for c, curve in camera.quantum_efficiency.items()}
@@ -126,7 +128,7 @@ def test_what_a_tiff_says(tmp_path: Path) -> None:
 
 
 def test_the_colour_matrix_is_that_of_the_light_and_the_efficiency() -> None:
-    """Of a camera whose efficiencies are combinations of colour-matching functions (per photon) it is exact: those factors."""
+    """For a camera whose efficiencies combine colour-matching functions (per photon), the matrix is exact."""
     want = np.array([[1.3, -0.3, -0.1], [-0.4, 1.2, 0.2], [0.0, 0.1, 0.9]])
     wavelength_nm = np.arange(380.0, 781.0)
     curves = np.stack([curve.at(wavelength_nm) for curve in _matching()])

@@ -1,4 +1,4 @@
-"""Recording sets: what is written is read again bit for bit, and everything the format refuses is named on one line."""
+"""Recording sets: written and read again bit for bit, and one line for everything that the format refuses."""
 
 import json
 import pickle
@@ -607,7 +607,7 @@ def test_foreign_sets_are_read_and_survive_a_copy(name: str, tmp_path: Path) -> 
 
 
 def test_joined_sets_keep_apart_what_they_name_alike(small_set: Callable[..., RecordingSet]) -> None:
-    """The same set as its own later one, with other frames: ids, paths and poses of the later have the folder before them."""
+    """A set joined to itself with other frames: the later ids, paths and poses begin with the folder."""
     first = small_set()
     later = first.with_frames({c.frame: np.full_like(first.frame(c), 7) for c in first.captures()})
     both = first.joined(later, "resolve")

@@ -1,4 +1,4 @@
-"""EMVA 1288 descriptors in their variants, and what becomes of damaged, missing and odd images."""
+"""Variants of EMVA 1288 descriptors; damaged, missing and unusual images."""
 
 from pathlib import Path
 from typing import Any
