@@ -26,7 +26,7 @@ from lab.fit.psf import estimate_kernel
 from lab.fit.psf.levelled_captures import ScreenPictures
 from lab.fit.psf.normal_equations import normal_equations
 from lab.fit.psf.photograph import photographed_kernel
-from lab.fit.psf.screen_kernel import measure_kernels
+from lab.fit.psf.screen_kernel import measure_field
 from lab.fit.psf.target_displacement import displaced
 from sim.camera import CameraModel, Lens
 from sim.frame import Exposure, expected_electrons
@@ -286,7 +286,7 @@ def simulated_camera() -> tuple[np.ndarray, np.ndarray]:
         screen=ScreenState(pose="p", cell_camera_px=3.8), target="noise.npy",
     )  # fmt: skip
     levelled = [(frames[name] - frames["black"]) / contrast for name in ("board", "noise")]
-    found = measure_kernels(ScreenPictures(first, *levelled, board, pattern), "MONO", 9)["Y"].kernel
+    found = measure_field(ScreenPictures(first, *levelled, board, pattern), "MONO", 9, patches=0).kernels["Y"].kernel
     return found, kernel(camera, "Y", light, len(found))
 
 

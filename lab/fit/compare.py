@@ -160,7 +160,9 @@ def _identity(model: Frozen) -> str:
 
 
 def _model_error(geometry: GeometryFit) -> float:
-    """Factor by which the uncertainties of a geometry are too small, where its own halves differ beyond them; else 1."""
+    """Factor by which the uncertainties of a geometry are too small, where its own halves differ beyond them; else
+    1.
+    """
     own = geometry.cross_validation
     return max(1.0, own.difference_px / own.expected_px) if own is not None and own.model_error_px > 0 else 1.0
 

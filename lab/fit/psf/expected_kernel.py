@@ -1,4 +1,4 @@
-"""The kernel that `measure_kernels` converges to for a given transfer function."""
+"""The kernel that `measure_field` converges to for a given transfer function."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.floating[Any]]
 def expected_kernel(
     transfer: Callable[[Array, Array], NDArray[np.complex128]], support_px: int, cell_px: float, oversample: int = 2
 ) -> Array:
-    """Kernel on the pixels of the sensor, (support, support), sum 1, that `measure_kernels` converges to for a
+    """Kernel on the pixels of the sensor, (support, support), sum 1, that `measure_field` converges to for a
     transfer function of lens and pixel.
 
     `transfer(fx, fy)`, in cy/px, broadcasts over both. `cell_px`: size of a cell of the pattern. The kernel is the

@@ -68,25 +68,17 @@ class ScreenField:
     parts: tuple[ScreenKernel, ...]
 
 
-def measure_kernels(
-    pictures: ScreenPictures, cfa: Cfa, support_px: int = 9, oversample: int = 2, patches: int = 0
-) -> dict[str, ScreenKernel]:
-    """Kernels of all channels of one pose, `support_px` (odd) wide; doubled once where a kernel doesn't fit.
-
-    The registration from the corners is refined with the kernel, except a common shift, by Gauss-Newton on the
-    residual: first on the green (or only) channel, then on each. `oversample` samples per pixel (2 or 4) resolve the
-    kernel: 4 is worth its time where the cells of the target are about a quarter of a pixel, or the noise is low.
-    Raises `NotDetermined` where the pattern can't be registered.
-    """
-    return measure_field(pictures, cfa, support_px, oversample, patches).kernels
-
-
 def measure_field(
     pictures: ScreenPictures, cfa: Cfa, support_px: int = 9, oversample: int = 2, patches: int = 3
 ) -> ScreenField:
-    """As `measure_kernels`; and kernels of `patches` x `patches` parts of the pattern, of the green (or only) channel.
+    """Kernels of all channels of one pose, `support_px` (odd) wide, and of parts of the pattern.
 
-    Each part has a kernel of its own, with the registration and the prior of the whole.
+    The support is doubled once where a kernel doesn't fit. The registration from the corners is refined with the
+    kernel, except a common shift, by Gauss-Newton on the residual: first on the green (or only) channel, then on each.
+    `oversample` samples per pixel (2 or 4) resolve the kernel: 4 is worth its time where the cells of the target are
+    about a quarter of a pixel, or the noise is low. With `patches` > 1, `patches` x `patches` parts of the pattern
+    have a kernel each, of the green (or only) channel, with the registration and the prior of the whole. Raises
+    `NotDetermined` where the pattern can't be registered, ValueError for another `oversample`.
     """
     if oversample not in (2, 4):
         raise ValueError(f"oversample = {oversample} must be 2 or 4 samples a pixel")
