@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -190,6 +193,23 @@ def test_names_are_found_at_any_depth() -> None:
     moved = {key: value for key, _, value in names_in(in_folder(shown, "later"))}
     assert moved == {key: f"later/{value}" for key, value in named.items()}
     assert in_folder(shown, "later").model_fields_set == shown.model_fields_set
+
+
+def test_the_how_tos_examples_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = Path(__file__).parents[3] / "docs/how-to/add-a-capture-kind.md"
+    files = [code for code in re.findall(r"```python\n(.*?)```", page.read_text(), re.S) if "KIND = " in code]
+    assert len(files) == 2
+    for number, code in enumerate(files):
+        file = tmp_path / f"how_to_{number}.py"
+        file.write_text(code)
+        spec = importlib.util.spec_from_file_location(file.stem, file)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, file.stem, module)
+        spec.loader.exec_module(module)
+        with registered(module.KIND):
+            steps = full_plan(fake_bench.station(), quick=True).steps(fake_bench.station())
+            assert sum(isinstance(c, module.KIND) for step in steps for c in step.captures) >= 2 * 2
 
 
 def test_a_name_is_taken_once() -> None:
