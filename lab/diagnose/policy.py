@@ -197,15 +197,6 @@ class DecisionPolicy(Frozen):
             "wider than `noise_sigma`, as the correlation kernel of a law's error is assumed; " + TUNED,
         ),
     ] = 5.0
-    replacing_odds: Annotated[
-        float,
-        Rule(
-            "name",
-            "1",
-            "ratio of probabilities from which on a rival takes a name's place",
-            "less is what refits of the same set differ by",
-        ),
-    ] = 1.1
     companion_share: Annotated[
         float,
         Rule(
@@ -215,15 +206,6 @@ class DecisionPolicy(Frozen):
             TUNED,
         ),
     ] = 0.03
-    least_companion_share: Annotated[
-        float,
-        Rule(
-            "name",
-            "1",
-            "the same of the gain of any effect on common measurements",
-            "(1 %)^2: the smallest form tolerance, squared",
-        ),
-    ] = 0.0001
     remainder_log_odds: Annotated[
         float, Rule("name", "log odds", "gain of a discrepancy that never speaks against a name", "odds of 20 to 1")
     ] = 3.0
@@ -245,15 +227,6 @@ class DecisionPolicy(Frozen):
             "as `least_explained_share_open`: 2 % may be left",
         ),
     ] = 0.02
-    sure_remainder_log_odds: Annotated[
-        float,
-        Rule(
-            "name",
-            "log odds",
-            "gain of a discrepancy from which on `own_remainder_share` holds for it in any of the same frames",
-            TUNED,
-        ),
-    ] = 1000.0
     equal_sign_log_odds: Annotated[
         float,
         Rule(

@@ -126,8 +126,7 @@ def _is_part_of_unknown(
     frames = _frames(model, strongest)
 
     def is_strong(one: Discrepancy) -> bool:
-        is_own = one.index == strongest or one.log_odds > policy.sure_remainder_log_odds
-        share = policy.own_remainder_share if is_own else policy.remainder_share
+        share = policy.own_remainder_share if one.index == strongest else policy.remainder_share
         return one.log_odds > max(share * candidate.log_odds, policy.remainder_log_odds)
 
     def shares_frames(index: int) -> bool:

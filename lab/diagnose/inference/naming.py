@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from operator import and_
 
 import numpy as np
 
@@ -114,8 +113,8 @@ def _is_beside_stronger(candidate: Candidate, members: Sequence[Candidate], sear
 def _is_companion(candidate: Candidate, members: Sequence[Candidate], search: Search) -> bool:
     """Whether a member may be no more than the error of a stronger one's law.
 
-    It may where its log odds are below `companion_share` of a rival's, or below `least_companion_share` of those of any member on common
-    blocks; and where, in the block that it changes most, its change is below `companion_share` of another member's.
+    It may where its log odds are below `companion_share` of a rival's; and where, in the block that it changes most, its change is below
+    `companion_share` of another member's.
     """
     model, policy = search.model, search.policy
     others = [c for c in members if c is not candidate]
@@ -123,12 +122,6 @@ def _is_companion(candidate: Candidate, members: Sequence[Candidate], search: Se
     if any(c.effect.name in rivals and candidate.log_odds < policy.companion_share * c.log_odds for c in others):
         return True
     acts = model.acts(type(candidate.effect))
-    if any(
-        candidate.log_odds < policy.least_companion_share * c.log_odds
-        and any(map(and_, acts, model.acts(type(c.effect))))
-        for c in others
-    ):
-        return True
     around = tuple(c.effect for c in others)
     changes = [model.change_chi2(candidate.effect, around, i) if acting else 0.0 for i, acting in enumerate(acts)]
     most = int(np.argmax(changes))

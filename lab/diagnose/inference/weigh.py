@@ -91,7 +91,7 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
     rivals = [(n, o / total) for n, o in odds.items() if n != effect.name and o / total > LEAST_KEPT_PROBABILITY]
     share, is_closed = explained(model, fit, without, affected, policy)
     first = max((n for n in odds if n != UNKNOWN), key=lambda n: odds[n])
-    better = fits[first] if odds[first] > policy.replacing_odds * odds[effect.name] else None
+    better = fits[first] if odds[first] > odds[effect.name] else None
     candidate = Candidate(
         effect,
         fit.std[index],
