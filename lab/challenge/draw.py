@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
@@ -22,6 +24,7 @@ WEAK, STRONG = (10.0, 50.0), (50.0, 2000.0)  # non-centralities aimed at, half o
 INVISIBLE = 1.0  # a non-centrality below which no strength is searched
 SIZING_ROUNDS, SIZING_FACTOR = 3, 1.6  # attempts to reach the non-centrality aimed at, and how near is near enough
 FAULT_SHARE = 0.35  # of the cases outside the library
+Sizing = Literal["aimed", "nominal", "unmeasured"]
 
 
 @dataclass(frozen=True)
@@ -33,13 +36,13 @@ class Case:
 
 
 def draw(
-    seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None, law: type[Law] | None = None, sized: bool = True
+    seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None, law: type[Law] | None = None, sizing: Sizing = "aimed"
 ) -> Case:  # fmt: skip
     """Case number `index` of a challenge; the same arguments give the same case.
 
     cfa, kind, law    None: drawn
-    sized             laws get the strength that gives a drawn non-centrality; else the nominal strength, and a non-centrality from one draw
-                      of the noise, which is quick and too high
+    sizing            "aimed": laws get the strength that gives a drawn non-centrality. "nominal": the nominal strength, and a non-centrality from
+                      one draw of the noise, which is quick and too high. "unmeasured": the nominal strength, and 0 for the non-centrality
     """
     rng = np.random.default_rng([seed, index])
     what = kind or kind_of(seed, index)
@@ -69,12 +72,16 @@ def draw(
     kinds = tuple(k for k in plan.kinds if k != drop)
     plan = replace(plan, kinds=kinds, warm=plan.warm or any(one.needs == "temperature" for one in laws))
 
-    def take(present: Sequence[Law], noise_draw: int = 0) -> Session:
+    @lru_cache(maxsize=4)  # what was measured last is what is handed out
+    def take(present: tuple[Law, ...], noise_draw: int) -> Session:
         return record(ConcealedCamera(camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw), plan)
 
     targets = [float(np.exp(rng.uniform(*np.log(WEAK if rng.random() < 0.5 else STRONG)))) for _ in laws]
-    chosen, sizes = _sized(take, laws, targets if sized else [], (0, 1) if sized else (0, 0))
-    session = take(chosen)
+    chosen, sizes = laws, [0.0] * len(laws)
+    if sizing != "unmeasured":
+        aimed = sizing == "aimed"
+        chosen, sizes = _sized(take, laws, targets if aimed else [], (0, 1) if aimed else (0, 0))
+    session = take(tuple(chosen), 0)
     if fault is not None:
         session = spoilt(session, fault, rng)
     concealed = tuple(
@@ -129,13 +136,14 @@ def _resized(law: Law, strength: float) -> Law:
 
 
 def _sized(
-    take: Callable[[Sequence[Law], int], Session], laws: list[Law], targets: list[float], draws: tuple[int, int]
+    take: Callable[[tuple[Law, ...], int], Session], laws: list[Law], targets: list[float], draws: tuple[int, int]
 ) -> tuple[list[Law], list[float]]:
     """Laws at the strengths that come near the non-centralities aimed at, and the non-centralities reached."""
     if not laws:
         return [], []
 
-    def both(present: Sequence[Law]) -> list[MeasurementModel | None]:
+    @lru_cache(maxsize=4)
+    def both(present: tuple[Law, ...]) -> list[MeasurementModel | None]:
         found = {k: summaries(recording_set(take(present, k))) for k in set(draws)}
         return [found[k] for k in draws]
 
@@ -150,6 +158,6 @@ def _sized(
                 break
             ratio = float(np.clip((target / size) ** (0.5 / laws[i].power), 0.1, 10.0))
             laws[i] = _resized(laws[i], laws[i].strength * ratio)
-    whole = both(laws)
-    without = [none] if len(laws) == 1 else [both([one for one in laws if one is not law]) for law in laws]
+    whole = both(tuple(laws))
+    without = [none] if len(laws) == 1 else [both(tuple(one for one in laws if one is not law)) for law in laws]
     return laws, [shown(whole, absent) for absent in without]

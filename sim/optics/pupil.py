@@ -37,6 +37,8 @@ FEW, SOME, MANY_A_DIRECTION = 600, 20_000, 40
 #: Steps of a table over the radius that lines are drawn through, to 1e-6; least steps of one over radius and angle, for splines.
 RADII_LINE = 4096
 RADII, ANGLES, PAD = 256, 256, 8
+#: Points that are summed at once: their arrays stay in the processor's cache.
+IN_CACHE = 20_000
 #: A polar grid is fine enough where the last coefficients of its expansion are below this.
 SETTLED = 1e-7
 
@@ -67,6 +69,14 @@ class Wavefront:
                     inner = inner * y + row.get(j, 0.0)
                 total = total + inner
         return total
+
+    def at_square(self, square: FloatArray) -> FloatArray:
+        """An isotropic W at squared radii."""
+        radial = {i // 2: um for i, j, um in self.terms if j == 0}
+        total: FloatArray | float = 0.0
+        for power in range(max(radial, default=0), -1, -1):
+            total = total * square + radial.get(power, 0.0)
+        return np.asarray(total)
 
     def __add__(self, other: Wavefront) -> Wavefront:
         return self.plus(dict(other.coefficients))
@@ -339,7 +349,7 @@ def _mean_of_any(
         t, t_weight = t[(nodes // 2) :], t_weight[(nodes // 2) :] * np.where(t[(nodes // 2) :] == 0.0, 0.5, 1.0)
     ratio = np.empty(half.size, float if not odd.terms else complex)
     k = 2.0 * np.pi / wavelength_um
-    block = max(1, 500_000 // (node.size * t.size))
+    block = max(1, IN_CACHE // (node.size * t.size))
     for start in range(0, half.size, block):
         at = slice(start, start + block)
         c = half[at, None, None]
@@ -348,6 +358,13 @@ def _mean_of_any(
         sine = np.sin(theta)
         u, v = np.cos(theta) - c, sine * t
         area = weight[None, :, None] * t_weight * sine * sine
+        if bend.is_isotropic:
+            squares = v * v
+            difference = even.at_square((u + c) ** 2 + squares) - even.at_square((u - c) ** 2 + squares)
+            ratio[at] = np.sum(area * np.cos(k * difference), axis=(1, 2)) / np.maximum(
+                np.sum(area, axis=(1, 2)), 1e-300
+            )
+            continue
         ca, sa = cos[at, None, None], sin[at, None, None]
         x, y, step_x, step_y = u * ca - v * sa, u * sa + v * ca, c * ca, c * sa
         far, near = (x + step_x, y + step_y), (x - step_x, y - step_y)

@@ -27,11 +27,12 @@ from mocks.former.laws import (
     LampJumpLaw,
     NonlinearityLaw,
     OpticalLowPassFilterLaw,
+    RowNoiseLaw,
     TapGainLaw,
 )
 
 #: Laws whose nominal strength is far above what small frames need, whatever the variant.
-PLAIN: tuple[type[Law], ...] = (OpticalLowPassFilterLaw, InfraredCutFilterLaw, NonlinearityLaw, OpticalLowPassFilterLaw)
+PLAIN: tuple[type[Law], ...] = (OpticalLowPassFilterLaw, InfraredCutFilterLaw, NonlinearityLaw, RowNoiseLaw)
 #: Of the kinds that no list names, some that are soon diagnosed.
 STRANGE: tuple[type[Law], ...] = (
     AbsorptionBandLaw,
@@ -57,7 +58,9 @@ SEED = fresh_seed()
 
 
 def diagnosed(kind: Kind, index: int, law: type[Law] | None = None) -> tuple[Case, SaltedTruth, str, DiagnosisResult]:
-    case = draw(SEED, index, "small", cfa="MONO", kind=kind, law=law, sized=False)
+    case = draw(
+        SEED, index, "small", cfa="MONO", kind=kind, law=law, sizing="nominal" if kind == "single" else "unmeasured"
+    )
     kept = salted(case.truth)
     sealed = seal(kept)  # before anything is diagnosed
     return case, kept, sealed, diagnose(case.recordings)

@@ -101,7 +101,7 @@ def test_a_set_with_a_law_has_the_form_of_a_healthy_one() -> None:
     """The same keys, names and exposures of every kind of capture, whatever is concealed."""
     forms = []
     for kind, law in (("healthy", None), ("outside", OUTSIDE[0])):
-        case = draw(3, 2, "small", cfa="MONO", kind=kind, law=law, sized=False)  # type: ignore[arg-type]
+        case = draw(3, 2, "small", cfa="MONO", kind=kind, law=law, sizing="unmeasured")  # type: ignore[arg-type]
         manifest = json.loads(recording.manifest_json(case.recordings.manifest))
         assert manifest["name"] == "camera"
         form = {(c["kind"], c["exposure_s"], c.get("radiance"), *sorted(c)) for c in manifest["captures"]}
@@ -116,7 +116,7 @@ def test_the_mix_is_the_stated_one() -> None:
 
 
 def test_a_case_is_drawn_again_alike() -> None:
-    one, two = (draw(9, 1, "small", kind="single", law=LISTED[0], cfa="MONO", sized=False) for _ in range(2))
+    one, two = (draw(9, 1, "small", kind="single", law=LISTED[0], cfa="MONO", sizing="nominal") for _ in range(2))
     assert one.truth == two.truth
     assert all(
         np.array_equal(one.recordings.frame(c), two.recordings.frame(c)) for c in one.recordings.captures()[::20]

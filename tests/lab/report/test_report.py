@@ -19,6 +19,7 @@ from lab.formats.results import (
     FitResult,
     MakerDeparture,
     PatchComparison,
+    PolicyRule,
     Resolution,
     SpectralFit,
     Unexplained,
@@ -148,7 +149,8 @@ def test_baseline_that_explains_everything(small_set: Callable[..., RecordingSet
     page = Page(render_report(recordings, *made_up(verdict="no_mismatch", sides=("left",)), provenance_of(recordings)))
     assert "The baseline model explains these recordings." in page.text
     assert "false-alarm rate of 0.01" in page.text
-    assert "conceals" not in page.text
+    assert "shows no mismatch" not in page.text
+    assert "Decision policy" not in page.text
 
 
 def test_mismatch_without_a_name(small_set: Callable[..., RecordingSet], made_up: MadeUp) -> None:
@@ -158,14 +160,16 @@ def test_mismatch_without_a_name(small_set: Callable[..., RecordingSet], made_up
         side="left", measurement="flat", axis="time", where="0..10 s", shape="a slow fall", significance_sigma=9.1,
         chi2_before=300.0, chi2_after=98.0, n=100, check="The left camera looks as if the pitch were 3 um: check it.",
     )  # fmt: skip
+    rule = PolicyRule(name="false_alarm_rate", group="significance", value=0.01, unit="1", meaning="healthy cameras")
     changed = diagnosis.model_copy(
-        update={"verdict": "unexplained", "effects": (), "unexplained": (nameless, nameless)}
+        update={"verdict": "unexplained", "effects": (), "unexplained": (nameless, nameless), "policy": (rule,)}
     )
     page = Page(render_report(recordings, fit, validation, changed, provenance_of(recordings)))
     assert "no effect in the library accounts for" in page.text
     assert "a slow fall" in page.text
     assert page.text.count(nameless.check) == 1  # whatever the number of measurements that say so
     assert page.text.index(nameless.check) < page.text.index("a slow fall")
+    assert "significance false alarm rate 0.01 healthy cameras" in page.text
 
 
 def test_each_capture_that_settled_a_tie_is_told_with_what_stood_before_it(
