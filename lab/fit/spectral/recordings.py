@@ -19,7 +19,7 @@ from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
-# A curve is stated every 10 nm, mostly at the wavelengths of the lights, where structure finer than the lights is largest.
+# A curve is stated every 10 nm, mostly at the wavelengths of the lights, where structure finer than these is largest.
 FINE_SHARE = 0.13  # chosen so that bands contain measured curves at the stated wavelengths
 OUTPUT_STEP_NM = 10.0
 SEEN_SIGMA = 5.0  # standard deviations that one signal at least has to be above the dark

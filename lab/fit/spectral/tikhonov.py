@@ -31,8 +31,8 @@ def posterior_under_prior(
     roots = [root - line @ np.linalg.lstsq(line, root, rcond=None)[0] for root in roots]  # straight lines are free
     misfits = [least_misfit(root, line, operator, value, std) for root in roots]
     best = min(range(len(roots)), key=lambda i: misfits[i][0])
-    # Straight lines have a normal prior a thousand times as wide as the curve is high. Singular values keep well and poorly
-    # determined directions apart; differences of covariances lose digits where noise is small.
+    # Straight lines have a normal prior a thousand times as wide as the curve is high. Singular values keep well and
+    # poorly determined directions apart; differences of covariances lose digits where noise is small.
     height = float(np.max(np.abs(value / operator.sum(axis=1))))
     prior = np.concatenate([1e3 * height * line, misfits[best][1] * roots[best]], axis=1)
     left, singular, right = np.linalg.svd(operator @ prior / std[:, None], full_matrices=True)
