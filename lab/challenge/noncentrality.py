@@ -12,9 +12,9 @@ from collections.abc import Hashable, Sequence
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from lab.diagnose import BLOCKS
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Study
+from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
@@ -24,9 +24,9 @@ def summaries(recordings: RecordingSet) -> MeasurementModel | None:
     """The summaries of a single camera's recordings; None where nothing can be summarised."""
     study = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     blocks = []
-    for make in BLOCKS:
+    for measurement in measurements():
         try:
-            blocks.append(make(study))
+            blocks.append(measurement.make(study))
         except NotDetermined:
             continue
     return MeasurementModel(tuple(blocks), study.camera) if blocks else None
@@ -38,7 +38,7 @@ def _keys(found: MeasurementModel) -> list[Hashable]:
     keys: list[Hashable] = []
     for block in found.blocks:
         for label in block.labels:
-            key = block.measurement, label.channel, label.condition, label.captures
+            key = block.measurement.name, label.channel, label.condition, label.captures
             keys.append((key, count[key]))
             count[key] += 1
     return keys

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from lab.diagnose.measurements.blocks import BLOCKS
 from lab.diagnose.outcome.merge_sides import merged
 from lab.diagnose.outcome.next_capture import Proposal
 from lab.diagnose.policy import DecisionPolicy
@@ -24,7 +23,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult
 from sim.camera import Side
 
-__all__ = ["BLOCKS", "DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
+__all__ = ["DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
 
 #: Called with what is being done and the share of the work that is done, 0..1.
 Progress = Callable[[str, float], None]

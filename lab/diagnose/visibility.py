@@ -89,7 +89,7 @@ def _shown(model: MeasurementModel, changed: np.ndarray) -> Iterator[tuple[str, 
     for block, at in zip(model.blocks, model.slices, strict=True):
         labels = [label for label, is_changed in zip(block.labels, changed[at], strict=True) if is_changed]
         if labels:
-            yield block.measurement, {capture for label in labels for capture in label.captures}
+            yield block.measurement.name, {capture for label in labels for capture in label.captures}
 
 
 def _parts(model: MeasurementModel) -> Iterable[np.ndarray]:
@@ -97,7 +97,7 @@ def _parts(model: MeasurementModel) -> Iterable[np.ndarray]:
     yield np.ones(len(model.value), bool)
     for index, (block, at) in enumerate(zip(model.blocks, model.slices, strict=True)):
         yield model.mask(index)
-        if block.conditions:
+        if block.measurement.conditions:
             condition = np.array([label.condition for label in block.labels])
             for one in np.unique(condition):
                 part = np.zeros(len(model.value), bool)

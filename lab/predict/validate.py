@@ -15,9 +15,9 @@ from scipy import special
 from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.inference.gaussian import chi2
-from lab.diagnose.measurements.patches import Patch as PatchLevel
-from lab.diagnose.measurements.patches import patch_covariance, patch_levels
-from lab.diagnose.measurements.summaries import Study
+from lab.diagnose.measurements.chart import Patch as PatchLevel
+from lab.diagnose.measurements.chart import patch_covariance, patch_levels
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.transfer_function import EdgeMtf

@@ -16,6 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
+from lab.diagnose.measurements.library import measurement_title
 from lab.errors import InputError
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
@@ -149,6 +150,7 @@ def page_environment() -> jinja2.Environment:
 
     environment.filters |= {
         "words": lambda text: str(text).replace("_", " "),
+        "measurement": measurement_title,
         "chart_json": _chart_json,
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lab.diagnose.measurements.library import measurement_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Check, DiagnosisResult, NoiseFit, PatchComparison, ResidualCurve, SpectralFit
 from lab.report.figures import measured
@@ -422,7 +423,7 @@ def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
         if key not in strongest or item.significance_sigma > strongest[key].significance_sigma:
             strongest[key] = item
     cells = [[strongest.get((row, name)) for name in axes] for row in rows]
-    names = [f"{side}: {measurement.replace('_', ' ')}" for side, measurement in rows]
+    names = [f"{side}: {measurement_title(measurement)}" for side, measurement in rows]
     labels = [name.replace("_", " ") for name in axes]
     return {
         "data": [

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.detectability import detectable
 from lab.formats.results import DiagnosisResult, ExaminedPlace, ResidualCurve, ResidualPicture, Visibility
 from lab.report.charts import Figure, axis, layout
@@ -92,7 +93,7 @@ def _place_map(places: Sequence[ExaminedPlace], *, after: bool) -> Figure:
             {
                 "type": "heatmap",
                 "x": [name.replace("_", " ") for name in axes],
-                "y": [row.replace("_", " ") for row in rows],
+                "y": [measurement_title(row) for row in rows],
                 "z": [[None if cell is None else min(sigma(cell), DEEPEST_SIGMA) for cell in line] for line in cells],
                 "customdata": [
                     ["" if cell is None else f"{sigma(cell):.1f} σ, {cell.where}" for cell in line] for line in cells
@@ -114,7 +115,7 @@ def _place_map(places: Sequence[ExaminedPlace], *, after: bool) -> Figure:
             annotations=[
                 {
                     "x": axes[column].replace("_", " "),
-                    "y": rows[line].replace("_", " "),
+                    "y": measurement_title(rows[line]),
                     "text": _short(sigma(cell)),
                     "showarrow": False,
                     "font": {"size": 11, "color": "#ffffff" if sigma(cell) > 0.8 * DEEPEST_SIGMA else "#1b1b1b"},

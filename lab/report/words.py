@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from lab.diagnose.measurements.library import measurement_title
 from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ParameterValue, ValidationResult
 from lab.report.figures import measured
 
@@ -59,7 +60,7 @@ def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: Diag
     if diagnosis is not None:
         yield from (effect_sentence(effect) for effect in diagnosis.effects)
         if diagnosis.unexplained:
-            places = sorted({f"{item.measurement.replace('_', ' ')} ({item.side})" for item in diagnosis.unexplained})
+            places = sorted({f"{measurement_title(item.measurement)} ({item.side})" for item in diagnosis.unexplained})
             yield f"Without a name so far: {', '.join(places)}."
             yield from dict.fromkeys(u.check for u in diagnosis.unexplained if u.check)
         named = {side for effect in diagnosis.effects for side in effect.sides}

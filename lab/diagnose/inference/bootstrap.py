@@ -73,7 +73,7 @@ def _draw_of(model: MeasurementModel) -> HealthyDraw:
     for block, at in zip(model.blocks, model.slices, strict=True):
         index = np.arange(at.start, at.stop)[model.seen[at]]
         residual = (model.value - gaussian.mean)[index]
-        blocks[block.measurement] = chi2(residual, gaussian.covariance[np.ix_(index, index)]), len(index)
+        blocks[block.measurement.name] = chi2(residual, gaussian.covariance[np.ix_(index, index)]), len(index)
     return HealthyDraw(max((s.value for s in scores), default=0.0), blocks)
 
 

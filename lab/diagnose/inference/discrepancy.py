@@ -15,7 +15,7 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 
 from lab.diagnose.inference.gaussian import ROUNDING, Gaussian, chi2, conditional
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Block
+from lab.diagnose.measurements.block import Block
 from lab.diagnose.policy import DecisionPolicy
 from sim.spectrum import FloatArray
 
@@ -115,7 +115,7 @@ def _fitted(
     block, at = model.blocks[index], model.slices[index]
     seen = model.seen[at]
     residual = model.value[at][seen] - gaussian.mean[gaussian.slices[index]]
-    x = np.zeros_like(block.position) if block.places else block.position
+    x = np.zeros_like(block.position) if block.measurement.places else block.position
     lower = cholesky(gaussian.block_covariance(index), lower=True)
     white = solve_triangular(lower, residual, lower=True)
     yield _none(block, index)
@@ -151,14 +151,14 @@ def _groupings(block: Block) -> dict[str, NDArray[np.intp]]:
     channel = np.unique([label.channel for label in block.labels], return_inverse=True)[1]
     condition = np.unique([label.condition for label in block.labels], return_inverse=True)[1]
     both = np.unique(condition * len(channel) + channel, return_inverse=True)[1]
-    if block.places:
+    if block.measurement.places:
         return {"each place by itself": condition, "each place and channel by itself": both}
     found = {"shared": np.zeros_like(channel)}
     if channel.any():
         found["by channel"] = channel
-    if block.conditions and condition.any():
-        found[f"by {block.conditions}"] = condition
-        found[f"by channel and {block.conditions}"] = both
+    if block.measurement.conditions and condition.any():
+        found[f"by {block.measurement.conditions}"] = condition
+        found[f"by channel and {block.measurement.conditions}"] = both
     return found
 
 

@@ -10,7 +10,7 @@ from scipy import special
 
 from lab.diagnose.inference.gaussian import Gaussian, chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Block
+from lab.diagnose.measurements.block import Block
 from lab.diagnose.policy import DecisionPolicy
 from sim.spectrum import FloatArray
 
@@ -79,7 +79,7 @@ def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str,
     x = np.array([label.x for label in block.labels])
     channel = np.array([label.channel for label in block.labels])
     condition = np.array([label.condition for label in block.labels])
-    found = [(block, block.axis, _range(block, x[use]), index[use])]
+    found = [(block, block.measurement.axis, _range(block, x[use]), index[use])]
     if not use.any():
         return []
     if len(set(channel)) > 1:
@@ -88,26 +88,26 @@ def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str,
             for c in sorted(set(channel))
             if (use & (channel == c)).any()
         ]
-    if block.conditions and len(set(condition)) > 1:
+    if block.measurement.conditions and len(set(condition)) > 1:
         found += [
-            (block, block.conditions, c, index[use & (condition == c)])
+            (block, block.measurement.conditions, c, index[use & (condition == c)])
             for c in sorted(set(condition))
             if (use & (condition == c)).any()
         ]
-    if not block.places and len(set(x[use])) >= FEWEST_QUARTERED:
+    if not block.measurement.places and len(set(x[use])) >= FEWEST_QUARTERED:
         cuts = np.quantile(x[use], [0, 0.25, 0.5, 0.75, 1.0])
         for low, high in pairwise(cuts):
             part = use & (x >= low) & (x <= high)
             if part.any():
-                found.append((block, block.axis, _range(block, x[part]), index[part]))
+                found.append((block, block.measurement.axis, _range(block, x[part]), index[part]))
     return found
 
 
 def _range(block: Block, x: FloatArray) -> str:
-    if block.places or len(x) == 0:
-        return block.places
+    if block.measurement.places or len(x) == 0:
+        return block.measurement.places
     low, high = float(np.min(x)), float(np.max(x))
-    return f"{low:.4g}..{high:.4g} {block.unit}"
+    return f"{low:.4g}..{high:.4g} {block.measurement.unit}"
 
 
 def describe(model: MeasurementModel, gaussian: Gaussian, part: Slice) -> tuple[str, tuple[str, ...]]:
@@ -134,12 +134,12 @@ def describe(model: MeasurementModel, gaussian: Gaussian, part: Slice) -> tuple[
     conditions = list(dict.fromkeys(label.condition for label in labels))
     words = []
     listed = ", ".join(conditions[:6]) + (" and others" if len(conditions) > 6 else "")
-    if block.places:
-        words.append(f"{block.places}: {listed}")
+    if block.measurement.places:
+        words.append(f"{block.measurement.places}: {listed}")
     else:
         words.append(_range(block, np.array([label.x for label in labels])))
-        if block.conditions:
-            words.append(f"{block.conditions_words or block.conditions} {listed}")
+        if block.measurement.conditions:
+            words.append(f"{block.measurement.conditions_words or block.measurement.conditions} {listed}")
     words.append("all channels" if channels == every else "channel " + ", ".join(channels))
     captures = sorted({c for label in labels for c in label.captures})
     return ", ".join(words), tuple(captures)

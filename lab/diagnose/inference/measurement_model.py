@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lab.diagnose.inference.gaussian import ROUNDING, BlockCovariance, Gaussian
-from lab.diagnose.measurements.summaries import Block, Effects, Prediction
+from lab.diagnose.measurements.block import Block, Effects, Prediction
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray
@@ -181,7 +181,7 @@ class MeasurementModel:
             condition = np.array([label.condition for label in block.labels])
             kernel = np.exp(-0.5 * np.square((x[:, None] - x) / block.reach).sum(-1))
             kernel = kernel * np.where(channel[:, None] == channel, 1.0, CORRELATION_BETWEEN_CHANNELS)
-            if block.conditions and not block.places:
+            if block.measurement.conditions and not block.measurement.places:
                 kernel = kernel * np.where(condition[:, None] == condition, 1.0, CORRELATION_BETWEEN_CONDITIONS)
             found.append(kernel)
         return tuple(found)

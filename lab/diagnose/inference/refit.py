@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from lab.diagnose.inference.gaussian import Gaussian
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Effects
+from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
 from sim.parameters import Quantity

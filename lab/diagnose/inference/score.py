@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Effects
+from lab.diagnose.measurements.block import Effects
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray

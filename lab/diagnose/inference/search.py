@@ -10,7 +10,7 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit, refit
 from lab.diagnose.inference.rivals import session_rivals
 from lab.diagnose.inference.score import signatures
-from lab.diagnose.measurements.summaries import Effects
+from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
 

@@ -1,26 +1,14 @@
-"""What is looked at: the list of measurements, and one side's measurement model of those that its recordings allow."""
+"""The measurement model of one side: every measurement that its recordings allow, against its baseline."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.board import BOARD_BLOCKS
-from lab.diagnose.measurements.converter import code_block
-from lab.diagnose.measurements.darks import DARK_BLOCKS
-from lab.diagnose.measurements.edges import edge_block
-from lab.diagnose.measurements.flicker import flicker_block
-from lab.diagnose.measurements.neighbours import neighbour_block, variance_block
-from lab.diagnose.measurements.patches import chart_block, screen_block
-from lab.diagnose.measurements.pattern import green_block, line_block
-from lab.diagnose.measurements.screens import SCREEN_BLOCKS
-from lab.diagnose.measurements.shading import shading_block
-from lab.diagnose.measurements.stereo import STEREO_BLOCKS
-from lab.diagnose.measurements.summaries import Block, Study
-from lab.diagnose.measurements.uniform import linearity_block, narrowband_block
+from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
@@ -29,26 +17,6 @@ from lab.predict.camera_model import assumptions, camera_model
 from sim.camera import Side
 from sim.effects.pixel_aperture import PixelAperture
 from sim.spectrum import FloatArray
-
-#: Makers of blocks, in the order of the report; one that a recording set doesn't allow is left out with a reason.
-BLOCKS: tuple[Callable[[Study], Block], ...] = (
-    *DARK_BLOCKS,
-    linearity_block,
-    flicker_block,
-    variance_block,
-    neighbour_block,
-    code_block,
-    green_block,
-    line_block,
-    shading_block,
-    narrowband_block,
-    chart_block,
-    edge_block,
-    screen_block,
-    *SCREEN_BLOCKS,
-    *BOARD_BLOCKS,
-    *STEREO_BLOCKS,
-)
 
 #: Apertures that a pixel may have whose fill factor nobody states: the least side (px), how many are tried, what they are told by.
 LEAST_SIDE, APERTURES, APERTURE_DIRECTIONS = 0.5, 10, 4
@@ -78,9 +46,9 @@ def measurement_model(
     study = Study(recordings, side, camera, _saturation_dn(camera_fit))
     skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for _, reason in study.stale]
     blocks = []
-    for make in BLOCKS:
+    for measurement in measurements():
         try:
-            blocks.append(make(study))
+            blocks.append(measurement.make(study))
         except NotDetermined as refused:
             skipped.append(Skipped(step=f"diagnose {refused.step}", reason=refused.reason, side=side))
     blocks = [b for b in blocks if any(not label.held_out for label in b.labels)]

@@ -8,7 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from lab.diagnose.measurements.summaries import Effects, Study, act_on
+from lab.diagnose.measurements.block import Effects
+from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.study import Study
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray, Spectrum, linear_shares
 from sim.uniform import SPECTRAL, Uniform, electron_rate

@@ -14,7 +14,8 @@ from lab.capture_kinds.narrowband import NarrowbandSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
-from lab.diagnose.measurements.summaries import BLACK_FLOOR_DN, LAMP_FLOOR, NARROWBAND_FLOOR
+from lab.diagnose.measurements.narrowband import NARROWBAND_FLOOR
+from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, LAMP_FLOOR
 from lab.formats.recording_set import RecordingSet
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
@@ -116,7 +117,7 @@ def _narrowband(camera: CameraModel) -> Iterator[Design]:
 def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iterator[Design]:
     """Slanted edges: at four orientations, in the lamp's and in narrowband light, at the lens's and at twice its f-number."""
     frequency = np.arange(1, 17) * 0.05
-    block = next((b for b in model.blocks if b.measurement == "slanted_edge"), None)
+    block = next((b for b in model.blocks if b.measurement.name == "slanted_edge"), None)
     std = np.full(frequency.shape, EDGE_STD)
     if block is not None:  # the smallest standard deviation of any recorded edge at each frequency
         x, variance = np.array([label.x for label in block.labels]), np.diag(block.covariance)
@@ -247,5 +248,6 @@ def _again(model: MeasurementModel) -> Iterator[Design]:
         def predict(h: Hypothesis, at: slice = at) -> FloatArray:
             return model.fitted_mean(tuple(e for e in h.effects if e not in model.always))[at]
 
-        name = block.measurement.replace("_", " ")
-        yield Design(f"the captures of {name} again, with as many repeats", predict, block.covariance)
+        yield Design(
+            f"the captures of {block.measurement.title} again, with as many repeats", predict, block.covariance
+        )

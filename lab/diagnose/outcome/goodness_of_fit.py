@@ -9,7 +9,7 @@ import numpy as np
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.gaussian import ROUNDING, chi2, conditional
 from lab.diagnose.inference.locate import chi2_by_slice
-from lab.diagnose.measurements.summaries import Effects
+from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import ExaminedPlace, HeldOut, MeasurementFit, ResidualCurve
 from sim.camera import Side
@@ -26,7 +26,7 @@ def places(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[Exa
         now = after[id(one.block), one.axis, one.where]
         yield ExaminedPlace(
             side=side,
-            measurement=one.block.measurement,
+            measurement=one.block.measurement.name,
             axis=one.axis,
             where=one.where,
             n=one.n,
@@ -45,7 +45,7 @@ def measurement_fits(side: Side, verdict: Verdict) -> Iterator[MeasurementFit]:
     for block, at, b, a in zip(model.blocks, model.slices, before, after, strict=True):
         yield MeasurementFit(
             side=side,
-            measurement=block.measurement,
+            measurement=block.measurement.name,
             n=int(model.seen[at].sum()),
             chi2_before=b[0],
             chi2_after=a[0],
@@ -102,17 +102,18 @@ def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
         std = np.sqrt(np.diag(block.covariance))
         groups: dict[tuple[str, str, bool], list[int]] = {}
         for i, label in enumerate(block.labels):
-            condition = label.condition if block.conditions else ""
+            condition = label.condition if block.measurement.conditions else ""
             groups.setdefault((condition, label.channel, label.held_out), []).append(i)
         for (condition, channel, is_held_out), members in groups.items():
             order = sorted(members, key=lambda i: block.labels[i].x)
             yield ResidualCurve(
                 side=side,
-                measurement=block.measurement,
-                label=condition or block.measurement,
+                measurement=block.measurement.name,
+                label=condition or block.measurement.name,
                 channel=channel,
-                axis=block.places or f"{block.axis.replace('_', ' ')}, {block.unit}",
-                names=tuple(block.labels[i].condition for i in order) if block.places else (),
+                axis=block.measurement.places
+                or f"{block.measurement.axis.replace('_', ' ')}, {block.measurement.unit}",
+                names=tuple(block.labels[i].condition for i in order) if block.measurement.places else (),
                 x=tuple(block.labels[i].x for i in order),
                 measured=tuple(float(block.value[i]) for i in order),
                 measured_std=tuple(float(std[i]) for i in order),

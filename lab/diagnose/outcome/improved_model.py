@@ -10,8 +10,8 @@ import numpy as np
 
 from lab.diagnose.inference.discrepancy import Discrepancy
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.curves import freed_curve
-from lab.diagnose.measurements.summaries import Block
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
@@ -78,10 +78,10 @@ def improved_model(
     acting: list[Effect] = [*always, *effects]
     for one, (kind, why) in zip(discrepancies, applied, strict=True):
         block = model.blocks[one.index]
-        name = block.measurement.replace("_", " ")
+        name = block.measurement.title
         if kind is None:
             said = f"{name}: no correction in the improved model; {why}"
-            corrections.append(Correction(block.measurement, None, said))
+            corrections.append(Correction(block.measurement.name, None, said))
             continue
         at = model.slices[one.index]
         x, factor, each = _factor(block, discrepancy[at], model.fitted_mean(effects)[at])
@@ -94,7 +94,7 @@ def improved_model(
             acting.append(_correction(kind, block, x, factor, camera))
             is_shared = one.grouping == "shared"
             said = f"{name}: a factor on the {kind}" + ("" if is_shared else f"; the mean of what goes {one.grouping}")
-        corrections.append(Correction(block.measurement, kind, said))
+        corrections.append(Correction(block.measurement.name, kind, said))
     improved = camera.model_copy(update={"quantum_efficiency": curves})
     return CameraFile(f"{recordings.manifest.name} {side}".strip(), improved, tuple(acting)), tuple(corrections)
 
@@ -121,9 +121,11 @@ def _applied(
 
 def _place_for(block: Block) -> Applied | None:
     """The stage that a smooth factor along the measurement's axis can act on."""
-    if block.places:
+    if block.measurement.places:
         return None
-    return next((kind for kind, axis, quantity in PLACES if block.axis == axis and quantity in block.reads), None)
+    return next(
+        (kind for kind, axis, quantity in PLACES if block.measurement.axis == axis and quantity in block.reads), None
+    )
 
 
 def _factor(

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
@@ -81,7 +82,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 continue
             value, std = _mean([(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates])
             parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit)
-        shown = sorted({measurement.replace("_", " ") for _, one in members for measurement in one.shown_in})
+        shown = sorted({measurement_title(measurement) for _, one in members for measurement in one.shown_in})
         values = ", ".join(
             f"{f.removesuffix('_' + p.unit).replace('_', ' ')} {_number(p)}" for f, p in parameters.items()
         )
@@ -147,12 +148,12 @@ def _summary(
             f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * policy.false_alarm_rate:.0f} %."
         )
     lines += [
-        f"{m.measurement.replace('_', ' ')} of the {m.side} camera departs from the baseline: {m.where} ({m.significance_sigma:.1f} sigma)."
+        f"{measurement_title(m.measurement)} of the {m.side} camera departs from the baseline: {m.where} ({m.significance_sigma:.1f} sigma)."
         for m in mismatches
     ]
     lines += [e.statement for e in effects]
     lines += [
-        f"Not explained: {u.measurement.replace('_', ' ')} of the {u.side} camera, {u.where}: {u.shape}."
+        f"Not explained: {measurement_title(u.measurement)} of the {u.side} camera, {u.where}: {u.shape}."
         for u in unexplained
     ]
     lines += dict.fromkeys(u.check for u in unexplained if u.check)

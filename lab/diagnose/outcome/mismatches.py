@@ -10,7 +10,7 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.discrepancy import Discrepancy
 from lab.diagnose.inference.locate import Slice, describe
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.summaries import Block
+from lab.diagnose.measurements.block import Block
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import Mismatch, Unexplained
@@ -30,7 +30,7 @@ def located(side: Side, verdict: Verdict) -> list[Mismatch]:
     baseline = model.gaussian()
     found: dict[str, Mismatch] = {}
     for part in verdict.before:
-        name = part.block.measurement
+        name = part.block.measurement.name
         if name not in found:
             where, captures = describe(model, baseline, part)
             sigma = round(part.significance_sigma, 2)
@@ -39,12 +39,12 @@ def located(side: Side, verdict: Verdict) -> list[Mismatch]:
             )
     for candidate in (*verdict.named, *verdict.abstained):
         changed = [b for b in model.blocks if b.touched_by(type(candidate.effect))]
-        if changed and not any(b.measurement in found for b in changed):
+        if changed and not any(b.measurement.name in found for b in changed):
             block = max(changed, key=lambda b: _change_chi2(verdict, candidate.effect, b))
-            found[block.measurement] = Mismatch(
+            found[block.measurement.name] = Mismatch(
                 side=side,
-                measurement=block.measurement,
-                axis=block.axis,
+                measurement=block.measurement.name,
+                axis=block.measurement.axis,
                 where=f"{WHOLE_AXIS}, as {candidate.effect.name}",
                 significance_sigma=round(float(np.sqrt(max(2.0 * candidate.log_odds, 0.0))), 2),
                 captures=model.captures(False, model.mask(model.blocks.index(block))),
@@ -56,7 +56,7 @@ def shown_in(verdict: Verdict, candidate: Candidate, policy: DecisionPolicy) -> 
     """Measurements in which an effect's change stands out of the noise; the strongest, where none does."""
     model = verdict.model
     changes = {
-        b.measurement: _change_chi2(verdict, candidate.effect, b)
+        b.measurement.name: _change_chi2(verdict, candidate.effect, b)
         for b in model.blocks
         if b.touched_by(type(candidate.effect))
     }
@@ -87,8 +87,8 @@ def unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction])
         found.append(
             Unexplained(
                 side=side,
-                measurement=block.measurement,
-                axis=part.axis if part is not None else block.axis,
+                measurement=block.measurement.name,
+                axis=part.axis if part is not None else block.measurement.axis,
                 where=describe(model, gaussian, part)[0] if part is not None else WHOLE_AXIS,
                 shape=_shape(one, block, near),
                 significance_sigma=_sigma(part),
@@ -117,7 +117,5 @@ def _shape(one: Discrepancy, block: Block, near: Sequence[Candidate]) -> str:
         f"; nearest of the library, none of them likely enough to be named: {'; '.join(nearest)}" if nearest else ""
     )
     if one.log_odds > 0:
-        return (
-            f"smooth over {one.length:.3g} {block.unit}, {one.grouping}, of relative size {one.amplitude:.2g}{family}"
-        )
+        return f"smooth over {one.length:.3g} {block.measurement.unit}, {one.grouping}, of relative size {one.amplitude:.2g}{family}"
     return f"irregular: no smooth discrepancy describes it{family}"

@@ -16,7 +16,7 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.patches import PATCH_COLOUR_STD, PATCH_STD, _patches
+from lab.diagnose.measurements.chart import PATCH_COLOUR_STD, PATCH_STD, patch_boxes
 from lab.errors import NotDetermined
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
@@ -92,7 +92,7 @@ def _judged(capture: Capture, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Mask of the pixels that the model predicts: an edge's region, the inner halves of a chart's patches, else all."""
     inside = np.zeros(shape, bool)
     if isinstance(capture, ChartCapture):
-        for _, rows, cols, *_ in _patches(capture):
+        for _, rows, cols, *_ in patch_boxes(capture):
             inside[slice(*rows), slice(*cols)] = True
     else:
         row0, col0, row1, col1 = (isinstance(capture, SlantedEdgeCapture) and capture.region) or (0, 0, *shape)

@@ -11,7 +11,8 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.measurements.block import Block, Measurement
+from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
@@ -25,6 +26,15 @@ from sim.uniform import electron_rate
 
 UNIFORM = ("dark", "flat", "narrowband")
 WAVELENGTH = np.arange(380.0, 781.0)
+
+
+def declared(name: str, axis: str, unit: str, *, conditions: str = "", places: str = "") -> Measurement:
+    """The declaration of a measurement whose numbers a test makes up."""
+
+    def make(study: Study) -> Block:
+        raise NotImplementedError(f"{name}: a test makes its numbers")
+
+    return Measurement(name, name, 0, axis, unit, make, conditions=conditions, places=places)
 
 
 def former(

@@ -49,7 +49,7 @@ def test_real_frames_show_odd_pixels_filters_off_their_names_and_what_cant_be_ju
     monkeypatch.setattr(sys, "argv", ["llanos.py", str(FLEA), str(tmp_path)])
     runpy.run_path(str(ROOT / "docs" / "llanos.py"), run_name="__main__")
     result = diagnose(read_foreign("raw-folder", tmp_path / "darks"))
-    assert "odd_pixels" in {m.measurement for m in result.mismatches}
+    assert "defective_pixels" in {m.measurement for m in result.mismatches}
     assert {e.name for e in result.effects} <= {"hot_pixels"}  # nothing else may be named from these
     reasons = " ".join(item.reason for item in result.skipped)
     assert "codes are too coarse" in reasons

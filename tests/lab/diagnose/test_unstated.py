@@ -15,7 +15,7 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.summaries import Study
+from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
@@ -126,7 +126,7 @@ def test_codes_too_coarse_for_the_noise_are_no_mismatch() -> None:
 
     model, _ = measurement_model(_changed(coarse, -4), "left", None)
     assert model is not None
-    assert {"slanted_edge", "screen", "noise"} <= {b.measurement for b in model.blocks}
+    assert {"slanted_edge", "screen", "noise"} <= {b.measurement.name for b in model.blocks}
     found = decide(model, np.random.default_rng(1), DecisionPolicy())
     assert (found.before, found.named, found.abstained) == ((), (), ())
 

@@ -8,7 +8,7 @@ import pytest
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.challenge.recordings import recordings_of
-from lab.diagnose.measurements.summaries import Study
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model

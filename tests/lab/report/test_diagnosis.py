@@ -27,7 +27,7 @@ def test_the_map_has_every_measurement_and_its_worst_place() -> None:
     ((title, figure),) = place_maps(RESULT, ("left", "right"))
     assert title == "left, baseline"
     (heat,) = figure["data"]
-    assert heat["y"] == ["a new one", "slanted edge"]
+    assert heat["y"] == ["a new one", "transfer function of slanted edges"]
     assert heat["z"] == [[0.0, None], [None, 12.0]]  # the colour ends there
     assert "1234.5" in heat["customdata"][1][1]
     assert [note["text"] for note in figure["layout"]["annotations"]] == ["99+"]

@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.measurements.block import Block, Label, Prediction
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
 from sim.point import TRANSFER, Blur
 from sim.spectrum import Spectrum
+from tests.lab.diagnose.on_blocks import declared
 
 FREQUENCY = np.linspace(0.02, 0.9, 23)
 NOISE = 0.004
@@ -46,7 +47,7 @@ def contrast_model(
     n = len(labels)
     value = np.concatenate([_transfer(truth, a) + extra for a in angles]) + NOISE * rng.standard_normal(n)
     block = Block(
-        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=NOISE**2 * np.eye(n),
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=value, covariance=NOISE**2 * np.eye(n),
         labels=labels, reads=TRANSFER, scale=np.ones(n),
         predict=lambda acting: Prediction(np.concatenate([_transfer(acting, a) for a in angles]), {}),
     )  # fmt: skip
@@ -59,7 +60,7 @@ def spectral_model(rng: np.random.Generator, extra: Callable[[np.ndarray], np.nd
     labels = tuple(Label(float(w), "Y", "", (f"narrow-{i}",), i % 3 == 1) for i, w in enumerate(x))
     n = len(x)
     block = Block(
-        measurement="narrowband", axis="wavelength", unit="nm", reach=40.0, value=extra(x) + NOISE * rng.standard_normal(n),
+        measurement=declared("narrowband", "wavelength", "nm"), reach=40.0, value=extra(x) + NOISE * rng.standard_normal(n),
         covariance=NOISE**2 * np.eye(n), labels=labels, reads=frozenset({"image.transmittance"}), predict=lambda _: Prediction(np.zeros(n), {}),
         scale=np.ones(n),
     )  # fmt: skip

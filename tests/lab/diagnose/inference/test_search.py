@@ -16,7 +16,7 @@ from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
@@ -26,6 +26,7 @@ from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Signal
 from sim.uniform import Uniform
 from tests.lab.diagnose.inference.made_up import contrast_model
+from tests.lab.diagnose.on_blocks import declared
 
 X = np.linspace(0.0, 1.0, 60)
 NOISE = 0.01
@@ -108,7 +109,7 @@ def _model(truth: Sequence[Effect], rng: np.random.Generator) -> MeasurementMode
         return np.array([Uniform(camera, acting).offset_dn(float(x), None) for x in X])
 
     block = Block(
-        measurement="dark", axis="time", unit="s", reach=0.2, value=line(truth) + NOISE * rng.standard_normal(X.size),
+        measurement=declared("dark", "time", "s"), reach=0.2, value=line(truth) + NOISE * rng.standard_normal(X.size),
         covariance=NOISE**2 * np.eye(X.size), labels=tuple(Label(float(x), "all", "", (f"c{i}",), False) for i, x in enumerate(X)),
         reads=frozenset({"signal.offset_dn"}), predict=lambda acting: Prediction(line(acting), {}), scale=np.ones(X.size),
     )  # fmt: skip

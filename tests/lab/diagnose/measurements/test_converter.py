@@ -11,10 +11,10 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.converter import code_block
-from lab.diagnose.measurements.neighbours import variance_block
-from lab.diagnose.measurements.summaries import Study
-from lab.diagnose.measurements.uniform import linearity_block
+from lab.diagnose.measurements.code_density import code_block
+from lab.diagnose.measurements.linearity import linearity_block
+from lab.diagnose.measurements.noise import variance_block
+from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.predict.camera_model import camera_model, mean_dn
 from mocks.former import ConcealedCamera, Law, Plan
@@ -71,7 +71,7 @@ def test_other_combs_are_located_and_not_named(law: Law) -> None:
     study = _study(772021, (law,))
     model = MeasurementModel((code_block(study),), study.camera)
     verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
-    assert verdict.before[0].block.measurement == "code_density"
+    assert verdict.before[0].block.measurement.name == "code_density"
     assert not verdict.named
 
 

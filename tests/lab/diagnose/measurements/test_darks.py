@@ -13,10 +13,12 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements import darks
+from lab.diagnose.measurements import dark_noise, defective_pixels
+from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.measurements.darks import DARK_BLOCKS
-from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
+from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.recording_set import Manifest, RecordingSet
@@ -34,6 +36,7 @@ from sim.spectrum import Spectrum
 from sim.stages import signal_of
 
 ROWS, COLS = 96, 128
+OF_DARK_FRAMES = [one for one in measurements() if one.order < 200]
 
 
 def _sim_darks(
@@ -73,9 +76,9 @@ def _concealed(seed: int, *built_in: Law, warm: bool = False) -> RecordingSet:
 def _blocks(recordings: RecordingSet) -> tuple[Study, list[Block], dict[str, str]]:
     study = Study(recordings, "left", camera_model(recordings, "left"))
     found, refused = [], {}
-    for make in DARK_BLOCKS:
+    for measurement in OF_DARK_FRAMES:
         try:
-            found.append(make(study))
+            found.append(measurement.make(study))
         except NotDetermined as reason:
             refused[reason.step] = reason.reason
     return study, found, refused
@@ -93,8 +96,8 @@ def _names(verdict: Verdict) -> list[str]:
 # --- statistics against drawn numbers ----------------------------------------------------------------------------------------
 
 
-def test_shares_of_odd_pixels_are_those_of_drawn_pixels() -> None:
-    """Two kinds of odd pixels in 400 000; each bin's count within 4.5 sigma of a binomial, all of the same draw."""
+def test_shares_of_defective_pixels_are_those_of_drawn_pixels() -> None:
+    """Two kinds of defective pixels in 400 000; each bin's count within 4.5 sigma of a binomial, all of the same draw."""
     rng = np.random.default_rng(1)
     n, frames, moving, fixed = 400_000, 4, 2.0, 1.0
     kind = rng.choice(3, n, p=[0.98, 0.01, 0.01])
@@ -104,37 +107,39 @@ def test_shares_of_odd_pixels_are_those_of_drawn_pixels() -> None:
         more + fixed * rng.standard_normal(n) + noise * rng.standard_normal((frames, n))
         + jump * (rng.integers(0, 2, (frames, n)) - 0.5)
     )  # fmt: skip
-    median = np.sort(drawn, axis=0)[(frames - 1) // 2] - darks._order_moments(frames)[0] * moving
+    median = np.sort(drawn, axis=0)[(frames - 1) // 2] - defective_pixels._order_moments(frames)[0] * moving
     spread = 1.6
-    classes = [darks._Class(0.01, 30.0, 0.0), darks._Class(0.01, 0.0, 40.0)]
-    shares = darks._tail_shares(classes, moving, fixed, frames, spread, 0.5, 0.0)
-    edges = np.array([-np.inf, -6.0, -4.5, *darks.TAIL_EDGES, np.inf]) * spread
+    classes = [defective_pixels._DefectClass(0.01, 30.0, 0.0), defective_pixels._DefectClass(0.01, 0.0, 40.0)]
+    shares = defective_pixels._tail_shares(classes, moving, fixed, frames, spread, 0.5, 0.0)
+    edges = np.array([-np.inf, -6.0, -4.5, *TAIL_EDGES, np.inf]) * spread
     counts = np.histogram(median, edges)[0]
-    expected = n * np.concatenate([shares[: len(darks.TAIL_EDGES)], shares[len(darks.TAIL_EDGES) :]])
+    expected = n * np.concatenate([shares[: len(TAIL_EDGES)], shares[len(TAIL_EDGES) :]])
     got = np.concatenate([counts[3:], counts[1::-1]])
     np.testing.assert_array_less(np.abs(got - expected), 4.5 * np.sqrt(expected) + 4.0)
 
 
-def test_shares_of_blinking_pixels_are_those_of_drawn_pixels() -> None:
+def test_shares_of_flickering_pixels_are_those_of_drawn_pixels() -> None:
     """Contrasts of frames that are high or low at random: the cube root is good to a few per cent of a share."""
     rng = np.random.default_rng(2)
     n, frames, amplitude = 200_000, 5, 6.0
     values = rng.standard_normal((frames, n)) + amplitude * (rng.integers(0, 2, (frames, n)) - 0.5)
     total = np.square(values - values.mean(0)).sum(0)
-    condition = darks.Condition(1.0, None, tuple([None] * frames), ())  # type: ignore[arg-type]
-    edges = darks._blink_edges(frames - 1)[:3]
-    away = amplitude**2 * darks._jump_sums(condition)[False]
-    shares = darks._chance_above(np.full(len(away), frames - 1.0), np.maximum(away, 1e-9), edges).mean(axis=0)
+    condition = DarkCondition(1.0, None, tuple([None] * frames), ())  # type: ignore[arg-type]
+    edges = defective_pixels._flicker_edges(frames - 1)[:3]
+    away = amplitude**2 * defective_pixels._jump_sums(condition)[False]
+    shares = defective_pixels._chance_above(np.full(len(away), frames - 1.0), np.maximum(away, 1e-9), edges).mean(
+        axis=0
+    )
     drawn = (total[:, None] > edges).mean(axis=0)
     # 256 draws of states: a share p is known to sqrt(p (1 - p) / 256)
-    assert np.all(np.abs(shares - drawn) < 4.0 * np.sqrt(drawn * (1 - drawn) / darks.JUMPS) + 0.01)
+    assert np.all(np.abs(shares - drawn) < 4.0 * np.sqrt(drawn * (1 - drawn) / defective_pixels.JUMPS) + 0.01)
 
 
 def test_clipped_square_is_its_integral() -> None:
     x = np.linspace(-12.0, 12.0, 200_001)
     density = stats.norm.pdf(x, 1.0, 1.5)
     wanted = np.sum(np.clip(x, -2.0, 2.0) ** 2 * density) * (x[1] - x[0])
-    assert darks._cut_square(np.array([1.0]), np.array([2.25]), 2.0)[0] == pytest.approx(wanted, rel=1e-4)
+    assert dark_noise._cut_square(np.array([1.0]), np.array([2.25]), 2.0)[0] == pytest.approx(wanted, rel=1e-4)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 2.0])
@@ -250,7 +255,7 @@ def test_what_sim_renders_is_named_with_its_parameters(one: Effect) -> None:
 def test_siblings_are_located_and_get_no_name(law: Law, measurement: str) -> None:
     verdict = _verdict(_concealed(92, law))
     assert not verdict.named
-    assert measurement in {part.block.measurement for part in verdict.after}
+    assert measurement in {part.block.measurement.name for part in verdict.after}
 
 
 # --- what the recordings don't allow, and faults ------------------------------------------------------------------------------
@@ -258,15 +263,15 @@ def test_siblings_are_located_and_get_no_name(law: Law, measurement: str) -> Non
 
 def test_one_dark_frame_is_judged_by_what_it_has() -> None:
     _, blocks, refused = _blocks(_sim_darks(7, plan=[(0.5, 25.0)]))
-    assert {"dark", "dark_field", "odd_pixels"} <= {b.measurement for b in blocks}
+    assert {"dark", "dark_field", "defective_pixels"} <= {b.measurement.name for b in blocks}
     assert "no two dark frames" in refused["dark_noise"]
 
 
 def test_codes_that_are_too_coarse_say_so() -> None:
     """8 bit: a gain of 0.025 DN/e leaves 0.3 DN of noise with what rounding adds."""
     _, blocks, refused = _blocks(_sim_darks(8, bits=8))
-    assert "codes are too coarse" in refused["blinking_pixels"]
-    assert "dark" in {b.measurement for b in blocks}
+    assert "codes are too coarse" in refused["flickering_pixels"]
+    assert "dark" in {b.measurement.name for b in blocks}
 
 
 def test_a_black_level_off_the_stated_one_is_no_drift() -> None:
@@ -280,7 +285,7 @@ def test_a_black_level_off_the_stated_one_is_no_drift() -> None:
     )
     verdict = _verdict(wrong)
     assert not verdict.named
-    assert {part.block.measurement for part in verdict.after} == {"black_level"}
+    assert {part.block.measurement.name for part in verdict.after} == {"black_level"}
 
 
 def test_a_frame_that_was_not_taken_anew_is_left_out_and_told() -> None:

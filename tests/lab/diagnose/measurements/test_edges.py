@@ -9,8 +9,10 @@ import pytest
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.gaussian import chi2
-from lab.diagnose.measurements.edges import ASIDE, REAL_AT, _Edges, _interpolation, _spread, edge_block
-from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.edge_estimator import REAL_AT, profile_interpolation, spread_operator
+from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block
+from lab.diagnose.measurements.study import Study
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
@@ -74,11 +76,11 @@ def test_a_direct_sum_over_the_samples_agrees() -> None:
     geometry = edges.edges[0].measured.geometry
     reach = geometry.reach_px + 1.0
     light = study.recordings.spectrum(str(edges.edges[0].part[0].light_radiance))
-    on_grid = edge_profile(study.camera, "Y", light, 5.0, _interpolation(reach)[1])
+    on_grid = edge_profile(study.camera, "Y", light, 5.0, profile_interpolation(reach)[1])
     exact = edge_profile(study.camera, "Y", light, 5.0, geometry.distance_px)
     weighted = exact * geometry.weight
     right = np.concatenate([geometry.basis.T @ weighted, geometry.gradients @ weighted])
-    np.testing.assert_allclose(_spread(geometry, reach) @ on_grid, right, atol=1e-5 * np.abs(right).max())
+    np.testing.assert_allclose(spread_operator(geometry, reach) @ on_grid, right, atol=1e-5 * np.abs(right).max())
 
 
 def test_noise_is_what_the_covariance_says() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.measurements.flicker import flicker_block
-from lab.diagnose.measurements.shading import shading_block
-from lab.diagnose.measurements.uniform import linearity_block
+from lab.diagnose.measurements.flat_field import shading_block
+from lab.diagnose.measurements.flat_rows import flicker_block
+from lab.diagnose.measurements.linearity import linearity_block
 from lab.errors import NotDetermined
 from mocks.former.laws import LightFlickerLaw, PeriodicBandingLaw, RowNoiseLaw
 from sim.effects.light_flicker import LightFlicker

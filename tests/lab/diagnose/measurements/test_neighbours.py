@@ -10,9 +10,13 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.neighbours import PAIRS, correlations, held_out_flats, neighbour_block, variance_block
-from lab.diagnose.measurements.summaries import Block, Study
-from lab.diagnose.measurements.uniform import linearity_block
+from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.linearity import linearity_block
+from lab.diagnose.measurements.noise import variance_block
+from lab.diagnose.measurements.noise_neighbours import correlations, neighbour_block
+from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.temporal_noise import PAIRS
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model

@@ -12,9 +12,11 @@ from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements import pattern
-from lab.diagnose.measurements.pattern import green_block, line_block
-from lab.diagnose.measurements.summaries import Block, Study
-from lab.diagnose.measurements.uniform import narrowband_block
+from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.flat_lines import line_block
+from lab.diagnose.measurements.green_balance import green_block
+from lab.diagnose.measurements.narrowband import narrowband_block
+from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.predict.camera_model import camera_model

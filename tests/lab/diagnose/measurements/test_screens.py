@@ -12,16 +12,15 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.patches import screen_block
-from lab.diagnose.measurements.screens import (
-    SCREEN_BLOCKS,
-    colour_block,
-    contrast_block,
-    grid_block,
-    rim_block,
-    turned_block,
-)
-from lab.diagnose.measurements.summaries import Block, Study
+from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.cell_borders import cell_border_block
+from lab.diagnose.measurements.dark_squares import screen_block
+from lab.diagnose.measurements.ghost import ghost_block
+from lab.diagnose.measurements.lateral_colour import colour_block
+from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.pattern_contrast import contrast_block
+from lab.diagnose.measurements.screen_grid import grid_block
+from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
@@ -32,6 +31,7 @@ from sim.effects.defocus import Defocus
 from sim.effects.ghost import Ghost
 from sim.effects.screen_gamma import ScreenGamma
 
+OF_SCREENS = [one for one in measurements() if 400 < one.order < 500]
 PLAN = Plan(kinds=("dark", "flat", "screen"))
 
 
@@ -51,9 +51,9 @@ def measured_model(recordings: RecordingSet, make: Callable[[Study], Block]) -> 
 def verdict_of(recordings: RecordingSet) -> Verdict:
     study = study_of(recordings)
     blocks = []
-    for make in SCREEN_BLOCKS:
+    for measurement in OF_SCREENS:
         try:
-            blocks.append(make(study))
+            blocks.append(measurement.make(study))
         except NotDetermined:
             continue
     return decide(MeasurementModel(tuple(blocks), study.camera), np.random.default_rng(3), DecisionPolicy())
@@ -117,7 +117,7 @@ def test_a_steep_gamma_over_wide_rims_is_predicted() -> None:
         residual = contrasts.value - contrasts.mean(effects)
         chi2 = float(residual @ np.linalg.solve(covariance, residual))
         assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
-    rims = rim_block(study)
+    rims = cell_border_block(study)
     np.testing.assert_allclose(rims.predict((effect,)).mean, rims.value, rtol=0.05)
 
 
@@ -180,4 +180,4 @@ def test_the_screen_s_grid_is_seen_in_white_frames_alone() -> None:
     with pytest.raises(NotDetermined, match="no white captures"):
         grid_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))
     with pytest.raises(NotDetermined, match="no bernoulli captures"):
-        turned_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))
+        ghost_block(study_of(recorded(plan=Plan(kinds=("dark", "flat")))))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.measurements.shading import (
+from lab.diagnose.measurements.flat_field import (
     ALIKE,
     _adjacent,
     _cell_means,
@@ -13,7 +13,7 @@ from lab.diagnose.measurements.shading import (
     _pattern_variance,
     shading_block,
 )
-from lab.diagnose.measurements.uniform import linearity_block
+from lab.diagnose.measurements.linearity import linearity_block
 from mocks.former import Law
 from mocks.former.laws import DustShadowLaw, NonUniformIlluminationLaw, TapGainLaw, VignettingDecentreLaw, VignettingLaw
 from tests.lab.diagnose.on_blocks import former, measured_model, names, sigmas, study, verdict
@@ -63,7 +63,7 @@ def test_a_slope_is_uneven_light_with_or_without_a_bow(variant: int) -> None:
 def test_what_no_law_fits_is_seen_and_gets_no_name(law: Law) -> None:
     found = verdict(former(24, law), *LOOKED_AT)
     assert not found.named
-    assert {s.block.measurement for s in found.before} == {"flat_field"}
+    assert {s.block.measurement.name for s in found.before} == {"flat_field"}
 
 
 def test_a_pattern_that_neighbours_share_counts_more() -> None:

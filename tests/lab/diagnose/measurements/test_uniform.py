@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.measurements.summaries import level_scatter, repeated_levels
-from lab.diagnose.measurements.uniform import (
+from lab.diagnose.measurements.linearity import RADIOMETER_STD, linearity_block
+from lab.diagnose.measurements.narrowband import (
     MOST_SAMPLE_STD,
-    RADIOMETER_STD,
     READING_SAMPLE_STD,
     READING_STD,
     _reading_std,
     _sample_std,
-    linearity_block,
     narrowband_block,
 )
+from lab.diagnose.measurements.noise_guess import level_repeatability, repeated_levels
 from lab.fit.rounding import rounding_std_dn
 from mocks.former import Law
 from mocks.former.laws import (
@@ -80,7 +79,7 @@ def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None
     cfa = "MONO" if isinstance(law, RedLeakLaw) else "RGGB"
     found = verdict(former(33, law, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
     assert not found.named
-    assert {s.block.measurement for s in found.before} == {"narrowband"}
+    assert {s.block.measurement.name for s in found.before} == {"narrowband"}
 
 
 def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
@@ -105,7 +104,7 @@ def test_a_drifting_lamp_doesn_t_scatter() -> None:
     for shuttle in (False, True):
         looked_at = study(former(34, SourceDriftLaw(0.5), shuttle=shuttle))
         noise = looked_at.noise
-        found = level_scatter(repeated_levels(looked_at, noise.black, noise.gain, noise.read_dn))
+        found = level_repeatability(repeated_levels(looked_at, noise.black, noise.gain, noise.read_dn))
         assert found < 4e-4
 
 

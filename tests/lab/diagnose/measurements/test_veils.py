@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lab.diagnose.measurements.edges import edge_block
-from lab.diagnose.measurements.patches import chart_block, screen_block
-from lab.diagnose.measurements.veils import Surroundings, harmonics
+from lab.diagnose.measurements.chart import chart_block
+from lab.diagnose.measurements.dark_squares import screen_block
+from lab.diagnose.measurements.halo_light import Surroundings, harmonics
+from lab.diagnose.measurements.slanted_edge import edge_block
 from mocks.former import laws as concealed
 from sim.point import halos
 from tests.lab.diagnose.on_blocks import former, names, verdict

@@ -9,11 +9,12 @@ import numpy as np
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.formats.camera_file import default_camera
 from sim.effects.base import Effect
 from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.point import TRANSFER, Blur
+from tests.lab.diagnose.on_blocks import declared
 
 CAMERA = default_camera().camera
 FREQUENCY = np.linspace(0.05, 0.9, 18)
@@ -36,9 +37,9 @@ def filtered_edges(named: tuple[Effect, ...] = ()) -> Verdict:
     )
     value = predict((TRUTH,)).mean + NOISE * np.random.default_rng(8).standard_normal(len(labels))
     block = Block(
-        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value,
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2, value=value,
         covariance=NOISE**2 * np.eye(len(labels)), labels=labels, reads=TRANSFER, predict=predict,
-        scale=np.ones(len(labels)), conditions="orientation",
+        scale=np.ones(len(labels)),
     )  # fmt: skip
     candidates = tuple(Candidate(e, {}, 1.0, (), 100.0) for e in named)
     return Verdict(MeasurementModel((block,), CAMERA), 12.0, 60.0, (), candidates, (), (), ())

@@ -14,7 +14,7 @@ from lab.diagnose import Diagnosis, examine
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile, default_camera, read_camera, write_camera
@@ -26,6 +26,7 @@ from sim.effects.base import Effect
 from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.point import TRANSFER, Blur
 from sim.uniform import Uniform
+from tests.lab.diagnose.on_blocks import declared
 
 SET = RecordingSet(
     Manifest.model_validate(
@@ -93,8 +94,8 @@ def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
 
     value = contrast * np.tile(1.0 + departs, 2) + NOISE * np.random.default_rng(3).standard_normal(46)
     block = Block(
-        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=value, covariance=NOISE**2 * np.eye(46),
-        labels=labels, reads=TRANSFER, predict=predict, scale=np.ones(46), conditions="orientation",
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px", conditions="orientation"), reach=0.2, value=value, covariance=NOISE**2 * np.eye(46),
+        labels=labels, reads=TRANSFER, predict=predict, scale=np.ones(46),
     )  # fmt: skip
     return block, content
 
@@ -118,7 +119,10 @@ def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
 
 def test_what_the_model_has_no_place_for_is_said() -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
-    model = MeasurementModel((replace(block, measurement="patches_of_light", places="patches"),), content.camera)
+    model = MeasurementModel(
+        (replace(block, measurement=replace(block.measurement, title="patches of light", places="patches")),),
+        content.camera,
+    )
     gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
     improved, corrections = improved_model(SET, "left", None, content, model, (), (gap,))
     assert not improved.effects
@@ -135,7 +139,7 @@ def test_what_the_model_has_no_place_for_is_said() -> None:
 )  # fmt: skip
 def test_a_correction_acts_on_the_stage_of_its_measurement(axis: str, unit: str, quantity: str, along: str) -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
-    other = replace(block, axis=axis, unit=unit, reads=frozenset({quantity}), conditions="")
+    other = replace(block, measurement=declared("other", axis, unit), reads=frozenset({quantity}))
     model = MeasurementModel((other,), content.camera)
     gap = likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
     improved, _ = improved_model(SET, "left", None, content, model, (), (gap,))

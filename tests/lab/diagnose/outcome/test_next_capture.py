@@ -11,7 +11,7 @@ from scipy.stats import norm
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
-from lab.diagnose.measurements.summaries import Block, Label, Prediction
+from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.outcome.candidate_captures import Hypothesis, designs
 from lab.diagnose.outcome.next_capture import next_sentence, proposals
 from lab.diagnose.policy import DecisionPolicy
@@ -25,6 +25,7 @@ from sim.effects.library import effect
 from sim.effects.nonlinearity import Nonlinearity
 from sim.effects.source_drift import SourceDrift
 from sim.point import TRANSFER, Blur
+from tests.lab.diagnose.on_blocks import declared
 
 CAMERA = default_camera().camera
 SET = RecordingSet(
@@ -45,7 +46,7 @@ def _model(acting: Sequence[Effect] = ()) -> MeasurementModel:
         return Prediction(np.exp(-2.0 * FREQUENCY) * np.real(factor), {})
 
     block = Block(
-        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=predict(acting).mean, covariance=4e-6 * np.eye(16),
+        measurement=declared("slanted_edge", "spatial_frequency", "cy/px"), reach=0.2, value=predict(acting).mean, covariance=4e-6 * np.eye(16),
         labels=tuple(Label(float(f), "G", "5 deg", ("edge-1",), False) for f in FREQUENCY), reads=TRANSFER,
         predict=predict, scale=np.ones(16),
     )  # fmt: skip

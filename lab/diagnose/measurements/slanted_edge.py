@@ -1,45 +1,37 @@
 """Slanted edges: the transfer function that the estimator reports, and the same of a model at the same geometry.
 
-The MTF's estimator finds the edge and its noise, and leaves the normal equations of the profile's spline. Of these few numbers
-are taken: by how much the transfer function departs from the baseline's at some frequencies (`_Estimator`), by weighted least
-squares without a prior, so that all is linear in the pixels' values and the covariance is true.
-
-A prediction goes through the same at the recording's geometry (`_Operators`): transfer functions of the model at the nodes of a
-quadrature become the edge's profile, the profile the right side of the normal equations, this the reported numbers. So
-shading and a response that bends are in it.
+A prediction goes through the estimator at the recording's geometry (`edge_estimator.Operators`): shading and a nonlinear response
+are in it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from itertools import pairwise
+from collections.abc import Callable
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
-from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
-from lab.diagnose.measurements.summaries import (
-    Block,
-    Effects,
-    Label,
-    Prediction,
-    Study,
-    act_on,
-    held_out_of,
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.edge_estimator import (
+    GRID_PX,
+    IMAGINARY_AT,
+    REAL_AT,
+    ComplexArray,
+    Estimator,
+    Operators,
+    Quadrature,
+    departure_shapes,
+    profile_interpolation,
+    relative_covariance,
+    spread_operator,
 )
-from lab.errors import NotDetermined
-from lab.fit.mtf.edge_profile import ROUGHNESS_SHARE
-from lab.fit.mtf.edges_in_frame import find_edges
-from lab.fit.mtf.recordings import measure_edge
-from lab.fit.mtf.samples import Region
-from lab.fit.mtf.transfer_function import EdgeGeometry, EdgeMtf
+from lab.diagnose.measurements.edge_profiles import MeasuredEdge, measured_edges
+from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.study import Study
 from lab.fit.rounding import rounding_waves_dn
 from sim.effects.base import Effect
 from sim.frame import charge_response
@@ -57,20 +49,10 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
 
-ComplexArray = NDArray[np.complex128]
-
 EDGE_FLOOR = 3e-4  # of the contrast: numerical floor of the edge estimator and the model's wavelength sampling
-#: Where the transfer function is measured, in shares of the highest frequency: its real part, and its imaginary one; this is nil
-#: up to `STILL`, as a phase in proportion to frequency only moves the edge.
-REAL_AT = np.array([0.04, 0.09, 0.15, 0.22, 0.30, 0.39, 0.49, 0.60, 0.72, 0.86, 1.0])
-IMAGINARY_AT = np.array([0.28, 0.42, 0.57, 0.72, 0.86, 1.0])
-STILL = 0.14
 #: The highest frequency, cy/px, but not beyond this share of the lens's cutoff.
 HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE = 1.15, 0.95
 ASIDE, APART_CY_PER_PX = ", asymmetry", 100.0
-PLAIN = np.array([0.25])  # cy/px, of the estimator's own transfer function, which isn't used here
-#: Departures from the baseline's transfer that count as likely: next to nothing is said of what no sample tells.
-DEPARTURE_STD = 0.5
 #: Of the light on the target, left free: its bend across the edge, of the level at `UNEVEN_PX` from it.
 UNEVEN_STD, UNEVEN_PX = 0.003, 50.0
 UNEVEN_ORDER = 4  # of the polynomial that shading along the distance is
@@ -81,13 +63,11 @@ TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
 #: Wavelengths at which aberrated transfers are formed; and those at which the perfect lens's, which has the cutoff's kink, is.
 WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
 HIGHEST_CY_PER_PX = 10.0
-GRID_PX, FINE_PX = 0.05, 0.0125
 #: Predictions that are kept, and as many of their parts: a step of a refit leaves the others as they were.
 KEPT = 64
 #: Quantities of the stages that change a profile beside its transfer.
 CHANGING = SHADING | {"signal.response", "image.veils"}
 KERNELS = frozenset({"charge.kernels"})
-
 K = TypeVar("K")
 V = TypeVar("V")
 _Key = tuple[Effect, ...]
@@ -120,271 +100,17 @@ def edge_block(study: Study) -> Block:
         return Prediction(edges.predict(effects).ravel(), edges.jacobian)
 
     return Block(
-        measurement="slanted_edge", axis="spatial_frequency", unit="cy/px", reach=0.2, value=edges.value.ravel(),
+        measurement=SLANTED_EDGE, reach=0.2, value=edges.value.ravel(),
         covariance=edges.covariance,
         labels=tuple(
             Label(float(f), e.channel, e.orientation + (ASIDE if k >= len(REAL_AT) else ""), tuple(c.id for c in e.part), e.held_out)
             for e in edges.edges for k, f in enumerate(x)
         ),
         reads=TRANSFER | CHANGING | {"image.transmittance"}, predict=predict,
-        scale=np.ones(edges.value.size), conditions="orientation", conditions_words="edges at",
+        scale=np.ones(edges.value.size),
         # what is wrong with contrast says nothing of asymmetry
         along=np.tile(np.where(np.arange(len(x)) < len(REAL_AT), x, x + APART_CY_PER_PX), len(edges.edges)),
     )  # fmt: skip
-
-
-# --- what was measured ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Edge:
-    """One edge in one channel, of the repeats that choice may see or of those held out."""
-
-    part: tuple[SlantedEdgeCapture, ...]
-    channel: str
-    measured: EdgeMtf
-    held_out: bool
-    region: Region
-    direction_deg: float  # of the normal towards the light, from x (columns) to y (rows)
-    fixed_share: float  # of the noise's variance, that repeats have in common
-
-    @property
-    def orientation(self) -> str:
-        nominal = self.part[0].angle_deg
-        return f"{self.measured.angle_deg if nominal is None else nominal:.3g} deg"
-
-    @property
-    def setting(self) -> tuple[Region, float, str]:
-        """Alike for edges that see the same pixels in the same way."""
-        return self.region, round(self.direction_deg), self.channel
-
-
-def _measured(study: Study) -> list[_Edge]:
-    if not study.diffraction_is_known:
-        raise NotDetermined(
-            "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
-        )
-    groups = study.groups(
-        SlantedEdgeCapture, lambda c: (c.region, c.angle_deg, c.exposure_s, c.gain_db, c.light_radiance, c.field_mm)
-    )
-    if not groups:
-        raise NotDetermined("slanted_edge", "no slanted-edge captures")
-    edges: list[_Edge] = []
-    reasons = []
-    for i, group in enumerate(groups):
-        out = held_out_of(group, i, len(groups))
-        try:
-            regions = [group[0].region] if group[0].region else _found(study, group[0])
-        except NotDetermined as refused:
-            reasons.append(refused.reason)
-            continue
-        for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
-            for channel in study.channels if part else ():
-                for region in regions:
-                    try:
-                        measured = measure_edge(study.recordings, part, channel, None, PLAIN, region)
-                    except NotDetermined as refused:
-                        reasons.append(refused.reason)
-                        continue
-                    direction = _direction_deg(study, part[0], region, measured.angle_deg)
-                    share = _fixed_share(study, group, len(part), channel, region, measured)
-                    edges.append(
-                        _Edge(tuple(part), channel, measured, part[0].id in out, region, direction, share)
-                    )  # fmt: skip
-    if not edges:
-        raise NotDetermined("slanted_edge", reasons[0])
-    return edges
-
-
-def _found(study: Study, capture: SlantedEdgeCapture) -> list[Region]:
-    return [f.region for f in find_edges(study.recordings.frame(capture), study.stated.cfa, study.saturation_dn)]
-
-
-def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, angle_deg: float) -> float:
-    """Of the edge's normal that points to the light."""
-    row0, col0, row1, col1 = region
-    frame = np.asarray(study.recordings.frame(capture)[row0:row1, col0:col1], float)
-    angle = np.deg2rad(angle_deg)
-    row, col = np.arange(row1 - row0) - 0.5 * (row1 - row0 - 1), np.arange(col1 - col0) - 0.5 * (col1 - col0 - 1)
-    side = np.cos(angle) * col[None, :] + np.sin(angle) * row[:, None]
-    return angle_deg if float(np.sum(side * (frame - frame.mean()))) > 0 else angle_deg + 180.0
-
-
-def _fixed_share(
-    study: Study, group: Sequence[SlantedEdgeCapture], frames: int, channel: str, region: Region, measured: EdgeMtf
-) -> float:
-    """Share of the variance of a mean of `frames` frames that doesn't differ from repeat to repeat (pixels' response)."""
-    total = measured.noise_std_light**2
-    if len(group) > 1:
-        row0, col0, row1, col1 = region
-        mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))[row0:row1, col0:col1]
-        first, second = (
-            np.asarray(study.recordings.frame(c)[row0:row1, col0:col1], float)[mask] for c in (group[0], group[1])
-        )
-        black = study.stated.black_level_dn or 0.0
-        middle = black + 0.5 * (measured.dark_level + measured.light_level)
-        light = 0.5 * (first + second) > middle + 0.35 * (measured.light_level - measured.dark_level)
-        apart = (first - second)[light]
-        if apart.size < 64:
-            return 0.0
-        temporal = 0.5 * float(np.var(apart))
-    elif study.stated.conversion_gain_dn_per_e is not None:
-        temporal = study.noise.gain * measured.light_level + study.noise.read_dn**2
-    else:
-        return 0.0
-    return float(np.clip(1.0 - temporal / frames / max(total, 1e-300), 0.0, 0.95))
-
-
-# --- the estimator as an operator ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Quadrature:
-    """ESF(d) = 1/2 + sum over nodes of Re H(f_k) odd[k](d) + (Im H(f_k) / f_k) even[k](d), H a polynomial in pieces.
-
-    ESF(d) = 1/2 + integral of [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df. Tables are at d = 0, `GRID_PX`, ...
-    """
-
-    frequency: FloatArray
-    odd: FloatArray  # (nodes, d)
-    even: FloatArray
-
-    @staticmethod
-    def of(highest: float, reach_px: float) -> _Quadrature:
-        """Up to `highest` cy/px. Pieces of 1/4, 1/2, 1 cy/px with 8, 6, 6 of Gauss's points: a copy of the image 3 px aside is
-        still followed to 1e-4."""
-        cuts = np.concatenate([np.arange(0.0, 1.0, 0.25), np.arange(1.0, 2.0, 0.5), np.arange(2.0, 64.0)])
-        cuts = np.append(cuts[cuts < highest], highest)
-        distance = np.arange(int(np.ceil(reach_px / GRID_PX)) + 2) * GRID_PX
-        nodes, odd, even = [], [], []
-        for low, high in pairwise(cuts):
-            unit = np.polynomial.legendre.leggauss(8 if high <= 1.0 else 6)[0]
-            fine, weight = np.polynomial.legendre.leggauss(int(16 + 4.0 * (high - low) * reach_px))
-            f, width = 0.5 * (low + high) + 0.5 * (high - low) * fine, 0.5 * (high - low) * weight
-            hats = _lagrange(unit, fine)
-            phase = 2.0 * np.pi * np.outer(f, distance)
-            nodes.append(0.5 * (low + high) + 0.5 * (high - low) * unit)
-            odd.append((hats * (width / (np.pi * f))) @ np.sin(phase))
-            even.append((hats * (width / np.pi)) @ np.cos(phase))
-        return _Quadrature(np.concatenate(nodes), np.concatenate(odd), np.concatenate(even))
-
-
-def _lagrange(nodes: FloatArray, at: FloatArray) -> FloatArray:
-    """(nodes, at): the polynomials that are 1 at one node and 0 at all others."""
-    basis = np.ones((len(nodes), len(at)))
-    for k, node in enumerate(nodes):
-        for other in np.delete(nodes, k):
-            basis[k] *= (at - other) / (node - other)
-    return basis
-
-
-@dataclass(frozen=True)
-class _Estimator:
-    """How an edge's profile departs from the baseline's: weighted least squares of few shapes, linear in the samples' values.
-
-    profile = level + contrast x (baseline + shift x slope + sum of departures x shapes) + the illumination's gradient; a shape is
-    what the profile gains where the transfer function does at one frequency. So what is told of neighbouring frequencies is
-    told by all samples that see it; with next to no prior, and none of what a camera is expected to do.
-    """
-
-    rows: FloatArray  # (contrast, shift, departures..., distances): of values at distances
-    value: FloatArray  # (rows,): of the recording
-    scatter: FloatArray  # (rows, rows): its covariance over repeats
-
-    @staticmethod
-    def of(geometry: EdgeGeometry, spread: FloatArray, shapes: FloatArray) -> _Estimator:
-        """`spread` (k + g, distances): from values at distances to the normal equations' right side; `shapes` (j, distances):
-        level, contrast, slope, and the departures."""
-        size = geometry.spline.size
-        matrix, right = geometry.gram[:-1, :-1], geometry.gram[:-1, -1]
-        bridged = matrix[:size, :size] + geometry.spline.roughness(
-            ROUGHNESS_SHARE * np.trace(matrix[:size, :size]) / size
-        )
-        count = len(shapes)
-        columns = np.zeros((len(matrix), count + len(matrix) - size))
-        columns[:size, :count] = np.linalg.solve(bridged, spread[:size] @ shapes.T)
-        columns[size:, count:] = np.eye(len(matrix) - size)
-        normal = columns.T @ matrix @ columns
-        normal[np.arange(3, count), np.arange(3, count)] += DEPARTURE_STD**-2
-        solve = (np.linalg.inv(normal) @ columns.T)[1:count]
-        return _Estimator(solve @ spread, solve @ right, solve @ matrix @ solve.T)
-
-
-@dataclass(frozen=True)
-class _Operators:
-    """The estimators of all edges, each at its own geometry; rows are contrast, shift and departures."""
-
-    constant: FloatArray  # (edges, rows): of the profile's mean, 1/2
-    odd: FloatArray  # (edges, rows, nodes)
-    even: FloatArray
-    profile: FloatArray  # (edges, rows, distances): of any change of the profile at `distance`
-    distance: FloatArray
-    offset: FloatArray  # (edges,): the dark side's light, of the contrast
-    shade: FloatArray  # (edges, distances): the illumination, which is in the operators
-
-    def report(self, otf: ComplexArray, frequency: FloatArray, change: FloatArray | None = None) -> FloatArray:
-        """What is reported, (edges, rows), of the model's transfer functions (edges, nodes); `change` of the profile (edges, distances)
-        beside them."""
-        rows = self.constant + (self.odd @ np.real(otf)[..., None])[..., 0]
-        if np.any(np.imag(otf)):
-            rows = rows + (self.even @ (np.imag(otf) / frequency)[..., None])[..., 0]
-        if change is not None:
-            rows = rows + (self.profile @ change[..., None])[..., 0]
-        return np.asarray(rows)
-
-
-@lru_cache(maxsize=4)
-def _interpolation(reach_px: float) -> tuple[FloatArray, FloatArray, sparse.csr_array]:
-    """Distances of the fine and of the coarse grid, and the cubic interpolation (fine, coarse) between them."""
-    count = int(np.ceil(reach_px / GRID_PX)) + 1
-    coarse = GRID_PX * np.arange(-count, count + 1, dtype=float)
-    ratio = round(GRID_PX / FINE_PX)
-    fine = FINE_PX * np.arange(-(count - 2) * ratio, (count - 2) * ratio + 1, dtype=float)
-    place = (fine - coarse[0]) / GRID_PX
-    left = np.floor(place + 1e-9).astype(int)
-    t = place - left
-    weights = np.stack(
-        [0.5 * t * (-1 + t * (2 - t)), 1 + 0.5 * t * t * (-5 + 3 * t), 0.5 * t * (1 + t * (4 - 3 * t)), 0.5 * t * t * (t - 1)], axis=1
-    )  # fmt: skip
-    index = left[:, None] + np.array([-1, 0, 1, 2])
-    rows = np.repeat(np.arange(len(fine)), 4)
-    return fine, coarse, sparse.csr_array((weights.ravel(), (rows, index.ravel())), shape=(len(fine), len(coarse)))
-
-
-def _spread(geometry: EdgeGeometry, reach_px: float) -> FloatArray:
-    """(k + g, coarse distances): from a profile to the right side of an edge's normal equations."""
-    fine, _, between = _interpolation(reach_px)
-    distance = np.asarray(geometry.distance_px, float)
-    weight = _shared_out(distance, np.asarray(geometry.weight, float), fine)
-    used = np.flatnonzero(weight)
-    table = np.zeros((geometry.spline.size + len(geometry.gradients), len(fine)))
-    table[: geometry.spline.size, used] = (geometry.spline.design(fine[used]).T * weight[used]).toarray()
-    for k, row in enumerate(geometry.gradients):
-        table[geometry.spline.size + k] = _shared_out(distance, np.asarray(row * geometry.weight, float), fine)
-    return np.asarray(table @ between)
-
-
-def _shapes(quadrature: _Quadrature, top: float) -> tuple[FloatArray, FloatArray]:
-    """(nodes of the quadrature, numbers): transfer functions that are 1 at one of the frequencies measured and 0 at the others,
-    real and imaginary, cubic between; nil at no frequency and well beyond the highest."""
-    f = quadrature.frequency
-    tables = []
-    for at, still in ((REAL_AT, np.zeros(1)), (IMAGINARY_AT, np.array([0.0, 0.5 * STILL, STILL]))):
-        knots = np.concatenate([still, at, [1.25, 1.6]]) * top
-        cardinal = CubicSpline(knots, np.eye(len(knots))[:, len(still) : -2], bc_type="natural")
-        tables.append(np.where((f < knots[-1])[:, None], cardinal(np.minimum(f, knots[-1])), 0.0))
-    return tables[0], tables[1]
-
-
-def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> FloatArray:
-    """Amounts at any distances laid on an even grid, each on its two neighbours: sums over them are linear between grid points."""
-    place = (distance - grid[0]) / FINE_PX
-    left = place.astype(int)
-    right_part = amount * (place - left)
-    return np.asarray(np.bincount(left, amount - right_part, len(grid)) + np.bincount(left + 1, right_part, len(grid)))
-
-
-# --- all edges of one side ------------------------------------------------------------------------------------------------------
 
 
 class _Edges:
@@ -392,7 +118,7 @@ class _Edges:
 
     def __init__(self, study: Study) -> None:
         self._study, self._camera = study, study.camera
-        self.edges = _measured(study)
+        self.edges = measured_edges(study)
         lights = list(dict.fromkeys(e.part[0].light_radiance for e in self.edges))
         #: All channels in every light: neighbours of other colours may matter.
         self._sights = [(c, light) for light in lights for c in study.channels]
@@ -409,11 +135,11 @@ class _Edges:
         lens = self._camera.lens
         cutoff = self._camera.pixel_pitch_um * lens.imaging.cutoff_cy_per_um(shortest, lens.f_number)
         reach = max(e.measured.geometry.reach_px for e in self.edges) + 3 * GRID_PX
-        self._quadrature = _Quadrature.of(min(cutoff, HIGHEST_CY_PER_PX), reach)
+        self._quadrature = Quadrature.of(min(cutoff, HIGHEST_CY_PER_PX), reach)
         top = min(HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE * self._mean_cutoff())
         #: cy/px of the numbers, real parts and then imaginary ones.
         self.frequencies = np.concatenate([REAL_AT, IMAGINARY_AT]) * top
-        self._at = _shapes(self._quadrature, top)
+        self._at = departure_shapes(self._quadrature, top)
         self._spectral: dict[_Key, tuple[FloatArray, FloatArray, ComplexArray]] = {}
         self._blurred: dict[tuple[_Key, _Key, tuple[float, float]], ComplexArray] = {}
         self._changes: dict[_Key, FloatArray | None] = {}
@@ -428,7 +154,7 @@ class _Edges:
              for row in self._baseline]
         )  # fmt: skip
         self.value = self._numbers(self._recorded)
-        self._noise = [_relative(e.scatter, row) for e, row in zip(estimators, self._recorded, strict=True)]
+        self._noise = [relative_covariance(e.scatter, row) for e, row in zip(estimators, self._recorded, strict=True)]
 
     def _light(self, path: str | None) -> Spectrum | None:
         return self._study.spectrum(path) if path else None
@@ -493,9 +219,9 @@ class _Edges:
             rows = self._operators.report(otf * np.exp(2j * np.pi * moved[:, None] * f), f, change)
         return rows
 
-    def _estimated(self, reach_px: float) -> tuple[list[_Estimator], _Operators]:
+    def _estimated(self, reach_px: float) -> tuple[list[Estimator], Operators]:
         """The estimator of every edge, about its baseline, and all of them as operators on transfer functions."""
-        distance = _interpolation(reach_px)[1]
+        distance = profile_interpolation(reach_px)[1]
         quadrature = self._quadrature
         half, count = len(distance) // 2, quadrature.odd.shape[1]
         odd, even = np.zeros((2, len(quadrature.frequency), len(distance)))
@@ -514,13 +240,13 @@ class _Edges:
             shapes = np.concatenate(
                 [np.ones((1, len(distance))), profile[None], slope[None], real * shade, imaginary * shade]
             )
-            estimator = _Estimator.of(edge.measured.geometry, _spread(edge.measured.geometry, reach_px), shapes)
+            estimator = Estimator.of(edge.measured.geometry, spread_operator(edge.measured.geometry, reach_px), shapes)
             estimators.append(estimator)
             shaded = estimator.rows * shade
             constant = shaded.sum(axis=1) * (0.5 + offset) - estimator.rows.sum(axis=1) * offset
             found.append((constant, shaded @ odd.T, shaded @ even.T, estimator.rows, offset, shade))
         constant, by_odd, by_even, rows, offsets, shades = (np.array(part) for part in zip(*found, strict=True))
-        return estimators, _Operators(constant, by_odd, by_even, rows, distance, offsets, shades)
+        return estimators, Operators(constant, by_odd, by_even, rows, distance, offsets, shades)
 
     def _mean_cutoff(self) -> float:
         """The lens's cutoff at the mean wavelength of all sights, cy/px."""
@@ -714,15 +440,6 @@ class _Edges:
         return np.tensordot(apart[1:] - apart[:1], whole, 1)
 
 
-def _relative(scatter: FloatArray, rows: FloatArray) -> FloatArray:
-    """Covariance of departures relative to the contrast, of what was reported."""
-    departure = rows[2:] / rows[0]
-    jacobian = (
-        np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1) / rows[0]
-    )
-    return np.asarray(jacobian @ scatter @ jacobian.T)
-
-
 def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[np.intp]]:
     """Means of angles that lie closer together than `width`, and which of them each belongs to."""
     order = np.argsort(angle_deg)
@@ -734,7 +451,7 @@ def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[
     return np.bincount(which, angle_deg) / count, which
 
 
-def _place_um(study: Study, edge: _Edge) -> tuple[float, float]:
+def _place_um(study: Study, edge: MeasuredEdge) -> tuple[float, float]:
     """(x, y) of the edge's middle from the sensor's centre."""
     field_mm = edge.part[0].field_mm
     if field_mm is not None and edge.part[0].region is not None:
@@ -742,3 +459,15 @@ def _place_um(study: Study, edge: _Edge) -> tuple[float, float]:
     pitch = study.camera.pixel_pitch_um
     row0, col0, row1, col1 = edge.region
     return 0.5 * pitch * (col0 + col1 - study.camera.cols), 0.5 * pitch * (row0 + row1 - study.camera.rows)
+
+
+SLANTED_EDGE = Measurement(
+    "slanted_edge",
+    title="transfer function of slanted edges",
+    order=310,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=edge_block,
+    conditions="orientation",
+    conditions_words="edges at",
+)

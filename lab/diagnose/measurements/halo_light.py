@@ -1,4 +1,4 @@
-"""Light that a lens spreads over the frame, and about its place: what a measurement has of it."""
+"""Light that a lens spreads over the frame around a place."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lab.diagnose.measurements.summaries import Effects
+from lab.diagnose.measurements.block import Effects
 from sim.camera import CameraModel
 from sim.point import halos
 from sim.sensor import mosaic

@@ -1,13 +1,12 @@
-"""Boards: where a camera's corners lie off its geometry, by place in the frame, and each colour's corners off green's.
+"""Boards: where a camera's corners lie off its geometry, by place in the frame.
 
-Focal length, principal point, the boards' poses and their warp are fitted freely, so never a finding. So is Brown's distortion
-(k1 k2 p1 p2 k3) where nothing says what it should be: a maker's data say nothing of it, and a lens that distorts is no sick lens.
-It is judged where a camera that was calibrated before is held against its boards: then its distortion is the baseline, and what
-the boards show beyond it is `distortion` along the radius and `decentre` across it. A fit of the very same boards explains them
-within noise, and leaves nothing to find.
+Focal length, principal point, the boards' poses and their warp are fitted: they are never a finding. So is Brown's distortion
+(k1 k2 p1 p2 k3) where nothing states it: a distorting lens isn't a fault. It is judged where a camera that was calibrated before is
+held against its boards: that distortion is then the baseline, and what the boards show beyond it is `distortion` along the radius
+and `decentre` across it. A fit of the very same boards explains them within noise, and leaves nothing to find.
 
-What is left of the corners is averaged over cells of the frame. An effect's shifts go through the same fit: what poses and focal
-length take up of them doesn't count.
+The residuals of the corners are averaged over cells of the frame. An effect's shifts go through the same fit: the part that poses
+and focal length take up doesn't count.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from lab.diagnose.measurements.screens import COLOUR_FLOOR_PX, colour_shift_px
-from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from lab.fit.geometry.board_detection import BoardView, channel_corners, find_boards
+from lab.fit.geometry.board_detection import BoardView, find_boards
 from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Solution
 from lab.fit.geometry.calibration import Calibration, calibrate_robustly, observations_of
 from lab.fit.geometry.distortion_model import MODELS, free_intrinsics
@@ -38,8 +37,6 @@ CELL_FLOOR_PX = 0.006
 CALIBRATED_STD_PX = 0.05
 HELD_OUT_FROM = 6  # views: of as many or more, every third is held out
 REFERENCE_NM = 550.0
-COLOUR_VIEWS = 8  # evenly over the views: a colour's corners cost a fit each
-COLOUR_RINGS = (0.3, 0.6, 1.0)  # half diagonals
 
 
 def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:
@@ -128,11 +125,10 @@ def board_block(study: Study) -> Block:
         return Prediction(projected @ shifts.ravel(), jacobian)
 
     return Block(
-        measurement="boards", axis="field", unit="half diagonals", reach=0.4, value=mean @ corners.left.ravel(),
+        measurement=BOARDS, reach=0.4, value=mean @ corners.left.ravel(),
         covariance=covariance,
         labels=tuple(Label(r, "Y", way, tuple(captures[k] for k in used), out) for r, way, used, out in labels),
-        reads=frozenset({"image.shift"}), predict=predict, scale=np.ones(len(labels)), conditions="direction",
-        conditions_words="corners",
+        reads=frozenset({"image.shift"}), predict=predict, scale=np.ones(len(labels)),
     )  # fmt: skip
 
 
@@ -217,95 +213,13 @@ def _calibrated(
     }
 
 
-def board_colour_block(study: Study) -> Block:
-    """How far out red and blue corners of boards lie against green's, by distance from the frame's middle."""
-    if "G" not in study.channels:
-        raise NotDetermined("board_colour", "one channel: nothing to hold it against")
-    views, missed = views_of(study, study.side)
-    if not views and not missed:
-        raise NotDetermined("board_colour", "no charuco captures")
-    views = views[:: max(1, len(views) // COLOUR_VIEWS)]
-    camera = study.camera
-    half = camera.half_diagonal_px
-    points: dict[str, list[FloatArray]] = {c: [] for c in study.channels if c != "G"}
-    for k, view in enumerate(views):
-        fits = channel_corners(study.recordings.frame(view.capture), camera.cfa, view)
-        away = view.image_px - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
-        radius = np.hypot(*away.T)
-        for channel, gathered in points.items():
-            use = fits[channel].trusted & fits["G"].trusted & (radius > 0.05 * half)
-            gap = (fits[channel].points - fits["G"].points)[use]
-            unit = (away / np.maximum(radius, 1e-9)[:, None])[use]
-            n = int(use.sum())
-            gathered.append(np.column_stack([radius[use] / half, unit, gap, np.full(n, k)]))
-    values, variances, labels = [], [], []
-    for channel, parts in points.items():
-        for held_out in (False, True):
-            table = np.concatenate(
-                [p for i, p in enumerate(parts) if (i % 3 == 1 and len(parts) >= 3) == held_out] or [np.zeros((0, 6))]
-            )
-            found = _rings(table)
-            ids = tuple(v.capture.id for i, v in enumerate(views) if (i % 3 == 1 and len(views) >= 3) == held_out)
-            for r, value, variance in found:
-                values.append(value)
-                variances.append(variance + COLOUR_FLOOR_PX**2)
-                labels.append(Label(r, channel, "outwards", ids, held_out))
-    if not values:
-        raise NotDetermined("board_colour", "too few corners are clear in every colour")
-    light = None
-
-    def predict(effects: Effects) -> Prediction:
-        mean = np.zeros(len(labels))
-        if effects:
-            mean = np.array(
-                [colour_shift_px(study, label.channel, label.x, light, effects, "charuco") for label in labels]
-            )
-        return Prediction(mean, {})
-
-    return Block(
-        measurement="board_colour", axis="field", unit="half diagonals", reach=0.5, value=np.array(values),
-        covariance=np.diag(variances), labels=tuple(labels), reads=frozenset({"image.shift"}), predict=predict,
-        scale=np.ones(len(values)),
-    )  # fmt: skip
-
-
-def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
-    """Mean distance, outward shift and its variance in rings of corners; a shift that the whole frame shares is a prism's, and out."""
-    if len(table) < 4 * FEWEST_CORNERS:
-        return []
-    radius, unit, gap, view = table[:, 0], table[:, 1:3], table[:, 3:5], table[:, 5]
-    # together: gap = shared + unit s(r), s in steps of the rings
-    edges = (0.0, *COLOUR_RINGS[:-1], np.inf)
-    which = np.digitize(radius, edges[1:-1])
-    used = [k for k in range(len(COLOUR_RINGS)) if (which == k).sum() >= FEWEST_CORNERS]
-    keep = np.isin(which, used)
-    columns = [
-        np.column_stack([np.ones(len(table)), np.zeros(len(table))]),
-        np.column_stack([np.zeros(len(table)), np.ones(len(table))]),
-    ]
-    columns += [np.where((which == k)[:, None], unit, 0.0) for k in used]
-    design = np.array([c[keep].ravel() for c in columns]).T
-    seen = gap[keep].ravel()
-    solution, *_ = np.linalg.lstsq(design, seen, rcond=None)
-    rest = seen - design @ solution
-    inside = np.abs(rest) < 6.0 * 1.4826 * float(np.median(np.abs(rest))) + 1e-9
-    solution, *_ = np.linalg.lstsq(design[inside], seen[inside], rcond=None)
-    rest = np.where(inside, seen - design @ solution, 0.0)
-    inverse = np.linalg.pinv(design[inside].T @ design[inside])
-    # corners of one view share its errors: scatter by view (clustered)
-    groups = np.repeat(view[keep], 2)
-    meat = np.zeros_like(inverse)
-    for k in np.unique(groups):
-        score = design[groups == k].T @ rest[groups == k]
-        meat += np.outer(score, score)
-    plain = float(np.mean(rest[inside] ** 2)) * inverse
-    spread = inverse @ meat @ inverse
-    found = []
-    for i, k in enumerate(used):
-        at = 2 + i
-        found.append((float(radius[which == k].mean()), float(solution[at]), float(max(spread[at, at], plain[at, at]))))
-    return found
-
-
-#: Makers of blocks, in the order of the report.
-BOARD_BLOCKS = (board_block, board_colour_block)
+BOARDS = Measurement(
+    "boards",
+    title="corners of boards",
+    order=500,
+    axis="field",
+    unit="half diagonals",
+    make=board_block,
+    conditions="direction",
+    conditions_words="corners",
+)

@@ -1,40 +1,20 @@
-"""Patches: reflectance charts, and the dark squares of patterns on a screen. Both show light that is spread widely."""
+"""Patches of a reflectance chart."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage
 
-from lab.capture_kinds.base import Capture
-from lab.capture_kinds.bernoulli import BernoulliCapture
-from lab.capture_kinds.black import BlackCapture
 from lab.capture_kinds.chart import ChartCapture
-from lab.capture_kinds.checkerboard import CheckerboardCapture
-from lab.capture_kinds.white import WhiteCapture
+from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.curves import CurveJacobian
-from lab.diagnose.measurements.summaries import (
-    CLIPPED_SHARE,
-    LEVEL_REACH,
-    REFLECTIONS,
-    Block,
-    Effects,
-    Label,
-    Prediction,
-    Study,
-    act_on,
-    held_out_of,
-)
-from lab.diagnose.measurements.veils import Surroundings, halo_light, harmonics
+from lab.diagnose.measurements.halo_light import Surroundings, halo_light, harmonics
+from lab.diagnose.measurements.held_out import held_out_of
+from lab.diagnose.measurements.saturation import CLIPPED_SHARE
+from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
-from lab.formats.recording_set import RecordingSet
-from sim.camera import CameraModel
-from sim.frame import with_reflections
 from sim.point import even_share, optical_transfer, wide_contrast
 from sim.scene.colorchecker import reflectances
 from sim.sensor import mosaic
@@ -45,9 +25,6 @@ PATCH_STD = 0.01  # of a patch's reflectance, common to the channels
 PATCH_COLOUR_STD = 0.004  # of a patch's reflectance, each channel by itself
 PATCH_LEVEL_STD = 4.0e-4  # of a perfect diffuser: gloss and the dark patches' own errors
 CHART_SCALE_STD, CHART_GRADIENT_STD = 0.05, 0.005
-SCREEN_FLOOR = (
-    6e-4  # of the lit screen: what reaches dark squares from the farthest lit ones and from around the screen
-)
 
 
 @dataclass(frozen=True)
@@ -113,9 +90,7 @@ def chart_block(study: Study) -> Block:
         return Prediction(noise.black + out * noise.gain + shift, jacobian)
 
     return Block(
-        measurement="chart",
-        axis="level",
-        unit="DN",
+        measurement=CHART,
         reach=LEVEL_REACH,
         along=np.log(np.maximum(signal, 1.0)),
         value=value,
@@ -126,7 +101,6 @@ def chart_block(study: Study) -> Block:
         reads=(LEVEL - {"light.level"}) | SPECTRAL | {"image.veils"},
         predict=predict,
         scale=signal,
-        places="patches",
     )
 
 
@@ -140,7 +114,7 @@ def patch_levels(study: Study) -> list[Patch]:
         for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
             if not part:
                 continue
-            frame = steady(study.recordings, part)
+            frame = mean_frame(study.recordings, part)
             clipped = study.recordings.frame(part[0]) >= study.saturation_dn
             for channel in study.channels:
                 first_row, first_col = mosaic.phases(study.camera.cfa)[channel][0]
@@ -149,7 +123,7 @@ def patch_levels(study: Study) -> list[Patch]:
                 mean = float(study.pixels_of(frame, channel).mean())
                 low = harmonics(plane - study.noise.black - study.noise.dark_dn_per_s * part[0].exposure_s)
                 mask = study.plane_mask(channel, (study.camera.rows, study.camera.cols))
-                for name, rows, cols, row, col in _patches(part[0]):
+                for name, rows, cols, row, col in patch_boxes(part[0]):
                     box = (slice(*rows), slice(*cols))
                     values = frame[box][mask[box]]
                     if values.size < 16 or np.mean(clipped[box][mask[box]]) >= CLIPPED_SHARE:
@@ -212,7 +186,7 @@ def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uni
     return factor
 
 
-def _patches(capture: ChartCapture) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
+def patch_boxes(capture: ChartCapture) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
     """Patches' inner halves: name, rows, cols, centre."""
     corners = np.array(capture.corners, float)
     found = []
@@ -229,163 +203,6 @@ def _patches(capture: ChartCapture) -> list[tuple[str, tuple[int, int], tuple[in
     return found
 
 
-def screen_block(study: Study) -> Block:
-    """Light in the dark squares of a pattern on the screen, beyond what the all-dark screen leaves, by channel.
-
-    Only pixels well away from any lit one count. The baseline's own point spread reaches there too and is predicted from the
-    lit pixels; a veil adds a share of the frame's mean.
-    """
-    recordings, side, camera, noise = study.recordings, study.side, study.camera, study.noise
-    by_pose: dict[str, dict[str, list[Any]]] = {}
-    shown: list[WhiteCapture | BlackCapture | CheckerboardCapture | BernoulliCapture] = [
-        *recordings.captures(WhiteCapture, side), *recordings.captures(BlackCapture, side),
-        *recordings.captures(CheckerboardCapture, side), *recordings.captures(BernoulliCapture, side),
-    ]  # fmt: skip
-    for capture in shown:
-        by_pose.setdefault(capture.screen.pose, {}).setdefault(capture.kind, []).append(capture)
-    points = []
-    for kinds in by_pose.values():
-        if "white" not in kinds or "black" not in kinds:
-            continue
-        levels = {k: steady(recordings, kinds[k]) for k in ("white", "black")}
-        exposure = kinds["white"][0].exposure_s
-        if kinds["black"][0].exposure_s != exposure:
-            continue
-        for kind in ("checkerboard", "bernoulli"):
-            patterned = kinds.get(kind, [])
-            if not patterned or patterned[0].exposure_s != exposure:
-                continue
-            out = held_out_of(patterned, 0, 0) if len(patterned) > 1 else set()
-            for part in ([c for c in patterned if c.id not in out], [c for c in patterned if c.id in out]):
-                if part:
-                    points += _dark_squares(
-                        study,
-                        part,
-                        steady(recordings, part),
-                        levels["white"],
-                        levels["black"],
-                        part[0].id in out,
-                        len(kinds["black"]),
-                    )
-    if not points:
-        raise NotDetermined(
-            "screen", "no white, black and patterned captures of one screen with dark squares wide enough"
-        )
-    value = np.array([p.value for p in points])
-    tail, beyond = np.array([p.tail for p in points]), np.array([p.beyond for p in points])
-    lift = np.array([p.lift for p in points])
-    covariance = np.diag(np.array([p.std for p in points]) ** 2 + 2 * noise.jitter_dn**2)
-    ids = [p.kind for p in points]
-    same = np.array([[a == b for b in ids] for a in ids])
-    white = np.array([p.white for p in points])
-    channel, digits = np.array([p.channel for p in points]), np.array([p.digits for p in points])
-    covariance += (
-        same * np.outer(tail, tail) * study.tail_std**2
-        + np.outer(beyond, beyond)
-        + np.outer(white, white) * SCREEN_FLOOR**2
-        + np.diag(np.square(1e-4 * white))
-        + same * (channel[:, None] == channel) * np.outer(digits, digits)
-    )
-
-    def predict(effects: Effects) -> Prediction:
-        shift = halo_light([p.around for p in points], effects, camera)
-        model = Uniform(camera, effects)
-        if not model.is_linear:
-            low = np.maximum(tail, 0.0) / noise.gain
-            base = np.array([p.black for p in points]) / noise.gain
-            shift = (model.response(base + low) - model.response(base)) * noise.gain - tail
-        if any(act_on(effects, REFLECTIONS)):
-            shift = shift + np.array([_copied(p, effects, camera) for p in points])
-        return Prediction(wide_contrast(camera, effects) * tail + even_share(camera, effects) * lift + shift, {})
-
-    return Block(
-        measurement="screen", axis="level", unit="DN", reach=1e9, value=value, covariance=covariance,
-        labels=tuple(Label(float(i), p.channel, p.kind, p.captures, p.held_out) for i, p in enumerate(points)),
-        reads=REFLECTIONS | {"image.veils", "signal.response"}, predict=predict, scale=np.array([p.white for p in points]),
-        conditions="pattern", places="dark squares",
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _DarkSquares:
-    kind: str
-    channel: str
-    captures: tuple[str, ...]
-    held_out: bool
-    value: float
-    std: float
-    tail: float
-    picture: FloatArray  # what the pattern adds to the dark screen, DN, over the channel's plane
-    use: NDArray[np.bool_]  # the dark squares' insides in it
-    around: Surroundings  # of these
-    beyond: float  # what the tail is uncertain by: light beyond the frame
-    lift: float
-    white: float
-    black: float
-    digits: float  # what rounding leaves in the value
-
-
-def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> float:
-    """What effects on the whole image bring into the dark squares, DN."""
-    shown = with_reflections(camera, squares.picture, effects)
-    return float(shown[squares.use].mean() - squares.picture[squares.use].mean())
-
-
-def steady(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatArray:
-    return np.asarray(np.mean([recordings.frame(c).astype(float) for c in captures], axis=0))
-
-
-def _dark_squares(
-    study: Study,
-    part: Sequence[Any],
-    shown: FloatArray,
-    white: FloatArray,
-    black: FloatArray,
-    held_out: bool,
-    blacks: int,
-) -> list[_DarkSquares]:
-    camera, noise = study.camera, study.noise
-    found = []
-    step = mosaic.step(camera.cfa)
-    lit_by_channel: dict[str, Any] = {}
-    for channel in study.channels:
-        row, col = mosaic.phases(camera.cfa)[channel][0]
-        plane = (slice(row, None, step), slice(col, None, step))
-        full = (white - black)[plane]
-        share = (shown - black)[plane] / np.maximum(full, 1e-6)
-        bright = full > 0.3 * np.quantile(full, 0.95)
-        lit_by_channel[channel] = plane, full, np.where(bright, np.clip(share, 0.0, 1.0), 0.0), bright
-    for channel, (plane, full, share, bright) in lit_by_channel.items():
-        lit = share > 0.25
-        away = ndimage.distance_transform_edt(~lit) * step
-        inside = ndimage.distance_transform_edt(bright) * step
-        for reach in (12.0, 9.0, 7.0):
-            use = (away >= reach) & (inside >= reach)
-            if use.sum() >= 60:
-                break
-        else:
-            continue
-        pad = [(0, n) for n in share.shape]
-        picture = np.where((share > 0.5) & bright, full, 0.0)
-        fy = np.fft.fftfreq(2 * share.shape[0], step)[:, None]
-        fx = np.fft.rfftfreq(2 * share.shape[1], step)[None, :]
-        radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
-        otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
-        # halves of the contrast mark the edges: as much light is drawn as there is, and far away its outline doesn't matter;
-        # a screen that reaches the frame's border goes on beyond it, nobody says how far: not at all, or without an end
-        ends, endless = (
-            np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
-            for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))
-        )
-        added = (shown - black)[plane]
-        difference = added[use]
-        lights = np.maximum([float(frame[plane][use].mean()) - noise.black for frame in (shown, black)], 0.0)
-        variance = (noise.gain * lights[1] + noise.read_dn**2) * (1 / len(part) + 1 / blacks)
-        means = [float(study.pixels_of(f, channel).mean()) for f in (shown, black)]
-        found.append(
-            _DarkSquares(part[0].kind, channel, tuple(c.id for c in part), held_out, float(difference.mean()),
-                         float(np.sqrt(variance / use.sum())), 0.5 * float(ends + endless),
-                         added, use, Surroundings.of(harmonics(added), use), 0.5 * float(endless - ends), means[0] - means[1], float(full[bright].mean()),
-                         float(black[plane][use].mean()) - noise.black, float(np.linalg.norm(rounding_std_dn(noise.spread_dn2(lights)))))
-        )  # fmt: skip
-    return found
+CHART = Measurement(
+    "chart", title="patches of the chart", order=300, axis="level", unit="DN", make=chart_block, places="patches"
+)

@@ -1,4 +1,4 @@
-"""Light that changes while a frame is read: what single flat frames' rows differ from those of all others."""
+"""Light that changes while a frame is read: rows of single flat frames against those of all others."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.diagnose.measurements.neighbours import held_out_flats
-from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, act_on
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.effects.base import Effect
 from sim.sensor import mosaic
@@ -96,11 +98,11 @@ def flicker_block(study: Study) -> Block:
         return Prediction(mean, jacobian)
 
     return Block(
-        measurement="flat_rows", axis="row_frequency", unit="cy/row", reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),
+        measurement=FLAT_ROWS, reach=LOG_REACH, along=np.log(np.tile(frequency, len(levels))),
         value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.captures[0].id in out)
                      for level in levels for f in frequency),
-        reads=FLICKER, predict=predict, scale=np.ones(len(value)), conditions="exposure", conditions_words="flats of",
+        reads=FLICKER, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -212,3 +214,15 @@ def _modulation(
     lines = np.abs(np.fft.rfft(relative, axis=1)) ** 2 / rows / level.variance
     power = np.array([lines[:, list(band)].mean(1) for band in bands])
     return power.mean(1), power.std(1)
+
+
+FLAT_ROWS = Measurement(
+    "flat_rows",
+    title="flicker in the rows of flat fields",
+    order=210,
+    axis="row_frequency",
+    unit="cy/row",
+    make=flicker_block,
+    conditions="exposure",
+    conditions_words="flats of",
+)

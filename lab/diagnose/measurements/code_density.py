@@ -1,8 +1,8 @@
-"""How often each code comes: what even light leaves of a converter's steps.
+"""The code-density test of the converter: how often each code comes in uniform light.
 
-Frames of even light, taken together, are spread over their codes as smoothly as their noise and shading make them: by more than the
-noise's own standard deviation at that level. What departs from a smooth curve over that distance is the converter's, or of
-whatever handled the codes after it.
+Frames of uniform light, taken together, are spread over their codes as smoothly as their noise and shading make them: over more than
+the noise's standard deviation at that level. A departure from a smooth curve over that distance is the converter's, or of a
+component that handled the codes after it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from scipy.special import ndtr
 
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
-from lab.diagnose.measurements.neighbours import held_out_flats
-from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study, held_out_of
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.held_out import held_out_flats, held_out_of
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -120,7 +121,7 @@ def code_block(study: Study) -> Block:
         return Prediction(np.concatenate(found), {})
 
     return Block(
-        measurement="code_density", axis="level", unit="DN", reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
+        measurement=CODE_DENSITY, reach=0.1 * study.camera.white_level_dn, value=np.concatenate(values),
         covariance=block_diag(*covariances), labels=tuple(labels), reads=frozenset({"codes.codes"}), predict=predict, scale=np.ones(len(labels)),
         along=np.array(places),
     )  # fmt: skip
@@ -308,3 +309,8 @@ def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
         inside = (at >= 0) & (at < size)
         found += np.bincount(at[inside], share[inside], minlength=size + 1)
     return found[:size] / FINE
+
+
+CODE_DENSITY = Measurement(
+    "code_density", title="code-density test", order=240, axis="level", unit="DN", make=code_block
+)

@@ -1,4 +1,4 @@
-"""How even flat fields are: cells of the frame against cos^4, each channel relative to its mean."""
+"""Shading of flat fields: cells of the frame against cos^4, each channel relative to its mean."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lab.diagnose.measurements.neighbours import held_out_flats
-from lab.diagnose.measurements.summaries import Block, Effects, Label, Prediction, Study
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.camera import CameraModel
 from sim.point import even_share
@@ -63,7 +64,7 @@ def shading_block(study: Study) -> Block:
 
     radius = np.hypot(x_mm, y_mm)
     return Block(
-        measurement="flat_field", axis="field", unit="mm", reach=0.2 * float(np.ptp(x_mm)),
+        measurement=FLAT_FIELD, reach=0.2 * float(np.ptp(x_mm)),
         value=np.concatenate([p.cells for p in planes]), covariance=_covariance(planes),
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures), p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
@@ -205,3 +206,8 @@ def _cells(plane: FloatArray) -> FloatArray:
     r = np.linspace(0, plane.shape[0], ROWS + 1).astype(int)
     c = np.linspace(0, plane.shape[1], COLS + 1).astype(int)
     return np.add.reduceat(np.add.reduceat(plane, r[:-1], 0), c[:-1], 1) / np.outer(np.diff(r), np.diff(c))
+
+
+FLAT_FIELD = Measurement(
+    "flat_field", title="shading of flat fields", order=270, axis="field", unit="mm", make=shading_block
+)

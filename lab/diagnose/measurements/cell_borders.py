@@ -1,0 +1,50 @@
+"""Grey levels at the borders between the lit and dark cells of a pattern."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.pattern_fit import BORDER, joint_covariance, patterns
+from lab.diagnose.measurements.reads import SHOWN
+from lab.diagnose.measurements.study import Study
+from sim.uniform import Uniform
+
+BORDER_FLOOR = 0.0015
+
+
+def cell_border_block(study: Study) -> Block:
+    """What rims between lit and dark cells lack or have too much of: greys that screen or camera show otherwise."""
+    found = patterns(study)
+    points = [(g, p, len(p.bands) + BORDER) for g, group in enumerate(found) for p in group]
+    value = np.array([p.value[b] for _, p, b in points])
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(points))
+        model = Uniform(study.camera, effects)
+        for k, (_, p, b) in enumerate(points):
+            mean[k] = p.shown_by(effects)[b]
+            if not model.is_linear:
+                low, high = p.levels_e
+                out = model.response(np.array([low, 0.5 * (low + high), high]))
+                # a bend a y (1 - y) lifts the middle by a / 4
+                mean[k] += 4.0 * float((out[1] - out[0]) / (out[2] - out[0]) - 0.5)
+        return Prediction(mean, {})
+
+    return Block(
+        measurement=CELL_BORDERS, reach=1e9, value=value,
+        covariance=joint_covariance(points, study) + np.diag(np.full(len(value), BORDER_FLOOR**2)),
+        labels=tuple(Label(float(i), p.channel, "rims of cells", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
+        reads=SHOWN | {"signal.response"}, predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+CELL_BORDERS = Measurement(
+    "cell_borders",
+    title="borders of pattern cells",
+    order=420,
+    axis="level",
+    unit="1",
+    make=cell_border_block,
+    places="rims",
+)

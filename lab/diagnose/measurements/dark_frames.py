@@ -1,0 +1,339 @@
+"""Statistics of dark frames: each is read once, and every measurement of dark frames takes its numbers from here.
+
+The baseline's dark frame is black level + dark current x exposure, the same at every temperature, with normal noise and a normal
+fixed pattern of independent pixels. Powers and counts, whose size may be of any order of magnitude, are kept as logarithms or
+square roots: their noise then hardly depends on their size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from lab.capture_kinds.dark import DarkCapture
+from lab.diagnose.measurements.held_out import held_out_of
+from lab.diagnose.measurements.line_spectra import Image, periodogram, pooled, pooled_along
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.sensor.lines import Lines
+from sim.spectrum import FloatArray
+
+TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures are that close are repeats
+CELLS = 4, 6  # of a frame: rows, columns
+CELL_FLOOR_DN = 0.005
+MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
+CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
+MEDIAN_OF = 5  # frames at most, whose median is looked at for odd pixels
+#: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
+TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
+SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their noise are taken
+
+
+@dataclass(frozen=True)
+class DarkCondition:
+    """Dark captures of one exposure and temperature: those that choice and fit may see, and those that they don't."""
+
+    exposure_s: float
+    temperature_c: float | None
+    seen: tuple[DarkCapture, ...]
+    held_out: tuple[DarkCapture, ...]
+
+    @property
+    def captures(self) -> tuple[DarkCapture, ...]:
+        return (*self.seen, *self.held_out)
+
+    @property
+    def name(self) -> str:
+        warm = "" if self.temperature_c is None else f" at {self.temperature_c:.0f} C"
+        return f"{self.exposure_s:.4g} s{warm}"
+
+
+@dataclass(frozen=True)
+class DarkPattern:
+    """What some frames of one condition have in common: their mean and the lower median of some of them, both less black level."""
+
+    frames: int
+    of_median: int
+    captures: tuple[str, ...]
+    cells: FloatArray  # CELLS, DN
+    lines: dict[
+        Lines, tuple[FloatArray, FloatArray, float]
+    ]  # frequency, power over the white level's, number of its modes
+    white_dn2: float  # power of single pixels
+    parity_dn: dict[Lines, float]  # odd lines less even ones
+    line_dn2: dict[Lines, float]  # variance of the lines' means beyond the pixels' own
+    counts: FloatArray  # of TAIL_EDGES, upwards, then the two downwards
+    spread_dn: float  # of single pixels of the median
+    skewness: float  # of the bulk of these, by its quantiles at 0.5 %: z_p + z_(1 - p) = g (z_p^2 - 1) / 3
+
+
+@dataclass(frozen=True)
+class DarkNoise:
+    """What differs from frame to frame of one condition: contrasts of every frame to the mean of those before it, each with the
+    variance of one frame and independent of the others (Helmert)."""
+
+    contrasts: int
+    variance_dn2: float  # of a pixel
+    pixel_dn2: float  # the same without what lines have in common
+    squares: Image  # sum of squared contrasts, over its surroundings' variance
+    lines: dict[Lines, tuple[FloatArray, FloatArray, float]]
+    along: dict[
+        Lines, tuple[FloatArray, FloatArray, FloatArray]
+    ]  # within lines: frequency, power over the level, modes
+    white_dn2: float
+    line_dn2: dict[Lines, float]
+    cells_dn2: float  # variance of a cell's mean, measured
+
+
+@dataclass(frozen=True)
+class DarkStatistics:
+    """All that is kept of one condition."""
+
+    condition: DarkCondition
+    means: dict[str, float]
+    fixed: dict[bool, DarkPattern]  # held out or seen; only those of `MOST_CONDITIONS`
+    changing: dict[bool, DarkNoise]
+
+
+def conditions(study: Study) -> list[DarkCondition]:
+    """Dark captures by exposure and temperature, at the gain that most have; the last third of the repeats is held out.
+
+    Of two repeats both are seen, as noise needs both: then every third condition is held out.
+    """
+    captures = study.recordings.captures(DarkCapture, study.side)
+    if not captures:
+        raise NotDetermined("dark", "no dark captures")
+    gains = [c.gain_db for c in captures]
+    usual = max(dict.fromkeys(gains), key=gains.count)
+    groups: list[list[DarkCapture]] = []
+    for c in sorted(
+        (c for c in captures if c.gain_db == usual),
+        key=lambda c: (c.temperature_c is None, c.temperature_c or 0.0),
+    ):
+        for group in groups:
+            first = group[0]
+            same = first.exposure_s == c.exposure_s and (first.temperature_c is None) == (c.temperature_c is None)
+            if same and abs((first.temperature_c or 0.0) - (c.temperature_c or 0.0)) <= TEMPERATURE_STEP_C:
+                group.append(c)
+                break
+        else:
+            groups.append([c])
+    place = {c.id: i for i, c in enumerate(captures)}
+    groups = [sorted(g, key=lambda c: (study.elapsed_s(c), place[c.id])) for g in groups]
+    groups.sort(key=lambda g: (g[0].exposure_s, g[0].temperature_c or 0.0))
+    found = []
+    for i, group in enumerate(groups):
+        if len(group) == 2:
+            out = {c.id for c in group} if len(groups) >= 3 and i % 3 == 1 else set()
+        else:
+            out = held_out_of(group, i, len(groups))
+        warm = [c.temperature_c for c in group if c.temperature_c is not None]
+        found.append(
+            DarkCondition(
+                group[0].exposure_s,
+                float(np.mean(warm)) if warm else None,
+                tuple(c for c in group if c.id not in out),
+                tuple(c for c in group if c.id in out),
+            )
+        )
+    return found
+
+
+def dark_frames(study: Study) -> list[DarkStatistics]:
+    """Every dark capture, read once."""
+    every = conditions(study)
+    usual = [c for c in every if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0] or every  # fmt: skip
+    warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
+    picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]
+    return [_read(study, c, c.name in picked) for c in every]
+
+
+def _read(study: Study, condition: DarkCondition, with_pattern: bool) -> DarkStatistics:
+    means: dict[str, float] = {}
+    mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
+    contrasts: dict[bool, list[Image]] = {False: [], True: []}
+    stacks: dict[bool, list[Image]] = {False: [], True: []}
+    for k, capture in enumerate(condition.captures):
+        frame = study.recordings.frame(capture).astype(np.float32)
+        means[capture.id] = level = float(frame.mean(dtype=np.float64))
+        held_out = k >= len(condition.seen)
+        frame -= np.float32(level)
+        if k:
+            contrasts[held_out].append((frame - mean) * np.float32(np.sqrt(k / (k + 1.0))))
+        mean += (frame - mean) / np.float32(k + 1)
+        if with_pattern:
+            stacks[held_out].append(frame)
+    changing = {out: _changing(part) for out, part in contrasts.items() if part}
+    # the first frame of a condition all of which is held out has no contrast, and neither has a lone one
+    variance = next((c.variance_dn2 for c in changing.values()), None)
+    ids = {False: [c.id for c in condition.seen], True: [c.id for c in condition.held_out]}
+    fixed = {out: _fixed(part, tuple(ids[out]), variance) for out, part in stacks.items() if part}
+    return DarkStatistics(condition, means, fixed, changing)
+
+
+def _changing(contrasts: list[Image]) -> DarkNoise:
+    total = np.zeros_like(contrasts[0])
+    variance: list[float] = []
+    pixel: list[float] = []
+    white: list[float] = []
+    cells: list[float] = []
+    rows, cols, along_rows, along_cols = [], [], [], []
+    excess: dict[Lines, list[float]] = {"rows": [], "columns": []}
+    for contrast in contrasts:
+        std = _robust_std(contrast)
+        cut = np.clip(contrast, -CLIP * std, CLIP * std)
+        rest, spare = _without_lines(contrast, cut)
+        for lines, value in spare.items():
+            excess[lines].append(value)
+        variance.append(float(np.mean(np.square(cut), dtype=np.float64)))
+        own = _robust_std(rest)
+        pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
+        total += np.square(rest)
+        cells.append(float(np.mean(np.square(cell_means(cut)))))
+        if len(white) < 6:  # spectra of more are known well enough
+            power = periodogram(cut)
+            white.append(power.level)
+            rows.append(power.line("rows"))
+            cols.append(power.line("columns"))
+            along_rows.append(power.along("rows"))
+            along_cols.append(power.along("columns"))
+    local = _local_variance(total, len(contrasts))
+    return DarkNoise(
+        contrasts=len(contrasts),
+        variance_dn2=float(np.mean(variance)),
+        pixel_dn2=float(np.mean(pixel)),
+        squares=(total / local).astype(np.float32),
+        lines={"rows": pooled(rows), "columns": pooled(cols)},
+        along={"rows": pooled_along(along_rows), "columns": pooled_along(along_cols)},
+        white_dn2=float(np.mean(white)),
+        line_dn2={lines: max(float(np.mean(values)), 0.0) for lines, values in excess.items()},
+        cells_dn2=float(np.mean(cells)),
+    )
+
+
+def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float | None) -> DarkPattern:
+    mean: Image = np.asarray(np.mean(frames, axis=0, dtype=np.float32))
+    part = frames[:MEDIAN_OF]
+    level = [f - _row_means(f)[:, None] for f in part]
+    median: Image = np.sort(np.array(level), axis=0)[(len(part) - 1) // 2]
+    # odd pixels: against their surroundings, lines taken out, in units of the surroundings' own spread
+    std = _robust_std(median)
+    flat, _ = _without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
+    step = 2
+    for r in range(step):
+        for c in range(step):
+            phase = flat[r::step, c::step]
+            phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
+    around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
+    steep = np.clip(flat - around, -CLIP * std, CLIP * std)
+    # a second pass keeps hot pixels beside a glow from pulling at it
+    around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
+    away = flat - around
+    local = np.sqrt(np.maximum(_local_variance(np.square(away), 1), 0.25)) * np.sqrt(
+        SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0)
+    )
+    z = away / local
+    edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
+    counts = np.histogram(z, edges)[0].astype(float)
+    low, high = np.quantile(z, [0.005, 0.995])
+    # smooth structure and lines: the mean, odd pixels cut off
+    std = _robust_std(mean)
+    smooth = ndimage.uniform_filter(np.clip(mean, -8.0 * std, 8.0 * std), SMOOTH_PX, mode="mirror")
+    spread = np.sqrt(_local_variance(np.square(mean - smooth), 1))
+    mean = smooth + np.clip(mean - smooth, -CLIP * spread, CLIP * spread)
+    power = periodogram(mean)
+    _, excess = _without_lines(mean, mean)
+    return DarkPattern(
+        frames=len(frames),
+        of_median=len(part),
+        captures=captures,
+        cells=cell_means(mean),
+        lines={"rows": pooled([power.line("rows")]), "columns": pooled([power.line("columns")])},
+        white_dn2=power.level,
+        parity_dn={
+            "rows": float(mean[1::2].mean() - mean[::2].mean()),
+            "columns": float(mean[:, 1::2].mean() - mean[:, ::2].mean()),
+        },
+        line_dn2={lines: max(value, 0.0) for lines, value in excess.items()},
+        counts=np.concatenate([counts[3:], counts[1::-1]]),
+        spread_dn=float(np.median(local)),
+        skewness=float(np.clip(3.0 * (low + high) / 5.63, 0.0, 1.0)),
+    )
+
+
+def _robust_std(image: Image) -> float:
+    """Standard deviation of the bulk: what lies beyond five of it doesn't count. Half a code at least."""
+    low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
+    std = max(float(high - low) / 4.107, 0.3)
+    for _ in range(3):
+        inside = image[np.abs(image) < 5.0 * std]
+        std = max(float(inside.std(dtype=np.float64)), 0.25)
+    return std
+
+
+def _row_means(image: Image) -> Image:
+    std = _robust_std(image)
+    return np.asarray(np.clip(image, -CLIP * std, CLIP * std).mean(axis=1))
+
+
+def _without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
+    """An image less the means of its rows and columns (of `cut`), and the variance that neighbouring lines' means have beyond what
+    single pixels give them: by their differences, which nothing smooth changes."""
+    rows, cols = cut.mean(axis=1, dtype=np.float64), cut.mean(axis=0, dtype=np.float64)
+    own = float(np.var(np.diff(cut, axis=1), dtype=np.float64)) / 2.0
+    spare: dict[Lines, float] = {
+        "rows": float(np.var(np.diff(rows))) / 2.0 - own / cut.shape[1],
+        "columns": float(np.var(np.diff(cols))) / 2.0 - own / cut.shape[0],
+    }
+    mean = float(cut.mean(dtype=np.float64))
+    return (image - (rows - mean)[:, None].astype(np.float32) - cols[None, :].astype(np.float32)), spare
+
+
+def _local_variance(squares: Image, freedom: int) -> Image:
+    """Variance of a pixel by its surroundings, pixels far beyond it cut off."""
+    usual = float(np.mean(np.minimum(squares, 16.0 * freedom * np.median(squares) / 0.45)))
+    cap = np.float32(64.0 * usual)
+    rough = ndimage.uniform_filter(np.minimum(squares, cap), LOCAL_PX, mode="mirror")
+    cap_here = 16.0 * rough if freedom == 1 else (1.0 + 12.0 / np.sqrt(freedom)) * rough
+    fine = ndimage.uniform_filter(np.minimum(squares, cap_here), LOCAL_PX, mode="mirror")
+    return np.asarray(np.maximum(fine / np.float32(freedom), np.float32(1e-3)))
+
+
+def cell_means(image: Image) -> FloatArray:
+    r = np.linspace(0, image.shape[0], CELLS[0] + 1).astype(int)
+    c = np.linspace(0, image.shape[1], CELLS[1] + 1).astype(int)
+    total = np.add.reduceat(np.add.reduceat(image.astype(float), r[:-1], 0), c[:-1], 1)
+    return np.asarray(total / np.outer(np.diff(r), np.diff(c)))
+
+
+#: Quantities of the stages that dark frames' pixels and lines depend on.
+DEFECTS = frozenset({"charge.defects", "signal.telegraph"})
+
+
+def fine_conditions(step: str, frames: Sequence[DarkStatistics], least_dn: float) -> list[DarkStatistics]:
+    """Conditions whose frames differ by at least so much noise; NotDetermined where there are none."""
+    every = [f for f in frames if f.changing]
+    if not every:
+        raise NotDetermined(step, "no two dark frames of the same exposure and temperature")
+    fine = [f for f in every if all(c.pixel_dn2 > least_dn**2 for c in f.changing.values())]
+    if not fine:
+        raise NotDetermined(step, too_coarse(every, least_dn))
+    return fine
+
+
+def by_part(frames: Sequence[DarkStatistics]) -> dict[bool, list[DarkNoise]]:
+    """What changes from frame to frame, of what choice and fit may see and of what is held out; neither if there is none."""
+    parts = {out: [f.changing[out] for f in frames if out in f.changing] for out in (False, True)}
+    return {out: part for out, part in parts.items() if part}
+
+
+def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
+    noise = min(np.sqrt(c.pixel_dn2) for f in frames for c in f.changing.values())
+    return f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse to show how it is distributed; a higher gain would"
+
+
+def captures_of(frames: DarkStatistics, held_out: bool) -> tuple[str, ...]:
+    return tuple(c.id for c in (frames.condition.held_out if held_out else frames.condition.seen))

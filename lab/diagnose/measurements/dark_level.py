@@ -1,0 +1,110 @@
+"""The mean of dark frames by exposure, temperature and time; and the black level against the stated one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.dark_frames import CELLS, DarkStatistics, conditions, dark_frames
+from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
+from lab.diagnose.measurements.reads import LAG
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+
+def dark_current_map(study: Study, effects: Effects, temperature_c: float | None) -> FloatArray:
+    """Dark current (e/s) of pixels as large as a cell's twelfth: laws are of whole frames, of which nothing is smaller here."""
+    camera = study.camera
+    down = max(min(camera.rows // (12 * CELLS[0]), camera.cols // (12 * CELLS[1])), 1)
+    coarse = camera.model_copy(
+        update={
+            "rows": camera.rows // down,
+            "cols": camera.cols // down,
+            "pixel_pitch_um": camera.pixel_pitch_um * down,
+        }
+    )
+    return Uniform(coarse, effects).dark_e_per_s(temperature_c)
+
+
+def added_dark_e_per_s(study: Study, effects: Effects, temperature_c: float | None) -> float:
+    """What effects add to the mean dark current of pixels that are like their neighbours."""
+    if not Uniform(study.camera, effects).changes_dark_current:
+        return 0.0
+    return float(dark_current_map(study, effects, temperature_c).mean()) - study.camera.dark_current_e_per_s
+
+
+def dark_level_block(study: Study) -> Block:
+    """Mean of every dark frame: black level and dark current are free; what remains is time, temperature and the frame before."""
+    frames = study.once(dark_frames)
+    captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
+    value = np.array([f.means[c.id] for f in frames for c in f.condition.captures])
+    exposures = np.array([c.exposure_s for c, *_ in captures])
+    noise, gain = study.noise, study.noise.gain
+    base = noise.black + noise.dark_dn_per_s * exposures
+
+    def predict(effects: Effects) -> Prediction:
+        mean = base + np.array([study.offset(c, effects) for c, *_ in captures])
+        more = {t: added_dark_e_per_s(study, effects, t) for t in {k.temperature_c for _, k, _ in captures}}
+        for i, (capture, condition, _) in enumerate(captures):
+            carried = np.mean([study.carried_e(capture, c, effects) for c in study.channels])
+            mean[i] += gain * (more[condition.temperature_c] * capture.exposure_s + float(carried))
+        return Prediction(mean, study.free_offsets(exposures))
+
+    # codes as coarse as all noise round a level up or down, with where it lies between two
+    coarse = np.array([_rounding_dn(f) for f in frames for _ in f.condition.captures])
+    same = np.array([[a[1] is b[1] for b in captures] for a in captures])
+    # smooth along the exposure at one temperature; ten degrees are as far as all exposures
+    reach = float(max(np.ptp(exposures), 1e-3))
+    warmer = np.array([0.0 if k.temperature_c is None or study.temperature_c is None else k.temperature_c - study.temperature_c for _, k, _ in captures])  # fmt: skip
+    return Block(
+        measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
+        covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
+        labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
+        reads=LAG | {"signal.offset_dn", "charge.dark_current"}, predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def _rounding_dn(frames: DarkStatistics) -> float:
+    """By how much rounding may move a level: exp(-2 pi^2 variance) / pi codes at most."""
+    changing = next((c.variance_dn2 for c in frames.changing.values()), None)
+    if changing is None:
+        return 0.1
+    return float(np.exp(-2.0 * np.pi**2 * max(changing - 1.0 / 12.0, 0.0)) / np.pi)
+
+
+def black_level_block(study: Study) -> Block:
+    """The black level that the darks show against the stated one: no effect is about a level that is wrong from the start."""
+    stated = study.stated.black_level_dn
+    if stated is None:
+        raise NotDetermined("black_level", "the black level isn't stated: nothing to hold the dark frames against")
+    shortest = min(conditions(study), key=lambda c: c.exposure_s)
+    std = float(np.hypot(STATED_BLACK_SHARE * stated, STATED_BLACK_DN)) + study.noise.black_std
+    return Block(
+        measurement=BLACK_LEVEL, reach=1.0, value=np.array([study.noise.black]),
+        covariance=np.array([[std**2]]),
+        labels=(Label(0.0, "all", "stated level", tuple(c.id for c in shortest.captures), False),),
+        reads=frozenset(), predict=lambda effects: Prediction(np.array([stated]), {}), scale=np.array([max(stated, 1.0)]),
+    )  # fmt: skip
+
+
+DARK = Measurement(
+    "dark",
+    title="mean level of dark frames",
+    order=100,
+    axis="exposure",
+    unit="s",
+    make=dark_level_block,
+    conditions="exposure and temperature",
+)
+
+
+BLACK_LEVEL = Measurement(
+    "black_level",
+    title="black level against the stated one",
+    order=110,
+    axis="exposure",
+    unit="s",
+    make=black_level_block,
+)

@@ -1,0 +1,209 @@
+"""What the pixels of a row or of a column share in dark frames: row and column noise, their fixed patterns, and correlation along lines."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.dark_frames import (
+    CELL_FLOOR_DN,
+    DarkStatistics,
+    by_part,
+    captures_of,
+    dark_frames,
+    fine_conditions,
+)
+from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.sensor.lines import Lines
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+BANDS = 6  # of a spectrum over lines
+POWER_FLOOR = 0.02  # of a band's power: what isn't quite white in a healthy read-out
+LEAST_LINE_DN = 0.3  # the same of lines' means
+LINES = frozenset({"signal.lines"})
+
+
+def temporal_line_block(lines: Lines, study: Study) -> Block:
+    """Spectrum of what all pixels of a row (column) share in one frame and not in the next, over that of single pixels."""
+    frames = study.once(dark_frames)
+    name = "row_noise" if lines == "rows" else "column_noise"
+    fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN)
+    parts = by_part(fine)
+    frequency = next(iter(parts.values()))[0].lines[lines][0]
+    # a ripple of some rows' period lies where noise that neighbouring rows share has its bend
+    bands = Bands.of(frequency, 8, 1.5)
+    length = study.camera.cols if lines == "rows" else study.camera.rows
+    value, variance, labels, inverse = [], [], [], []
+    for out, part in parts.items():
+        weight = np.array([min(c.contrasts, 6) for c in part], float)
+        power = np.average([c.lines[lines][1] for c in part], axis=0, weights=weight)
+        modes, level = bands.modes * weight.sum(), sum(c.lines[lines][2] for c in part)
+        value.append(np.log(bands.mean(power)) - log_mean_bias(modes))
+        variance.append(log_mean_variance(modes) + 1.0 / level + POWER_FLOOR**2)
+        inverse.append(np.full(len(modes), float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))))
+        ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
+        labels += [Label(float(x), "all", "temporal", ids, out) for x in bands.middle]
+    over = np.concatenate(inverse) * study.noise.gain**2 * length
+    sets = len(parts)
+
+    def predict(effects: Effects) -> Prediction:
+        total = np.zeros(len(frequency))
+        for one in Uniform(study.camera, effects).lines:
+            if one.lines == lines:
+                total += one.spectrum_e2(frequency, fixed=False)
+        return Prediction(np.log1p(over * np.tile(bands.mean(total), sets)), {})
+
+    n = len(labels)
+    return Block(
+        measurement=ROW_NOISE if lines == "rows" else COLUMN_NOISE, reach=0.1, value=np.concatenate(value),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
+        predict=predict, scale=np.ones(n),
+    )  # fmt: skip
+
+
+def fixed_line_block(lines: Lines, study: Study) -> Block:
+    """The same of what they share in every frame: the shortest exposure's mean; and how odd lines differ from even ones."""
+    frames = study.once(dark_frames)
+    name = "row_pattern" if lines == "rows" else "column_pattern"
+    first = next(f for f in frames if f.fixed)
+    if min(part.white_dn2 for part in first.fixed.values()) < 1e-3:
+        raise NotDetermined(
+            f"dark_{name}", "dark frames have no noise and no pattern: codes are too coarse to show one"
+        )
+    frequency = next(iter(first.fixed.values())).lines[lines][0]
+    bands = Bands.of(frequency, BANDS)
+    length = study.camera.cols if lines == "rows" else study.camera.rows
+    size = study.camera.rows * study.camera.cols
+    value: list[FloatArray] = []
+    labels: list[Label] = []
+    factor: list[FloatArray] = []
+    share = _fixed_share(first)
+    for out, part in first.fixed.items():
+        _, power, _ = part.lines[lines]
+        value.append(np.log(bands.mean(power)) - log_mean_bias(bands.modes))
+        labels += [Label(float(x), "all", "fixed", part.captures, out) for x in bands.middle]
+        factor.append(np.full(len(bands.middle), study.noise.gain**2 * length / part.white_dn2))
+    pieces = len(first.fixed)
+    one = np.diag(log_mean_variance(bands.modes))
+    kin = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
+    covariance = np.kron(kin, one) + np.eye(pieces * len(one)) * (POWER_FLOOR**2 + 0.01**2)
+    parity = np.array([part.parity_dn[lines] for part in first.fixed.values()])
+    pixel = np.array([4.0 * part.white_dn2 / size for part in first.fixed.values()])
+    offset = np.array([4.0 * part.line_dn2[lines] * length / size for part in first.fixed.values()])
+    parity_cov = (
+        np.sqrt(np.outer(pixel, pixel)) * kin + np.sqrt(np.outer(offset, offset)) + np.eye(pieces) * CELL_FLOOR_DN**2
+    )
+    n = len(covariance)
+    whole = np.zeros((n + pieces, n + pieces))
+    whole[:n, :n], whole[n:, n:] = covariance, parity_cov
+    labels += [Label(0.5, "all", "odd and even", part.captures, out) for out, part in first.fixed.items()]
+    std = np.sqrt(np.diag(parity_cov))
+
+    def predict(effects: Effects) -> Prediction:
+        still, moving, odd = np.zeros(len(frequency)), np.zeros(len(frequency)), 0.0
+        for one in Uniform(study.camera, effects).lines:
+            if one.lines == lines:
+                still += one.spectrum_e2(frequency, fixed=True)
+                moving += one.spectrum_e2(frequency, fixed=False)
+                odd += one.odd_even_e
+        parts = zip(factor, first.fixed.values(), strict=True)
+        power = np.concatenate([np.log1p(f * bands.mean(still + moving / part.frames)) for f, part in parts])
+        return Prediction(np.concatenate([power, np.full(pieces, study.noise.gain * odd)]), {})
+
+    return Block(
+        measurement=ROW_PATTERN if lines == "rows" else COLUMN_PATTERN, reach=0.1,
+        value=np.concatenate([*value, parity]), covariance=whole, labels=tuple(labels),
+        reads=LINES, predict=predict,
+        scale=np.concatenate([np.ones(n), 10.0 * std]),
+    )  # fmt: skip
+
+
+def _fixed_share(frames: DarkStatistics) -> dict[bool, float]:
+    """Share of a mean frame's pixel variance that is fixed, and so the same in seen and held-out frames."""
+    changing = next((c.white_dn2 for c in frames.changing.values()), None)
+    if changing is None:
+        return dict.fromkeys(frames.fixed, 0.0)
+    return {
+        out: float(np.clip(1.0 - changing / part.frames / part.white_dn2, 0.0, 1.0))
+        for out, part in frames.fixed.items()
+    }
+
+
+def correlation_block(study: Study) -> Block:
+    """Spectrum within rows and columns at low frequencies, over that of the band above: white noise has none to spare."""
+    fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
+    value, variance, labels = [], [], []
+    for out, part in by_part(fine).items():
+        ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
+        weight = np.array([min(c.contrasts, 6) for c in part], float)
+        for lines in ("rows", "columns"):
+            frequency = part[0].along[lines][0]
+            if len(frequency) < 1:
+                continue
+            power = np.average([c.along[lines][1] for c in part], axis=0, weights=weight)
+            modes = np.sum([c.along[lines][2] for c in part], axis=0)
+            level = sum(c.lines[lines][2] for c in part)
+            bands = Bands.of(frequency, 3)
+            total = np.array([modes[a:b].sum() for a, b in zip(bands.first, bands.last, strict=True)])
+            value.append(np.log(bands.mean(power)))
+            variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
+            labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
+    if not labels:
+        raise NotDetermined("dark_correlation", "the frames are too small to show noise that neighbours share")
+    n = len(labels)
+    # what lines share leaves no trace within them: where there is one, it wasn't the lines
+    return Block(
+        measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),
+        covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,
+        predict=lambda effects: Prediction(np.zeros(n), {}), scale=np.ones(n),
+    )  # fmt: skip
+
+
+DARK_CORRELATION = Measurement(
+    "dark_correlation",
+    title="correlation along the lines of dark frames",
+    order=180,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=correlation_block,
+    conditions="direction",
+)
+ROW_NOISE = Measurement(
+    "dark_row_noise",
+    title="row noise of dark frames",
+    order=140,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(temporal_line_block, "rows"),
+)
+COLUMN_NOISE = Measurement(
+    "dark_column_noise",
+    title="column noise of dark frames",
+    order=150,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(temporal_line_block, "columns"),
+)
+ROW_PATTERN = Measurement(
+    "dark_row_pattern",
+    title="fixed row pattern of dark frames",
+    order=160,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(fixed_line_block, "rows"),
+    conditions="pattern",
+)
+COLUMN_PATTERN = Measurement(
+    "dark_column_pattern",
+    title="fixed column pattern of dark frames",
+    order=170,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=partial(fixed_line_block, "columns"),
+    conditions="pattern",
+)

@@ -1,0 +1,113 @@
+"""The temporal variance of dark frames by exposure and temperature."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.dark_frames import CLIP, DEFECTS, captures_of, dark_frames, too_coarse
+from lab.diagnose.measurements.dark_level import added_dark_e_per_s
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+VARIANCE_FLOOR = 0.004  # of a temporal variance
+LEAST_NOISE_DN = 0.4  # below, codes are too coarse to say what the temporal noise is
+
+
+def dark_noise_block(study: Study) -> Block:
+    """Temporal variance of dark frames by exposure and temperature: it grows with the dark charge, and not with an offset."""
+    frames = study.once(dark_frames)
+    points = [(f, out, c) for f in frames for out, c in f.changing.items()]
+    if not points:
+        raise NotDetermined("dark_noise", "no two dark frames of the same exposure and temperature")
+    value = np.array([c.variance_dn2 for *_, c in points])
+    if np.sqrt(value.min()) < LEAST_NOISE_DN:
+        raise NotDetermined("dark_noise", too_coarse([f for f, *_ in points], LEAST_NOISE_DN))
+    size = study.camera.rows * study.camera.cols
+    noise = study.noise
+    exposures = np.array([f.condition.exposure_s for f, *_ in points])
+    count = np.array([c.contrasts for *_, c in points])
+    lines = np.array(
+        [
+            c.line_dn2["rows"] ** 2 / study.camera.rows + c.line_dn2["columns"] ** 2 / study.camera.cols
+            for *_, c in points
+        ]
+    )
+    # codes as coarse as the noise round it up or down, with where the level lies between two
+    bare = np.maximum(value - 1.0 / 12.0, 0.0)
+    coarse = (4.0 * bare + 0.1) * np.exp(-2.0 * np.pi**2 * bare)
+    covariance = np.diag(
+        2.0 * value**2 / (size * count) + 2.0 * lines / count + (VARIANCE_FLOOR * value) ** 2 + coarse**2
+    )
+    dark = noise.gain * noise.dark_dn_per_s * exposures
+    shortest = float(value[int(np.argmin(exposures))])
+    base = shortest + dark - float(dark.min())
+    # without flats nothing measures the gain; where it isn't stated either, it is anything
+    flats = len(study.flat_levels()) > 1
+    gain_std = 0.05 if flats else 0.3 if study.stated.conversion_gain_dn_per_e is not None else 10.0
+
+    def predict(effects: Effects) -> Prediction:
+        mean = base.copy()
+        shot = dark.copy()
+        model, grid = Uniform(study.camera, effects), np.linspace(0.0, 0.5, 65)
+        lines = sum((float(np.mean(one.spectrum_e2(grid, fixed=False))) for one in model.lines), 0.0)
+        for i, (f, *_) in enumerate(points):
+            t, temperature = f.condition.exposure_s, f.condition.temperature_c
+            shot[i] += noise.gain**2 * added_dark_e_per_s(study, effects, temperature) * t
+            mean[i] += shot[i] - dark[i]
+            mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
+        jacobian = {
+            "dark_read": np.full(len(points), 0.5 * shortest + 0.1),
+            "dark": noise.gain * exposures * noise.dark_std,
+        }
+        jacobian["gain" if flats else "dark_gain"] = gain_std * shot
+        return Prediction(mean, jacobian)
+
+    return Block(
+        measurement=DARK_NOISE, reach=float(max(np.ptp(exposures), 1e-3)), value=value,
+        covariance=covariance,
+        labels=tuple(Label(f.condition.exposure_s, "all", f.condition.name, captures_of(f, out), out) for f, out, _ in points),
+        reads=DEFECTS | {"charge.dark_current", "signal.lines"}, predict=predict, scale=value,
+    )  # fmt: skip
+
+
+def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn2: float) -> float:
+    """What defective pixels add to the mean variance (DN^2), contrasts cut off at CLIP standard deviations."""
+    cut = CLIP * np.sqrt(variance_dn2)
+    more = 0.0
+    for hot in model.hot:
+        share, excess_e_per_s = hot.nodes()
+        noisy = variance_dn2 + gain**2 * excess_e_per_s * exposure_s
+        more += float(share @ (_cut_square(np.zeros_like(noisy), noisy, cut) - variance_dn2))
+    for jumps in model.telegraph:
+        share, distance_e = jumps.nodes()
+        # two frames: both high or both low half of the time
+        apart = gain * distance_e / np.sqrt(2.0)
+        still = np.full_like(apart, variance_dn2)
+        apart_square = _cut_square(apart, still, cut)
+        more += float(share @ (0.5 * (apart_square - variance_dn2)))
+    return more
+
+
+def _cut_square(mean: FloatArray, variance: FloatArray, cut: float) -> FloatArray:
+    """Mean of the square of a normal variable that is cut off at +-cut."""
+    s = np.sqrt(variance)
+    a, b = (-cut - mean) / s, (cut - mean) / s
+    pa, pb = (np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) for x in (a, b))
+    inside = ndtr(b) - ndtr(a)
+    square = (mean**2 + variance) * inside + 2.0 * mean * s * (pa - pb) + variance * (a * pa - b * pb)
+    return np.asarray(square + cut**2 * (1.0 - inside))
+
+
+DARK_NOISE = Measurement(
+    "dark_noise",
+    title="temporal noise of dark frames",
+    order=120,
+    axis="exposure",
+    unit="s",
+    make=dark_noise_block,
+    conditions="exposure and temperature",
+)

@@ -1,0 +1,273 @@
+"""Defective pixels in dark frames: counts of pixels that are off in every frame, and of pixels that flicker from frame to frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import betainc, chdtrc, chdtri, gammaln, ndtr, xlogy
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.dark_frames import (
+    DEFECTS,
+    TAIL_EDGES,
+    DarkCondition,
+    DarkPattern,
+    DarkStatistics,
+    by_part,
+    captures_of,
+    dark_frames,
+    fine_conditions,
+)
+from lab.diagnose.measurements.study import Study
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+LEAST_COUNTED_DN = 0.6  # the same of single pixels, whose far tail counts
+#: Of the first edge, which one pixel in 1e5 passes by chance: edges of the bins of temporal variance.
+FLICKER_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
+FLICKER_CHANCE = 1e-5
+JUMPS = 256  # draws of which frames of a jumping pixel are high
+#: What a root of a count may be off by beside chance (about 1 where many are expected): one odd pixel more is no finding.
+COUNT_STD = 0.6
+
+
+def _rooted(counts: FloatArray) -> FloatArray:
+    """Roots of counts, of standard deviation 1 whatever the count (Anscombe 1948)."""
+    return np.asarray(2.0 * np.sqrt(counts + 0.375))
+
+
+def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
+    """Chance (1 where many are expected), and what the expected counts themselves are uncertain by."""
+    number = np.arange(60.0)
+    mean = np.minimum(expected, 20.0)[:, None]
+    share = np.exp(xlogy(number, mean) - mean - gammaln(number + 1.0))
+    chance = share @ np.square(_rooted(number)) - np.square(share @ _rooted(number))
+    return np.diag(chance + COUNT_STD**2 + np.square(_rooted(expected + uncertain) - _rooted(expected)))
+
+
+def defective_pixel_block(study: Study) -> Block:
+    """How many pixels lie far from their surroundings in the median of repeats, by how far and by exposure: hot pixels are the
+    same in every frame, and bright in proportion to the exposure."""
+    frames = [f for f in study.once(dark_frames) if f.fixed]
+    points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
+    value = np.concatenate([_rooted(part.counts) for *_, part in points])
+    size = study.camera.rows * study.camera.cols
+    bins = len(points[0][2].counts)
+    own = [_pixel_noise(study, f, part) for f, _, part in points]
+
+    def expected(effects: Effects, times: float = 1.0) -> FloatArray:
+        found = []
+        for (f, _, part), (moving, fixed) in zip(points, own, strict=True):
+            classes = _defect_classes(Uniform(study.camera, effects), study.noise.gain, f.condition.exposure_s)
+            skew = times * part.skewness * (part.spread_dn / moving) ** 3
+            found.append(
+                size * _tail_shares(classes, moving, fixed, part.of_median, part.spread_dn, study.noise.gain, skew)
+            )
+        return np.concatenate(found)
+
+    low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]])
+    labels = tuple(
+        Label(float(low[b]), "all", f.condition.name, part.captures, out)
+        for f, out, part in points
+        for b in range(bins)
+    )
+    base = expected(())
+    # a skewness says little of the far tail
+    uncertain = np.abs(expected((), 2.0) - expected((), 0.0)) + 0.2 * base
+    return Block(
+        measurement=DEFECTIVE_PIXELS, reach=1.0, value=value,
+        covariance=_count_covariance(base, uncertain), labels=labels, reads=DEFECTS,
+        predict=lambda effects: Prediction(_rooted(expected(effects)), {}), scale=np.full(len(value), 10.0),
+        along=np.tile(np.sign(low) * np.log(np.abs(low)), len(points)),
+    )  # fmt: skip
+
+
+def _pixel_noise(study: Study, frames: DarkStatistics, part: DarkPattern) -> tuple[float, float]:
+    """(temporal, fixed) standard deviation of single pixels in DN: their median's spread less what the frames' noise leaves of it."""
+    moving = next((c.pixel_dn2 for c in frames.changing.values()), None)
+    left = _order_moments(part.of_median)[1]
+    if moving is None:  # of a lone frame all counts as noise
+        return max(part.spread_dn, 0.05), 0.0
+    return max(float(np.sqrt(moving)), 0.05), float(np.sqrt(max(part.spread_dn**2 - left * moving, 0.0)))
+
+
+def _order_moments(n: int) -> tuple[float, float]:
+    """Mean and variance of the lower median of n standard normal numbers."""
+    return {1: (0.0, 1.0), 2: (-0.5642, 0.6817), 3: (0.0, 0.4487), 4: (-0.2970, 0.3605), 5: (0.0, 0.2868)}[n]
+
+
+@dataclass(frozen=True)
+class _DefectClass:
+    """Pixels of one kind: their share, additional dark signal and distance of two levels in DN."""
+
+    share: float
+    more_dn: float
+    jump_dn: float
+
+
+def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_DefectClass]:
+    found = []
+    for hot in model.hot:
+        found += [_DefectClass(float(s), gain * float(x) * exposure_s, 0.0) for s, x in zip(*hot.nodes(), strict=True)]
+    for jumps in model.telegraph:
+        found += [_DefectClass(float(s), 0.0, gain * float(x)) for s, x in zip(*jumps.nodes(), strict=True)]
+    return found
+
+
+def _tail_shares(
+    classes: Sequence[_DefectClass], moving: float, fixed: float, frames: int, spread: float, gain: float, skew: float
+) -> FloatArray:
+    """Shares of all pixels in the bins of TAIL_EDGES: a pixel's lower median of `frames` numbers of noise `moving`, on a normal
+    fixed deviation `fixed`, is compared with `spread` times the edges."""
+    low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]]) * spread + _order_moments(frames)[0] * moving
+    u = np.linspace(-7.5, 7.5, 61) if fixed > 0.02 * moving else np.zeros(1)
+    weight = np.exp(-0.5 * u * u)
+    weight /= weight.sum()
+    rest = 1.0 - sum(c.share for c in classes)
+    share = np.array([max(rest, 0.0), *(c.share for c in classes)])
+    more = np.array([0.0, *(c.more_dn for c in classes)])
+    jump = np.array([0.0, *(c.jump_dn for c in classes)])
+    s = np.sqrt(moving**2 + gain * more)
+    at = low[None, :, None] - fixed * u[None, None, :] - more[:, None, None]
+    z = [(at + sign * 0.5 * jump[:, None, None]) / s[:, None, None] for sign in (1.0, -1.0)]
+    single = [_upper(part, skew) for part in z]
+    above = np.clip(0.5 * (single[0] + single[1]), 0.0, 1.0)
+    # the (n - k)-th highest of n is above where n - k of them are at least
+    needed = frames - (frames - 1) // 2
+    if frames > 1:
+        above = betainc(needed, frames - needed + 1, above)
+    beyond = (above * weight).sum(axis=2)
+    up = beyond[:, : len(TAIL_EDGES)]
+    up = up - np.concatenate([up[:, 1:], np.zeros((len(share), 1))], axis=1)
+    down = 1.0 - beyond[:, len(TAIL_EDGES) :]
+    down = np.stack([down[:, 0] - down[:, 1], down[:, 1]], axis=1)
+    return np.asarray(share @ np.concatenate([np.maximum(up, 0.0), np.maximum(down, 0.0)], axis=1))
+
+
+def _upper(z: FloatArray, skew: float) -> FloatArray:
+    """Probability of more than z of a variable of variance 1 and a small skewness (Edgeworth's first term)."""
+    return np.asarray(ndtr(-z) + np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) * skew / 6.0 * (z * z - 1.0))
+
+
+def flickering_pixel_block(study: Study) -> Block:
+    """How many pixels change from frame to frame far more than their surroundings, all dark frames together."""
+    fine = fine_conditions("flickering_pixels", study.once(dark_frames), LEAST_COUNTED_DN)
+    parts = {out: [f for f in fine if out in f.changing] for out in by_part(fine)}
+    size = study.camera.rows * study.camera.cols
+    value, labels, sums = [], [], []
+    for out, part in parts.items():
+        freedom = sum(f.changing[out].contrasts for f in part)
+        edges = _flicker_edges(freedom)
+        total = np.sum([f.changing[out].squares for f in part], axis=0)
+        value.append(_rooted(np.histogram(total, [*edges, np.inf])[0].astype(float)))
+        ids = tuple(i for f in part for i in captures_of(f, out))
+        labels += [Label(float(x), "all", "all exposures", ids, out) for x in edges / freedom]
+        sums.append((out, part, freedom, edges))
+    draws = {id(f): _jump_sums(f.condition) for f in fine}
+
+    def expected(effects: Effects) -> FloatArray:
+        model, found = Uniform(study.camera, effects), []
+        for out, part, freedom, edges in sums:
+            shares = _chance_above(np.array([freedom], float), np.zeros(1), edges)[0]
+            for hot in model.hot:
+                weight, rate = hot.nodes()
+                shares = shares + weight @ (_hot_above(study, part, out, rate, edges) - shares)
+            for jumps in model.telegraph:
+                weight, distance_e = jumps.nodes()
+                above = _jump_above(study, part, out, draws, distance_e, edges, freedom)
+                shares = shares + weight @ (above - shares)
+            found.append(size * (shares - np.append(shares[1:], 0.0)))
+        return np.maximum(np.concatenate(found), 0.0)
+
+    base = expected(())
+    position = np.array([label.x for label in labels])
+    return Block(
+        measurement=FLICKERING_PIXELS, reach=1.0,
+        value=np.concatenate(value), covariance=_count_covariance(base, base), labels=tuple(labels),
+        reads=DEFECTS, predict=lambda effects: Prediction(_rooted(expected(effects)), {}),
+        scale=np.full(len(base), 10.0), along=np.log(position),
+    )  # fmt: skip
+
+
+def _flicker_edges(freedom: int) -> FloatArray:
+    return np.asarray(float(chdtri(freedom, FLICKER_CHANCE)) * np.array(FLICKER_EDGES))
+
+
+def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray) -> FloatArray:
+    """Probability that a chi-squared variable is above the edges, (n, edges): exact where it is central, else its cube root is
+    taken as normal (Abdel-Aty 1954)."""
+    if not np.any(noncentral):
+        return np.asarray(chdtrc(freedom[:, None], edges[None, :]))
+    a = (freedom + noncentral)[:, None]
+    b = (noncentral / (freedom + noncentral))[:, None]
+    variance = 2.0 * (1.0 + b) / (9.0 * a)
+    return np.asarray(ndtr(-(np.cbrt(edges[None, :] / a) - 1.0 + variance) / np.sqrt(variance)))
+
+
+def _hot_above(
+    study: Study, part: Sequence[DarkStatistics], out: bool, rate: FloatArray, edges: FloatArray
+) -> FloatArray:
+    """(rates, edges): hot pixels have more shot noise, the more the longer the exposure; by the first two moments."""
+    count = np.array([f.changing[out].contrasts for f in part], float)
+    noise = np.array([f.changing[out].pixel_dn2 for f in part])
+    charge = study.noise.gain**2 * rate[:, None] * np.array([f.condition.exposure_s for f in part])
+    factor = 1.0 + charge / noise
+    mean, variance = factor @ count, 2.0 * np.square(factor) @ count
+    scale = variance / (2.0 * mean)
+    freedom = mean / scale
+    return np.asarray(chdtrc(freedom[:, None], edges[None, :] / scale[:, None]))
+
+
+def _jump_above(
+    study: Study,
+    part: Sequence[DarkStatistics],
+    out: bool,
+    draws: Mapping[int, Mapping[bool, FloatArray]],
+    amplitude_e: FloatArray,
+    edges: FloatArray,
+    freedom: int,
+) -> FloatArray:
+    """(amplitudes, edges): mean over which of the frames are high."""
+    unit = np.sum([draws[id(f)][out] / f.changing[out].pixel_dn2 for f in part], axis=0)
+    found = []
+    for amplitude in amplitude_e:
+        away = np.square(study.noise.gain * amplitude) * unit
+        found.append(_chance_above(np.full(len(away), float(freedom)), np.maximum(away, 1e-9), edges).mean(axis=0))
+    return np.array(found)
+
+
+def _jump_sums(condition: DarkCondition) -> dict[bool, FloatArray]:
+    """Sums of squared contrasts (seen, held out) of numbers that are -1/2 or 1/2 at random, JUMPS draws: always the same ones."""
+    n, seen = len(condition.captures), len(condition.seen)
+    rng = np.random.default_rng([n, seen, round(1e6 * condition.exposure_s)])
+    state = rng.integers(0, 2, (JUMPS, n)) - 0.5
+    square: dict[bool, FloatArray] = {False: np.zeros(JUMPS), True: np.zeros(JUMPS)}
+    mean = np.zeros(JUMPS)
+    for k in range(n):
+        if k:
+            square[k >= seen] += (state[:, k] - mean) ** 2 * k / (k + 1.0)
+        mean += (state[:, k] - mean) / (k + 1.0)
+    return square
+
+
+DEFECTIVE_PIXELS = Measurement(
+    "defective_pixels",
+    title="defective pixels",
+    order=190,
+    axis="deviation",
+    unit="sigma",
+    make=defective_pixel_block,
+    conditions="exposure and temperature",
+)
+
+
+FLICKERING_PIXELS = Measurement(
+    "flickering_pixels",
+    title="flickering pixels",
+    order=195,
+    axis="variance",
+    unit="times their surroundings'",
+    make=flickering_pixel_block,
+)

@@ -1,0 +1,99 @@
+"""Mean frames of uniform light, and the ratio of the two green planes in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lab.capture_kinds.dark import DarkCapture
+from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.study import Study
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+
+@dataclass(frozen=True)
+class FlatLevel:
+    """Frames of even light at one setting: means above black by plane (DN), over its frames; `relative`: their sum by pixel over
+    the planes' means, and how many DN of signal that holds."""
+
+    captures: tuple[Any, ...]
+    held_out: bool
+    mean: dict[str, float]
+    ratios: tuple[float, ...]  # of the two greens, frame by frame, less 1
+
+
+def _unclipped(study: Study, capture: Any) -> bool:
+    return all(m is not None for m in study.levels(capture).mean.values())
+
+
+def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, float]]]:
+    """Unclipped flats by level; and for what is seen (False) and what is held out the sum of their frames above black, each
+    plane over its mean, with weights by signal, and the variance of that by shot and read noise, a pixel."""
+    out = study.once(held_out_flats)
+    levels: list[FlatLevel] = []
+    total: dict[bool, Any] = {}
+    weights: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
+    for group in study.flat_levels():
+        for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
+            part = [c for c in part if _unclipped(study, c)]  # noqa: PLW2901
+            if not part:
+                continue
+            held_out = part[0].id in out
+            means, ratios = [], []
+            for capture in part:
+                frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(
+                    dark_level_dn(study, capture)
+                )
+                own = {n: float(p.mean(dtype=float)) for n, p in mosaic.planes(frame, study.camera.cfa).items()}
+                means.append(own)
+                if "G1" in own:
+                    ratios.append(green_ratio(study, frame))
+                weight = float(np.mean(list(own.values())))
+                if weight < 10.0 * study.noise.read_dn:
+                    continue
+                for name, plane in mosaic.planes(frame, study.camera.cfa).items():
+                    np.multiply(plane, np.float32(weight / own[name]), out=plane)
+                total[held_out] = total[held_out] + frame if held_out in total else frame
+                noise = sum((study.noise.gain * m + study.noise.read_dn**2) / m**2 for m in own.values()) / len(own)
+                weights[held_out].append((weight, noise))
+            mean = {n: float(np.mean([m[n] for m in means])) for n in means[0]}
+            levels.append(FlatLevel(tuple(part), held_out, mean, tuple(ratios)))
+    images = {}
+    for held_out, image in total.items():
+        w = np.array(weights[held_out])
+        share = w[:, 0] / w[:, 0].sum()
+        images[held_out] = image / np.float32(w[:, 0].sum()), float(np.sum(np.square(share) * w[:, 1]))
+    return sorted(levels, key=lambda u: sum(u.mean.values())), images
+
+
+def dark_level_dn(study: Study, capture: Any) -> float:
+    return study.noise.black + study.noise.dark_dn_per_s * float(capture.exposure_s)
+
+
+def _green_dark(study: Study) -> float:
+    """Mean of the greens on red rows less that of those on blue rows in the dark, DN: columns' offsets and the like."""
+    captures = study.recordings.captures(DarkCapture, study.side)[:16]
+    pairs = [green_planes(study, np.asarray(study.recordings.frame(c), np.float32)) for c in captures]
+    return float(np.mean([float(a.mean(dtype=float)) - float(b.mean(dtype=float)) for a, b in pairs])) if pairs else 0.0
+
+
+def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
+    """The green pixels on red rows, but for the outermost, and for each the mean of the four on blue rows across its corners: a slope
+    of the light falls on both alike."""
+    row, col = mosaic.phases(study.camera.cfa)["G"][0]
+    red_rows = frame[row + 2 * (row == 0) : -1 : 2, col + 2 * (col == 0) : -1 : 2]
+    first = row + 2 * (row == 0) - 1, col + 2 * (col == 0) - 1
+    blue_rows = frame[first[0] :: 2, first[1] :: 2]
+    rows, cols = red_rows.shape
+    corners = [blue_rows[i : i + rows, j : j + cols] for i in (0, 1) for j in (0, 1)]
+    return red_rows, 0.25 * (corners[0] + corners[1] + corners[2] + corners[3])
+
+
+def green_ratio(study: Study, frame: Any) -> float:
+    """Of a frame above black, less 1."""
+    red_rows, blue_rows = green_planes(study, frame)
+    below = max(float(blue_rows.mean(dtype=float)), 1e-3)
+    return (float(red_rows.mean(dtype=float)) - study.once(_green_dark)) / below - 1.0

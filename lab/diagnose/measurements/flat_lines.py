@@ -1,0 +1,89 @@
+"""Lines in uniform light: steps where read-outs meet, and the difference of even and odd rows and columns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.diagnose.measurements.block import Block, Label, Measurement, Prediction
+from lab.diagnose.measurements.even_flats import flats
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+LINE_FLOOR = 1e-4  # of a step in an even field's lines
+#: Where read-outs meet, as shares of a side.
+MEETING = (0.25, 0.5, 0.75)
+
+
+def line_block(study: Study) -> Block:
+    """Mean flats, each plane over its mean: steps in the lines' means at halves and quarters of a side, and what even and odd lines
+    of a plane differ by. How uncertain a step is, steps everywhere else say."""
+    _, images = study.once(flats)
+    if not images:
+        raise NotDetermined("flat_lines", "no unclipped flat captures")
+    period = mosaic.step(study.camera.cfa)
+    levels = study.once(flats)[0]
+    values: list[float] = []
+    labels: list[Label] = []
+    whole: list[tuple[float, float]] = []
+    for held_out, (image, noise) in sorted(images.items()):
+        members = tuple(c.id for u in levels if u.held_out == held_out for c in u.captures)
+        for axis, name in ((0, "column"), (1, "row")):
+            line = np.asarray(image.mean(axis=axis, dtype=float))
+            shot = noise / image.shape[axis]
+            for share, value, std, size in _steps(line, period, study.noise.prnu / np.sqrt(image.shape[axis])):
+                values.append(value)
+                whole.append((std**2 + LINE_FLOOR**2, shot * size))
+                labels.append(Label(share * len(line), name, f"{name} {share * len(line):.0f}", members, held_out))
+            value, std = _stripes(line, period, study.noise.prnu / np.sqrt(image.shape[axis]))
+            values.append(value)
+            whole.append((std**2 + LINE_FLOOR**2, shot * 4.0 / len(line)))
+            labels.append(Label(0.0, name, f"even and odd {name}s", members, held_out))
+    covariance = np.diag([total for total, _ in whole])
+    conditions = [label.condition for label in labels]
+    for i, label in enumerate(labels):
+        for j in range(i):
+            if conditions[j] == label.condition:  # the same pixels, seen and held out: only the noise is another
+                covariance[i, j] = covariance[j, i] = min(max(whole[k][0] - whole[k][1], 0.0) for k in (i, j))
+    return Block(
+        measurement=FLAT_LINES, reach=1.0, value=np.array(values), covariance=covariance, labels=tuple(labels),
+        reads=frozenset(), predict=lambda effects: Prediction(np.zeros(len(values)), {}), scale=np.ones(len(values)),
+    )  # fmt: skip
+
+
+def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, float, float, float]]:
+    """(share of the side, step, its standard uncertainty, variance a line of variance 1 would give it) where read-outs meet: of a
+    straight line with a step in `width` lines on either side, fitted."""
+    width = max(len(line) // 16 // (2 * period) * 2 * period, 4 * period)
+    x = np.arange(-width, width) + 0.5
+    design = np.stack([np.ones_like(x), x, x > 0], axis=1)
+    weight = np.linalg.pinv(design)[2]
+    every = np.convolve(line, weight[::-1], mode="valid")  # at boundaries width, width + 1, ...
+    size = float(np.sum(weight * weight))
+    at = {share: round(share * len(line) / period) * period for share in MEETING}
+    far = np.ones(len(every), bool)
+    for b in at.values():
+        far[max(b - 2 * width, 0) : max(b, 0) + 1] = False
+    others = every[::period][far[::period]]
+    spread = 1.4826 * float(np.median(np.abs(others - np.median(others)))) if len(others) >= 8 else 0.0
+    std = max(spread, least * np.sqrt(size))
+    return [(share, float(every[b - width]), std, size) for share, b in at.items() if 0 <= b - width < len(every)]
+
+
+def _stripes(line: FloatArray, period: int, least: float) -> tuple[float, float]:
+    """Mean of the even lines of a plane less that of the odd ones, and its standard uncertainty by how lines four periods apart
+    depart from a straight line."""
+    lag = 4 * period
+    pairs = line[: len(line) // (2 * period) * 2 * period].reshape(-1, 2, period)
+    value = float((pairs[:, 0] - pairs[:, 1]).mean())
+    # the light's slope from a line to the next of the plane
+    slope = float(np.mean(line[-lag:] - line[:lag])) / (len(line) - lag) * period
+    bend = line[2 * lag :] - 2.0 * line[lag:-lag] + line[: -2 * lag]
+    one = max(1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0), least)
+    return value + slope, one * 2.0 / np.sqrt(len(line))
+
+
+FLAT_LINES = Measurement(
+    "flat_lines", title="lines in flat fields", order=260, axis="field", unit="px", make=line_block
+)

@@ -1,0 +1,169 @@
+"""The two greens of a mosaic against each other in uniform light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lab.capture_kinds.narrowband import NarrowbandCapture
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.even_flats import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
+from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
+from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.frame import collected_mosaic
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+GREEN_FLOOR = 1e-4  # of a ratio: what two greens that are alike may differ by
+GREEN_NOISE = 0.02  # of a ratio: what a frame's has to be known to
+CELLS = (3, 4)
+TILE_ROWS, TILE_COLS = 64, 4  # uniform light on which the effects act
+
+
+@dataclass(frozen=True)
+class _Ratio:
+    """One ratio of the greens less 1, with what makes it uncertain by itself."""
+
+    value: float
+    std: float
+    x: float
+    condition: str
+    captures: tuple[str, ...]
+    held_out: bool
+    mean: dict[str, float]  # by channel, DN
+    exposure_s: float
+    elapsed_s: float
+
+
+def green_block(study: Study) -> Block:
+    """Signal of the green pixels on red rows over that of those on blue rows, less 1: by level of flats, by wavelength, and by
+    place relative to the frame's."""
+    if study.camera.cfa == "MONO":
+        raise NotDetermined("green_balance", "the camera has no colour mosaic")
+    levels, images = study.once(flats)
+    rows_dn2 = _rows_dn2(study, levels)
+    every = *_by_level(study, levels, rows_dn2), *_by_wavelength(study, rows_dn2)
+    ratios = [r for r in every if r.std < GREEN_NOISE]
+    if not ratios:
+        raise NotDetermined("green_balance", "no unclipped flat or narrowband captures")
+    pixels = (study.camera.rows // 2) * (study.camera.cols // 2)
+    common = 2.0 * study.noise.prnu**2 / pixels
+    value = np.array([r.value for r in ratios])
+    covariance = np.diag([r.std**2 + GREEN_FLOOR**2 for r in ratios]) + common
+    labels = [Label(r.x, "G", r.condition, r.captures, r.held_out) for r in ratios]
+    number = CELLS[0] * CELLS[1]
+    for held_out, (image, noise) in sorted(images.items()):  # what is seen first
+        red_rows, blue_rows = green_planes(study, image)
+        place = _cell_means(red_rows) / _cell_means(blue_rows)
+        members = tuple(c.id for u in levels if u.held_out == held_out for c in u.captures)
+        value = np.concatenate([value, (place / place.mean() - 1.0).ravel()])
+        labels += [Label(0.0, "G", f"cell {k // CELLS[1]},{k % CELLS[1]}", members, held_out) for k in range(number)]
+        size, one = len(covariance), 2.0 * number / pixels
+        bigger = np.zeros((size + number, size + number))
+        bigger[:size, :size] = covariance
+        centred = np.eye(number) - 1.0 / number
+        bigger[size:, size:] = one * (study.noise.prnu**2 + noise) * centred + GREEN_FLOOR**2 * np.eye(number)
+        if held_out and False in images:
+            # the pixels' own responses are the same in both
+            bigger[size:, size - number : size] = one * study.noise.prnu**2 * centred
+            bigger[size - number : size, size:] = one * study.noise.prnu**2 * centred
+        covariance = bigger
+    cells = len(value) - len(ratios)
+
+    def predict(effects: Effects) -> Prediction:
+        acting = any(act_on(effects, GREENS))
+        found = [_predicted_ratio(r, effects, study) if acting else 0.0 for r in ratios]
+        return Prediction(np.concatenate([found, np.zeros(cells)]), {})
+
+    return Block(
+        measurement=GREEN_BALANCE, reach=25.0, value=value, covariance=covariance, labels=tuple(labels),
+        reads=GREENS, predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
+    """What the greens' difference in two frames of a level differs by beyond shot and read noise (DN^2): rows that are read with noise
+    of their own."""
+    excess, weights = 0.0, 0.0
+    for u in levels:
+        signal = u.mean["G2"]
+        if len(u.ratios) > 1 and signal > 0:
+            shot = _shot_dn2(study, signal)
+            weight = (len(u.ratios) - 1) / shot**2
+            excess += weight * (float(np.var(u.ratios, ddof=1)) * signal**2 - shot)
+            weights += weight
+    # what chance makes of none isn't taken for some
+    return max(excess / weights - weights**-0.5, 0.0) if weights > 0 else 0.0
+
+
+def _shot_dn2(study: Study, signal: float) -> float:
+    """Variance of the difference of the greens' means in one frame by shot and read noise, DN^2."""
+    pixels = (study.camera.rows // 2) * (study.camera.cols // 2)
+    return 2.0 * (study.noise.gain * signal + study.noise.read_dn**2) / pixels
+
+
+def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> list[_Ratio]:
+    found = []
+    for u in levels:
+        signal = u.mean["G2"]
+        if signal <= 0:
+            continue
+        dn2 = (_shot_dn2(study, signal) + rows_dn2) / len(u.ratios) + 2.0 * BLACK_FLOOR_DN**2
+        std = float(np.sqrt(dn2)) / signal
+        c = u.captures[0]
+        mean = {"R": u.mean["R"], "G": 0.5 * (u.mean["G1"] + signal), "B": u.mean["B"]}
+        found.append(
+            _Ratio(float(np.mean(u.ratios)), std, 0.0, f"{signal:.4g} DN", tuple(c.id for c in u.captures), u.held_out, mean, c.exposure_s, study.elapsed_s(c))
+        )  # fmt: skip
+    return found
+
+
+def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
+    found = []
+    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    for i, group in enumerate(groups):
+        for capture in group:
+            if study.levels(capture).mean["G"] is None:
+                continue
+            frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(dark_level_dn(study, capture))
+            own = {n: float(p.mean(dtype=float)) for n, p in mosaic.planes(frame, study.camera.cfa).items()}
+            signal = own["G2"]
+            if signal < 5.0:
+                continue
+            dn2 = _shot_dn2(study, signal) + rows_dn2 + 2.0 * BLACK_FLOOR_DN**2
+            found.append(
+                _Ratio(
+                    green_ratio(study, frame), float(np.sqrt(dn2)) / signal, capture.wavelength_nm,
+                    f"{capture.wavelength_nm:g} nm", (capture.id,), i % 3 == 1, {"R": own["R"], "G": 0.5 * (own["G1"] + signal), "B": own["B"]},
+                    capture.exposure_s, study.elapsed_s(capture),
+                )
+            )  # fmt: skip
+    return found
+
+
+#: Quantities of the stages that even light's fine structure depends on.
+GREENS = frozenset({"light.rows", "charge.collected", "charge.kernels"})
+
+
+def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:
+    shape = TILE_ROWS, TILE_COLS
+    electrons = {c: np.full(shape, max(m, 0.0) / study.noise.gain) for c, m in ratio.mean.items()}
+    tile = mosaic.assemble(electrons, study.camera.cfa)
+    tile = collected_mosaic(study.camera, tile, effects, exposure_s=ratio.exposure_s, elapsed_s=ratio.elapsed_s)
+    planes = mosaic.planes(tile, study.camera.cfa)
+    return float(planes["G1"].mean() / max(float(planes["G2"].mean()), 1e-9)) - 1.0
+
+
+def _cell_means(plane: FloatArray) -> FloatArray:
+    rows, cols = (np.linspace(0, n, k + 1).astype(int) for n, k in zip(plane.shape, CELLS, strict=True))
+    sums = np.add.reduceat(np.add.reduceat(np.asarray(plane, float), rows[:-1], 0), cols[:-1], 1)
+    return np.asarray(sums / np.outer(np.diff(rows), np.diff(cols)))
+
+
+GREEN_BALANCE = Measurement(
+    "green_balance", title="balance of the two greens", order=250, axis="wavelength", unit="nm", make=green_block
+)

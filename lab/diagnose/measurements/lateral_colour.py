@@ -1,0 +1,100 @@
+"""Lateral colour of a pattern on a screen: how far red and blue detail lies from green's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.pattern_fit import ACROSS, RADIAL, RADIAL3, Pattern, patterns
+from lab.diagnose.measurements.reads import SHIFT
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.point import displaced_um
+from sim.spectrum import Spectrum
+from sim.uniform import Uniform
+
+COLOUR_FLOOR_PX = (
+    0.012  # cells of whole pixels alias alike everywhere: what a drawing gets wrong there doesn't average out
+)
+
+
+def colour_block(study: Study) -> Block:
+    """How far out red and blue detail of a pattern lies against green, at two distances from the frame's middle, and its turn."""
+    if "G" not in study.channels:
+        raise NotDetermined("lateral_colour", "one channel: nothing to hold it against")
+    points: list[tuple[Pattern, Pattern]] = []
+    for group in patterns(study):
+        for p in group:
+            if p.channel != "G":
+                green = next(q for q in group if q.channel == "G" and q.held_out == p.held_out)
+                points.append((p, green))
+    values, labels, places = [], [], []
+    n = len(points)
+    covariance = np.zeros((3 * n, 3 * n))
+    for i, (p, green) in enumerate(points):
+        near, far = 0.5 * p.reach, p.reach
+        table = np.array([[near, near**3, 0.0], [far, far**3, 0.0], [0.0, 0.0, far]])
+        at = np.array([len(p.bands) + k for k in (RADIAL, RADIAL3, ACROSS)])
+        values.append(table @ (p.value[at] - green.value[at]))
+        for j, (q, other) in enumerate(points):
+            if p.channel != q.channel or p.light is not q.light:
+                continue
+            # parts beyond the bands, which stand last, needn't be as many for every channel
+            own = np.ix_(at, at)
+            both = 0.5 * np.sum([one.common[own] for one in (p, q, green, other)], axis=0)
+            if i == j:
+                both = both + p.shown[own] + green.shown[own]
+            covariance[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = table @ both @ table.T
+        for k, (distance, way) in enumerate(((near, "outwards"), (far, "outwards"), (far, "around"))):
+            labels.append(Label(distance, p.channel, way, p.captures, p.held_out))
+            places.append((p, distance, k < 2))
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.zeros(len(places))
+        if effects:
+            for k, (p, distance, outwards) in enumerate(places):
+                if outwards:
+                    mean[k] = colour_shift_px(study, p.channel, distance, p.light, effects)
+        return Prediction(mean, {})
+
+    return Block(
+        measurement=LATERAL_COLOUR, reach=0.5, value=np.concatenate(values),
+        covariance=covariance + np.diag(np.full(3 * n, COLOUR_FLOOR_PX**2)), labels=tuple(labels),
+        reads=SHIFT, predict=predict, scale=np.ones(3 * n),
+    )  # fmt: skip
+
+
+def colour_shift_px(
+    study: Study, channel: str, distance: float, light: Spectrum | None, effects: Effects, kind: str = "bernoulli"
+) -> float:
+    """How far a channel's detail lands outside of green's, px, at a distance from the middle in half diagonals: the mean of four
+    directions, by the light that each channel detects."""
+    camera = study.camera
+    wavelength = np.arange(400.0, 721.0, 10.0)
+    half_um = camera.half_diagonal_um
+    turn = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
+    x, y = distance * half_um * np.cos(turn), distance * half_um * np.sin(turn)
+    outwards = np.zeros(len(wavelength))
+    for i, w in enumerate(wavelength):
+        shift = displaced_um(camera, x, y, float(w), effects)
+        if shift is not None:
+            outwards[i] = float(np.mean(shift[0] * np.cos(turn) + shift[1] * np.sin(turn)))
+    if not outwards.any():
+        return 0.0
+    radiance = np.ones_like(wavelength) if light is None else light.at(wavelength)
+    model = Uniform(camera, effects)
+    radiance = model.radiance(wavelength, radiance, kind) * model.transmittance(wavelength)
+    seen = [radiance * wavelength * camera.quantum_efficiency[c].at(wavelength) for c in (channel, "G")]
+    own, green = (float(s @ outwards / max(s.sum(), 1e-300)) for s in seen)
+    return (own - green) / camera.pixel_pitch_um
+
+
+LATERAL_COLOUR = Measurement(
+    "lateral_colour",
+    title="lateral colour of patterns",
+    order=440,
+    axis="field",
+    unit="half diagonals",
+    make=colour_block,
+    conditions="direction",
+)

@@ -1,0 +1,172 @@
+"""Signals in narrowband light against the maker's sensitivity curves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from lab.capture_kinds.narrowband import NarrowbandCapture
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.curves import CurveJacobian
+from lab.diagnose.measurements.held_out import held_out_of
+from lab.diagnose.measurements.linearity import RADIOMETER_STD, beside_light_dn
+from lab.diagnose.measurements.reads import LAG, act_on
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from lab.fit.rounding import rounding_std_dn
+from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import LEVEL, SPECTRAL, Uniform
+
+NARROWBAND_FLOOR = 1e-4  # of a level, each channel by itself, one for its repeats
+
+
+READING_SAMPLE_STD = 1e-3  # of a narrowband reading, sample by sample, where no repeats tell
+MOST_SAMPLE_STD = 4e-3
+READING_STD = 1e-4  # what readings scatter at least
+_READINGS = 8  # wavelengths from which on their own scatter tells
+
+
+def narrowband_block(study: Study) -> Block:
+    """Mean of every narrowband frame by channel against the maker's curves, of which a smooth few per cent are free."""
+    if not study.stated.quantum_efficiency:
+        raise NotDetermined(
+            "narrowband", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"
+        )
+    captures = study.recordings.captures(NarrowbandCapture, study.side)
+    groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
+    out = set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
+    points = []
+    for capture in captures:
+        for channel in study.channels:
+            mean = study.levels(capture).mean[channel]
+            if mean is not None and channel in study.stated.quantum_efficiency:
+                points.append((capture, channel, mean, capture.id in out))
+    if len(points) < 4:
+        raise NotDetermined("narrowband", "fewer than four unclipped narrowband signals")
+    exposures = np.array([c.exposure_s for c, *_ in points])
+    value = np.array([p[2] for p in points])
+    noise = study.noise
+    signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 0.0)
+    curves = CurveJacobian(
+        study,
+        [(c.radiance, channel, c.exposure_s, "narrowband", None) for c, channel, *_ in points],
+        signal / noise.gain / exposures,
+    )
+    every = list(dict.fromkeys(c.radiance for c, *_ in points))
+    known = [c for c in study.channels if c in study.camera.quantum_efficiency]
+    whole = CurveJacobian(
+        study, [(path, c, 1.0, "narrowband", None) for path in every for c in known], scale=curves.scale
+    )
+    covariance = _narrowband_covariance(study, points, signal, curves)
+
+    def jacobian_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
+        """By what is free; `share`: DN over electrons a second on axis."""
+        jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+        return jacobian | {k: v * share for k, v in curves.jacobian(effects).items()}
+
+    def predict(effects: Effects) -> Prediction:
+        rates = curves.rates(effects)
+        if not any(act_on(effects, LEVEL | LAG)):
+            # what acts on the light's colours alone leaves signals in proportion to its rates
+            share = noise.gain * float(study.field.light.mean()) * exposures
+            return Prediction(
+                noise.black + noise.dark_dn_per_s * exposures + share * rates, jacobian_of(effects, share)
+            )
+        lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
+        model = Uniform(study.camera, effects)
+        field = model.field(study.field)
+        mean, share = np.empty(len(points)), np.empty(len(points))
+        done: dict[str, dict[str, float]] = {}
+        for i, (capture, channel, _, _) in enumerate(points):
+            if capture.id not in done:
+                by_channel = dict(zip(known, lit[capture.radiance].tolist(), strict=True))
+                electrons = model.electrons(
+                    by_channel, capture.exposure_s, field=field, elapsed_s=study.elapsed_s(capture)
+                )
+                done[capture.id] = model.mean_dn(electrons)
+            mean[i] = done[capture.id][channel] + beside_light_dn(study, capture, channel, effects)
+            share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
+        return Prediction(mean, jacobian_of(effects, share))
+
+    return Block(
+        measurement=NARROWBAND, reach=25.0, value=value, covariance=covariance,
+        labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
+        reads=LEVEL | LAG | SPECTRAL, predict=predict, scale=np.maximum(signal, 1.0),
+    )  # fmt: skip
+
+
+def _narrowband_covariance(
+    study: Study, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveJacobian
+) -> FloatArray:
+    """Of narrowband signals: shot and read noise, what is one for repeats, the radiometer's reading, the lamp's scatter."""
+    noise = study.noise
+    exposures = np.array([c.exposure_s for c, *_ in points])
+    pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
+    rounded = curves.rounding * exposures * float(study.field.light.mean()) * noise.gain
+    shot = (noise.gain * signal + noise.read_dn**2) / pixels
+    frame = np.array([c.id for c, *_ in points])
+    setting = np.array([f"{c.wavelength_nm} {c.exposure_s} {channel}" for c, channel, *_ in points])
+    reading = np.array([c.radiance for c, *_ in points])
+    digits = rounding_std_dn(noise.spread_dn2(signal))
+    own = np.sqrt((NARROWBAND_FLOOR * signal) ** 2 + rounded**2 + digits**2)
+    expected = curves.rates(()) * exposures
+    radiometer = signal * _reading_std(points, signal, shot, expected)
+    covariance = np.diag(shot) + (setting[:, None] == setting) * np.outer(own, own)
+    readings: dict[float, dict[str, Spectrum]] = {}
+    for c, *_ in points:
+        readings.setdefault(c.wavelength_nm, {})[c.radiance] = study.spectrum(c.radiance)
+    sampled = curves.sample_shares * (_sample_std([*r.values()] for r in readings.values()) * signal)[:, None]
+    covariance += (reading[:, None] == reading) * (np.outer(radiometer, radiometer) + sampled @ sampled.T)
+    scatter = signal * noise.jitter_lamp
+    covariance += (frame[:, None] == frame) * (np.outer(scatter, scatter) + noise.jitter_dn**2)
+    return np.asarray(covariance)
+
+
+def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expected: FloatArray) -> float:
+    """Relative scatter of a radiometer's readings that all channels share, from the second differences between neighbouring
+    wavelengths; at most RADIOMETER_STD, so that no structure of the light's or the filters' passes for scatter.
+
+    Neighbours u_1, u_2, u_3 in relative deviation: u_2 - (u_1 + u_3) / 2 has variance 1.5 s^2 beside that of the noise; the median of
+    the magnitudes keeps a few odd wavelengths out.
+    """
+    deviation: dict[str, tuple[float, float, float]] = {}
+    by_frame: dict[str, list[int]] = {}
+    for i, (capture, *_) in enumerate(points):
+        by_frame.setdefault(capture.id, []).append(i)
+    strong = signal > 0.05 * signal.max()
+    for frame, members in by_frame.items():
+        use = [i for i in members if strong[i] and expected[i] > 0]
+        if use:
+            weight = np.square(signal[use]) / shot[use]
+            ratio = np.log(signal[use] / expected[use])
+            place = points[use[0]][0].wavelength_nm
+            deviation[frame] = place, float(np.sum(weight * ratio) / weight.sum()), float(1.0 / weight.sum())
+    found = sorted(deviation.values())
+    if len(found) < _READINGS:
+        return RADIOMETER_STD
+    u, v = np.array([f[1] for f in found]), np.array([f[2] for f in found])
+    bend = u[1:-1] - 0.5 * (u[:-2] + u[2:])
+    noise = float(np.median(v[1:-1] + 0.25 * (v[:-2] + v[2:])))
+    spread = float(np.median(np.abs(bend))) / 0.6745
+    return float(np.sqrt(np.clip((spread**2 - noise) / 1.5, READING_STD**2, RADIOMETER_STD**2)))
+
+
+def _sample_std(repeats: Iterable[Sequence[Spectrum]]) -> float:
+    """Relative scatter of a radiometer's readings from sample to sample, from those of one wavelength each: of the log ratio of two
+    readings about its mean, over sqrt 2, where the light exceeds a tenth of its peak; the median of all pairs."""
+    found = []
+    for readings in repeats:
+        for first, second in pairwise(readings):
+            (w, a), (v, b) = first.arrays, second.arrays
+            lit = (a > 0.1 * a.max()) & (b > 0.1 * b.max()) if np.array_equal(w, v) else np.zeros(len(w), bool)
+            if lit.sum() > 2:
+                found.append(float(np.std(np.log(a[lit] / b[lit]), ddof=1)) / np.sqrt(2.0))
+    return min(float(np.median(found)), MOST_SAMPLE_STD) if found else READING_SAMPLE_STD
+
+
+NARROWBAND = Measurement(
+    "narrowband", title="signal in narrowband light", order=280, axis="wavelength", unit="nm", make=narrowband_block
+)

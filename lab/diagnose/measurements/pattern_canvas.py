@@ -1,0 +1,192 @@
+"""A random pattern on a screen, drawn on the camera's pixels where the registration places it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.interpolate import CubicSpline, RectBivariateSpline
+
+from lab.diagnose.measurements.block import Effects
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from lab.fit.psf.drawn_pattern import area_drawn
+from lab.fit.psf.screen_registration import ScreenWarp
+from sim.camera import CameraModel
+from sim.frame import screen_light
+from sim.optics.diffraction import aperture_otf
+from sim.point import optical_transfer
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray, Spectrum
+
+OVERSAMPLE = 4
+LARGEST_PX = 320  # a side of the part that is looked at: enough for a band's contrast to 1e-3
+MARGIN_PX = 12  # of the frame and of that part: drawings there lack what lies beyond
+MARGIN_CELLS = 2.0
+#: ... and what lies beyond, along the larger of both axes: not looked at, but there.
+BEYOND_CY_PER_PX = (0.5, 0.62, 0.8, 4.0)
+LEAST_PIXELS = 1500
+
+
+def mask_points(mask: NDArray[np.bool_], window: tuple[slice, slice]) -> FloatArray:
+    """(x, y) in the frame of a mask's pixels, (pixels, 2)."""
+    row, col = np.nonzero(mask)
+    return np.column_stack([col + window[1].start, row + window[0].start]).astype(float)
+
+
+def from_middle(camera: CameraModel, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Along columns and rows from the frame's middle, in half diagonals, and the squared distance."""
+    half = camera.half_diagonal_px
+    u, v = ((points - 0.5 * np.array([camera.cols - 1, camera.rows - 1])) / half).T
+    return u, v, u * u + v * v
+
+
+def pattern_window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """The part of the frame that is looked at: the pattern's middle, even numbers of rows and columns."""
+    row, col = (np.arange(0, n, 4) for n in seen.shape)
+    x, y = np.meshgrid(col, row)
+    cells = warp.cells(np.column_stack([x.ravel(), y.ravel()]).astype(float)).reshape(*x.shape, 2)
+    inside = (cells[..., 0] > 0) & (cells[..., 0] < shape[1]) & (cells[..., 1] > 0) & (cells[..., 1] < shape[0])
+    if not inside.any():
+        raise NotDetermined("bernoulli", "the pattern lies outside the frame")
+    slices = []
+    for at, length in ((y[inside], seen.shape[0]), (x[inside], seen.shape[1])):
+        low, high = max(int(at.min()) - MARGIN_PX, 0), min(int(at.max()) + MARGIN_PX + 4, length)
+        size = 2 * (min(high - low, LARGEST_PX) // 2)
+        low += (high - low - size) // 2
+        low -= low % 2  # mosaics keep their phase
+        slices.append(slice(low, low + size))
+    return slices[0], slices[1]
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The pattern drawn by area on a window of the frame, `OVERSAMPLE` samples a pixel."""
+
+    warp: ScreenWarp
+    window: tuple[slice, slice]
+    fine: FloatArray
+    inside: NDArray[np.bool_]  # pixels well inside the pattern
+
+    @staticmethod
+    def of(target: FloatArray, warp: ScreenWarp, window: tuple[slice, slice]) -> Canvas:
+        y, x = (np.arange(w.start - 16.0, w.stop + 24.0, 8.0) for w in window)
+        at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
+        row, col = (w.start + (np.arange(OVERSAMPLE * (w.stop - w.start)) + 0.5) / OVERSAMPLE - 0.5 for w in window)
+        cell_x, cell_y = (RectBivariateSpline(y, x, at[:, :, k])(row, col) for k in (0, 1))
+        inside = np.ones((window[0].stop - window[0].start, window[1].stop - window[1].start), bool)
+        for cell, count in ((cell_x, target.shape[1]), (cell_y, target.shape[0])):
+            middle = cell[OVERSAMPLE // 2 :: OVERSAMPLE, OVERSAMPLE // 2 :: OVERSAMPLE]
+            inside &= (middle > MARGIN_CELLS) & (middle < count - MARGIN_CELLS)
+        inside[:MARGIN_PX] = inside[-MARGIN_PX:] = False
+        inside[:, :MARGIN_PX] = inside[:, -MARGIN_PX:] = False
+        return Canvas(warp, window, np.asarray(area_drawn(target, cell_x, cell_y), float), inside)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of the window, px."""
+        return self.inside.shape[0], self.inside.shape[1]
+
+    @cached_property
+    def drawn(self) -> NDArray[np.complex128]:
+        """The picture's transform, at all frequencies of its samples."""
+        return np.asarray(fft.rfft2(self.fine))
+
+    @cached_property
+    def low(self) -> NDArray[np.complex128]:
+        """The picture's transform below half a cycle a pixel: (rows, cols / 2 + 1), as of the window's own pixels."""
+        return self._below(self.drawn)
+
+    def as_shown(self, effects: Effects, camera: CameraModel) -> NDArray[np.complex128]:
+        """As `low`, of the picture as a screen with effects shows it, over its lit state there."""
+        y, x = (
+            (w.start + (np.arange(n) + 0.5) / OVERSAMPLE - 0.5 * whole) * camera.pixel_pitch_um
+            for w, n, whole in zip(self.window, self.fine.shape, (camera.rows, camera.cols), strict=True)
+        )
+        shown, lit = self.fine, np.ones_like(self.fine)
+        shown, lit = (screen_light(camera, part, x[None, :], y[:, None], effects) for part in (shown, lit))
+        return self._below(np.asarray(fft.rfft2(shown / lit)))
+
+    def _below(self, whole: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        rows, cols = self.shape
+        part = whole[:, : cols // 2 + 1] / OVERSAMPLE**2
+        part = np.concatenate([part[: rows // 2], part[len(part) - rows // 2 :]])
+        fy, fx = self.frequencies
+        # a sample is a mean over its square; a pixel's centre lies between samples
+        turn = np.exp(1j * np.pi * (fx + fy) * (1.0 - 1.0 / OVERSAMPLE))
+        return np.asarray(part * turn / (np.sinc(fx / OVERSAMPLE) * np.sinc(fy / OVERSAMPLE)))
+
+    @property
+    def frequencies(self) -> tuple[FloatArray, FloatArray]:
+        """fy (rows, 1) and fx (1, cols / 2 + 1), cy/px."""
+        return fft.fftfreq(self.shape[0])[:, None], fft.rfftfreq(self.shape[1])[None, :]
+
+    def passed(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
+        """Transfer of a lens and of the pixel at these frequencies, (rows, cols / 2 + 1)."""
+        fy, fx = self.frequencies
+        return np.asarray(otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, fill_factor))
+
+    def picture(self, spectrum: NDArray[np.complex128]) -> FloatArray:
+        """Back to the window's pixels."""
+        return np.asarray(fft.irfft2(spectrum, self.shape))
+
+    def beyond(self, otf: CubicSpline, fill_factor: float) -> list[FloatArray]:
+        """What the lens passes above half a cycle a pixel, at the pixels: by ring and by whether it lies nearer to rows or columns.
+
+        Cells of whole pixels repeat their spectrum: what aliases is coherent with what doesn't.
+        """
+        rows, cols = (OVERSAMPLE * n for n in self.shape)
+        highest = min(float(otf.x[-1]), 0.5 * OVERSAMPLE)
+        keep = np.abs(fft.fftfreq(rows, 1.0 / OVERSAMPLE)) < highest
+        fy = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[keep, None]
+        fx = fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
+        fx = fx[:, fx[0] < highest]
+        high = (
+            self.drawn[keep][:, : fx.shape[1]]
+            * otf(np.minimum(np.hypot(fy, fx), highest))
+            * aperture_otf(fx, fy, fill_factor)
+        )
+        high *= np.exp(1j * np.pi * fx * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fx / OVERSAMPLE)
+        high *= np.exp(1j * np.pi * fy * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fy / OVERSAMPLE)
+        largest, across = np.maximum(np.abs(fy), fx), fx >= np.abs(fy)
+        found = []
+        for low, end in pairwise(BEYOND_CY_PER_PX):
+            for side in (across, ~across):
+                part = np.where((largest >= low) & (largest < end) & (np.hypot(fy, fx) < highest) & side, high, 0.0)
+                spread = np.zeros((rows, part.shape[1]), complex)
+                spread[keep] = part
+                folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
+                folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
+                found.append(np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE]))
+        return found
+
+
+def lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:
+    """The baseline's transfer without the pixel's aperture: it looks the same all around the axis."""
+    f = np.linspace(0.0, 2.0, 101)
+    whole = np.real(optical_transfer(study.camera, channel, light, f, 0.0 * f, (), "bernoulli"))
+    return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
+
+
+def channel_pixels(study: Study, canvas: Canvas, channel: str, seen: FloatArray) -> NDArray[np.bool_]:
+    mask = canvas.inside & np.isfinite(seen[canvas.window])
+    step = mosaic.step(study.camera.cfa)
+    own = np.zeros_like(mask)
+    for row, col in mosaic.phases(study.camera.cfa)[channel]:
+        own[row::step, col::step] = True
+    mask &= own
+    if mask.sum() < LEAST_PIXELS:
+        raise NotDetermined(
+            "bernoulli", f"only {mask.sum()} pixels of channel {channel} see the pattern, {LEAST_PIXELS} needed"
+        )
+    return mask
+
+
+def below_nyquist(canvas: Canvas) -> NDArray[np.bool_]:
+    """Frequencies below half a cycle a pixel along both axes."""
+    fy, fx = canvas.frequencies
+    return np.asarray((np.abs(fy) < 0.5) & (fx < 0.5))

@@ -1,0 +1,122 @@
+"""The contrast that a random pattern on a screen keeps, by spatial frequency, orientation and channel."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.pattern_fit import Pattern, joint_covariance, patterns
+from lab.diagnose.measurements.reads import SHOWN
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.point import TRANSFER, common_wavelengths, transfer_at
+from sim.spectrum import FloatArray
+
+LARGEST_STD = 0.04  # of a band's contrast: beyond, it says nothing
+CONTRAST_FLOOR = 0.0015  # of a band's contrast: drawing and registration
+CONTRAST_SCALE_STD = 0.01  # levels of screens are free: each channel of each part of the repeats
+SCREEN_BLUR_PX = 0.08  # a target's rims needn't be sharp: standard deviation of a Gaussian
+PLACINGS = 4  # steps in which a shifted picture is found
+
+
+def contrast_block(study: Study) -> Block:
+    """Contrast that a random pattern keeps, over the baseline's, by frequency, orientation and channel."""
+    found = patterns(study)
+    labels: list[Label] = []
+    places: list[tuple[int, Pattern, int]] = []
+    for number, group in enumerate(found):
+        for p in group:
+            spread = np.sqrt(np.diag(p.shown + p.common))
+            for b, band in enumerate(p.bands):
+                if spread[b] < LARGEST_STD and b > 0:  # the lowest band is the levels'
+                    places.append((number, p, b))
+                    labels.append(Label(band.frequency, p.channel, f"{band.angle_deg:.0f} deg", p.captures, p.held_out))
+    if not places:
+        raise NotDetermined("bernoulli", "the patterns are too noisy, or too few of their cells are in view")
+    value = np.array([p.value[b] for _, p, b in places])
+    frequency = np.array([label.x for label in labels])
+    covariance = joint_covariance(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
+    scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
+    # drawn alike and seen in the same light, what is held out has its twin's prediction
+    poses: list[dict[str, tuple[Pattern, list[int], list[int]]]] = [{} for _ in found]
+    for k, (number, p, b) in enumerate(places):
+        _, members, parts = poses[number].setdefault(p.channel, (p, [], []))
+        members.append(k)
+        parts.append(b)
+    poses = [sights for sights in poses if sights]
+    plain = [_transfers(study, sights, ()) for sights in poses]
+    weights = {id(p): _node_weights(p) for sights in poses for p, *_ in sights.values()}
+
+    def predict(effects: Effects) -> Prediction:
+        mean = np.ones(len(places))
+        if effects:
+            for sights, before in zip(poses, plain, strict=True):
+                changed = _transfers(study, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
+                for (p, members, parts), ratio in zip(sights.values(), changed, strict=True):
+                    placed, (real, imaginary) = _in_place(p, ratio), weights[id(p)]
+                    kept = real @ np.real(placed) + imaginary @ np.imag(placed) + p.shown_by(effects)[: len(real)]
+                    mean[members] = kept[parts]
+            mean[~np.isfinite(mean)] = 1.0
+        jacobian = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
+        for name in dict.fromkeys(scales):
+            jacobian[name] = CONTRAST_SCALE_STD * mean * np.array([s == name for s in scales])
+        return Prediction(mean, jacobian)
+
+    return Block(
+        measurement=BERNOULLI, reach=0.2, value=value, covariance=covariance,
+        labels=tuple(labels), reads=TRANSFER | SHOWN | {"image.transmittance"}, predict=predict,
+        scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def _transfers(
+    study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
+) -> NDArray[np.complex128]:
+    """Of a pose's channels at the frequencies of all bands, one after another: (channels, nodes)."""
+    first = next(iter(sights.values()))[0]
+    fx, fy = np.concatenate([b.fx for b in first.bands]), np.concatenate([b.fy for b in first.bands])
+    lit = [(channel, first.light) for channel in sights]
+    nodes, shares = common_wavelengths(study.camera, lit, effects, "bernoulli")
+    whole = [transfer_at(study.camera, float(w), fx, fy, effects) for w in nodes]
+    return np.asarray(np.tensordot(shares, np.array(whole), 1), complex)
+
+
+def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray]:
+    """What a transfer's real and its imaginary part at all bands' nodes do to the bands' coefficients, (bands, nodes) each: by its means
+    over the lower and the upper half of every band."""
+    halves = np.zeros((2 * len(p.bands), sum(len(b.fx) for b in p.bands)))
+    start = 0
+    for k, band in enumerate(p.bands):
+        own = slice(start, start + len(band.fx))
+        start += len(band.fx)
+        for row, use in zip(halves[2 * k : 2 * k + 2], (~band.upper, band.upper), strict=True):
+            share = np.where(use, band.share, 0.0)
+            row[own] = share / share.sum() if share.sum() > 0 else band.share
+    return p.mix[:, : len(halves)] @ halves, p.mix[:, len(halves) :] @ halves
+
+
+def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """A change of transfer where the drawing is laid over the picture: a shift s that least squares find, of which
+    sum P f Im(ratio exp(-2 pi i f s)) = 0 along both axes (Gauss and Newton), isn't a loss of contrast."""
+    if not np.any(np.abs(np.imag(ratio)) > 1e-6):
+        return ratio
+    turn = 2.0 * np.pi * np.array([np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])])
+    weight = np.concatenate([b.power * b.share for b in p.bands])
+    for _ in range(PLACINGS):
+        slope = (turn * weight * np.maximum(np.real(ratio), 0.0)) @ turn.T
+        shift = np.linalg.lstsq(slope, (turn * weight) @ np.imag(ratio), rcond=1e-9)[0]
+        ratio = ratio * np.exp(-1j * shift @ turn)
+    return ratio
+
+
+BERNOULLI = Measurement(
+    "bernoulli",
+    title="contrast of random patterns",
+    order=410,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=contrast_block,
+    conditions="orientation",
+    conditions_words="patterns' parts at",
+)

@@ -1,0 +1,19 @@
+"""Quantities of the stages that predictions depend on, and which effects change them."""
+
+from __future__ import annotations
+
+from lab.diagnose.measurements.block import Effects
+from sim.effects.library import changed_by
+
+#: Of measurements in whose prediction the frame before enters.
+LAG = frozenset({"charge.lag"})
+#: Of measurements of patterns: what a screen shows of what it is asked for, and reflections of the whole image.
+SHOWN = frozenset({"light.screen"})
+REFLECTIONS = frozenset({"image.copies"})
+#: Of measurements of where light lands.
+SHIFT = frozenset({"image.shift"})
+
+
+def act_on(effects: Effects, reads: frozenset[str]) -> list[bool]:
+    """Of each effect, whether it changes any of these quantities of the stages."""
+    return [not reads.isdisjoint(changed_by(effect)) for effect in effects]

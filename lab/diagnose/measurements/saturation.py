@@ -1,0 +1,51 @@
+"""The level from which on a pixel counts as clipped."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.sensor import mosaic
+
+if TYPE_CHECKING:
+    from lab.diagnose.measurements.study import Study
+
+CLIPPED_SHARE = 2e-4  # of a plane: with fewer clipped pixels its mean counts
+
+
+def clipping_level_dn(study: Study) -> float:
+    """DN from which on a pixel counts as clipped: the converter's highest code, or less where full wells pile up below it.
+
+    Wells that are full carry no shot noise: among the captures, planes whose highest quantiles lie closer together than a
+    third of what shot noise makes them do pile up, at full well.
+    """
+    white = study.camera.white_level_dn
+    gain = study.stated.conversion_gain_dn_per_e
+    black = study.stated.black_level_dn or 0.0
+    piles = []
+    for kind in ("flat", "narrowband", "white"):
+        for capture in study.recordings.captures(kind, study.side):
+            frame = study.recordings.frame(capture)
+            for channel in study.channels:
+                row, col = mosaic.phases(study.camera.cfa)[channel][0]
+                step = mosaic.step(study.camera.cfa)
+                values = np.asarray(frame[row::step, col::step])
+                if values.max() < 0.25 * white:
+                    continue
+                middle, high, top = np.quantile(values, [0.97, 0.99, 0.999])
+                if gain is None:
+                    # a tenth of the usual noise of a well of 1e5 e: what no unclipped plane falls below
+                    least = 0.1 * np.sqrt(max(top - black, 1.0) * white / 1e5)
+                else:
+                    least = np.sqrt(gain * max(top - black, 1.0)) / 3.0
+                if (
+                    top - high < 0.76 * least and high - middle < 0.45 * least
+                ):  # a normal distribution's quantiles, in sigmas
+                    piles.append((float(top), float(top - middle)))
+    below = [(top, width) for top, width in piles if top < white - 1.0]
+    if not below:
+        return white
+    top = float(np.median([t for t, _ in below]))
+    # a margin of the read noise under the pile
+    return min(white, top - 3.0 * max(float(np.median([w for _, w in below])), 2.0))

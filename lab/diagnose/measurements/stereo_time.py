@@ -1,0 +1,117 @@
+"""Whether the two cameras of a pair capture at the same time: where each sees a moving board.
+
+Boards that stand still say nothing of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.boards import views_of
+from lab.diagnose.measurements.stereo_gain import SIDES, needs_both_sides
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from lab.fit.geometry.board_detection import BoardView
+from lab.fit.geometry.bundle_adjustment import board_pose
+from lab.fit.geometry.calibration import Calibration, calibrate_robustly
+from lab.fit.geometry.pinhole import project
+from sim.frame import right_delay_s
+from sim.spectrum import FloatArray
+
+#: Captures of a moving board that lie further apart say nothing of its speed.
+LONGEST_GAP_S = 1.0
+SLOWEST_PX_PER_S = 5.0
+FEWEST_PAIRS = 6
+SHIFT_STD_PX = 0.05  # of a pair: the speed between captures isn't even
+POINTING_STD_PX = 2.0  # of the rig's turn and the cameras' axes, over the frame
+
+
+def time_block(study: Study) -> Block:
+    """Where the right camera sees a moving board, across the baseline, against where the left one's pose puts it."""
+    needs_both_sides(study, "stereo_time")
+    moving = _moving(study)
+    views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
+    try:
+        left, right = (
+            calibrate_robustly(list(v.values()), (study.camera.rows, study.camera.cols), side)
+            for v, side in zip(views, SIDES, strict=True)
+        )
+    except NotDetermined as refused:
+        raise NotDetermined("stereo_time", refused.reason) from refused
+    pairs = [(pose, views[0][pose], views[1][pose]) for pose in moving if pose in views[0] and pose in views[1]]
+    if len(pairs) < FEWEST_PAIRS:
+        raise NotDetermined("stereo_time", f"{len(pairs)} pairs of a moving board, {FEWEST_PAIRS} needed")
+    gaps, across = _gaps(pairs, left, right)
+    speed = np.array([across @ moving[pose] for pose, *_ in pairs])
+    place = np.array([v.image_px.mean(axis=0) for _, _, v in pairs])
+    place = (place - place.mean(axis=0)) / (0.5 * float(np.hypot(study.camera.rows, study.camera.cols)))
+    noise = np.array([right.solution.noise_px**2 * 2.0 / len(v.index) for _, _, v in pairs])
+    pointing = {
+        "stereo:turn": np.full(len(pairs), POINTING_STD_PX),
+        "stereo:x": POINTING_STD_PX * place[:, 0],
+        "stereo:y": POINTING_STD_PX * place[:, 1],
+    }
+
+    def predict(effects: Effects) -> Prediction:
+        return Prediction(right_delay_s(study.camera, effects) * speed, pointing)
+
+    return Block(
+        measurement=STEREO_TIME, reach=1e9, value=gaps, covariance=np.diag(noise + SHIFT_STD_PX**2),
+        labels=tuple(
+            Label(float(v), "Y", pose, (a.capture.id, b.capture.id), i % 3 == 1) for i, (v, (pose, a, b)) in enumerate(zip(speed, pairs, strict=True))
+        ),
+        reads=frozenset({"light.pair_delay_s"}), predict=predict, scale=np.ones(len(pairs)),
+    )  # fmt: skip
+
+
+def _moving(study: Study) -> dict[str, FloatArray]:
+    """Speed (x, y), px/s, of the board's middle in the right picture, of poses between others that lie close in time."""
+    timed = [(study.elapsed_s(v.capture), v) for v in views_of(study, "right")[0] if v.capture.time is not None]
+    timed.sort(key=lambda one: one[0])
+    found = {}
+    for (start, before), (_, here), (end, after) in zip(timed, timed[1:], timed[2:], strict=False):
+        lasted = end - start
+        index, first, last = np.intersect1d(before.index, after.index, return_indices=True)
+        if not 0.0 < lasted <= 2.0 * LONGEST_GAP_S or len(index) < 4:
+            continue
+        found[here.capture.pose] = np.asarray(
+            (after.image_px[last] - before.image_px[first]).mean(axis=0) / lasted, float
+        )
+    fastest = max((float(np.hypot(*v)) for v in found.values()), default=0.0)
+    if fastest < SLOWEST_PX_PER_S:
+        raise NotDetermined(
+            "stereo_time",
+            f"no board moves between captures less than {LONGEST_GAP_S:g} s apart: only what moves shows whether both sides capture at the same time",
+        )
+    return found
+
+
+def _gaps(
+    pairs: Sequence[tuple[str, BoardView, BoardView]], left: Calibration, right: Calibration
+) -> tuple[FloatArray, FloatArray]:
+    """Mean gap of each pair's corners in the right picture across the baseline's direction there, px; that direction (x, y)."""
+    turns, shifts = [], []
+    poses = []
+    for _, one, two in pairs:
+        (turn, shift), (turn_two, shift_two) = board_pose(one, left.intrinsics), board_pose(two, right.intrinsics)
+        between = turn_two @ turn.T
+        turns.append(Rotation.from_matrix(between).as_rotvec())
+        shifts.append(shift_two - between @ shift)
+        poses.append((turn, shift))
+    rotation, translation = Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(), np.median(shifts, axis=0)
+    along = translation[:2] / max(float(np.hypot(*translation[:2])), 1e-12)
+    across = np.array([-along[1], along[0]])
+    gaps = []
+    for (_, _, two), (turn, shift) in zip(pairs, poses, strict=True):
+        points = (two.board_mm @ turn.T + shift) @ rotation.T + translation
+        gaps.append(float(((two.image_px - project(points, right.intrinsics)) @ across).mean()))
+    return np.array(gaps), across
+
+
+STEREO_TIME = Measurement(
+    "stereo_time", title="capture times of the two cameras", order=610, axis="time", unit="px/s", make=time_block
+)

@@ -1,0 +1,231 @@
+"""One side of a recording set: its frames summarised once, and what several measurements ask of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from lab.capture_kinds.base import Capture
+from lab.capture_kinds.flat import FlatCapture
+from lab.diagnose.measurements.block import Effects
+from lab.diagnose.measurements.noise_guess import NoiseGuess, noise_guess
+from lab.diagnose.measurements.reads import LAG, act_on
+from lab.diagnose.measurements.saturation import CLIPPED_SHARE, clipping_level_dn
+from lab.diagnose.measurements.stale_frames import stale
+from lab.errors import NotDetermined
+from lab.formats.recording_set import DataSheet, RecordingSet
+from sim.camera import CameraModel, Side
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray, Spectrum
+from sim.uniform import FieldPoints, Uniform
+
+T = TypeVar("T")
+C = TypeVar("C", bound=Capture)
+TAIL_STD = 0.1  # of the light that the baseline's point spread sends into dark squares and patches
+WARMTH_STD = 0.1  # of the dark current, a degree: it doubles within 5 to 10 degrees
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Means of one capture: DN by channel over the unclipped plane, None where it clips; over the plane as it is; its pixels."""
+
+    mean: dict[str, float | None]
+    pixels: dict[str, int]
+    whole: dict[str, float]
+
+
+class Study:
+    """One side of a recording set, its frames summarised once; the blocks are made from it."""
+
+    def __init__(
+        self, recordings: RecordingSet, side: Side, camera: CameraModel, saturation_dn: float | None = None
+    ) -> None:
+        #: What isn't looked at, as it wasn't taken: (capture's id, why), each in one line.
+        self.stale: tuple[tuple[str, str], ...] = stale(recordings, side)
+        left_out = {name for name, _ in self.stale}
+        self.recordings = recordings.without(left_out) if left_out else recordings
+        self.side, self.camera = side, camera
+        #: Pixels from here on say nothing of the light: the converter's highest code, or the full well where that comes first.
+        self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)
+        self.stated: DataSheet = recordings.camera(side)
+        self.channels = camera.channels
+        self._levels: dict[str, Levels] = {}
+        self._made: dict[Any, Any] = {}
+        self._spectra: dict[str, Spectrum] = {}
+        times = [c.time for c in recordings.captures(side=side) if c.time is not None]
+        self._start = min(times) if times else None
+        warm = [c.temperature_c for c in recordings.captures(side=side) if c.temperature_c is not None]
+        #: The sensor's, at most captures; None where none is stated.
+        self.temperature_c = float(np.median(warm)) if warm else None
+        self.field = FieldPoints.of(camera)
+        if saturation_dn is None:
+            self.saturation_dn = clipping_level_dn(self)
+        self.noise: NoiseGuess = noise_guess(self)
+        self.camera = camera.model_copy(
+            update={
+                "conversion_gain_dn_per_e": self.noise.gain,
+                "black_level_dn": self.noise.black,
+                "dark_current_e_per_s": self.noise.dark_dn_per_s / self.noise.gain,
+                "read_noise_e": self.noise.read_dn / self.noise.gain,
+                "full_well_e": (self.saturation_dn - self.noise.black) / self.noise.gain,
+                "dark_current_reference_c": camera.dark_current_reference_c
+                if self.temperature_c is None
+                else self.temperature_c,
+            }
+        )
+
+    def elapsed_s(self, capture: Capture) -> float:
+        return 0.0 if capture.time is None or self._start is None else (capture.time - self._start).total_seconds()
+
+    def spectrum(self, path: str) -> Spectrum:
+        if path not in self._spectra:
+            self._spectra[path] = self.recordings.spectrum(path)
+        return self._spectra[path]
+
+    def plane_mask(self, channel: str, shape: tuple[int, int]) -> FloatArray:
+        mask = np.zeros(shape, bool)
+        step = mosaic.step(self.camera.cfa)
+        for row, col in mosaic.phases(self.camera.cfa)[channel]:
+            mask[row::step, col::step] = True
+        return mask
+
+    def pixels_of(self, frame: Any, channel: str) -> FloatArray:
+        """All pixels of a channel, flat, as float."""
+        step = mosaic.step(self.camera.cfa)
+        parts = [frame[row::step, col::step] for row, col in mosaic.phases(self.camera.cfa)[channel]]
+        return np.concatenate([np.asarray(p, float).ravel() for p in parts])
+
+    def levels(self, capture: Capture) -> Levels:
+        if capture.id not in self._levels:
+            frame = self.recordings.frame(capture)
+            mean: dict[str, float | None] = {}
+            pixels, whole = {}, {}
+            for channel in self.channels:
+                values = self.pixels_of(frame, channel)
+                clipped = float(np.mean(values >= self.saturation_dn))
+                whole[channel] = float(values.mean())
+                mean[channel] = whole[channel] if clipped < CLIPPED_SHARE else None
+                pixels[channel] = values.size
+            self._levels[capture.id] = Levels(mean, pixels, whole)
+        return self._levels[capture.id]
+
+    @property
+    def diffraction_is_known(self) -> bool:
+        """Whether f-number and pitch are stated."""
+        return self.stated.f_number is not None and self.stated.pixel_pitch_um is not None
+
+    @property
+    def level_is_known(self) -> bool:
+        """Whether the light in front of the lens tells how many DN to expect."""
+        return self.noise.gain_is_known and self.diffraction_is_known
+
+    @property
+    def tail_std(self) -> float:
+        """Of the light that the baseline's point spread itself sends far, which is anything where the lens or the pitch aren't stated."""
+        return TAIL_STD if self.diffraction_is_known else 1.0
+
+    @cached_property
+    def lamps(self) -> dict[str, int]:
+        """Which lamp the flats' radiance files are readings of: one lamp where they differ by less than 1 % in shape and 5 % in
+        level, for a radiometer reads a lamp anew before every pass."""
+        found: list[tuple[FloatArray, FloatArray]] = []
+        lamps: dict[str, int] = {}
+        for capture in self.recordings.captures(FlatCapture, self.side):
+            if capture.radiance is None or capture.radiance in lamps:
+                continue
+            wavelength, value = self.spectrum(capture.radiance).arrays
+            for k, (where, level) in enumerate(found):
+                if len(where) != len(wavelength) or np.any(where != wavelength):
+                    continue
+                ratio = float(value.sum() / level.sum())
+                if abs(ratio - 1.0) < 0.05 and np.abs(value / ratio - level).sum() < 0.01 * np.abs(level).sum():
+                    lamps[capture.radiance] = k
+                    break
+            else:
+                lamps[capture.radiance] = len(found)
+                found.append((wavelength, value))
+        return lamps
+
+    def flat_levels(self) -> list[list[Any]]:
+        """Flat captures by what makes their level: exposure, lamp, gain."""
+        return self.groups(
+            "flat", lambda c: (c.exposure_s, self.lamps.get(c.radiance, -1), c.gain_db, c.photons_per_pixel)
+        )
+
+    def groups(self, kind: Any, key: Callable[[Any], object]) -> list[list[Any]]:
+        """Captures of a kind by their settings, in the manifest's order."""
+        found: dict[object, list[Any]] = {}
+        for capture in self.recordings.captures(kind, self.side):
+            found.setdefault(key(capture), []).append(capture)
+        return list(found.values())
+
+    # --- parts that several blocks share ---
+
+    def once(self, make: Callable[[Study], T]) -> T:
+        """What `make` finds, or why it can't, made once: several blocks read different numbers off it."""
+        if make not in self._made:
+            try:
+                self._made[make] = make(self)
+            except NotDetermined as refused:
+                self._made[make] = refused
+        found = self._made[make]
+        if isinstance(found, NotDetermined):
+            raise found
+        return cast(T, found)
+
+    @cached_property
+    def _before(self) -> dict[str, Capture]:
+        """The capture before each, in the order of their times where all have one, else in the manifest's."""
+        order: list[Capture] = list(self.recordings.captures(side=self.side))
+        if all(c.time is not None for c in order):
+            order.sort(key=self.elapsed_s)
+        return {c.id: before for before, c in pairwise(order)}
+
+    def settled(self, group: Sequence[C]) -> list[C]:
+        """Of repeats those that follow another of them, and so hold nothing of another level that was left behind; all where these
+        are fewer than two."""
+        names = {c.id for c in group}
+        found = [c for c in group if c.id in self._before and self._before[c.id].id in names]
+        return found if len(found) > 1 else list(group)
+
+    def carried_e(self, capture: Capture, channel: str, effects: Effects) -> float:
+        """By how many electrons a channel's mean changes where charge is left behind, given what was read of it and of the capture
+        before: read is y_t = (1 - q) x_t + q y_(t-1), of which q (y_(t-1) - y_t) is new. The first one follows empty pixels."""
+        if not any(act_on(effects, LAG)):
+            return 0.0
+        model = Uniform(self.camera, effects)
+        before = self._before.get(capture.id)
+        read, left = (
+            max(self.levels(c).whole[channel] - self.noise.black, 0.0) / self.noise.gain if c is not None else 0.0
+            for c in (capture, before)
+        )
+        return float(np.mean(model.lag_e(np.array([left])) - model.lag_e(np.array([read]))))
+
+    def offset(self, capture: Capture, effects: Effects) -> float:
+        elapsed = self.elapsed_s(capture)
+        return Uniform(self.camera, effects).offset_dn(elapsed, capture.temperature_c)
+
+    def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
+        """Jacobian by black level and dark current, per prior standard deviation: that of their first guess."""
+        return {
+            "black": np.full(len(exposures), self.noise.black_std),
+            "dark": exposures * self.noise.dark_std,
+        }
+
+    def free_warmth(self, captures: Sequence[Capture]) -> dict[str, FloatArray]:
+        """Jacobian by the change of dark current per degree, for captures at another temperature than most. Dark frames don't take it:
+        they measure the change."""
+        if self.temperature_c is None:
+            return {}
+        warmer = [0.0 if c.temperature_c is None else c.temperature_c - self.temperature_c for c in captures]
+        exposures = np.array([c.exposure_s for c in captures])
+        return {"warmth": WARMTH_STD * self.noise.dark_dn_per_s * exposures * np.array(warmer)}
+
+
+def mean_frame(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatArray:
+    return np.asarray(np.mean([recordings.frame(c).astype(float) for c in captures], axis=0))

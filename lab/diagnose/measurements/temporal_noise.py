@@ -1,0 +1,159 @@
+"""Temporal noise of repeated frames: its variance by plane of the mosaic, and the correlation of neighbouring pixels.
+
+Frames of one setting are compared with their mean. What isn't a pixel's own is taken out before, plane by plane: the frame's level
+(of flats as a factor, so that shading and pixels' responses don't count where the lamp flickers), and the mean of every row and
+of every column (read-out, flicker by rows). What that takes from the pixels' own noise is put back. Pixels that depart by more
+than `OUTLIER` standard deviations don't count for the correlation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.saturation import CLIPPED_SHARE
+from lab.diagnose.measurements.study import Study
+from sim.camera import Cfa
+from sim.sensor import mosaic
+from sim.spectrum import FloatArray
+
+OUTLIER = 6.0
+#: Values that a level is repeats_of by; frames beyond them cost time and teach nothing.
+ENOUGH = 3_000_000
+LEAST_DN2 = 0.02  # a temporal variance below which nothing but rounding is seen
+#: Pairs of pixels on the mosaic, by how the report calls them: (rows down, columns to the right).
+PAIRS: dict[str, tuple[tuple[int, int], ...]] = {
+    "next in the row": ((0, 1),),
+    "next in the column": ((1, 0),),
+    "next across corners": ((1, 1), (1, -1)),
+    "second in the row": ((0, 2),),
+    "second in the column": ((2, 0),),
+    "second across corners": ((2, 2), (2, -2)),
+}
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Temporal noise of the repeats of one setting: by plane of the mosaic the mean above black and the variance (DN, DN^2; None
+    where it is clipped), the variance's standard uncertainty as a share of it; by `PAIRS` the correlation and its uncertainty."""
+
+    captures: tuple[str, ...]
+    exposure_s: float
+    gain: float  # factor on the conversion gain, of the setting in dB
+    held_out: bool
+    signal: dict[str, float]
+    variance: dict[str, float | None]
+    relative_std: dict[str, float]
+    correlation: FloatArray
+    correlation_std: FloatArray
+
+    @property
+    def level(self) -> float:
+        return float(np.mean(list(self.signal.values())))
+
+
+def flat_repeats(study: Study) -> list[Repeats]:
+    """Of every level of light, what is seen and what is held out by themselves; darkest first."""
+    out = study.once(held_out_flats)
+    found = []
+    for group in study.flat_levels():
+        for part in ([c for c in group if c.id not in out], [c for c in group if c.id in out]):
+            if len(part) > 1:
+                found.append(repeats_of(study, part, part[0].id in out))
+    return sorted(found, key=lambda r: r.level)
+
+
+def dark_repeats(study: Study) -> list[Repeats]:
+    """Of every setting of dark frames, every third held out."""
+    groups = [g for g in study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)) if len(g) > 1]
+    return [repeats_of(study, g, len(groups) >= 3 and i % 3 == 1) for i, g in enumerate(groups)]
+
+
+def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats:
+    """The noise of two repeats or more."""
+    cfa, lit = study.camera.cfa, captures[0].kind != "dark"
+    first = study.recordings.frame(captures[0])
+    use = list(captures)[: max(2, int(np.ceil(ENOUGH / first.size)) + 1)]
+    frames = [np.array(study.recordings.frame(c), np.float32) for c in use]
+    signal, clipped = {}, {}
+    for name in mosaic.planes(first, cfa):
+        planes = [mosaic.planes(f, cfa)[name] for f in frames]
+        clipped[name] = max(float(np.mean((p >= study.saturation_dn) | (p <= 0))) for p in planes)
+        signal[name] = float(np.mean([p.mean(dtype=float) for p in planes])) - study.noise.black
+    level = float(np.mean(list(signal.values())))
+    dark_dn = abs(study.noise.dark_dn_per_s) * captures[0].exposure_s
+    _level_out(frames, cfa, study.noise.black if lit and level > 20.0 * max(dark_dn, 1.0) else None)
+    freedom = len(frames) - 1
+    sizes = {name: plane.shape for name, plane in mosaic.planes(first, cfa).items()}
+    variance = {}
+    for name, (rows, cols) in sizes.items():
+        planes = [mosaic.planes(f, cfa)[name] for f in frames]
+        taken = (1.0 - 1.0 / rows) * (1.0 - 1.0 / cols)
+        variance[name] = sum(float(np.mean(np.square(p), dtype=float)) for p in planes) / freedom / taken
+        for plane in planes:
+            np.divide(plane, np.float32(np.sqrt(max(variance[name], 1e-12))), out=plane)
+            plane[np.abs(plane) > OUTLIER] = 0.0
+    correlation, std = _correlations(frames, freedom, cfa)
+    clean = {name: share < 0.1 * CLIPPED_SHARE for name, share in clipped.items()}
+    moving = min(variance.values()) > LEAST_DN2
+    if not (moving and (all(clean.values()) or not lit)):
+        correlation = np.full(len(PAIRS), np.nan)
+    # of coloured noise the estimates scatter more
+    spread = 1.0 + float(np.sum(_NUMBER * np.square(np.where(np.abs(correlation) > 4.0 * std, correlation, 0.0))))
+    return Repeats(
+        captures=tuple(c.id for c in use),
+        exposure_s=captures[0].exposure_s,
+        gain=10.0 ** ((captures[0].gain_db or 0.0) / 20.0),
+        held_out=held_out,
+        signal=signal,
+        variance={n: v if clean[n] and moving else None for n, v in variance.items()},
+        relative_std={n: float(np.sqrt(2.0 * spread / (freedom * rows * cols))) for n, (rows, cols) in sizes.items()},
+        correlation=correlation,
+        correlation_std=std * np.sqrt(spread),
+    )
+
+
+def _level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
+    """Leave departures from the mean frame, in place; `black_dn` None: the frames' levels are no factors but sums."""
+    for name in mosaic.planes(frames[0], cfa):
+        planes = [mosaic.planes(f, cfa)[name] for f in frames]
+        means = [float(p.mean(dtype=float)) for p in planes]
+        for plane, mean in zip(planes, means, strict=True):
+            if black_dn is None:
+                np.subtract(plane, np.float32(mean), out=plane)
+            else:
+                np.subtract(plane, np.float32(black_dn), out=plane)
+                np.multiply(plane, np.float32((np.mean(means) - black_dn) / (mean - black_dn)), out=plane)
+        average = np.mean(planes, axis=0, dtype=np.float32)
+        for plane in planes:
+            np.subtract(plane, average, out=plane)
+            np.subtract(plane, plane.mean(axis=1, keepdims=True), out=plane)
+            np.subtract(plane, plane.mean(axis=0, keepdims=True), out=plane)
+
+
+#: How many pairs of every kind a pixel has.
+_NUMBER = np.array([2.0 * len(lags) for lags in PAIRS.values()])
+
+
+def _correlations(frames: Sequence[Any], freedom: int, cfa: Cfa) -> tuple[FloatArray, FloatArray]:
+    """Of standardised departures; what the taking out of rows' and columns' means took is put back."""
+    rows, cols = frames[0].shape
+    value, std = [], []
+    for lags in PAIRS.values():
+        total, count = 0.0, 0
+        for down, right in lags:
+            here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
+            there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
+            total += sum(float(np.einsum("ij,ij->", f[here], f[there], dtype=np.float64)) for f in frames)
+            count += (rows - down) * (cols - abs(right))
+        down, right = lags[0]
+        period = 1 if cfa == "MONO" else 2
+        same = down % period == 0 and right % period == 0
+        lost = (period / cols if down == 0 else period / rows) if same and 0 in (down, right) else 0.0
+        value.append(total / count / freedom + lost)
+        std.append(1.0 / np.sqrt(count * freedom))
+    return np.array(value), np.array(std)
