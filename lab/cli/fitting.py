@@ -57,7 +57,7 @@ def _fit(recordings: RecordingSet) -> FitResult:
 
 
 def _write_maps(recordings: RecordingSet, folder: Path) -> None:
-    """Maps of every side's pixels; a side without darks is said."""
+    """Write the maps of every side's pixels. A side without darks has none; a line on stderr says so."""
     from lab.fit.noise.pixel_maps import pixel_maps
     from lab.report.maps import write_maps
 
@@ -71,7 +71,7 @@ def _write_maps(recordings: RecordingSet, folder: Path) -> None:
 
 
 def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) -> None:
-    """Camera files of a fit, and what they hold that was neither fitted nor stated."""
+    """Write the camera files of a fit. A line on stderr names each value that was neither fitted nor stated."""
     from lab.formats.camera_file import fitted_camera, write_camera
     from lab.predict.camera_model import assumptions
 
@@ -111,7 +111,7 @@ def compare(
 
 
 def _calibration(source: str) -> FitResult:
-    """A fit: of a file that `--json` wrote, as a session keeps it, or of recordings that are fitted now."""
+    """A fit from the file that `--json` wrote, from the registry of sessions, or made now from recordings."""
     if Path(source).is_file():
         return read_result(FitResult, Path(source))
     if not Path(source).exists() and (store := existing_store()) is not None:

@@ -23,7 +23,7 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
     table = Table(box=None, pad_edge=False)
     table.add_column("quantity")
     for side in sides:
-        table.add_column(f"{side} (± one standard uncertainty)")
+        table.add_column(f"{side} (± one standard deviation)")
     for name, figures in by_side(fit, recordings.manifest.cameras):
         table.add_row(name, *(figures[side].text if side in figures else "-" for side in sides))
     if table.row_count:
