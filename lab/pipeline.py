@@ -48,14 +48,14 @@ STEPS: dict[Goal, tuple[Step, ...]] = {
     "report": ("fit", "validate", "diagnose", "report"),
     "pipeline": ("capture", "fit", "validate", "diagnose", "resolve", "report"),
 }
-#: Typical duration (s) of each step, for the share of the work that is done: a full stereo session on the mock bench, two cores.
+#: Duration (s) of each step in a quick stereo session on the mock bench, two cores; their ratios give the share of the work that is done.
 TYPICAL_S: dict[Step, float] = {
-    "capture": 90.0,
-    "fit": 60.0,
-    "validate": 5.0,
-    "diagnose": 100.0,
-    "resolve": 110.0,
-    "report": 10.0,
+    "capture": 48.0,
+    "fit": 49.0,
+    "validate": 4.0,
+    "diagnose": 84.0,
+    "resolve": 90.0,
+    "report": 15.0,
 }
 
 
