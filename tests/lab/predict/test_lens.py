@@ -3,11 +3,13 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from lab import cli
 from lab.errors import InputError
+from lab.predict import lens
 from lab.predict.lens import LensResult, TracedPrescription, parse_glasses, trace_prescription, with_glasses
 from lab.report.lens import write_lens_report
 from sim.optics.zmx import parse_zmx
@@ -66,12 +68,22 @@ def test_the_page_of_a_tilted_lens(tmp_path: Path) -> None:
     assert write_lens_report(tmp_path, traced).stat().st_size > 10_000
 
 
-def test_the_command_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_and_writes(
+    traced: TracedPrescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(
+        lens, "trace_prescription", lambda file, **options: asked.append({"file": file} | options) or traced
+    )
     out = tmp_path / "lens.json"
-    assert cli.main(["lens", str(LENS), "--json", str(out), "--field-deg", "9"]) == 0
-    assert "f = 9.7658 mm" in capsys.readouterr().out
-    document = json.loads(out.read_text())
-    assert document["maximum_field_deg"] == pytest.approx(9.0)
+    options = ["--field-deg", "9", "--focus", "best", "--glass", "A=N-BK7", "--report", str(tmp_path / "page")]
+    assert cli.main(["lens", str(LENS), "--json", str(out), *options]) == 0
+    (given,) = asked
+    assert (given["file"], given["maximum_field_deg"], given["focus"]) == (LENS, 9.0, "best")
+    assert given["glasses"] == parse_glasses(["A=N-BK7"])
+    shown = capsys.readouterr().out
+    assert "f = 9.7658 mm" in shown and "lens.html" in shown
+    assert LensResult.model_validate_json(out.read_text()) == traced.result
 
 
 @pytest.mark.parametrize(
