@@ -13,7 +13,8 @@ from lab.errors import InputError
 
 
 def changed_policy(rules: Sequence[str]) -> DecisionPolicy:
-    """The default policy with `NAME=VALUE` in place of its own. Raises InputError for what isn't a rule or not a number."""
+    """The default policy with `NAME=VALUE` in place of its own. Raises InputError for what isn't a rule or not a
+    number."""
     known = DecisionPolicy.rules()
     values: dict[str, str] = {}
     for rule in rules:

@@ -11,7 +11,8 @@ from lab.diagnose.side import SideFindings, diagnose_side
 
 
 def _serve() -> None:
-    """Read a task from standard input, diagnose that side, and write progress and findings as pickles to standard output."""
+    """Read a task from standard input, diagnose that side, and write progress and findings as pickles to standard
+    output."""
     with os.fdopen(os.dup(1), "wb") as to:
         os.dup2(2, 1)  # what a library prints goes to standard error
 

@@ -1,12 +1,13 @@
-"""The decision policy: every number by which a diagnosis decides, with its meaning, its unit and where its value comes from.
+"""The decision policy: every number by which a diagnosis decides, with its meaning, its unit and where its value comes
+from.
 
-Odds are natural logarithms throughout ("log odds"): 2.3 is ten to one, 4.6 is a hundred to one. A score is the gain in chi2 that an
-effect's signature promises: twice its log odds.
+Odds are natural logarithms throughout ("log odds"): 2.3 is ten to one, 4.6 is a hundred to one. A score is the gain in
+chi2 that an effect's signature promises: twice its log odds.
 
-Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge. `calibench challenge calibrate --rule NAME=VALUE` scores
-tuning cases under another value beside the default: healthy cases for false alarms, concealed effects for names and rivals, siblings
-outside the library for false names.
-docs/reference/decision-policy.md is generated from this module by docs/write_tables.py.
+Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge. `calibench challenge calibrate
+--rule NAME=VALUE` scores tuning cases under another value beside the default: healthy cases for false alarms, concealed
+effects for names and rivals, siblings outside the library for false names. docs/reference/decision-policy.md is
+generated from this module by docs/write_tables.py.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ TUNED = "tuned: `calibench challenge calibrate`"
 
 @dataclass(frozen=True)
 class Rule:
-    """Declaration of one field: its group, its unit ("1": a share, a ratio or a count), its meaning, and where its value comes from."""
+    """Declaration of one field: its group, its unit ("1": a share, a ratio or a count), its meaning, and where its
+    value comes from."""
 
     group: str
     unit: str

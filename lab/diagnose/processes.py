@@ -1,8 +1,9 @@
-"""The sides of a recording set at the same time, each in an OS process of its own, as Python computes in one thread at a time.
+"""The sides of a recording set at the same time, each in an OS process of its own, as Python computes in one thread at
+a time.
 
-A process is `python -m lab.diagnose`. It receives its task on standard input, and sends progress and findings as pickles on standard
-output. Unlike a pool's worker it needs nothing of the caller's main module, may be started by a pool's worker, and ends with the process
-that started it.
+A process is `python -m lab.diagnose`. It receives its task on standard input, and sends progress and findings as
+pickles on standard output. Unlike a pool's worker it needs nothing of the caller's main module, may be started by a
+pool's worker, and ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ def in_processes(
     pictures: bool = False,
     bootstrap: int = 0,
 ) -> list[SideFindings]:
-    """The findings of every side, in the order of the sides. `report` is called in the caller's thread. An exception in it, or in a process,
-    ends all processes. Raises InputError where a process was ended from outside."""
+    """The findings of every side, in the order of the sides. `report` is called in the caller's thread. An exception in
+    it, or in a process, ends all processes. Raises InputError where a process was ended from outside."""
     recordings.let_go()  # every process reads its own frames
     said: queue.SimpleQueue[tuple[Side, Any]] = queue.SimpleQueue()
     found: dict[Side, SideFindings] = {}

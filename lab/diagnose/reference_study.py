@@ -1,7 +1,8 @@
 """A reference session of a stereo pair with every kind of capture, drawn by the forward model without any effect.
 
-`visibility.py` derives from it which measurements show each effect. Frames are small, and conditions wide: darks at three temperatures, flats
-up and down again, a sweep into the near infrared, edges in several directions, lights, places and exposures, screens and boards.
+`visibility.py` derives from it which measurements show each effect. Frames are small, and conditions wide: darks at
+three temperatures, flats up and down again, a sweep into the near infrared, edges in several directions, lights, places
+and exposures, screens and boards.
 """
 
 from __future__ import annotations
@@ -158,7 +159,8 @@ class _Drawing:
             self.take("narrowband", UniformField(light, "narrowband"), exposure_s, 1, wavelength_nm=w, bandwidth_nm=10.0, radiance=self.noted(light))  # fmt: skip
 
     def edges(self) -> None:
-        """White light in the middle and off the axis, narrowband light, and a quarter of the exposure, at four angles each."""
+        """White light in the middle and off the axis, narrowband light, and a quarter of the exposure, at four angles
+        each."""
         line = {w: Spectrum.of(WAVELENGTH_NM, 0.05 * np.exp(-0.5 * ((WAVELENGTH_NM - w) / 4.2466) ** 2)) for w in (460.0, 640.0)}  # fmt: skip
         lights = [
             (self.lamp, EDGE_PLACES[0]),

@@ -53,8 +53,8 @@ class NamedCandidate:
 
 @dataclass(frozen=True)
 class SideFindings:
-    """What one side shows. `is_judged`: anything could be looked at; `threshold` is None where no effect acts on it. `improved`: the model with
-    what was found."""
+    """What one side shows. `is_judged`: anything could be looked at; `threshold` is None where no effect acts on it.
+    `improved`: the model with what was found."""
 
     side: Side
     skipped: tuple[Skipped, ...]
@@ -87,8 +87,8 @@ def diagnose_side(
 ) -> SideFindings:
     """Everything that is told of one side.
 
-    `pictures`: draw residual pictures, which takes the forward model some seconds. `bootstrap`: healthy recording sets that are drawn
-    frame by frame for the threshold, each as long as summarising takes.
+    `pictures`: draw residual pictures, which takes the forward model some seconds. `bootstrap`: healthy recording sets
+    that are drawn frame by frame for the threshold, each as long as summarising takes.
     """
     policy = policy or DecisionPolicy()
     report("summarising the recordings")

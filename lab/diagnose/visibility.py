@@ -1,11 +1,13 @@
 """Which measurements show each effect, and which effects are rivals, derived from the reference study.
 
-An effect is visible in a measurement where one of its prototypes changes a predicted number by more than rounding. Rivals are pairs of effects
-whose whitened signatures have a cosine of `DecisionPolicy.rival_cosine` or more in some part of a session: the whole, one measurement, or one
-condition of a measurement. (For independent measurements no other subset has to be looked at: the cosine over several is a weighted mean of
-the single ones with weights that sum to 1 at most, by Cauchy and Schwarz.)
+An effect is visible in a measurement where one of its prototypes changes a predicted number by more than rounding.
+Rivals are pairs of effects whose whitened signatures have a cosine of `DecisionPolicy.rival_cosine` or more in some
+part of a session: the whole, one measurement, or one condition of a measurement. (For independent measurements no other
+subset has to be looked at: the cosine over several is a weighted mean of the single ones with weights that sum to 1 at
+most, by Cauchy and Schwarz.)
 
-Deriving takes about a minute, so that the result is kept in visibility.toml. docs/write_tables.py writes it anew; a slow test compares.
+Deriving takes about a minute, so that the result is kept in visibility.toml. docs/write_tables.py writes it anew; a
+slow test compares.
 """
 
 from __future__ import annotations
@@ -28,13 +30,15 @@ from sim.effects.library import candidates, effects
 TABLE = Path(__file__).with_name("visibility.toml")
 #: Changes below this share of a number's standard deviation are rounding.
 ROUNDING = 1e-6
-#: Numbers that a condition has to have to count as a part of a session: of fewer, nuisance parameters leave no shape to compare.
+#: Numbers that a condition has to have to count as a part of a session: of fewer, nuisance parameters leave no shape to
+#: compare.
 LEAST_NUMBERS = 8
 
 
 @dataclass(frozen=True)
 class EffectVisibility:
-    """What shows one effect: measurements and the kinds of capture that they come from, none where nothing does; and its rivals."""
+    """What shows one effect: measurements and the kinds of capture that they come from, none where nothing does; and
+    its rivals."""
 
     effect: str
     measurements: tuple[str, ...]

@@ -1,7 +1,9 @@
-"""An image-level bootstrap: scores of healthy cameras like the fitted baseline, drawn frame by frame by the forward model.
+"""An image-level bootstrap: scores of healthy cameras like the fitted baseline, drawn frame by frame by the forward
+model.
 
-The threshold of `decide.py` is drawn from the covariance of the measurements. Here whole frames with their own patterns and noise go through
-every estimator, so that the scores hold what a covariance leaves out: estimators' errors, an edge's tail, rounding.
+The threshold of `decide.py` is drawn from the covariance of the measurements. Here whole frames with their own patterns
+and noise go through every estimator, so that the scores hold what a covariance leaves out: estimators' errors, an
+edge's tail, rounding.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ def healthy_draws(
     fit: FitResult | None = None,
     baseline: CameraFile | None = None,
 ) -> list[HealthyDraw]:
-    """`count` draws of the recordings by the baseline of `model`; measurements of captures that can't be replayed are left out."""
+    """`count` draws of the recordings by the baseline of `model`; measurements of captures that can't be replayed are
+    left out."""
     camera = _at_recorded_levels(recordings, side, model.camera)
     replay = Replay(recordings, side, camera)
     others = {c.id for c in recordings.captures(side=side)} - {c.id for c in replay.captures}
@@ -59,8 +62,9 @@ def healthy_draws(
 
 
 def image_threshold(draws: Sequence[HealthyDraw], false_alarm_rate: float) -> float:
-    """The score that a share `false_alarm_rate` of healthy cameras exceeds: the quantile of Gumbel's extreme-value distribution with the
-    draws' mean and standard deviation. The largest of many scores follows it, and few draws fix it."""
+    """The score that a share `false_alarm_rate` of healthy cameras exceeds: the quantile of Gumbel's extreme-value
+    distribution with the draws' mean and standard deviation. The largest of many scores follows it, and few draws fix
+    it."""
     tops = np.array([d.top_score for d in draws])
     scale = float(np.std(tops, ddof=1)) * np.sqrt(6.0) / np.pi
     return float(np.mean(tops)) - scale * (np.euler_gamma + float(np.log(-np.log1p(-false_alarm_rate))))
@@ -78,8 +82,8 @@ def _draw_of(model: MeasurementModel) -> HealthyDraw:
 
 
 def _at_recorded_levels(recordings: RecordingSet, side: Side, camera: CameraModel) -> CameraModel:
-    """The camera with sensitivities scaled so that it gives the recorded levels. Their scale is a nuisance parameter of the baseline; at a
-    wrong one, frames would clip or be lost in noise."""
+    """The camera with sensitivities scaled so that it gives the recorded levels. Their scale is a nuisance parameter of
+    the baseline; at a wrong one, frames would clip or be lost in noise."""
     replay = Replay(recordings, side, camera)
     ratios = []
     for capture in replay.captures:

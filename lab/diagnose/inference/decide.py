@@ -25,8 +25,8 @@ from sim.spectrum import FloatArray
 class Verdict:
     """What one side shows.
 
-    `before`, `after`: mismatches of the baseline, and with the named effects. `named`: most significant first. `abstained`: candidates that
-    weren't named. `discrepancies`: of the blocks that have a mismatch left.
+    `before`, `after`: mismatches of the baseline, and with the named effects. `named`: most significant first.
+    `abstained`: candidates that weren't named. `discrepancies`: of the blocks that have a mismatch left.
     """
 
     model: MeasurementModel
@@ -57,8 +57,8 @@ def decide(
     *,
     least_threshold: float = 0.0,
 ) -> Verdict:
-    """The whole chain on one side's measurement model; deterministic for a given generator. `least_threshold` of the scores: from drawn
-    healthy cameras, where there are any (`bootstrap.py`)."""
+    """The whole chain on one side's measurement model; deterministic for a given generator. `least_threshold` of the
+    scores: from drawn healthy cameras, where there are any (`bootstrap.py`)."""
     known = candidates()
     first = signatures(model, model.camera, (), known)
     threshold = max(first.threshold(rng, 1.0 - policy.false_alarm_rate, policy.threshold_draws), least_threshold)
@@ -93,8 +93,8 @@ def decide(
 def _with_either_sign(
     model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
 ) -> Candidate:
-    """The candidate with standard deviations about the value told that hold both signs of parameters that act by their square, where the
-    recordings don't tell the sign: sqrt(s^2 + (2 v)^2 / 2)."""
+    """The candidate with standard deviations about the value told that hold both signs of parameters that act by their
+    square, where the recordings don't tell the sign: sqrt(s^2 + (2 v)^2 / 2)."""
     effect = candidate.effect
     both = {
         name: float(getattr(effect, name))
@@ -121,7 +121,8 @@ def _is_part_of_unknown(
     discrepancies: Iterable[Discrepancy],
     policy: DecisionPolicy,
 ) -> bool:
-    """Whether the frames in which an effect shows most hold a discrepancy that is strong beside it: both may have one unknown cause."""
+    """Whether the frames in which an effect shows most hold a discrepancy that is strong beside it: both may have one
+    unknown cause."""
     strongest = model.strongest_block(candidate.effect, effects)
     frames = _frames(model, strongest)
 

@@ -1,7 +1,8 @@
-"""Model discrepancy: what no effect accounts for, as a smooth Gaussian process along a measurement's axis (Kennedy and O'Hagan, 2001).
+"""Model discrepancy: what no effect accounts for, as a smooth Gaussian process along a measurement's axis (Kennedy and
+O'Hagan, 2001).
 
-Kernel: a^2 s_i s_j exp(-(x_i - x_j)^2 / (2 l^2)) for numbers of one group, 0 between groups; s is the block's scale. Amplitude a, length l and
-grouping (which channels and conditions share one draw) are chosen from a grid.
+Kernel: a^2 s_i s_j exp(-(x_i - x_j)^2 / (2 l^2)) for numbers of one group, 0 between groups; s is the block's scale.
+Amplitude a, length l and grouping (which channels and conditions share one draw) are chosen from a grid.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ LENGTHS, PREDICTIVE_LENGTHS = (0.5, 1.0, 2.0), (0.5, 1.0, 2.0, 4.0)
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """A discrepancy of one block: its log posterior odds over none, its amplitude, correlation length, grouping in words, and kernel."""
+    """A discrepancy of one block: its log posterior odds over none, its amplitude, correlation length, grouping in
+    words, and kernel."""
 
     index: int
     log_odds: float
@@ -39,8 +41,8 @@ class Discrepancy:
 def likeliest_discrepancy(
     model: MeasurementModel, gaussian: Gaussian, index: int, policy: DecisionPolicy
 ) -> Discrepancy:
-    """The discrepancy of one block that maximises the marginal likelihood of the seen numbers, or none where that is likelier.
-    `gaussian`: the distribution of the seen numbers without it."""
+    """The discrepancy of one block that maximises the marginal likelihood of the seen numbers, or none where that is
+    likelier. `gaussian`: the distribution of the seen numbers without it."""
     return max(_fitted(model, gaussian, index, LENGTHS, policy), key=lambda d: d.log_odds)
 
 
@@ -49,10 +51,11 @@ def predictive_discrepancy(
 ) -> Discrepancy:
     """The discrepancy of one block that best predicts captures which it hasn't seen, or none where none does.
 
-    Captures are left out in turn (cross-validation); of the discrepancies with positive log odds, the one of the least chi2 over what was left
-    out is taken, if that beats none by twice `discrepancy_log_odds`. Longer lengths, and points by themselves, are tried besides.
-    Where mostly repeats of seen numbers are held out, leaving captures out asks for more than is needed: cross-validation then decides
-    only between discrepancies within `equal_discrepancy_log_odds` of the likeliest. With a single set of captures, the likeliest is taken.
+    Captures are left out in turn (cross-validation); of the discrepancies with positive log odds, the one of the least
+    chi2 over what was left out is taken, if that beats none by twice `discrepancy_log_odds`. Longer lengths, and points
+    by themselves, are tried besides. Where mostly repeats of seen numbers are held out, leaving captures out asks for
+    more than is needed: cross-validation then decides only between discrepancies within `equal_discrepancy_log_odds` of
+    the likeliest. With a single set of captures, the likeliest is taken.
 
     What was left out is judged by the covariance without the discrepancy, so that larger variances gain nothing.
     """
@@ -84,7 +87,8 @@ def predictive_discrepancy(
 
 
 def _left_out(block: Block, seen: np.ndarray, most_parts: int) -> list[np.ndarray]:
-    """Masks over the seen numbers that are left out together: those of the same captures, in at most `most_parts` parts."""
+    """Masks over the seen numbers that are left out together: those of the same captures, in at most `most_parts`
+    parts."""
     captures = [label.captures for label, s in zip(block.labels, seen, strict=True) if s]
     number = {names: k % most_parts for k, names in enumerate(dict.fromkeys(captures))}
     part = np.array([number[names] for names in captures])
@@ -92,7 +96,8 @@ def _left_out(block: Block, seen: np.ndarray, most_parts: int) -> list[np.ndarra
 
 
 def _repeated_share(block: Block, seen: np.ndarray, distance: float) -> float:
-    """Share of the held-out numbers that have a seen one of the same channel and condition within `distance` correlation lengths."""
+    """Share of the held-out numbers that have a seen one of the same channel and condition within `distance`
+    correlation lengths."""
     x = block.position.reshape(len(seen), -1) / block.reach
     kind = np.array([f"{label.channel}|{label.condition}" for label in block.labels])
     repeated = [
@@ -111,7 +116,8 @@ def _fitted(
     *,
     points: bool = False,
 ) -> Iterator[Discrepancy]:
-    """None; and for every length and grouping the one of the likeliest amplitude. `points`: every point by itself, too."""
+    """None; and for every length and grouping the one of the likeliest amplitude. `points`: every point by itself,
+    too."""
     block, at = model.blocks[index], model.slices[index]
     seen = model.seen[at]
     residual = model.value[at][seen] - gaussian.mean[gaussian.slices[index]]
@@ -168,7 +174,8 @@ def _none(block: Block, index: int) -> Discrepancy:
 
 
 def _kernel_factor(x: FloatArray, length: float) -> FloatArray:
-    """Factor B (m, k) of the squared exponential, exp(-(x_i - x_j)^2 / (2 l^2)) = B B' to 1e-9; k is small, as the kernel is smooth."""
+    """Factor B (m, k) of the squared exponential, exp(-(x_i - x_j)^2 / (2 l^2)) = B B' to 1e-9; k is small, as the
+    kernel is smooth."""
     place, which = np.unique(x.reshape(len(x), -1), axis=0, return_inverse=True)
     size, vectors = eigh(np.exp(-0.5 * np.square((place[:, None] - place) / length).sum(-1)))
     kept = size > 1e-10 * size[-1]

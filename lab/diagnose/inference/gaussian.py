@@ -2,8 +2,8 @@
 
 C = D + F F',  D block diagonal (one block a measurement),  F (n, k) of few columns
 
-With B = D^-1/2 F = U S V', all inverses follow from the Cholesky factors of D's blocks and from U and S (Woodbury's identity).
-The cost is that of the largest block.
+With B = D^-1/2 F = U S V', all inverses follow from the Cholesky factors of D's blocks and from U and S (Woodbury's
+identity). The cost is that of the largest block.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ LEAST_EIGENVALUE = 1e-4
 
 @dataclass(frozen=True)
 class BlockCovariance:
-    """Covariance (n, n) of one measurement's numbers: noise, floors, form tolerances, and nuisance parameters of that measurement alone."""
+    """Covariance (n, n) of one measurement's numbers: noise, floors, form tolerances, and nuisance parameters of that
+    measurement alone."""
 
     covariance: FloatArray
 
     @cached_property
     def lower(self) -> FloatArray:
-        """Lower Cholesky factor. Where the covariance, estimated from frames, is indefinite, eigenvalues of the correlation matrix are
-        raised to `LEAST_EIGENVALUE`."""
+        """Lower Cholesky factor. Where the covariance, estimated from frames, is indefinite, eigenvalues of the
+        correlation matrix are raised to `LEAST_EIGENVALUE`."""
         try:
             return np.asarray(cholesky(self.covariance, lower=True, check_finite=False))
         except LinAlgError:
@@ -43,8 +44,8 @@ class BlockCovariance:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """N(mean, D + F F'). `blocks` are the blocks of D; F = `shared_jacobian` (n, k) is the Jacobian by nuisance parameters that act on
-    several measurements, per prior standard deviation."""
+    """N(mean, D + F F'). `blocks` are the blocks of D; F = `shared_jacobian` (n, k) is the Jacobian by nuisance
+    parameters that act on several measurements, per prior standard deviation."""
 
     mean: FloatArray
     blocks: tuple[BlockCovariance, ...]
@@ -76,8 +77,8 @@ class Gaussian:
 
     @cached_property
     def _shared_svd(self) -> tuple[FloatArray, FloatArray]:
-        """U and S of B = D^-1/2 F, from the eigenvectors of B'B. Singular values that are lost beside the largest one are far below 1,
-        and count for nothing."""
+        """U and S of B = D^-1/2 F, from the eigenvectors of B'B. Singular values that are lost beside the largest one
+        are far below 1, and count for nothing."""
         split = self._whiten_blocks(self.shared_jacobian)
         square, v = eigh(split.T @ split) if split.shape[1] else (np.zeros(0), np.zeros((0, 0)))
         counts = square > 1e-12 + 1e-15 * float(square.max(initial=0.0))

@@ -22,8 +22,8 @@ LOG_UNDERFLOW = -650.0
 
 @dataclass(frozen=True)
 class Slice:
-    """A part of one measurement: a range of its axis, a channel or a condition. `log_probability`: of a chi2 as large by chance, corrected
-    for the number of slices (Bonferroni)."""
+    """A part of one measurement: a range of its axis, a channel or a condition. `log_probability`: of a chi2 as large
+    by chance, corrected for the number of slices (Bonferroni)."""
 
     block: Block
     axis: str
@@ -73,7 +73,8 @@ def _log_tail(value: float, n: int) -> float:
 
 
 def _slices(block: Block, at: slice, seen: np.ndarray) -> list[tuple[Block, str, str, np.ndarray]]:
-    """The block as a whole, its channels, its conditions, and the quarters of its axis: (block, axis, words, indices)."""
+    """The block as a whole, its channels, its conditions, and the quarters of its axis: (block, axis, words,
+    indices)."""
     index = np.arange(at.start, at.stop)
     use = seen[index]
     x = np.array([label.x for label in block.labels])
@@ -113,8 +114,9 @@ def _range(block: Block, x: FloatArray) -> str:
 def describe(model: MeasurementModel, gaussian: Gaussian, part: Slice) -> tuple[str, tuple[str, ...]]:
     """A mismatch in words, and the captures concerned.
 
-    The words give range, channels and conditions of the numbers whose residuals are largest: at least 3 standard deviations and 0.3 of the
-    largest; where all are smaller, by noise alone, 2 standard deviations and 0.5 of the largest.
+    The words give range, channels and conditions of the numbers whose residuals are largest: at least 3 standard
+    deviations and 0.3 of the largest; where all are smaller, by noise alone, 2 standard deviations and 0.5 of the
+    largest.
     """
     block = part.block
     at = model.slices[model.blocks.index(block)]

@@ -45,8 +45,8 @@ class MeasurementModel:
     """The blocks of one side, stacked into one vector of n numbers.
 
     `always` are effects that the baseline has: they act first, and their laws have tolerances like those of others.
-    `unstated_jacobian` has columns (n,) by nuisance parameters that stand for what nobody states, per prior standard deviation.
-    Predictions are cached by block, as most effects act on few blocks.
+    `unstated_jacobian` has columns (n,) by nuisance parameters that stand for what nobody states, per prior standard
+    deviation. Predictions are cached by block, as most effects act on few blocks.
     """
 
     blocks: tuple[Block, ...]
@@ -149,8 +149,8 @@ class MeasurementModel:
         return np.concatenate([self._prediction(i, acting).mean for i in range(len(self.blocks))])
 
     def nuisance_jacobian(self, effects: Effects = ()) -> dict[str, FloatArray]:
-        """Columns (n,) of the Jacobian by every nuisance parameter, per prior standard deviation. One that several blocks name is one
-        column."""
+        """Columns (n,) of the Jacobian by every nuisance parameter, per prior standard deviation. One that several
+        blocks name is one column."""
         columns = dict(self.unstated_jacobian)
         acting = self._numbered((*self.always, *effects))
         for index, at in enumerate(self.slices):
@@ -173,7 +173,8 @@ class MeasurementModel:
 
     @cached_property
     def _correlation_kernels(self) -> tuple[FloatArray, ...]:
-        """K of each block, (m, m): squared exponential along the axis, reduced between channels and between conditions."""
+        """K of each block, (m, m): squared exponential along the axis, reduced between channels and between
+        conditions."""
         found = []
         for block in self.blocks:
             x = block.position.reshape(len(block.value), -1)
@@ -226,8 +227,8 @@ class MeasurementModel:
     def weighted_residual(
         self, effects: Effects = (), discrepancies: Mapping[int, FloatArray] | None = None
     ) -> FloatArray:
-        """w = C^-1 (y - m) of the seen numbers, zero at the others, (n,). The posterior mean of any part A of the model with covariance
-        J P J' is J P J' w."""
+        """w = C^-1 (y - m) of the seen numbers, zero at the others, (n,). The posterior mean of any part A of the model
+        with covariance J P J' is J P J' w."""
         gaussian = self.seen_gaussian(effects)
         for index, kernel in (discrepancies or {}).items():
             seen = self.seen[self.slices[index]]
@@ -264,10 +265,11 @@ class MeasurementModel:
         where: np.ndarray | None = None,
         discrepancies: Mapping[int, FloatArray] | None = None,
     ) -> tuple[float, int]:
-        """chi2 and count of the held-out numbers given the seen ones: -2 log p(held out | seen) = chi2(both) - chi2(seen).
+        """chi2 and count of the held-out numbers given the seen ones: -2 log p(held out | seen) = chi2(both) -
+        chi2(seen).
 
-        `where` (n,) limits which are judged. Discrepancies enter by their posterior means alone: their variance isn't added, so that
-        one that predicts wrongly raises chi2.
+        `where` (n,) limits which are judged. Discrepancies enter by their posterior means alone: their variance isn't
+        added, so that one that predicts wrongly raises chi2.
         """
         out = ~self.seen if where is None else ~self.seen & where
         if not out.any():

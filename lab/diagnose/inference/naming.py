@@ -17,8 +17,9 @@ from lab.diagnose.policy import DecisionPolicy
 def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> tuple[list[Candidate], list[Candidate]]:
     """The members of a set whose names hold, and those that were given up, in that order.
 
-    One at a time: the weakest member that is too weak for any name; then the member for which a rival is likelier; then members that one
-    discrepancy replaces, or whose name doesn't hold. After each change the rest is fitted and weighed again.
+    One at a time: the weakest member that is too weak for any name; then the member for which a rival is likelier; then
+    members that one discrepancy replaces, or whose name doesn't hold. After each change the rest is fitted and weighed
+    again.
     """
     model, policy = search.model, search.policy
     current = best
@@ -83,8 +84,8 @@ def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
 
 
 def _too_weak(search: Search, fit: Fit) -> tuple[int, bool] | None:
-    """The weakest member that can't be named whatever its rivals, and whether it may be no more than the error of another member's law.
-    Tested before anything is weighed, as that fits every rival of every member."""
+    """The weakest member that can't be named whatever its rivals, and whether it may be no more than the error of
+    another member's law. Tested before anything is weighed, as that fits every rival of every member."""
     policy = search.policy
     log_odds = [fit.log_posterior - search.without(fit, i).log_posterior for i in range(len(fit.effects))]
     members = [Candidate(e, s, 0.0, (), odds) for e, s, odds in zip(fit.effects, fit.std, log_odds, strict=True)]
@@ -113,8 +114,8 @@ def _is_beside_stronger(candidate: Candidate, members: Sequence[Candidate], sear
 def _is_companion(candidate: Candidate, members: Sequence[Candidate], search: Search) -> bool:
     """Whether a member may be no more than the error of a stronger one's law.
 
-    It may where its log odds are below `companion_share` of a rival's; and where, in the block that it changes most, its change is below
-    `companion_share` of another member's.
+    It may where its log odds are below `companion_share` of a rival's; and where, in the block that it changes most,
+    its change is below `companion_share` of another member's.
     """
     model, policy = search.model, search.policy
     others = [c for c in members if c is not candidate]
@@ -134,7 +135,8 @@ def _is_companion(candidate: Candidate, members: Sequence[Candidate], search: Se
 
 
 def _replaced_by_a_discrepancy(search: Search, fit: Fit) -> list[int]:
-    """Indices of two or more members that change the same block most, where one discrepancy in their place is likelier."""
+    """Indices of two or more members that change the same block most, where one discrepancy in their place is
+    likelier."""
     model, policy = search.model, search.policy
     by_block: dict[int, list[int]] = {}
     for i, e in enumerate(fit.effects):

@@ -1,4 +1,5 @@
-"""Fit the parameters of a set of effects to the seen numbers: maximum a posteriori, by Gauss-Newton steps within bounds."""
+"""Fit the parameters of a set of effects to the seen numbers: maximum a posteriori, by Gauss-Newton steps within
+bounds."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 
-#: The covariance depends on the parameters through form tolerances: it is updated this often, for a fit to convergence and a rough one.
+#: The covariance depends on the parameters through form tolerances: it is updated this often, for a fit to convergence
+#: and a rough one.
 PASSES, ROUGH_PASSES = 3, 2
 #: Evaluations of the prediction in the first pass, likewise; and in later ones.
 EVALUATIONS, ROUGH_EVALUATIONS, LATER_EVALUATIONS = 12, 8, 5
@@ -30,7 +32,8 @@ DIFFERENCE_STEP = 0.02
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One parameter of one effect as u = sign(p - absent) |p - absent|^slope_power, in which predictions have a slope at `absent`."""
+    """One parameter of one effect as u = sign(p - absent) |p - absent|^slope_power, in which predictions have a slope
+    at `absent`."""
 
     index: int  # of the effect in its set
     name: str
@@ -125,9 +128,10 @@ def refit(
 ) -> Fit:
     """Maximum a posteriori of all parameters, from `start`.
 
-    Standard deviations follow from the Jacobian and hold form tolerances, as the covariance does. Dispensable parameters stay absent in a
-    converged fit unless they gain `dispensable_log_odds`. `rough`: fewer steps, enough to rank sets. `beside`: a fit whose Jacobian is
-    reused for members that stand as they do there; it changes little by what joins them.
+    Standard deviations follow from the Jacobian and hold form tolerances, as the covariance does. Dispensable
+    parameters stay absent in a converged fit unless they gain `dispensable_log_odds`. `rough`: fewer steps, enough to
+    rank sets. `beside`: a fit whose Jacobian is reused for members that stand as they do there; it changes little by
+    what joins them.
     """
     coords = coordinates(tuple(start))
     known = {} if beside is None else beside.jacobian_columns(start)
@@ -149,7 +153,8 @@ def _fit(
     passes: int | None,
     known: Mapping[Coordinate, FloatArray] = MappingProxyType({}),
 ) -> Fit:
-    """Fit the coordinates `coords`, other parameters as they are. `known`: columns of the Jacobian that aren't computed again."""
+    """Fit the coordinates `coords`, other parameters as they are. `known`: columns of the Jacobian that aren't computed
+    again."""
     seen = model.seen
     if not coords:
         value = log_likelihood(model, effects)
@@ -221,8 +226,8 @@ def _prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
 def _standard_deviations(
     jacobian: FloatArray, coords: Sequence[Coordinate], u: FloatArray, prior_std: FloatArray, effects: int
 ) -> list[dict[str, float | None]]:
-    """Of every effect's parameters, from (J'J + P^-1)^-1. With s the standard deviation of u = p^k, that of p is s / (k |p|^(k - 1)), and
-    at most s^(1/k), which holds at p = 0."""
+    """Of every effect's parameters, from (J'J + P^-1)^-1. With s the standard deviation of u = p^k, that of p is s / (k
+    |p|^(k - 1)), and at most s^(1/k), which holds at p = 0."""
     curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)
     covariance = np.linalg.pinv(curvature)
     std: list[dict[str, float | None]] = [{} for _ in range(effects)]
@@ -239,15 +244,16 @@ def _standard_deviations(
 def _promised_gain(
     gaussian: Gaussian, seen_value: FloatArray, jacobian: FloatArray, from_prior: FloatArray, prior_std: FloatArray
 ) -> float:
-    """Half of Newton's decrement, g' (J'J + P^-1)^-1 g / 2: what a step to the optimum would gain if the prediction were linear and without
-    bounds."""
+    """Half of Newton's decrement, g' (J'J + P^-1)^-1 g / 2: what a step to the optimum would gain if the prediction
+    were linear and without bounds."""
     white = gaussian.whiten(jacobian)
     gradient = white.T @ gaussian.whiten(seen_value - gaussian.mean) - from_prior / prior_std
     return float(0.5 * gradient @ np.linalg.pinv(white.T @ white + np.diag(1.0 / prior_std**2)) @ gradient)
 
 
 def _usual_log_odds(effect: Effect, std: dict[str, float | None]) -> float:
-    """The effect's `log_prior`, the largest within a standard deviation of the values found: noise makes nothing unusual."""
+    """The effect's `log_prior`, the largest within a standard deviation of the values found: noise makes nothing
+    unusual."""
     if type(effect).log_prior is Effect.log_prior:
         return 0.0
     quantities = type(effect).quantities()

@@ -1,7 +1,8 @@
-"""Rivals: pairs of effects whose signatures are nearly parallel in what was measured, so that either may be taken for the other.
+"""Rivals: pairs of effects whose signatures are nearly parallel in what was measured, so that either may be taken for
+the other.
 
-With whitened signatures a and b of non-centrality lambda (nuisance parameters marginalised), two effects are told apart with
-probability Phi(1/2 sqrt(lambda (1 - rho^2))), rho = a'b / (|a| |b|). The relation is symmetric by construction.
+With whitened signatures a and b of non-centrality lambda (nuisance parameters marginalised), two effects are told apart
+with probability Phi(1/2 sqrt(lambda (1 - rho^2))), rho = a'b / (|a| |b|). The relation is symmetric by construction.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ LEAST_NORM = 0.3
 def session_rivals(
     model: MeasurementModel, candidates: Iterable[type[Effect]], cosine: float
 ) -> dict[str, frozenset[str]]:
-    """By name, the effects that are rivals in one measurement of the model or in all together; effects without any have an empty set."""
+    """By name, the effects that are rivals in one measurement of the model or in all together; effects without any have
+    an empty set."""
     kinds = tuple(candidates)
     changes = signature_changes(model, kinds)
     pairs: set[tuple[str, str]] = set()
@@ -32,7 +34,8 @@ def session_rivals(
 
 
 def signature_changes(model: MeasurementModel, kinds: Iterable[type[Effect]]) -> dict[str, FloatArray]:
-    """Changes of the baseline's prediction by every effect's prototypes, (n, prototypes), of those effects that change any."""
+    """Changes of the baseline's prediction by every effect's prototypes, (n, prototypes), of those effects that change
+    any."""
     base, found = model.mean(), {}
     for kind in kinds:
         if model.affected(kind).any():
@@ -54,8 +57,8 @@ def whitened(model: MeasurementModel, changes: Mapping[str, FloatArray], where: 
 def parallel_pairs(
     signatures: Mapping[str, FloatArray], cosine: float, least_norm: float = LEAST_NORM
 ) -> set[tuple[str, str]]:
-    """Pairs of names of which any two columns have at least this cosine. Signs count: a one-sided effect is no rival of its opposite; an
-    effect of either sign has columns of both."""
+    """Pairs of names of which any two columns have at least this cosine. Signs count: a one-sided effect is no rival of
+    its opposite; an effect of either sign has columns of both."""
     unit = {}
     for name, table in signatures.items():
         norm = np.linalg.norm(table, axis=0)

@@ -1,6 +1,8 @@
-"""The score of every effect: how much of the residual its signature takes, nuisance parameters and known effects projected out.
+"""The score of every effect: how much of the residual its signature takes, nuisance parameters and known effects
+projected out.
 
-A signature is the change of the prediction by a small or typical instance of the effect (its prototypes), whitened by the covariance.
+A signature is the change of the prediction by a small or typical instance of the effect (its prototypes), whitened by
+the covariance.
 """
 
 from __future__ import annotations
@@ -19,8 +21,8 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray
 
-#: Ridge on unit columns in non-negative least squares, a relative change of 1e-8: without it, the active set cycles between columns that
-#: are all but equal.
+#: Ridge on unit columns in non-negative least squares, a relative change of 1e-8: without it, the active set cycles
+#: between columns that are all but equal.
 RIDGE = 1e-4
 #: A refit starts within this share of the way from `absent` to a bound.
 INSIDE_BOUND = 0.9
@@ -28,8 +30,8 @@ INSIDE_BOUND = 0.9
 
 @dataclass(frozen=True)
 class Score:
-    """S = |r|^2 - min over u >= 0 of |r - G u|^2, r the whitened residual, G the whitened signatures: the likelihood-ratio statistic of a small
-    effect, twice the log-likelihood that it gains."""
+    """S = |r|^2 - min over u >= 0 of |r - G u|^2, r the whitened residual, G the whitened signatures: the
+    likelihood-ratio statistic of a small effect, twice the log-likelihood that it gains."""
 
     effect: type[Effect]
     value: float
@@ -53,8 +55,8 @@ class Pair:
 class Signatures:
     """Whitened residual and signatures of all candidates, linearised about one set of effects.
 
-    `columns`: of every candidate and each of its alternative sets of prototypes, the prototypes and their signatures (n, prototypes).
-    `whitened_changes` gives the signatures of any effects as they stand, (n, effects).
+    `columns`: of every candidate and each of its alternative sets of prototypes, the prototypes and their signatures
+    (n, prototypes). `whitened_changes` gives the signatures of any effects as they stand, (n, effects).
     """
 
     white: FloatArray
@@ -78,8 +80,8 @@ class Signatures:
         return sorted(found, key=lambda s: -s.value)
 
     def _nearest(self, scaled: Effect, prototypes: Sequence[tuple[float, Effect]]) -> Effect:
-        """The prototype as it stands where that takes more of the residual than the linearly scaled one: of large changes, linear scaling may
-        be far off."""
+        """The prototype as it stands where that takes more of the residual than the linearly scaled one: of large
+        changes, linear scaling may be far off."""
         taken, prototype = max(prototypes, key=lambda one: one[0], default=(0.0, scaled))
         is_nearer = taken > 0.0 and taken > self._chi2_taken(self.whitened_changes([scaled])[:, 0])
         return prototype if is_nearer else scaled
@@ -89,8 +91,8 @@ class Signatures:
         return float(2.0 * signature @ self.white - signature @ signature)
 
     def pairs(self, count: int) -> list[Pair]:
-        """The best pairs of two effects by their common score, highest first. Of two effects that act on the same numbers, neither may be the
-        best alone. Computed in the span of the signatures, which is of low dimension."""
+        """The best pairs of two effects by their common score, highest first. Of two effects that act on the same
+        numbers, neither may be the best alone. Computed in the span of the signatures, which is of low dimension."""
         best: dict[str, tuple[float, tuple[Effect, ...], FloatArray]] = {}
         for effect, prototypes, table in self.columns:
             value, _ = _cone_score(table, self.white)
@@ -142,8 +144,8 @@ def signatures(
     candidates: Iterable[type[Effect]],
     jacobian: FloatArray | None = None,
 ) -> Signatures:
-    """Residual and signatures about a set of `current` effects. `jacobian` (n, p) by the parameters of these is projected out.
-    Candidates that change nothing that was measured are left out."""
+    """Residual and signatures about a set of `current` effects. `jacobian` (n, p) by the parameters of these is
+    projected out. Candidates that change nothing that was measured are left out."""
     seen = model.seen
     gaussian = model.seen_gaussian(current)
     base = model.mean(current)

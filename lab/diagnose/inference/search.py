@@ -1,4 +1,5 @@
-"""Which set of effects explains the seen numbers best: a beam search over sets, starting from single effects and pairs."""
+"""Which set of effects explains the seen numbers best: a beam search over sets, starting from single effects and
+pairs."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ from sim.effects.base import Effect
 class Search:
     """The sets that were fitted so far, by their effects' names, and the search over further ones.
 
-    `threshold` is that of the scores: twice the log odds that every effect has to earn. `refitted_again` holds the names of sets that
-    were fitted from a second start.
+    `threshold` is that of the scores: twice the log odds that every effect has to earn. `refitted_again` holds the
+    names of sets that were fitted from a second start.
     """
 
     model: MeasurementModel
@@ -36,7 +37,8 @@ class Search:
         return session_rivals(self.model, self.candidates, self.policy.rival_cosine)
 
     def log_odds(self, fit: Fit) -> float:
-        """Log posterior of a set, less half the threshold for every effect: one healthy camera in a hundred reaches that."""
+        """Log posterior of a set, less half the threshold for every effect: one healthy camera in a hundred reaches
+        that."""
         return fit.log_posterior - 0.5 * self.threshold * len(fit.effects)
 
     def best(self, report: Callable[[str], None] = lambda _: None) -> Fit:
@@ -60,8 +62,8 @@ class Search:
         return self._improved(current)
 
     def _without_exchanges(self, sets: Sequence[Fit]) -> list[Fit]:
-        """Sets, best first, without those that are a better one with a member exchanged for its rival: they would grow alike, and the exchange
-        is tried in the end (`_exchanged`)."""
+        """Sets, best first, without those that are a better one with a member exchanged for its rival: they would grow
+        alike, and the exchange is tried in the end (`_exchanged`)."""
         kept: list[Fit] = []
         for one in sets:
             if not any(self._is_exchange(one, better) for better in kept):
@@ -74,7 +76,8 @@ class Search:
         return len(mine) == len(theirs) == 1 and mine[0].name in self.rivals[theirs[0].name]
 
     def _added_cost(self, fit: Fit, grown_from: Fit) -> float:
-        """Log odds that an added effect has to earn beyond its own, where it shows most in a block on which an earlier member acts."""
+        """Log odds that an added effect has to earn beyond its own, where it shows most in a block on which an earlier
+        member acts."""
         new = [e for e in fit.effects if e.name not in grown_from.names]
         if not grown_from.effects or len(new) != len(fit.effects) - len(grown_from.effects):
             return 0.0
@@ -128,8 +131,8 @@ class Search:
     def fitted(self, start: Effects, *, converged: bool = False, again: bool = False, beside: Fit | None = None) -> Fit:
         """The fit of a set of effects, made once: rough, which is enough to rank sets, or to convergence.
 
-        There are several optima. `again`: fit once more from `start`, once, and keep the better. `beside`: the set that `start` grew from,
-        whose Jacobian a rough fit reuses.
+        There are several optima. `again`: fit once more from `start`, once, and keep the better. `beside`: the set that
+        `start` grew from, whose Jacobian a rough fit reuses.
         """
         key, begin = frozenset(e.name for e in start), tuple(start)
         known = self.fits.get(key)

@@ -1,4 +1,5 @@
-"""Weigh one member of a set of effects: its probability against rivals in its place, an unknown cause, and misstated metadata."""
+"""Weigh one member of a set of effects: its probability against rivals in its place, an unknown cause, and misstated
+metadata."""
 
 from __future__ import annotations
 
@@ -106,7 +107,8 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
 
 
 def _rival_fits(search: Search, fit: Fit, index: int, without: Fit) -> dict[str, Fit]:
-    """The set with each likely effect in the place of a member: fitted roughly, and to convergence where it isn't far behind."""
+    """The set with each likely effect in the place of a member: fitted roughly, and to convergence where it isn't far
+    behind."""
     model, policy, name = search.model, search.policy, fit.effects[index].name
     log_odds = fit.log_posterior - without.log_posterior
     others = [e for e in search.candidates if e.name not in fit.names]
@@ -130,8 +132,9 @@ def _rival_fits(search: Search, fit: Fit, index: int, without: Fit) -> dict[str,
 
 
 def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, str]:
-    """Log posterior, less prior odds, of the set with another f-number or pitch than stated in the place of an effect that blurs; and that
-    in words. -inf for effects that don't blur, and where the fitted ratio is below `misstated_ratio`."""
+    """Log posterior, less prior odds, of the set with another f-number or pitch than stated in the place of an effect
+    that blurs; and that in words. -inf for effects that don't blur, and where the fitted ratio is below
+    `misstated_ratio`."""
     model, policy, effect = search.model, search.policy, fit.effects[index]
     if TRANSFER.isdisjoint(changed_by(effect)):
         return -np.inf, ""
@@ -157,11 +160,12 @@ def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, st
 def explained(
     model: MeasurementModel, fit: Fit, without: Fit, affected: Sequence[int], policy: DecisionPolicy
 ) -> tuple[float, bool]:
-    """Share of the excess chi2 that an effect explains in the blocks it acts on; and whether what is left there is closed.
+    """Share of the excess chi2 that an effect explains in the blocks it acts on; and whether what is left there is
+    closed.
 
-    share = (chi2 without - chi2 with) / (chi2 without - n), by the baseline's covariance, so that an effect's own form tolerance explains
-    nothing; 1 where chi2 with it is within `noise_sigma` of n. Closed: chi2 by the covariance with form tolerances is within
-    `tolerance_sigma` of n; the standard deviation of chi2 is sqrt(2 n).
+    share = (chi2 without - chi2 with) / (chi2 without - n), by the baseline's covariance, so that an effect's own form
+    tolerance explains nothing; 1 where chi2 with it is within `noise_sigma` of n. Closed: chi2 by the covariance with
+    form tolerances is within `tolerance_sigma` of n; the standard deviation of chi2 is sqrt(2 n).
     """
     if not affected:
         return 1.0, True

@@ -1,4 +1,5 @@
-"""Captures that a station or a person could take next, each with the forward model's prediction of it and its covariance."""
+"""Captures that a station or a person could take next, each with the forward model's prediction of it and its
+covariance."""
 
 from __future__ import annotations
 
@@ -23,9 +24,11 @@ from sim.point import optical_transfer
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import FieldPoints, Uniform, electron_rate
 
-#: Size of a capture that is assumed: pixels of a channel, repeats, and the brightest channel's electrons over the full well.
+#: Size of a capture that is assumed: pixels of a channel, repeats, and the brightest channel's electrons over the full
+#: well.
 PIXELS, REPEATS, FILLED = 2e4, 4, 0.6
-#: Standard deviations that don't average out: of a variance, relative, beside its noise; of a transfer function, where no edge tells.
+#: Standard deviations that don't average out: of a variance, relative, beside its noise; of a transfer function, where
+#: no edge tells.
 VARIANCE_STD, EDGE_STD = 0.003, 0.004
 #: Prior standard deviation of a level that is a nuisance parameter, relative: so wide that it says nothing.
 NUISANCE_STD = 10.0
@@ -35,7 +38,8 @@ SESSION_S = 3600.0
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A rival with the effects that act beside it, and the camera with its nuisance parameters at their posterior means."""
+    """A rival with the effects that act beside it, and the camera with its nuisance parameters at their posterior
+    means."""
 
     name: str
     effects: tuple[Effect, ...]
@@ -44,8 +48,8 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Design:
-    """A capture that could be taken: the prediction of a hypothesis (n,), its covariance (n, n), and the sequence that takes it (None: a
-    station can't by itself)."""
+    """A capture that could be taken: the prediction of a hypothesis (n,), its covariance (n, n), and the sequence that
+    takes it (None: a station can't by itself)."""
 
     words: str
     predict: Callable[[Hypothesis], FloatArray]
@@ -115,7 +119,8 @@ def _narrowband(camera: CameraModel) -> Iterator[Design]:
 
 
 def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iterator[Design]:
-    """Slanted edges: at four orientations, in the lamp's and in narrowband light, at the lens's and at twice its f-number."""
+    """Slanted edges: at four orientations, in the lamp's and in narrowband light, at the lens's and at twice its
+    f-number."""
     frequency = np.arange(1, 17) * 0.05
     block = next((b for b in model.blocks if b.measurement.name == "slanted_edge"), None)
     std = np.full(frequency.shape, EDGE_STD)
@@ -150,8 +155,8 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
 
 
 def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
-    """Flats at many levels: by the exposure, or by the light at one exposure. Means and variances. Nuisance parameters: gain, read noise,
-    black level, and the light in each channel."""
+    """Flats at many levels: by the exposure, or by the light at one exposure. Means and variances. Nuisance parameters:
+    gain, read noise, black level, and the light in each channel."""
     shares = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92]) / FILLED
     full = _filling_exposure_s(camera, lamp)
     if full <= 0:

@@ -26,10 +26,11 @@ def detectable(threshold: float, probability: float = DecisionPolicy().detection
 
 
 def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Iterator[Visibility]:
-    """For every effect that acts on what was recorded: the smallest detectable size of each parameter, and the nearest effect.
+    """For every effect that acts on what was recorded: the smallest detectable size of each parameter, and the nearest
+    effect.
 
-    The non-centrality |L^-1 dm|^2 of a signature grows as the square of the coordinate u, so that the size follows from one instance. Two
-    effects of cosine rho are told apart with probability Phi(1/2 sqrt(lambda (1 - rho^2))).
+    The non-centrality |L^-1 dm|^2 of a signature grows as the square of the coordinate u, so that the size follows from
+    one instance. Two effects of cosine rho are told apart with probability Phi(1/2 sqrt(lambda (1 - rho^2))).
     """
     model = verdict.model
     if not np.isfinite(verdict.threshold):
@@ -59,7 +60,8 @@ def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Itera
 def _smallest(
     effect: type[Effect], members: list[tuple[tuple[Effect, ...], FloatArray]], needed: float
 ) -> dict[str, float]:
-    """By parameter, the least departure from `absent` that reaches a non-centrality; none for effects whose shape has no small limit."""
+    """By parameter, the least departure from `absent` that reaches a non-centrality; none for effects whose shape has
+    no small limit."""
     found: dict[str, float] = {}
     if effect.shapes:
         return found

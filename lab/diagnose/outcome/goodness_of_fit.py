@@ -82,8 +82,8 @@ def _chi2_by_block(
 
 
 def held_out(verdict: Verdict) -> HeldOut | None:
-    """chi2 of held-out numbers in the measurements that a named effect or a discrepancy acts on; in all, where nothing was found or nothing of
-    those is held out."""
+    """chi2 of held-out numbers in the measurements that a named effect or a discrepancy acts on; in all, where nothing
+    was found or nothing of those is held out."""
     model, effects, kernels = verdict.model, verdict.effects, verdict.kernels
     found = [model.affected(type(e)) for e in effects] + [model.mask(i) for i in kernels]
     where = np.any(found, axis=0) if found else None

@@ -1,4 +1,5 @@
-"""The improved model: the camera with what the diagnosis found, as a camera file that simulates and predicts like any other."""
+"""The improved model: the camera with what the diagnosis found, as a camera file that simulates and predicts like any
+other."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ from sim.effects.model_discrepancy import ModelDiscrepancy
 from sim.spectrum import FloatArray, Spectrum
 
 Applied = Literal["transfer", "sensitivity", "illumination", "response", "noise"]
-#: Stages on which a smooth factor can act: the stage, the axis of the measurement, and the quantity of the stages that changes it.
+#: Stages on which a smooth factor can act: the stage, the axis of the measurement, and the quantity of the stages that
+#: changes it.
 PLACES: tuple[tuple[Applied, str, str], ...] = (
     ("transfer", "spatial_frequency", "image.transfer"),
     ("sensitivity", "wavelength", "image.transmittance"),
@@ -54,8 +56,9 @@ def improved_model(
     effects: Sequence[Effect],
     discrepancies: Sequence[Discrepancy],
 ) -> tuple[CameraFile, tuple[Correction, ...]]:
-    """The baseline with the named effects, with the maker's sensitivity curves at the posterior mean of their nuisance parameters, and with
-    a correction for each discrepancy that a stage of the model can hold. Noise and levels are the fit's where there is one.
+    """The baseline with the named effects, with the maker's sensitivity curves at the posterior mean of their nuisance
+    parameters, and with a correction for each discrepancy that a stage of the model can hold. Noise and levels are the
+    fit's where there is one.
 
     Returns the camera and one `Correction` for each discrepancy.
     """
@@ -131,8 +134,9 @@ def _place_for(block: Block) -> Applied | None:
 def _factor(
     block: Block, mean: FloatArray, predicted: FloatArray
 ) -> tuple[FloatArray, FloatArray, dict[str, tuple[FloatArray, FloatArray]]]:
-    """x and the factor on the prediction there, averaged over channels and conditions; and the same by channel. `mean`: the posterior
-    mean of the discrepancy (m,). The factor is relative to the block's scale where that varies, else to the prediction."""
+    """x and the factor on the prediction there, averaged over channels and conditions; and the same by channel. `mean`:
+    the posterior mean of the discrepancy (m,). The factor is relative to the block's scale where that varies, else to
+    the prediction."""
     whole = block.scale if np.ptp(block.scale) > 0 else predicted
     usable = whole > LEAST_CONTRAST * float(np.max(whole))
     x = np.array([label.x for label in block.labels])

@@ -111,7 +111,8 @@ def _number(parameter: ParameterValue) -> str:
 
 
 def _mean(values: list[tuple[float, float | None]]) -> tuple[float, float | None]:
-    """Mean of (value, standard deviation), weighted by 1 / variance; the first value where a standard deviation isn't known."""
+    """Mean of (value, standard deviation), weighted by 1 / variance; the first value where a standard deviation isn't
+    known."""
     known = [(v, s) for v, s in values if s]
     if len(known) != len(values) or len(values) == 1:
         return values[0]

@@ -24,8 +24,8 @@ LISTED_RIVALS = 3
 
 
 def located(side: Side, verdict: Verdict) -> list[Mismatch]:
-    """The most significant slice of every measurement. Where only an effect's score shows a mismatch, the measurement that it changes most,
-    with the significance of its log odds: sqrt(2 log odds)."""
+    """The most significant slice of every measurement. Where only an effect's score shows a mismatch, the measurement
+    that it changes most, with the significance of its log odds: sqrt(2 log odds)."""
     model = verdict.model
     baseline = model.gaussian()
     found: dict[str, Mismatch] = {}
@@ -70,8 +70,8 @@ def _change_chi2(verdict: Verdict, effect: Effect, block: Block) -> float:
 
 
 def unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]) -> list[Unexplained]:
-    """Every mismatch that is left: where, how its discrepancy looks, which effects come nearest, and chi2 with and without the
-    discrepancy's covariance. `corrections` of the improved model, one for each."""
+    """Every mismatch that is left: where, how its discrepancy looks, which effects come nearest, and chi2 with and
+    without the discrepancy's covariance. `corrections` of the improved model, one for each."""
     model = verdict.model
     gaussian = model.gaussian(verdict.effects)
     found = []

@@ -1,11 +1,12 @@
 """The capture that would best tell rivals apart.
 
-Every capture that could be taken is predicted under each rival, at the parameters that the recordings give it. The best capture c is the
-one in which the two nearest rivals k, l lie furthest apart:
+Every capture that could be taken is predicted under each rival, at the parameters that the recordings give it. The best
+capture c is the one in which the two nearest rivals k, l lie furthest apart:
 
     argmax over c of min over k, l of D,   D = 1/2 |L^-1 (m_k(c) - m_l(c))|^2,   L L' = covariance of m(c)
 
-The covariance holds noise, floors and nuisance parameters. Two rivals are then told apart with probability Phi(sqrt(D / 2)).
+The covariance holds noise, floors and nuisance parameters. Two rivals are then told apart with
+probability Phi(sqrt(D / 2)).
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from sim.camera import Side
 from sim.effects.base import Effect
 from sim.effects.library import effects as library
 
-#: What to vary where no predicted capture tells two effects apart, but one depends on a condition and the other doesn't.
+#: What to vary where no predicted capture tells two effects apart, but one depends on a condition and the other
+#: doesn't.
 SETTLING = {
     "f_number": "the slanted edges again at twice the f-number",
     "wavelength": "slanted edges in narrowband light, at 450 and at 650 nm",
@@ -82,7 +84,8 @@ def proposals(recordings: RecordingSet, side: Side, verdict: Verdict, policy: De
 
 
 def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[Hypothesis]:
-    """The effect whose rivals are likeliest, and these rivals, each fitted in its place: as many as together hold `next_capture_share`."""
+    """The effect whose rivals are likeliest, and these rivals, each fitted in its place: as many as together hold
+    `next_capture_share`."""
     model, least = verdict.model, policy.least_rival_probability
 
     def rival_probability(candidate: Candidate) -> float:

@@ -1,8 +1,8 @@
 """Residual pictures: a held-out frame of each kind, measured less predicted, before and after the named effects.
 
-The forward model draws the mean frame (`lab.predict.replay`); the light's level, a nuisance parameter, is fitted channel by channel. A cell of
-a picture is the sum of its pixels' residuals over its standard deviation, sqrt(sum variance), with shot noise, read noise, PRNU and rounding: of
-noise alone, cells have variance 1.
+The forward model draws the mean frame (`lab.predict.replay`); the light's level, a nuisance parameter, is fitted
+channel by channel. A cell of a picture is the sum of its pixels' residuals over its standard deviation, sqrt(sum
+variance), with shot noise, read noise, PRNU and rounding: of noise alone, cells have variance 1.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ ROWS, COLS = 48, 64
 def residual_pictures(
     recordings: RecordingSet, side: Side, model: MeasurementModel, improved: CameraFile
 ) -> Iterator[ResidualPicture]:
-    """One picture of each kind that was captured and that can be replayed, held out where possible. Before: with the baseline's own effects."""
+    """One picture of each kind that was captured and that can be replayed, held out where possible. Before: with the
+    baseline's own effects."""
     replay = Replay(recordings, side, improved.camera)
     held_out = set(model.captures(True))
     both = model.always, tuple(improved.effects)
@@ -111,8 +112,8 @@ def _region(capture: Capture, shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 def _cells(residual: FloatArray, variance: FloatArray, common_std: FloatArray) -> FloatArray:
-    """Sums over cells of whole mosaics, over sqrt(sum variance + (sum common_std)^2); 0 of empty cells. `common_std`: the standard deviation of an
-    error that the pixels of a cell share."""
+    """Sums over cells of whole mosaics, over sqrt(sum variance + (sum common_std)^2); 0 of empty cells. `common_std`:
+    the standard deviation of an error that the pixels of a cell share."""
     high = max(-(-residual.shape[0] // ROWS), 1)
     wide = max(-(-residual.shape[1] // COLS), 1)
     high, wide = (size + size % 2 if size > 1 else size for size in (high, wide))

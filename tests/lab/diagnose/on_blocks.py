@@ -1,4 +1,5 @@
-"""A diagnosis on a few measurements only, of the second former's cameras and of `sim`'s: quick enough for the everyday suite."""
+"""A diagnosis on a few measurements only, of the second former's cameras and of `sim`'s: quick enough for the everyday
+suite."""
 
 from __future__ import annotations
 
@@ -69,7 +70,8 @@ def sigmas(found: MeasurementModel) -> float:
 
 
 def rendered(seed: int, effects: Sequence[Effect] = (), *, sweep_to_nm: int = 0, repeats: int = 3) -> RecordingSet:
-    """A session that `sim` takes: darks, flats at eight levels, a sweep from 400 nm where `sweep_to_nm` says how far."""
+    """A session that `sim` takes: darks, flats at eight levels, a sweep from 400 nm where `sweep_to_nm` says how
+    far."""
     wavelength = np.arange(380.0, max(781.0, sweep_to_nm + 41.0))
     efficiency = Spectrum.of(wavelength, 0.5 * np.exp(-0.5 * ((wavelength - 540.0) / 140.0) ** 2))
     camera = CameraModel(

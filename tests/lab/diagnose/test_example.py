@@ -24,8 +24,9 @@ FLEA, CCD = DATA / "llanos_colorchecker", DATA / "emva1288_ccd"
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_the_mtf_that_fell_short_and_the_red_end_have_names_and_then_fit() -> None:
-    """An anti-alias filter and an infrared filter, as in docs/explanation/examples/low-pass-and-infrared-filter.md: both named, edges and narrowband light within the
-    99.9 % quantile of noise on held-out captures, and nothing left where the improved model is the baseline."""
+    """An anti-alias filter and an infrared filter, as in docs/explanation/examples/low-pass-and-infrared-filter.md:
+    both named, edges and narrowband light within the 99.9 % quantile of noise on held-out captures, and nothing left
+    where the improved model is the baseline."""
     law = [concealed_laws.OpticalLowPassFilterLaw(1.6), concealed_laws.InfraredCutFilterLaw(60.0)]
     recordings = recordings_of(
         ConcealedCamera(20751, law, cfa="RGGB", f_number=4.0, rows=180, cols=240),

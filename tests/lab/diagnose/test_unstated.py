@@ -1,5 +1,5 @@
-"""Healthy cameras of which the maker says less, or of which less was recorded, or otherwise: what can't be judged is left out, and nothing
-is found."""
+"""Healthy cameras of which the maker says less, or of which less was recorded, or otherwise: what can't be judged is
+left out, and nothing is found."""
 
 from __future__ import annotations
 
@@ -74,7 +74,8 @@ def test_what_nobody_says_is_no_mismatch(change: Change) -> None:
 
 
 def test_edges_in_light_of_which_nothing_is_said_are_not_out_of_focus() -> None:
-    """A monochrome camera: against light of equal energy its edges score 52 over a threshold of 17, and were 'defocus'."""
+    """A monochrome camera: against light of equal energy its edges score 52 over a threshold of 17, and were
+    'defocus'."""
 
     def unlit(content: dict[str, Any]) -> None:
         _only("dark", "flat", "slanted_edge")(content)

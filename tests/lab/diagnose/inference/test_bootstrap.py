@@ -1,4 +1,5 @@
-"""Thresholds of drawn scores; that they hold on images is a slow test (`tests/recovery/test_diagnosis_bootstrap.py`)."""
+"""Thresholds of drawn scores; that they hold on images is a slow test
+(`tests/recovery/test_diagnosis_bootstrap.py`)."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ from mocks.former import ConcealedCamera, Plan
 
 
 def test_a_threshold_of_few_draws_is_that_of_many() -> None:
-    """Largest of 40 chi2 of one degree: 1 in 100 is above 13.3 (1 - (1 - p)^(1/40) of chi2's tail). Gumbel's law by its moments
-    lies 5 % off, 200 draws scatter by 3 %."""
+    """Largest of 40 chi2 of one degree: 1 in 100 is above 13.3 (1 - (1 - p)^(1/40) of chi2's tail). Gumbel's law by its
+    moments lies 5 % off, 200 draws scatter by 3 %."""
     rng = np.random.default_rng(8)
     tops = np.square(rng.standard_normal((200, 40))).max(axis=1)
     found = image_threshold([HealthyDraw(float(t), {}) for t in tops], 0.01)

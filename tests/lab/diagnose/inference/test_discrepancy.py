@@ -22,18 +22,21 @@ def test_a_smooth_departure_is_taken_and_noise_is_left() -> None:
 
 
 def test_the_unknown_is_predicted_where_nothing_was_seen() -> None:
-    """A smooth departure at wavelengths left out: chi2 falls to their number, as the noise of what was seen averages out."""
+    """A smooth departure at wavelengths left out: chi2 falls to their number, as the noise of what was seen averages
+    out."""
     model = spectral_model(np.random.default_rng(31), lambda x: 0.1 * np.sin(x / 60.0))
     gap = predictive_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy())
     before, n = model.held_out()
     after, _ = model.held_out(discrepancies={0: gap.kernel})
     assert before > 100 * n
-    # the discrepancy's own error adds to the noise at most as much again; the standard deviation of chi2 of n numbers is sqrt(2 n)
+    # the discrepancy's own error adds to the noise at most as much again; the standard deviation of chi2 of n numbers
+    # is sqrt(2 n)
     assert after < 2 * (n + 3 * np.sqrt(2 * n))
 
 
 def test_what_is_irregular_is_not_predicted_elsewhere() -> None:
-    """Departures that neighbours don't share: the likeliest discrepancy holds them as they are, and none is better left-out captures."""
+    """Departures that neighbours don't share: the likeliest discrepancy holds them as they are, and none is better
+    left-out captures."""
     rng = np.random.default_rng(32)
     model = spectral_model(rng, lambda x: 0.1 * rng.standard_normal(len(x)))
     assert likeliest_discrepancy(model, model.seen_gaussian(), 0, DecisionPolicy()).log_odds > 20.0
@@ -41,7 +44,8 @@ def test_what_is_irregular_is_not_predicted_elsewhere() -> None:
 
 
 def test_repeats_of_what_is_irregular_are_predicted() -> None:
-    """Each direction has its own departure, whose repeat is held out: another direction's says nothing of it, its own does."""
+    """Each direction has its own departure, whose repeat is held out: another direction's says nothing of it, its own
+    does."""
     rng = np.random.default_rng(33)
     ragged = [0.05 * rng.standard_normal(len(FREQUENCY)) for _ in range(2)]
     model = contrast_model(rng)

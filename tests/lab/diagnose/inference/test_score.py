@@ -41,7 +41,8 @@ def test_threshold_holds_its_rate() -> None:
 
 
 def test_a_refit_begins_at_the_prototype_that_lies_nearest() -> None:
-    """Ten times the first prototype promises most, but is far off where it isn't small; the second one is half of the residual."""
+    """Ten times the first prototype promises most, but is far off where it isn't small; the second one is half of the
+    residual."""
     few, many = (effect("hot_pixels")(excess_e_per_s=100.0, share_ppm=ppm) for ppm in (20.0, 200.0))
     white, promised, near = np.array([10.0, 1.0]), np.array([1.0, 0.0]), np.array([5.0, 1.0])
 

@@ -121,7 +121,8 @@ def _best(truth: Sequence[Effect], seed: int) -> set[str]:
 
 
 def test_a_pair_is_found_that_a_third_effect_hides() -> None:
-    """x - x^2 is within 3 % of an arch: the arch alone has the highest score, and only the pair is right to the noise."""
+    """x - x^2 is within 3 % of an arch: the arch alone has the highest score, and only the pair is right to the
+    noise."""
     truth = (_Up(size_dn=1.2), _Bend(size_dn=-1.2))
     model = _model(truth, np.random.default_rng(1))
     found = signatures(model, model.camera, (), KINDS)
@@ -137,7 +138,8 @@ def test_two_effects_of_different_shapes_are_both_found() -> None:
 
 
 def test_nothing_is_found_in_noise() -> None:
-    """A score beyond 12 of any of five comes in 5 x 5e-4 of the draws: of 40, none with a probability of 0.9, at most 2 with 0.9998."""
+    """A score beyond 12 of any of five comes in 5 x 5e-4 of the draws: of 40, none with a probability of 0.9, at most 2
+    with 0.9998."""
     assert sum(bool(_best((), seed)) for seed in range(100, 140)) <= 2
 
 
@@ -163,7 +165,8 @@ class _Lopsided(_Squared):
 
 
 def test_an_uncertainty_holds_both_signs_where_only_the_square_acts() -> None:
-    """Distances 0 and 2 v from the value told, as likely: sqrt(2) v. A sign that the numbers tell stays as it is known."""
+    """Distances 0 and 2 v from the value told, as likely: sqrt(2) v. A sign that the numbers tell stays as it is
+    known."""
     for kind, widened in ((_Squared, True), (_Lopsided, False)):
         truth = kind(size_dn=0.5)
         model = _model((truth,), np.random.default_rng(6))
@@ -182,7 +185,8 @@ def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> N
 
 
 def test_what_is_added_beside_a_stronger_effect_has_to_earn_more() -> None:
-    """Half as much again as the threshold, where both act on the same measurement; a first effect earns the threshold alone."""
+    """Half as much again as the threshold, where both act on the same measurement; a first effect earns the threshold
+    alone."""
     model = contrast_model(np.random.default_rng(24))
     search = Search(model, candidates(), 18.0)
     alone = Fit((effect("defocus")(defocus_um=3.0),), ({},), 0.0, 0.0, np.zeros((len(model.value), 0)))

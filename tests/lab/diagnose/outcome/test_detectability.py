@@ -20,7 +20,8 @@ def test_detectable_is_seen_at_its_rate() -> None:
 
 
 def test_the_smallest_size_that_is_seen_has_that_non_centrality() -> None:
-    """The change by the effect at that size, whitened: lambda to 5 %, as blurs bend a little beyond the slope at zero."""
+    """The change by the effect at that size, whitened: lambda to 5 %, as blurs bend a little beyond the slope at
+    zero."""
     verdict = filtered_edges()
     found = {item.effect: item for item in detectability("left", verdict, DecisionPolicy())}
     size = found["defocus"].smallest["defocus_um"]

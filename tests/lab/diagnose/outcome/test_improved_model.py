@@ -101,8 +101,8 @@ def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
 
 
 def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
-    """A ripple of 10 % of the contrast: the saved correction follows it to what 46 points of noise 0.004 / exp(-2 f) leave open, and
-    the model with it explains the numbers."""
+    """A ripple of 10 % of the contrast: the saved correction follows it to what 46 points of noise 0.004 / exp(-2 f)
+    leave open, and the model with it explains the numbers."""
     ripple = 0.1 * np.sin(9.0 * FREQUENCY)
     block, content = _edges(ripple)
     model = MeasurementModel((block,), content.camera)

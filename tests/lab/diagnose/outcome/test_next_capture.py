@@ -86,8 +86,8 @@ def test_the_design_follows_what_the_rivals_differ_in() -> None:
 
 
 def test_distance_is_what_decides() -> None:
-    """Numbers drawn under one rival are nearer to it than to the other with the probability that is stated: Phi(sqrt(D / 2)); 3 sigma
-    of a binomial of 4000 draws are 3 sqrt(p (1 - p) / 4000) < 0.024."""
+    """Numbers drawn under one rival are nearer to it than to the other with the probability that is stated: Phi(sqrt(D
+    / 2)); 3 sigma of a binomial of 4000 draws are 3 sqrt(p (1 - p) / 4000) < 0.024."""
     first, second = (
         Hypothesis("a", (InfraredCutFilter(cut_wavelength_nm=nm, width_nm=4.0),), CAMERA) for nm in (650.0, 650.02)
     )

@@ -16,7 +16,8 @@ from tests.lab.diagnose.outcome.filtered_edges import filtered_edges
 
 
 def test_pictures_show_what_the_model_lacks_and_noise_once_it_has_it() -> None:
-    """Cells' residuals of a right model are normal, of rms 1; the sensor's own patterns differ from their mean standard deviation by some per cent."""
+    """Cells' residuals of a right model are normal, of rms 1; the sensor's own patterns differ from their mean standard
+    deviation by some per cent."""
     law = concealed_laws.OpticalLowPassFilterLaw(1.8)
     camera = ConcealedCamera(20771, [law], cfa="MONO", f_number=4.0, rows=160, cols=200)
     recordings = recordings_of(camera, Plan(("flat", "slanted_edge")))
