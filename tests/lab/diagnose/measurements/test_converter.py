@@ -16,10 +16,11 @@ from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
-from lab.predict.camera_model import camera_model, mean_dn
+from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
 from sim.effects.library import effect
+from sim.uniform import Uniform
 
 
 def _study(seed: int, laws: Sequence[Law] = (), cfa: str | None = None) -> Study:
@@ -81,5 +82,5 @@ def test_codes_are_averaged_over_noise_in_a_mean() -> None:
     one = effect("adc_nonlinearity")(error_dn=4.0)
     for level, wanted in ((1000.0, -4.0 * 1000.0 / 4096.0), (2048.0, 2.0 - 2.0), (3000.0, 4.0 - 4.0 * 3000.0 / 4096.0)):
         electrons = np.array([(level - camera.black_level_dn) / camera.conversion_gain_dn_per_e])
-        plain, coded = (mean_dn(camera, {"Y": electrons}, acting)["Y"] for acting in ((), (one,)))
+        plain, coded = (Uniform(camera, acting).mean_dn({"Y": electrons})["Y"] for acting in ((), (one,)))
         assert coded - plain == pytest.approx(wanted, abs=0.1)  # 48 values stand for the noise: 4 DN / 48
