@@ -11,8 +11,9 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements import pattern
+from lab.diagnose.measurements import green_balance
 from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.even_flats import flats
 from lab.diagnose.measurements.flat_lines import line_block
 from lab.diagnose.measurements.green_balance import green_block
 from lab.diagnose.measurements.narrowband import narrowband_block
@@ -65,12 +66,12 @@ def test_greens_don_t_see_slopes_of_light(law: Law) -> None:
 
 def test_the_seen_image_comes_first_whichever_frames_were_read_first(monkeypatch: pytest.MonkeyPatch) -> None:
     study = _study(771013)
-    levels, images = pattern.flats(study)
+    levels, images = flats(study)
     assert set(images) == {False, True}
     found = []
     for order in ((False, True), (True, False)):
         turned = levels, {held_out: images[held_out] for held_out in order}
-        monkeypatch.setattr(pattern, "flats", lambda _, turned=turned: turned)
+        monkeypatch.setattr(green_balance, "flats", lambda _, turned=turned: turned)
         found.append(green_block(study))
     assert found[0].labels == found[1].labels
     np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
