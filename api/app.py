@@ -14,7 +14,7 @@ from fastapi.responses import HTMLResponse
 from starlette.middleware import Middleware
 
 from api import errors, schemas
-from api.errors import Defects, Problem, answers
+from api.errors import DefectMiddleware, Problem, answers
 from api.keys import LOOPBACK, holder, stored_keys
 from api.live import LiveSessions
 from api.routes import jobs, knowledge, recordings, sessions
@@ -147,7 +147,7 @@ def create_app(
         license_info={"name": "BSD-3-Clause", "identifier": "BSD-3-Clause"},
         middleware=[
             Middleware(SafeHeaders),
-            Middleware(Defects),
+            Middleware(DefectMiddleware),
             Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
             Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_path=f"{PREFIX}/recordings"),
         ],
@@ -188,7 +188,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             license_info=app.license_info,
         )
         known = made["components"]["schemas"]
-        for model in (Problem, Progress, schemas.Session, schemas.Job):
+        for model in (Problem, Progress, schemas.StoredSession, schemas.Job):
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             for name, definition in schema.pop("$defs", {}).items():
                 known.setdefault(name, definition)

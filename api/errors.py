@@ -81,7 +81,7 @@ def _invalid(request: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"detail": "; ".join(lines)}, 422)
 
 
-class Defects:
+class DefectMiddleware:
     """Turns an unexpected exception into status 500. Its text stays in the log."""
 
     def __init__(self, app: ASGIApp) -> None:

@@ -75,7 +75,7 @@ class Login(Schema):
     key: str = Field(min_length=1, max_length=200)
 
 
-class Station(Schema):
+class StationState(Schema):
     """A station file of the data folder; `problem` says why it can't be used."""
 
     name: str = Field(description="what `POST /sessions` takes: the station file's name without `.toml`")
@@ -114,7 +114,7 @@ class SessionResume(Schema):
     )
 
 
-class Session(Schema):
+class StoredSession(Schema):
     """A session; `state` is `pausing` until the step under way is done."""
 
     model_config = ConfigDict(
@@ -144,7 +144,7 @@ class Session(Schema):
     steps_done: int
 
 
-class SessionDetail(Session):
+class SessionDetail(StoredSession):
     """A session with its station, its progress and its provenance."""
 
     station: str
@@ -152,7 +152,7 @@ class SessionDetail(Session):
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
 
 
-class Capture(Schema):
+class StoredCapture(Schema):
     """One capture. `document` is its entry in the recording set's manifest."""
 
     id: int

@@ -38,7 +38,7 @@ from mocks.targets import (
     SCREEN_POSE,
     SCREEN_ROWS,
     TARGETS,
-    Shown,
+    ShownCells,
     UInt8Array,
     scene,
     station_targets,
@@ -140,7 +140,7 @@ class Bench:
         self._first_exposure_s: float | None = None
         self._light = LightSettings()
         self._placed = "cap"
-        self._shown = Shown()
+        self._shown = ShownCells()
 
     # --- light path -------------------------------------------------------------------------------------------------
 
@@ -236,14 +236,14 @@ class Bench:
         with self._lock:
             serial = self._shown.serial + 1
             if pattern is None:
-                self._shown = Shown(serial=serial)
+                self._shown = ShownCells(serial=serial)
                 return
             lit = (np.asarray(pattern) != 0).astype(np.uint8)
             if lit.ndim != 2 or lit.shape[0] * cell_px > SCREEN_ROWS or lit.shape[1] * cell_px > SCREEN_COLS:
                 raise BenchError(
                     f"a pattern of {lit.shape} cells x {cell_px} px doesn't fit the screen of {SCREEN_ROWS} x {SCREEN_COLS} px"
                 )
-            self._shown = Shown(lit, int(cell_px), serial)
+            self._shown = ShownCells(lit, int(cell_px), serial)
 
     # --- cameras ----------------------------------------------------------------------------------------------------
 

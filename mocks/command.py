@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from mocks.cornerstone260 import Cornerstone260
+from mocks.cornerstone260 import MockCornerstone260
 from mocks.cr300 import ColorimetryResearch
-from mocks.display import Page, Screen, browse
+from mocks.display import MockScreen, Page, browse
 from mocks.lamp import Lamp, LampClock
 from mocks.pr655 import PhotoResearch
-from mocks.specbos1211 import Specbos1211
-from mocks.stage import Stage, Targets
+from mocks.specbos1211 import MockSpecbos1211
+from mocks.stage import MockStage, Targets
 from mocks.wire import (
     AddressError,
     Endpoint,
@@ -54,18 +54,18 @@ CONCEAL_VARIABLE = "CALIBENCH_CONCEAL"
 WARMEST_C = 40.0
 
 
-class Place(MeasuredLight, Targets, Screen, Protocol):
+class Place(MeasuredLight, Targets, MockScreen, Protocol):
     """All that the mocks here act on: a bench, or a lamp alone."""
 
 
 INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
-    "cornerstone260": Cornerstone260,
-    "specbos1211": Specbos1211,
+    "cornerstone260": MockCornerstone260,
+    "specbos1211": MockSpecbos1211,
     "pr655": lambda place: PhotoResearch(place, "PR-655"),
     "pr670": lambda place: PhotoResearch(place, "PR-670", "67001234"),
     "cr250": lambda place: ColorimetryResearch(place, "CR-250"),
     "cr300": lambda place: ColorimetryResearch(place, "CR-300"),
-    "stage": Stage,
+    "stage": MockStage,
 }
 
 
@@ -221,9 +221,9 @@ def _start_bench(
         "stage": {"driver": "operator"},
     }
     for instrument, grammar, endpoint in (
-        ("monochromator", Cornerstone260(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
-        ("spectroradiometer", Specbos1211(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
-        ("stage", Stage(place), Tcp(line.host, 0)),
+        ("monochromator", MockCornerstone260(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
+        ("spectroradiometer", MockSpecbos1211(place), Tcp(line.host, 0) if line.serial_over_tcp else Pty()),
+        ("stage", MockStage(place), Tcp(line.host, 0)),
     ):
         address = _serve_in_thread(running, stop, instrument, grammar, endpoint, faults.get(instrument, ()))
         addresses[instrument]["address"] = line.advertised(address)

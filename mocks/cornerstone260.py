@@ -51,7 +51,7 @@ class _Done:
     effect: Callable[[], None] | None = None
 
 
-class Cornerstone260(Grammar):
+class MockCornerstone260(Grammar):
     """The instrument; `light` feels its grating, slits, filter wheel and shutter."""
 
     fault_code = SYSTEM

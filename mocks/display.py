@@ -23,7 +23,7 @@ from mocks.wire import Fault
 RETRY_S = 0.1
 
 
-class Screen(Protocol):
+class MockScreen(Protocol):
     """What shows patterns: `mocks.bench.Bench`, or `mocks.lamp.Lamp` alone."""
 
     def show(self, pattern: NDArray[np.uint8] | None, cell_px: int = 1) -> None: ...
@@ -34,7 +34,7 @@ class Page:
 
     def __init__(
         self,
-        screen: Screen,
+        screen: MockScreen,
         rows: int = 1080,
         cols: int = 1920,
         device_pixel_ratio: float = 1,

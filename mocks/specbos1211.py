@@ -46,7 +46,7 @@ class _Refusal(Exception):
         self.code = code
 
 
-class Specbos1211(Grammar):
+class MockSpecbos1211(Grammar):
     """The instrument; it looks at `light` when a measurement ends."""
 
     line_end = b"\r"

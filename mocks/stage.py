@@ -27,7 +27,7 @@ class Targets(Protocol):
     def place(self, name: str) -> None: ...
 
 
-class Stage(Grammar):
+class MockStage(Grammar):
     """The operator; `targets` is where things are put."""
 
     fault_code = 1

@@ -109,7 +109,7 @@ SCREEN_POSE = Pose.of((1.7, -0.9, DISTANCE_MM), (0.3, -0.4, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ShownCells:
     """What the display shows: 0/1 cells, each `cell_px` screen pixels wide, centred; None: all dark."""
 
     pattern: UInt8Array | None = None
@@ -172,7 +172,7 @@ def _edges(name: str, camera: HiddenCamera) -> tuple[PlaneEdge, ...]:
     return tuple(found)
 
 
-def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: Shown) -> Scene:
+def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: ShownCells) -> Scene:
     """What one camera sees of a target: its light is what the lamp and the monochromator give when nothing is wrong.
 
     First-order light is of the kind "narrowband" on every target: what goes wrong in a monochromator does so whatever it lights.
@@ -208,7 +208,7 @@ def scene(camera: HiddenCamera, placed: str, light: LightSettings, shown: Shown)
     return UniformField(shine(1.0), kind=kind("flat"))
 
 
-def _screen(camera: HiddenCamera, shown: Shown) -> Scene:
+def _screen(camera: HiddenCamera, shown: ShownCells) -> Scene:
     white = screen_radiance(WAVELENGTH_NM)
     dark, lit = Spectrum.of(WAVELENGTH_NM, white * SCREEN_BLACK), Spectrum.of(WAVELENGTH_NM, white)
     if shown.pattern is None:

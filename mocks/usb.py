@@ -25,7 +25,7 @@ from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
 from mocks.bench import Bench
 from mocks.cornerstone260b import Cornerstone260B
 from mocks.u3v import TriggerLine, U3vDevice
-from mocks.usb2000plus import Usb2000Plus
+from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb_device import Abandoned, UsbDevice, UsbFault
 
 SERIAL_NUMBERS = {"left": "CB-U3V-0001", "right": "CB-U3V-0002"}
@@ -44,7 +44,7 @@ _INSTRUMENTS: dict[str, Callable[[Bench], Sequence[UsbDevice]]] = {
     "cornerstone260b": lambda bench: (Cornerstone260B(bench),),
     "u3v": lambda bench: stereo_pair(bench)[:1],
     "u3v-stereo": stereo_pair,
-    "usb2000plus": lambda bench: (Usb2000Plus(bench),),
+    "usb2000plus": lambda bench: (MockUsb2000Plus(bench),),
 }
 
 

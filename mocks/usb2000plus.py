@@ -51,7 +51,7 @@ def calibration_csv() -> str:
     return "\n".join(["wavelength_nm,counts_per_s_per_w_sr_m2_nm", *rows]) + "\n"
 
 
-class Usb2000Plus(UsbDevice):
+class MockUsb2000Plus(UsbDevice):
     """The instrument; `light` is what it looks at, `seed` that of its noise."""
 
     def __init__(self, light: MeasuredLight, serial_number: str = "USB2+F00001", seed: int = 2000) -> None:

@@ -15,7 +15,15 @@ from api.errors import answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
 from api.preview import preview_png
-from api.schemas import Capture, CaptureKind, Session, SessionDetail, SessionResume, SessionStart, Station
+from api.schemas import (
+    CaptureKind,
+    SessionDetail,
+    SessionResume,
+    SessionStart,
+    StationState,
+    StoredCapture,
+    StoredSession,
+)
 from api.service import OPERATE, READ, Here, RegistryId, Service, SessionId
 from lab.capture.durable_files import npy_bytes
 from lab.capture.plan import full_plan
@@ -34,12 +42,12 @@ _INSTRUMENTS = ("monochromator", "spectroradiometer", "display", "stage")
 # --- stations ----------------------------------------------------------------------------------------------------------
 
 
-def _station(service: Service, name: str) -> Station:
+def _station(service: Service, name: str) -> StationState:
     try:
         station = service.station(name)
     except InputError as error:
-        return Station(name=name, title=name, problem=str(error))
-    return Station(
+        return StationState(name=name, title=name, problem=str(error))
+    return StationState(
         name=name,
         title=station.name or name,
         cameras=station.sides,
@@ -53,7 +61,7 @@ def _station(service: Service, name: str) -> Station:
 
 
 @router.get("/stations", tags=["stations"], dependencies=[READ], responses=answers(401))
-def list_stations(service: Here) -> list[Station]:
+def list_stations(service: Here) -> list[StationState]:
     """The station files in the folder `stations` of the data folder. They are written there, not sent: they name devices."""
     return [_station(service, name) for name in service.station_files()]
 
@@ -77,14 +85,14 @@ def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     )  # the error of an earlier run doesn't concern this one
 
 
-def _session(service: Service, session_id: str) -> Session:
-    return Session(**_fields(service, service.session(session_id)))
+def _session(service: Service, session_id: str) -> StoredSession:
+    return StoredSession(**_fields(service, service.session(session_id)))
 
 
 @router.get("/sessions", tags=["sessions"], dependencies=[READ], responses=answers(401))
-def list_sessions(service: Here) -> list[Session]:
+def list_sessions(service: Here) -> list[StoredSession]:
     """All sessions, newest first."""
-    return [Session(**_fields(service, info)) for info in service.store.sessions()]
+    return [StoredSession(**_fields(service, info)) for info in service.store.sessions()]
 
 
 @router.post(
@@ -94,7 +102,7 @@ def list_sessions(service: Here) -> list[Session]:
     dependencies=[OPERATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def start_session(service: Here, start: SessionStart, response: Response) -> Session:
+def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
     """Start a session, which runs in the background. 409 while another session runs on the same instruments."""
     station = service.station(start.station)
     session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
@@ -121,7 +129,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     dependencies=[OPERATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def pause_session(service: Here, session_id: SessionId) -> Session:
+def pause_session(service: Here, session_id: SessionId) -> StoredSession:
     """Pause at the end of the present step. The shutter closes, the screen goes dark."""
     service.session(session_id)
     service.live.pause(session_id)
@@ -135,7 +143,7 @@ def pause_session(service: Here, session_id: SessionId) -> Session:
     dependencies=[OPERATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def resume_session(service: Here, session_id: SessionId, resume: SessionResume | None = None) -> Session:
+def resume_session(service: Here, session_id: SessionId, resume: SessionResume | None = None) -> StoredSession:
     """Continue after a pause, or continue a session that ended early. Finished steps aren't taken again."""
     service.session(session_id)
     service.live.resume(session_id, service.station(resume.station) if resume and resume.station else None)
@@ -149,7 +157,7 @@ def resume_session(service: Here, session_id: SessionId, resume: SessionResume |
     dependencies=[OPERATE],
     responses=answers(401, 403, 404, 409, 422),
 )
-def abort_session(service: Here, session_id: SessionId) -> Session:
+def abort_session(service: Here, session_id: SessionId) -> StoredSession:
     """End the run now. The present step is dropped, finished steps are kept, and the session can be resumed."""
     service.session(session_id)
     service.live.abort(session_id, "aborted over the network")
@@ -157,7 +165,7 @@ def abort_session(service: Here, session_id: SessionId) -> Session:
 
 
 async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> AsyncIterator[ServerSentEvent]:
-    def look() -> Session:
+    def look() -> StoredSession:
         return _session(service, session_id)
 
     seen = None
@@ -183,9 +191,9 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
     response_class=EventSourceResponse,
     responses=answers(401, 404, 422)
     | described(
-        ("state", Session, "at once, and whenever the state changes"),
+        ("state", StoredSession, "at once, and whenever the state changes"),
         ("progress", Progress, "at once and at every step, while this service runs the session"),
-        ("end", Session, "when nothing more will come"),
+        ("end", StoredSession, "when nothing more will come"),
     ),
 )
 def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
@@ -197,9 +205,9 @@ def session_events(service: Here, session_id: SessionId) -> EventSourceResponse:
 # --- captures ----------------------------------------------------------------------------------------------------------
 
 
-def _capture(info: CaptureInfo) -> Capture:
+def _capture(info: CaptureInfo) -> StoredCapture:
     here = f"/api/v1/sessions/{info.session_id}/captures/{info.id}"
-    return Capture(
+    return StoredCapture(
         **info.model_dump(),
         exposure_s=info.document.get("exposure_s"),
         preview=f"{here}/preview.png",
@@ -223,7 +231,7 @@ def list_captures(
     side: Annotated[Side | None, Query(description="only of this camera")] = None,
     offset: Annotated[int, Query(ge=0)] = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
-) -> list[Capture]:
+) -> list[StoredCapture]:
     """The captures of a session, in the order in which they were taken."""
     service.session(session_id)
     chosen = [
@@ -240,7 +248,7 @@ def list_captures(
     dependencies=[READ],
     responses=answers(401, 404, 422),
 )
-def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) -> Capture:
+def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) -> StoredCapture:
     """One capture."""
     return _capture(_known_capture(service, session_id, capture_id))
 

@@ -15,7 +15,7 @@ from lab.challenge.recordings import recording_set
 from lab.challenge.truth import CaseTruth, Concealed, Kind
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.formats.recording_set import RecordingSet
-from mocks.former import LISTED, OUTSIDE, ConcealedCamera, Law, Plan, Session, record
+from mocks.former import LISTED, OUTSIDE, ConcealedCamera, DrawnSession, Law, Plan, record
 
 SIZES = {"small": (96, 128), "medium": (192, 256), "full": (384, 512)}
 #: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
@@ -73,7 +73,7 @@ def draw(
     plan = replace(plan, kinds=kinds, warm=plan.warm or any(one.needs == "temperature" for one in laws))
 
     @lru_cache(maxsize=4)  # what was measured last is what is handed out
-    def take(present: tuple[Law, ...], noise_draw: int) -> Session:
+    def take(present: tuple[Law, ...], noise_draw: int) -> DrawnSession:
         return record(ConcealedCamera(camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw), plan)
 
     targets = [float(np.exp(rng.uniform(*np.log(WEAK if rng.random() < 0.5 else STRONG)))) for _ in laws]
@@ -136,7 +136,7 @@ def _resized(law: Law, strength: float) -> Law:
 
 
 def _sized(
-    take: Callable[[tuple[Law, ...], int], Session], laws: list[Law], targets: list[float], draws: tuple[int, int]
+    take: Callable[[tuple[Law, ...], int], DrawnSession], laws: list[Law], targets: list[float], draws: tuple[int, int]
 ) -> tuple[list[Law], list[float]]:
     """Laws at the strengths that come near the non-centralities aimed at, and the non-centralities reached."""
     if not laws:

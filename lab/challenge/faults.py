@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mocks.former import WAVELENGTH_NM, Session
+from mocks.former import WAVELENGTH_NM, DrawnSession
 
 Spoil = Callable[[dict[str, Any], dict[str, Any], dict[str, Any], np.random.Generator], None]
 
@@ -24,7 +24,7 @@ class CaseFault:
     colour_only: bool = False
 
 
-def spoilt(session: Session, fault: CaseFault, rng: np.random.Generator) -> Session:
+def spoilt(session: DrawnSession, fault: CaseFault, rng: np.random.Generator) -> DrawnSession:
     """A session with a fault."""
     manifest, frames, spectra = deepcopy(session.manifest), dict(session.frames), dict(session.spectra)
     fault.spoil(manifest, frames, spectra, rng)

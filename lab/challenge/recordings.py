@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lab.formats.recording_set import Manifest, RecordingSet
-from mocks.former import WAVELENGTH_NM, WHOLE_SESSION, ConcealedCamera, Plan, Session, record, record_pair
+from mocks.former import WAVELENGTH_NM, WHOLE_SESSION, ConcealedCamera, DrawnSession, Plan, record, record_pair
 from sim.spectrum import Spectrum
 
 
@@ -17,7 +17,7 @@ def recordings_of_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan
     return recording_set(record_pair(left, right, plan))
 
 
-def recording_set(session: Session) -> RecordingSet:
+def recording_set(session: DrawnSession) -> RecordingSet:
     """The recording set of a session; raises ValidationError where its manifest doesn't follow the format."""
     spectra = {path: Spectrum.of(WAVELENGTH_NM, values) for path, values in session.spectra.items()}
     manifest = Manifest.model_validate(session.manifest)

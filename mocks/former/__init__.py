@@ -2,13 +2,13 @@
 
 It shares no stage and no code with `sim`: an error of `sim` can't cancel against the same error here. `law` and `laws` hold the concealed physics,
 `camera` the sensor and its frames, `transfer` the lens, `scenes` the targets, `session` the order of the captures. What comes out is plain data
-(`Session`); `lab.challenge` makes recording sets of it.
+(`DrawnSession`); `lab.challenge` makes recording sets of it.
 """
 
 from mocks.former.camera import ConcealedCamera
 from mocks.former.law import WAVELENGTH_NM, Law
 from mocks.former.laws import BESIDE, LISTED, OUTSIDE
-from mocks.former.session import WHOLE_SESSION, Plan, Session, record, record_pair
+from mocks.former.session import WHOLE_SESSION, DrawnSession, Plan, record, record_pair
 
 __all__ = [
     "BESIDE",
@@ -17,9 +17,9 @@ __all__ = [
     "WAVELENGTH_NM",
     "WHOLE_SESSION",
     "ConcealedCamera",
+    "DrawnSession",
     "Law",
     "Plan",
-    "Session",
     "record",
     "record_pair",
 ]

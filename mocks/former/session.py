@@ -48,7 +48,7 @@ WHOLE_SESSION = Plan()
 
 
 @dataclass(frozen=True)
-class Session:
+class DrawnSession:
     """What a session hands out, as plain data: the manifest of a recording set (docs/reference/recording-set.md) and the files that it names.
 
     Frames are raw DN, spectra values at WAVELENGTH_NM, targets cells of a screen.
@@ -60,12 +60,12 @@ class Session:
     targets: Mapping[str, NDArray[np.uint8]]
 
 
-def record(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION, name: str = "camera") -> Session:
+def record(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION, name: str = "camera") -> DrawnSession:
     """Take a session. What is requested (exposures, order, names) doesn't depend on the laws."""
     return _Recorder(camera).session(plan, name)
 
 
-def record_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan, name: str = "pair") -> Session:
+def record_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan, name: str = "pair") -> DrawnSession:
     """Both cameras' sessions in one; screen targets are the left one's."""
     one, two = record(left, plan, name), record(right, plan, name)
     manifest = {
@@ -73,7 +73,7 @@ def record_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan, name:
         "cameras": one.manifest["cameras"] | two.manifest["cameras"],
         "captures": [*one.manifest["captures"], *two.manifest["captures"]],
     }
-    return Session(manifest, {**one.frames, **two.frames}, {**one.spectra, **two.spectra}, one.targets)
+    return DrawnSession(manifest, {**one.frames, **two.frames}, {**one.spectra, **two.spectra}, one.targets)
 
 
 def lamp() -> Array:
@@ -97,7 +97,7 @@ class _Recorder:
         self.targets: dict[str, Any] = {}
         self.captures: list[dict[str, Any]] = []
 
-    def session(self, plan: Plan, name: str) -> Session:
+    def session(self, plan: Plan, name: str) -> DrawnSession:
         camera = self.camera
         curves = {c: self.noted(q) for c, q in camera.stated_efficiency.items()}
         steps = {
@@ -112,7 +112,7 @@ class _Recorder:
             "focal_length_mm": camera.focal_length_mm, "lens_transmittance": camera.lens_transmittance, "quantum_efficiency": curves,
         }  # fmt: skip
         manifest = {"name": name, "cameras": {camera.side: stated}, "captures": self.captures}
-        return Session(manifest, self.frames, self.spectra, self.targets)
+        return DrawnSession(manifest, self.frames, self.spectra, self.targets)
 
     def take(
         self, kind: str, images: dict[str, Array] | None, exposure_s: float, repeats: int = 1, temperature_c: float = 25.0, **more: Any

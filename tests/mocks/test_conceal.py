@@ -19,7 +19,7 @@ from mocks.bench import MARGIN_PX, OVERSAMPLE, SCREEN_OVERSAMPLE, Bench
 from mocks.command import commands
 from mocks.conceal import NOT_SHOWN, OF_THE_RADIOMETER, SIDES, ConcealError, parse
 from mocks.light_path import LightSettings
-from mocks.targets import Shown, scene
+from mocks.targets import ShownCells, scene
 from mocks.truth import HiddenCamera, hidden_truth
 from sim.camera import Side
 from sim.effects.base import Effect
@@ -124,7 +124,7 @@ def test_every_effect_is_tried_or_refused() -> None:
     assert sorted([*tried, *NOT_SHOWN]) == sorted(library())
 
 
-def set_up(bench: Bench, take: Take) -> Shown:
+def set_up(bench: Bench, take: Take) -> ShownCells:
     bench.set_wavelength(take.light.wavelength_nm)
     bench.set_filter(take.light.filter_place)
     bench.set_slit_um(take.light.slit_um)
@@ -132,10 +132,10 @@ def set_up(bench: Bench, take: Take) -> Shown:
     bench.place(take.target)
     bench.clock.sleep(take.wait_s)
     if not take.pattern:
-        return Shown()
+        return ShownCells()
     pattern = PATTERN[: 960 // take.cell_px, : 1800 // take.cell_px]
     bench.show(pattern, take.cell_px)
-    return Shown(pattern, take.cell_px)
+    return ShownCells(pattern, take.cell_px)
 
 
 def read_by(bench: Bench, kind: str) -> UniformField:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mocks.lamp import Lamp, tristimulus
-from mocks.specbos1211 import Specbos1211
+from mocks.specbos1211 import MockSpecbos1211
 from mocks.wire import Grammar
 from sim.spectrum import Spectrum
 
@@ -18,7 +18,7 @@ Talk = Callable[[Grammar, bytes], bytes]
 
 def test_the_spectrum_is_the_lamps(talk: Talk) -> None:
     lamp = Lamp(luminance_cd_m2=50.0)
-    mock = Specbos1211(lamp)
+    mock = MockSpecbos1211(lamp)
     assert talk(mock, b"*conf:wran 380 780 1\r*init\r") == b"\x06\x06\x07"
     lines = talk(mock, b"*fetch:sprad\r").split(b"\r")
     values = [float(line) for line in lines[2:-2]]
@@ -28,7 +28,7 @@ def test_the_spectrum_is_the_lamps(talk: Talk) -> None:
 
 
 def test_tristimulus_values_are_those_of_illuminant_a(talk: Talk) -> None:
-    mock = Specbos1211(Lamp(luminance_cd_m2=100.0))
+    mock = MockSpecbos1211(Lamp(luminance_cd_m2=100.0))
     talk(mock, b"*init\r")
     # Over 380..780 nm, the range after power-on, A keeps all but 1e-4 of its tristimulus values.
     found = re.fullmatch(rb"X: (\S+)\rY: (\S+)\rZ: (\S+)\r", talk(mock, b"*fetch:XYZ\r"))
@@ -40,7 +40,7 @@ def test_tristimulus_values_are_those_of_illuminant_a(talk: Talk) -> None:
 
 
 def test_wavelength_and_value_pairs_come_in_blocks_ended_by_an_empty_line(talk: Talk) -> None:
-    mock = Specbos1211(Lamp())
+    mock = MockSpecbos1211(Lamp())
     talk(mock, b"*CONF:WRAN 380 780 4\r*INIT\r")
     header, pairs, rest = talk(mock, b"*FETCH:SPRAD 7\r").split(b"\r\r")
     assert header
@@ -62,7 +62,7 @@ class Adjustable(Lamp):
 
 def test_too_much_light_and_too_little_are_told_apart(talk: Talk) -> None:
     light = Adjustable(10.0)
-    mock = Specbos1211(light)
+    mock = MockSpecbos1211(light)
     assert talk(mock, b"*init\r*stat:err?\r") == b"\x06\x15Error Code: 120\r"
     light.value = 1e-3
     assert talk(mock, b"*init\r") == b"\x06\x07"
@@ -77,7 +77,7 @@ def test_too_much_light_and_too_little_are_told_apart(talk: Talk) -> None:
 
 def test_a_dark_measurement_takes_as_long_as_it_may(talk: Talk) -> None:
     light = Adjustable(0.0)
-    mock = Specbos1211(light)
+    mock = MockSpecbos1211(light)
     talk(mock, b"*conf:maxtin 3000\r")
     mock.receive(b"*init\r")
     assert mock.wait_s == pytest.approx(2 * 3.0 + 0.5)
@@ -85,7 +85,7 @@ def test_a_dark_measurement_takes_as_long_as_it_may(talk: Talk) -> None:
 
 
 def test_escape_breaks_a_measurement_off(talk: Talk) -> None:
-    mock = Specbos1211(Lamp())
+    mock = MockSpecbos1211(Lamp())
     assert b"".join(mock.receive(b"*init\r")) == b"\x06"
     assert b"".join(mock.receive(b"*idn?\r")) == b""
     assert b"".join(mock.receive(b"\x1b")) == b"\x15JETI_SB1211\r"
@@ -94,7 +94,7 @@ def test_escape_breaks_a_measurement_off(talk: Talk) -> None:
 
 def test_a_hosts_session_with_probe_setup_and_terminal_counts(talk: Talk) -> None:
     """The order of commands, and the number of CR, ACK and NAK waited for, of a widely used colour-management host."""
-    mock = Specbos1211(Lamp())
+    mock = MockSpecbos1211(Lamp())
 
     def terminated(command: bytes, count: int) -> bytes:
         said = talk(mock, command + b"\r")

@@ -8,32 +8,32 @@ import numpy as np
 import pytest
 
 from mocks.bench import Bench
-from mocks.usb2000plus import DARK_COUNTS, DARK_PIXELS, NOISE_COUNTS, PIXELS, SATURATION_COUNTS, Usb2000Plus
+from mocks.usb2000plus import DARK_COUNTS, DARK_PIXELS, NOISE_COUNTS, PIXELS, SATURATION_COUNTS, MockUsb2000Plus
 from mocks.usb_device import Abandoned, Stalled
 
 
 @pytest.fixture
-def device() -> Usb2000Plus:
+def device() -> MockUsb2000Plus:
     bench = Bench()
     bench.place("sphere")
     bench.set_wavelength(0.0)
     bench.set_shutter(True)
-    return Usb2000Plus(bench)
+    return MockUsb2000Plus(bench)
 
 
-def ask(device: Usb2000Plus, data: bytes, endpoint: int = 0x81, length: int = 64) -> bytes:
+def ask(device: MockUsb2000Plus, data: bytes, endpoint: int = 0x81, length: int = 64) -> bytes:
     device.transfer(0x01, bytes(8), data, 0, lambda: False)
     return device.transfer(endpoint, bytes(8), None, length, lambda: True)
 
 
-def scan(device: Usb2000Plus) -> np.ndarray:
+def scan(device: MockUsb2000Plus) -> np.ndarray:
     packet = ask(device, b"\x09", 0x82, 4097)
     assert len(packet) == 2 * PIXELS + 1
     assert packet[-1] == 0x69
     return np.frombuffer(packet[:-1], "<u2").astype(float)
 
 
-def test_slots_are_texts_of_a_fixed_length(device: Usb2000Plus) -> None:
+def test_slots_are_texts_of_a_fixed_length(device: MockUsb2000Plus) -> None:
     answer = ask(device, b"\x05\x00")
     assert len(answer) == 17
     assert answer[:2] == b"\x05\x00"
@@ -44,14 +44,14 @@ def test_slots_are_texts_of_a_fixed_length(device: Usb2000Plus) -> None:
         device.transfer(0x01, bytes(8), b"\x05\xf0", 0, lambda: False)
 
 
-def test_status_tells_the_integration_time(device: Usb2000Plus) -> None:
+def test_status_tells_the_integration_time(device: MockUsb2000Plus) -> None:
     device.transfer(0x01, bytes(8), b"\x02" + struct.pack("<I", 20_000), 0, lambda: False)
     status = struct.unpack("<HIBBBBBBBBBB", ask(device, b"\xfe"))
     assert status[:2] == (PIXELS, 20_000)
     assert status[10] == 0x80  # high speed
 
 
-def test_covered_pixels_stay_dark_and_full_scale_clips(device: Usb2000Plus) -> None:
+def test_covered_pixels_stay_dark_and_full_scale_clips(device: MockUsb2000Plus) -> None:
     device.transfer(0x01, bytes(8), b"\x02" + struct.pack("<I", 60_000_000), 0, lambda: False)
     before = device._light.clock.now()
     counts = scan(device)
@@ -61,7 +61,7 @@ def test_covered_pixels_stay_dark_and_full_scale_clips(device: Usb2000Plus) -> N
     assert counts[DARK_PIXELS].mean() == pytest.approx(DARK_COUNTS, abs=4 * NOISE_COUNTS / np.sqrt(15))
 
 
-def test_what_it_does_not_know_it_passes_over(device: Usb2000Plus) -> None:
+def test_what_it_does_not_know_it_passes_over(device: MockUsb2000Plus) -> None:
     for data in (b"\x77", b"\x02\x01", b"\x09\x09"):
         device.transfer(0x01, bytes(8), data, 0, lambda: False)
     with pytest.raises(Abandoned):

@@ -64,7 +64,7 @@ class Observation:
 
 
 @dataclass(frozen=True)
-class State:
+class RigParameters:
     """All parameters.
 
     `intrinsics` (cameras, 12). `rotation` (3, 3), `translation_mm` (3,): camera 0 to camera 1. `warps_mm` (boards, 3).
@@ -89,7 +89,7 @@ class Solution:
     observation, seen less predicted, px. `noise_px`: standard deviation of one coordinate.
     """
 
-    state: State
+    state: RigParameters
     free: NDArray[np.bool_]
     names: tuple[str, ...]
     covariance: Array
@@ -220,7 +220,7 @@ class BundleAdjustment:
         several = self.boards > 1
         return (*found, *(f"board {k + 1} {name}" if several else name for k in range(self.boards) for name in WARP))
 
-    def _placed(self, state: State) -> tuple[Array, Array, Array]:
+    def _placed(self, state: RigParameters) -> tuple[Array, Array, Array]:
         """All corners (n, 3): in the frame of their camera; rotated into that of camera 0; and placed in it."""
         rotated, placed = np.empty_like(self.flat), np.empty_like(self.flat)
         for observation, part in zip(self.observations, self.parts, strict=True):
@@ -235,7 +235,7 @@ class BundleAdjustment:
             own[second] = placed[second] @ state.rotation.T + state.translation_mm
         return own, rotated, placed
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: RigParameters) -> Array:
         """Seen less predicted (n, 2), px; infinite where a corner would be behind its camera."""
         own = self._placed(state)[0]
         if np.any(own[:, 2] <= 0) or not np.isfinite(own).all():
@@ -246,7 +246,7 @@ class BundleAdjustment:
             predicted[its] = project(own[its], state.intrinsics[camera])
         return self.seen - predicted
 
-    def jacobian(self, state: State) -> tuple[Array, Array]:
+    def jacobian(self, state: RigParameters) -> tuple[Array, Array]:
         """Jacobian of the predictions by the shared parameters (n, 2, shared) and by the pose (n, 2, 6)."""
         own, rotated, placed = self._placed(state)
         count = len(own)
@@ -277,7 +277,7 @@ class BundleAdjustment:
         by_pose = np.concatenate([-in_first @ cross_matrices(rotated), in_first], axis=2)
         return shared, by_pose
 
-    def _prior_values(self, state: State) -> Array:
+    def _prior_values(self, state: RigParameters) -> Array:
         """The shared parameters that have priors; 0 for the rig."""
         if self.only_poses:
             return np.zeros(0)
@@ -285,7 +285,7 @@ class BundleAdjustment:
         rig = np.zeros(6 if self.cameras > 1 else 0)
         return np.concatenate([*free, rig, state.warps_mm.ravel()])
 
-    def _moved(self, state: State, shared: Array, poses: Array) -> State:
+    def _moved(self, state: RigParameters, shared: Array, poses: Array) -> RigParameters:
         intrinsics, rotation, translation, warps = (
             state.intrinsics,
             state.rotation,
@@ -305,9 +305,9 @@ class BundleAdjustment:
         rotations = np.array(
             [_rotation(step[:3]) @ before for step, before in zip(poses, state.rotations, strict=True)]
         )
-        return State(intrinsics, rotation, translation, warps, rotations, state.translations_mm + poses[:, 3:])
+        return RigParameters(intrinsics, rotation, translation, warps, rotations, state.translations_mm + poses[:, 3:])
 
-    def _normal(self, state: State, residual: Array, noise_px: float) -> tuple[Array, ...]:
+    def _normal(self, state: RigParameters, residual: Array, noise_px: float) -> tuple[Array, ...]:
         """Normal matrices of the shared parameters, shared x pose, and pose, and the right-hand sides."""
         shared, by_pose = self.jacobian(state)
         size, prior = self.size, (noise_px / self.prior_std) ** 2
@@ -324,13 +324,13 @@ class BundleAdjustment:
             own_right[observation.pose] += pose.T @ residual[part].ravel()
         return matrix, mixed, own, right, own_right
 
-    def _cost(self, state: State, residual: Array, noise_px: float) -> float:
+    def _cost(self, state: RigParameters, residual: Array, noise_px: float) -> float:
         if not np.isfinite(residual).all():
             return np.inf
         prior = float(np.sum((self._prior_values(state) * noise_px / self.prior_std) ** 2))
         return float(np.sum(residual**2)) + prior
 
-    def solve(self, start: State, noise_px: float = FIRST_NOISE_PX) -> Solution:
+    def solve(self, start: RigParameters, noise_px: float = FIRST_NOISE_PX) -> Solution:
         """Solve by the method of Levenberg and Marquardt, from `start`."""
         if not self.only_poses:
             self._set_distortion_prior(start.intrinsics)
@@ -365,7 +365,7 @@ class BundleAdjustment:
             noise_px=noise,
         )
 
-    def _covariance(self, state: State, residual: Array, noise_px: float) -> Array:
+    def _covariance(self, state: RigParameters, residual: Array, noise_px: float) -> Array:
         if self.only_poses:
             return np.zeros((0, 0))
         matrix, mixed, own, _, _ = self._normal(state, residual, noise_px)
@@ -442,10 +442,10 @@ def first_intrinsics(views: Sequence[BoardView], shape: tuple[int, int]) -> Arra
     return start
 
 
-def first_state(views: Sequence[BoardView], intrinsics: Array) -> State:
-    """State of one camera, each view with a pose of its own."""
+def first_state(views: Sequence[BoardView], intrinsics: Array) -> RigParameters:
+    """RigParameters of one camera, each view with a pose of its own."""
     poses = [board_pose(view, intrinsics) for view in views]
-    return State(
+    return RigParameters(
         intrinsics=intrinsics[None, :],
         rotation=np.eye(3),
         translation_mm=np.zeros(3),
@@ -455,6 +455,6 @@ def first_state(views: Sequence[BoardView], intrinsics: Array) -> State:
     )
 
 
-def with_boards(state: State, boards: int) -> State:
+def with_boards(state: RigParameters, boards: int) -> RigParameters:
     """The state with `boards` flat boards."""
     return replace(state, warps_mm=np.zeros((boards, 3)))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.fit.geometry.board_detection import BoardView
-from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Observation, Solution, State, board_key
+from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Observation, RigParameters, Solution, board_key
 from lab.fit.geometry.pinhole import COUNT, NAMES
 from lab.formats.results import DistortionModel
 
@@ -94,7 +94,7 @@ def first_view_of_boards(views: Sequence[BoardView]) -> list[BoardView]:
 
 
 def _held_out_square(
-    view: BoardView, trained: State, board: int, solution: Solution, pose: int, shape: tuple[int, int]
+    view: BoardView, trained: RigParameters, board: int, solution: Solution, pose: int, shape: tuple[int, int]
 ) -> float:
     """Sum of squared residuals, px^2, of a view that the camera `trained` has not seen."""
     state = replace(

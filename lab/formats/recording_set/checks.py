@@ -12,7 +12,7 @@ from lab.capture_kinds.base import Capture, Names, Open, names_in
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
-from lab.formats.recording_set.clipping import CLIPPED_LIMIT, FlatLevel, clipped_share, flat_level, saturated_flats
+from lab.formats.recording_set.clipping import CLIPPED_LIMIT, ClippedLevel, clipped_share, flat_level, saturated_flats
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
 from sim.camera import Side
@@ -45,7 +45,7 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
 
 def _check_frames(recordings: RecordingSet, found: Findings) -> None:
     """Load every frame once; find damaged frames, saturated flats and clipped captures."""
-    flats: dict[Side, list[FlatLevel]] = defaultdict(list)
+    flats: dict[Side, list[ClippedLevel]] = defaultdict(list)
     clipped_of: dict[tuple[Side, str], list[str]] = defaultdict(list)
     for capture in recordings.manifest.captures:
         camera = recordings.manifest.cameras[capture.side]

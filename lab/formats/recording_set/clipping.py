@@ -22,7 +22,7 @@ LADDER_REACH = 0.85
 
 
 @dataclass(frozen=True)
-class FlatLevel:
+class ClippedLevel:
     """Level of one flat: mean and clipped share of each channel."""
 
     id: str
@@ -72,16 +72,16 @@ def _light(recordings: RecordingSet, flat: FlatCapture) -> tuple[float, str]:
     return flat.exposure_s * float(np.trapezoid(spectrum.value, spectrum.wavelength_nm)), "radiance"
 
 
-def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clipped: dict[str, float]) -> FlatLevel:
+def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clipped: dict[str, float]) -> ClippedLevel:
     """The level of one flat. Raises InputError where its spectrum can't be used."""
     light, scale = _light(recordings, flat)
     planes = channel_planes(frame, recordings.camera(flat.side))
     mean_dn = {name: float(np.mean([plane.mean() for plane in planes[name]])) for name in planes}
     where = f"{recordings.where(flat.frame)} (capture {flat.id})"
-    return FlatLevel(flat.id, where, flat.gain_db, light, scale, mean_dn, clipped)
+    return ClippedLevel(flat.id, where, flat.gain_db, light, scale, mean_dn, clipped)
 
 
-def _why_not_a_ladder(level: FlatLevel, channel: str, levels: list[FlatLevel], black: float) -> str | None:
+def _why_not_a_ladder(level: ClippedLevel, channel: str, levels: list[ClippedLevel], black: float) -> str | None:
     """Why the clipped `channel` of a flat isn't the top of an exposure ladder, with the remedy; None where it is.
 
     EMVA 1288 asks for exposures up to and beyond saturation. A clipped flat is accepted where at least `LADDER_LEVELS` unclipped
@@ -104,7 +104,7 @@ def _why_not_a_ladder(level: FlatLevel, channel: str, levels: list[FlatLevel], b
     return None
 
 
-def saturated_flats(levels: list[FlatLevel], camera: DataSheet) -> Iterator[str]:
+def saturated_flats(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
     """One line for each clipped flat that isn't the top of an exposure ladder."""
     for level in levels:
         for channel, share in level.clipped.items():

@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Refused
 from drivers.monochromator.cornerstone260 import Cornerstone260
 from mocks.bench import Bench, Clock
-from mocks.cornerstone260 import Cornerstone260 as Mock
+from mocks.cornerstone260 import MockCornerstone260 as Mock
 from mocks.lamp import Lamp
 from mocks.wire import Pty, Tcp
 

@@ -14,7 +14,7 @@ import pytest
 from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Refused
 from drivers.spectroradiometer.specbos1211 import Specbos1211
 from mocks.lamp import Lamp, LampClock
-from mocks.specbos1211 import Specbos1211 as Mock
+from mocks.specbos1211 import MockSpecbos1211 as Mock
 from mocks.wire import Pty, Tcp
 
 

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from drivers.stage.operator import OperatorStage
 from mocks.bench import Bench
-from mocks.stage import Stage as Mock
+from mocks.stage import MockStage as Mock
 from mocks.wire import Tcp
 
 

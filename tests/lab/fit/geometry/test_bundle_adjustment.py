@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.fit.geometry.bundle_adjustment import BundleAdjustment, Observation, State, first_intrinsics, first_state
+from lab.fit.geometry.bundle_adjustment import (
+    BundleAdjustment,
+    Observation,
+    RigParameters,
+    first_intrinsics,
+    first_state,
+)
 from lab.fit.geometry.calibration import calibrate
 from lab.fit.geometry.distortion_model import MODELS, free_intrinsics
 from tests.lab.fit.projected import SHAPE, TRUTH, poses, seen
@@ -42,7 +48,7 @@ def test_jacobian_is_that_of_the_residuals():
     free = np.array([free_intrinsics(MODELS[-1])] * 2)
     problem = BundleAdjustment(sights, free, SHAPE)
     start = first_state(views[:2], first_intrinsics(views[:2], SHAPE))
-    state = State(
+    state = RigParameters(
         intrinsics=np.repeat(start.intrinsics, 2, axis=0), rotation=TRUTH.rotation, translation_mm=TRUTH.translation_mm,
         warps_mm=np.array([[0.1, 0.2, 0.3]]), rotations=start.rotations, translations_mm=start.translations_mm,
     )  # fmt: skip
@@ -81,7 +87,7 @@ def test_covariance_of_a_pair_is_that_of_repeated_solves():
             for camera, views in enumerate(sides)
             for k, view in enumerate(views)
         ]
-        start = State(
+        start = RigParameters(
             np.array(matrices), truth.rotation, truth.translation_mm, np.array([truth.warp_mm]),
             np.array([turn for turn, _ in AT]), np.array([shift for _, shift in AT]),
         )  # fmt: skip

@@ -1,0 +1,20 @@
+"""Two public classes never share a name, in whatever package they stand."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_two_classes_never_share_a_name() -> None:
+    found: dict[str, list[str]] = defaultdict(list)
+    for package in ("sim", "drivers", "mocks", "lab", "api"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    found[node.name].append(str(path.relative_to(ROOT)))
+    assert len(found) > 400
+    assert {name: files for name, files in found.items() if len(files) > 1} == {}
