@@ -29,8 +29,8 @@ from lab.fit.geometry.bundle_adjustment import (
     RIG,
     BundleAdjustment,
     Observation,
+    RigParameters,
     Solution,
-    State,
     board_key,
     board_pose,
     rms_px,
@@ -172,7 +172,7 @@ def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
         poses.append((rotation_one, translation_one))
         turns.append(Rotation.from_matrix(rotation).as_rotvec())
         translations.append(translation_two - rotation @ translation_one)
-    start = State(
+    start = RigParameters(
         intrinsics=cameras,
         rotation=Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(),
         translation_mm=np.median(translations, axis=0),
@@ -285,7 +285,7 @@ def depth_uncertainty(solution: Solution, depth_mm: float, shapes: Sequence[tupl
 # --- rectification ---------------------------------------------------------------------------------------------------
 
 
-def rectification(state: State, pairs: Sequence[StereoPair], shape: tuple[int, int]) -> Rectification:
+def rectification(state: RigParameters, pairs: Sequence[StereoPair], shape: tuple[int, int]) -> Rectification:
     """The rectification of OpenCV, with the rms difference of the rows of the corners that both cameras saw."""
     one, two = (matrix_of(camera) for camera in state.intrinsics)
     of_one, of_two = (distortion_of(camera) for camera in state.intrinsics)
