@@ -44,7 +44,7 @@ from sim.parameters import Quantity, declared
 from sim.spectrum import Spectrum
 
 FORMAT, VERSION = "calibench-camera", 1
-HEADER = "# A camera for calibench: each key is a parameter, and ends in its unit. docs/reference/simulate.md says what they do."
+HEADER = "# A camera for calibench: each key is a parameter, and ends in its unit. docs/reference/camera-file.md says what they do."
 #: Keys of the file that don't belong to the camera model.
 OWN_KEYS = ("format", "version", "name", "effects")
 CURVES = ("quantum_efficiency", "quantum_efficiency_std")

@@ -224,7 +224,8 @@ def scene_row(scene: type[NamedScene]) -> str:
 
 
 def test_the_documentation_is_what_the_declarations_say() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "reference" / "simulate.md").read_text()
+    pages = Path(__file__).parents[3] / "docs" / "reference"
+    text = (pages / "camera-file.md").read_text(encoding="utf-8")
     lines = text.splitlines()
     for model in (CameraModel, Lens):
         for key, quantity in declared(model).items():
@@ -232,6 +233,7 @@ def test_the_documentation_is_what_the_declarations_say() -> None:
     for model in (CameraModel, Lens, ZernikePupil, MeasuredPsf, MeasuredOtf):
         for key in model.model_fields:
             assert key in text, f"{model.__name__}.{key} isn't described"
+    lines = (pages / "simulate.md").read_text(encoding="utf-8").splitlines()
     for scene in SCENES.values():
         assert scene_row(scene) in lines
 
