@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import runpy
 from functools import cache
 from pathlib import Path
 
@@ -128,3 +129,20 @@ def test_every_page_can_be_reached(page: Path) -> None:
         if "://" not in link
     }
     assert page in linked or page.parent in linked
+
+
+@pytest.mark.parametrize("page", ["effects", "command-line"])
+def test_generated_pages_are_current(page: str) -> None:
+    """Else: `python docs/write_tables.py PAGE`."""
+    pages = runpy.run_path(str(ROOT / "docs" / "write_tables.py"))["PAGES"]
+    assert (ROOT / "docs" / "reference" / f"{page}.md").read_text(encoding="utf-8") == pages[page]()
+
+
+def test_pages_that_the_code_names_exist() -> None:
+    missing = {
+        f"{source.relative_to(ROOT)}: {page}"
+        for source in SOURCES
+        for page in re.findall(r"\bdocs/[\w/-]+\.(?:md|py|svg|png|jpg)\b", text_of(source))
+        if not exists(page)
+    }
+    assert not missing

@@ -48,7 +48,7 @@ class CaptureInfo(_Record):
 
 
 class ResultInfo(_Record):
-    """A stored result; `document` as `docs/results.md` has it."""
+    """A stored result; `document` as `docs/reference/results.md` has it."""
 
     id: str
     job_id: str | None

@@ -29,7 +29,7 @@ for _group in (capturing, fitting, diagnosis, effects, recordings, kinds, simula
 app.add_typer(challenge)
 
 
-def _attach_service_and_mocks() -> None:
+def attach_service_and_mocks() -> None:
     """Add the commands of `api` and `mocks`. Only this function imports them, and only when a command line is parsed."""
     from api.command import commands as service
     from mocks.command import commands as mocks
@@ -45,7 +45,7 @@ def _attach_service_and_mocks() -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     try:
-        _attach_service_and_mocks()
+        attach_service_and_mocks()
         code = app(arguments, standalone_mode=False)
     except (InputError, DeviceError) as error:
         if os.environ.get("CALIBENCH_DEBUG"):
