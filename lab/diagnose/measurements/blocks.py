@@ -20,7 +20,7 @@ from sim.spectrum import FloatArray
 
 #: Apertures that a pixel may have whose fill factor nobody states: the least side (px), how many are tried, what they are told by.
 LEAST_SIDE, APERTURES, APERTURE_DIRECTIONS = 0.5, 10, 4
-#: What is left free of a quantity that had to be assumed.
+#: What a nuisance parameter covers of a quantity that had to be assumed.
 FREE_BESIDE = {"fill_factor": ", but contrast may be that of any aperture"}
 #: Of the full well: from here on pixels of a noisy level are cut off.
 _NEAR_FULL = 0.985

@@ -17,7 +17,7 @@ COLOUR_RINGS = (0.3, 0.6, 1.0)  # half diagonals
 
 
 def board_colour_block(study: Study) -> Block:
-    """How far out red and blue corners of boards lie against green's, by distance from the frame's middle."""
+    """Radial displacement of red and blue corners of boards from green's, px, by distance from the frame's middle."""
     if "G" not in study.channels:
         raise NotDetermined("board_colour", "one channel: nothing to hold it against")
     views, missed = views_of(study, study.side)
@@ -91,7 +91,7 @@ def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
     solution, *_ = np.linalg.lstsq(design[inside], seen[inside], rcond=None)
     rest = np.where(inside, seen - design @ solution, 0.0)
     inverse = np.linalg.pinv(design[inside].T @ design[inside])
-    # corners of one view share its errors: scatter by view (clustered)
+    # corners of one view share its errors: covariance clustered by view
     groups = np.repeat(view[keep], 2)
     meat = np.zeros_like(inverse)
     for k in np.unique(groups):

@@ -176,7 +176,7 @@ def _averages(
 
 
 def _between_views(corners: _Corners, mean: FloatArray, noise_px: float) -> float:
-    """Variance by which a view's mean over a cell scatters beyond its corners' noise: prints, motion, shading."""
+    """Variance of a view's mean over a cell beyond its corners' noise: imperfect prints, motion, shading."""
     excess, count = 0.0, 0
     for weight in mean:
         members = weight.reshape(-1, 2)

@@ -14,7 +14,7 @@ BORDER_FLOOR = 0.0015
 
 
 def cell_border_block(study: Study) -> Block:
-    """What rims between lit and dark cells lack or have too much of: greys that screen or camera show otherwise."""
+    """Coefficient of P (1 - P): the excess of light at borders between lit and dark cells, where screen and camera show greys."""
     found = patterns(study)
     points = [(g, p, len(p.bands) + BORDER) for g, group in enumerate(found) for p in group]
     value = np.array([p.value[b] for _, p, b in points])
@@ -34,7 +34,7 @@ def cell_border_block(study: Study) -> Block:
     return Block(
         measurement=CELL_BORDERS, reach=1e9, value=value,
         covariance=joint_covariance(points, study) + np.diag(np.full(len(value), BORDER_FLOOR**2)),
-        labels=tuple(Label(float(i), p.channel, "rims of cells", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
+        labels=tuple(Label(float(i), p.channel, "borders of cells", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
         reads=SHOWN | {"signal.response"}, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
@@ -46,5 +46,5 @@ CELL_BORDERS = Measurement(
     axis="level",
     unit="1",
     make=cell_border_block,
-    places="rims",
+    places="borders",
 )

@@ -45,7 +45,10 @@ class Patch:
 
 
 def chart_block(study: Study) -> Block:
-    """Every patch of a chart by channel; level and evenness of its light are free, and the patches' own tolerance."""
+    """Mean of every patch of a chart by channel, DN.
+
+    Nuisance parameters: level and gradient of the light. The patches' tolerance is in the covariance.
+    """
     if not study.stated.quantum_efficiency:
         raise NotDetermined(
             "chart", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"

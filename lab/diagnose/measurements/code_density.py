@@ -40,11 +40,11 @@ NEAR, FAR = (
 )  # codes about a boundary; of the noise's standard deviation, the distance over which the curve is fitted
 STEP_FLOOR = 0.02
 COMB_FLOOR = 3e-4
-SCATTER_FLOOR = 0.03  # of a chi2's number of codes
+VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
 #: Periods of combs that are looked at, in cycles a code.
 COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
 AROUND = 9  # pixels a side of a colour's plane, whose mean is the light's own course
-PARTS = 4  # of the range of codes, whose scatter is looked at by itself
+PARTS = 4  # of the range of codes; each has a variance about the smooth curve of its own
 FINE = 8  # samples a code of the converter's law
 
 
@@ -62,7 +62,8 @@ class _Codes:
 
 
 def code_block(study: Study) -> Block:
-    """Of all even light: steps (DN) where a high bit changes, combs of a few codes' period, and the scatter about a smooth curve."""
+    """Code-density test of all uniform light: steps (DN) where a high bit changes, combs of a few codes' period, and the variance of the
+    counts about a smooth curve."""
     counts = _counted(study)
     joined = int(np.bitwise_or.reduce(np.flatnonzero(sum(c.count for c in counts.values()))))
     apart = joined & -joined  # the largest power of two that divides every code
@@ -79,7 +80,7 @@ def code_block(study: Study) -> Block:
         codes = _prepared(study, counts[held_out])
         if codes is None:
             continue
-        (steps, boundaries), parts = _steps(study, codes), _scattered(codes)
+        (steps, boundaries), parts = _steps(study, codes), _parts(codes)
         combs, names = _combs(codes)
         residual = codes.rough @ codes.count
         values += [
@@ -91,7 +92,7 @@ def code_block(study: Study) -> Block:
         floor = np.concatenate([np.full(len(steps), STEP_FLOOR), np.full(len(combs), COMB_FLOOR)])
         covariances += [
             (linear * np.maximum(codes.expected, 1.0)) @ linear.T + np.diag(np.square(floor)),
-            np.diag([1.0 + (SCATTER_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
+            np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
         ]
         members = tuple(counts[held_out].captures)
         labels += [
@@ -100,7 +101,7 @@ def code_block(study: Study) -> Block:
         labels += [Label(x, "comb", words, members, held_out) for x, words in names]
         for p in parts:
             low, high = codes.first + p.at.start, codes.first + p.at.stop - 1
-            labels.append(Label(0.5 * (low + high), "scatter", f"codes {low} to {high}", members, held_out))
+            labels.append(Label(0.5 * (low + high), "variance", f"codes {low} to {high}", members, held_out))
         # combs of other periods and phases have nothing in common, one of the same is the same everywhere
         far = 10.0 * study.camera.white_level_dn
         places += [(float(codes.first + b), 0.0) for b in boundaries]
@@ -276,7 +277,7 @@ class _Part:
         return float(np.sum(np.square(residual[self.at]) / self.variance)) / self.chi2_std
 
 
-def _scattered(codes: _Codes) -> list[_Part]:
+def _parts(codes: _Codes) -> list[_Part]:
     variance = np.asarray(codes.rough.power(2) @ np.maximum(codes.smooth, 1.0))
     found = []
     for part in np.array_split(np.flatnonzero(codes.used), PARTS):

@@ -1,4 +1,4 @@
-"""What is free of the maker's sensitivity curves: a scale, a tilt, a bend, a smooth few per mille, and a little everywhere."""
+"""Nuisance parameters of the maker's sensitivity curves: scale, tilt, bend, a smooth few per mille, and a constant leak."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sim.effects.base import Effect
 from sim.spectrum import FloatArray, Spectrum, linear_shares
 from sim.uniform import SPECTRAL, Uniform, electron_rate
 
-LEAK_STD = 2.0e-4  # of the curve's peak, alike at all wavelengths: blindness that isn't quite
+LEAK_STD = 2.0e-4  # of the curve's peak, the same at all wavelengths: sensitivity where the maker states none
 MOST_DECIMALS = 6  # of a curve's values; with fewer they are rounded
 CURVE_SCALE_STD = 0.2  # of the sensitivity: holds gain, aperture and lens too
-LEVEL_STD = 0.5  # of all signals where gain, f-number or pitch aren't known, about those recorded
+LEVEL_STD = 0.5  # of all signals where gain, f-number or pitch aren't known
 CURVE_TILT_STD = 0.05  # per 100 nm
 CURVE_BEND_STD = 0.01  # per (100 nm)^2
 CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
@@ -41,8 +41,8 @@ class CurveJacobian:
         measured_e_per_s: FloatArray | None = None,
         scale: float = 1.0,
     ) -> None:
-        """`measured_e_per_s` (n,): where gain, f-number or pitch aren't known the level is free about that of these; `scale`: on all
-        rates."""
+        """`measured_e_per_s` (n,): where gain, f-number or pitch aren't known, the rates are scaled to these and their level is a nuisance
+        parameter. `scale`: a factor on all rates."""
         self.study, self.items = study, items
         self.kind = items[0][3]
         lights = {path: study.spectrum(path) for path in {item[0] for item in items}}
@@ -63,7 +63,7 @@ class CurveJacobian:
         self._rate = np.array(
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
         )
-        #: Of the rates: what nobody knows of the light's way to the codes.
+        #: Factor on the rates: the unknown part of the way from light to codes.
         self.scale, self._is_free = scale, measured_e_per_s is not None and not study.level_is_known
         if measured_e_per_s is not None and self._is_free:
             self.scale = max(float(measured_e_per_s.sum()), 1e-9) / max(float(self._rate.sum()), 1e-300)
@@ -128,7 +128,7 @@ class CurveJacobian:
         return self._under(effects)[0]
 
     def jacobian(self, effects: Effects) -> dict[str, FloatArray]:
-        """By the free quantities, in electrons a second."""
+        """Derivatives of the rates by the nuisance parameters, per prior standard deviation: name -> (n,), e/s."""
         table = self._under(effects)[1]
         named = {}
         for channel in self.study.channels:
@@ -142,7 +142,7 @@ class CurveJacobian:
 
 
 def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
-    """What is free of every curve: relative changes of one prior standard deviation each, (modes, wavelengths)."""
+    """Relative changes of a curve by its nuisance parameters, one prior standard deviation each, (modes, wavelengths)."""
     knots = np.arange(380.0, 781.0, 20.0)
     cov = CURVE_ROUGH_STD**2 * np.exp(-0.5 * ((knots[:, None] - knots) / CURVE_ROUGH_NM) ** 2)
     size, vector = np.linalg.eigh(cov)
@@ -157,8 +157,8 @@ def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
 
 
 def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) -> Spectrum:
-    """A maker's curve with what is free of it at `quantities` (as `CurveJacobian.jacobian` names them, in prior standard deviations); the
-    same curve where none is among them."""
+    """A maker's curve at nuisance parameters `quantities` (names of `CurveJacobian.jacobian`, values in prior standard deviations). The
+    same curve where none of them is the channel's."""
     names = [name for name in quantities if name.startswith(f"curve:{channel}:")]
     if not names:
         return curve

@@ -14,7 +14,7 @@ from sim.uniform import Uniform
 
 
 def dark_field_block(study: Study) -> Block:
-    """Cells of the mean dark frame by exposure; each frame's level is free."""
+    """Means over cells of the mean dark frame by exposure, DN. Each frame's level is a nuisance parameter."""
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
     rows, cols = CELLS

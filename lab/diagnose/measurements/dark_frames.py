@@ -26,7 +26,7 @@ CELLS = 4, 6  # of a frame: rows, columns
 CELL_FLOOR_DN = 0.005
 MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
 CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
-MEDIAN_OF = 5  # frames at most, whose median is looked at for odd pixels
+MEDIAN_OF = 5  # frames at most, whose median shows defective pixels
 #: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
 TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
 SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their noise are taken
@@ -34,7 +34,7 @@ SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their
 
 @dataclass(frozen=True)
 class DarkCondition:
-    """Dark captures of one exposure and temperature: those that choice and fit may see, and those that they don't."""
+    """Dark captures of one exposure and temperature, seen and held out."""
 
     exposure_s: float
     temperature_c: float | None
@@ -53,7 +53,8 @@ class DarkCondition:
 
 @dataclass(frozen=True)
 class DarkPattern:
-    """What some frames of one condition have in common: their mean and the lower median of some of them, both less black level."""
+    """Statistics of what frames of one condition have in common: of their mean, and of the lower median of some, each frame's level
+    subtracted."""
 
     frames: int
     of_median: int
@@ -62,8 +63,8 @@ class DarkPattern:
     lines: dict[
         Lines, tuple[FloatArray, FloatArray, float]
     ]  # frequency, power over the white level's, number of its modes
-    white_dn2: float  # power of single pixels
-    parity_dn: dict[Lines, float]  # odd lines less even ones
+    white_dn2: float  # variance of independent pixels
+    parity_dn: dict[Lines, float]  # mean of odd lines less that of even ones
     line_dn2: dict[Lines, float]  # variance of the lines' means beyond the pixels' own
     counts: FloatArray  # of TAIL_EDGES, upwards, then the two downwards
     spread_dn: float  # of single pixels of the median
@@ -72,8 +73,11 @@ class DarkPattern:
 
 @dataclass(frozen=True)
 class DarkNoise:
-    """What differs from frame to frame of one condition: contrasts of every frame to the mean of those before it, each with the
-    variance of one frame and independent of the others (Helmert)."""
+    """Statistics of what differs from frame to frame of one condition.
+
+    They are taken from Helmert contrasts: every frame less the mean of those before it, scaled to the variance of one frame. Contrasts are
+    independent of each other.
+    """
 
     contrasts: int
     variance_dn2: float  # of a pixel
@@ -90,11 +94,11 @@ class DarkNoise:
 
 @dataclass(frozen=True)
 class DarkStatistics:
-    """All that is kept of one condition."""
+    """The statistics of one condition's dark frames."""
 
     condition: DarkCondition
     means: dict[str, float]
-    fixed: dict[bool, DarkPattern]  # held out or seen; only those of `MOST_CONDITIONS`
+    fixed: dict[bool, DarkPattern]  # by whether they are held out; of at most `MOST_CONDITIONS` conditions
     changing: dict[bool, DarkNoise]
 
 
@@ -167,7 +171,7 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool) -> DarkSta
         if with_pattern:
             stacks[held_out].append(frame)
     changing = {out: _changing(part) for out, part in contrasts.items() if part}
-    # the first frame of a condition all of which is held out has no contrast, and neither has a lone one
+    # without a contrast of these frames (a single one) any other's variance is taken
     variance = next((c.variance_dn2 for c in changing.values()), None)
     ids = {False: [c.id for c in condition.seen], True: [c.id for c in condition.held_out]}
     fixed = {out: _fixed(part, tuple(ids[out]), variance) for out, part in stacks.items() if part}
@@ -193,7 +197,7 @@ def _changing(contrasts: list[Image]) -> DarkNoise:
         pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
         total += np.square(rest)
         cells.append(float(np.mean(np.square(cell_means(cut)))))
-        if len(white) < 6:  # spectra of more are known well enough
+        if len(white) < 6:  # more spectra don't add much
             power = periodogram(cut)
             white.append(power.level)
             rows.append(power.line("rows"))
@@ -219,7 +223,7 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
     part = frames[:MEDIAN_OF]
     level = [f - _row_means(f)[:, None] for f in part]
     median: Image = np.sort(np.array(level), axis=0)[(len(part) - 1) // 2]
-    # odd pixels: against their surroundings, lines taken out, in units of the surroundings' own spread
+    # defective pixels: deviation from their surroundings without lines, in standard deviations of these
     std = _robust_std(median)
     flat, _ = _without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
     step = 2
@@ -229,7 +233,7 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
             phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
     around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
     steep = np.clip(flat - around, -CLIP * std, CLIP * std)
-    # a second pass keeps hot pixels beside a glow from pulling at it
+    # a second pass, so that hot pixels in a glow don't shift the mean around them
     around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
     away = flat - around
     local = np.sqrt(np.maximum(_local_variance(np.square(away), 1), 0.25)) * np.sqrt(
@@ -239,7 +243,7 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
     counts = np.histogram(z, edges)[0].astype(float)
     low, high = np.quantile(z, [0.005, 0.995])
-    # smooth structure and lines: the mean, odd pixels cut off
+    # smooth structure and lines: the mean, defective pixels clipped
     std = _robust_std(mean)
     smooth = ndimage.uniform_filter(np.clip(mean, -8.0 * std, 8.0 * std), SMOOTH_PX, mode="mirror")
     spread = np.sqrt(_local_variance(np.square(mean - smooth), 1))
@@ -265,7 +269,7 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
 
 
 def _robust_std(image: Image) -> float:
-    """Standard deviation of the bulk: what lies beyond five of it doesn't count. Half a code at least."""
+    """Standard deviation of the pixels within five of it. At least a quarter of a code."""
     low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
     std = max(float(high - low) / 4.107, 0.3)
     for _ in range(3):
@@ -280,8 +284,8 @@ def _row_means(image: Image) -> Image:
 
 
 def _without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
-    """An image less the means of its rows and columns (of `cut`), and the variance that neighbouring lines' means have beyond what
-    single pixels give them: by their differences, which nothing smooth changes."""
+    """An image less the means of its rows and columns (of `cut`); and the variance of the lines' means beyond that of independent pixels,
+    from differences of neighbouring lines, in which smooth structure cancels."""
     rows, cols = cut.mean(axis=1, dtype=np.float64), cut.mean(axis=0, dtype=np.float64)
     own = float(np.var(np.diff(cut, axis=1), dtype=np.float64)) / 2.0
     spare: dict[Lines, float] = {
@@ -293,7 +297,7 @@ def _without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]
 
 
 def _local_variance(squares: Image, freedom: int) -> Image:
-    """Variance of a pixel by its surroundings, pixels far beyond it cut off."""
+    """Mean square of a pixel's surroundings a degree of freedom, outliers clipped."""
     usual = float(np.mean(np.minimum(squares, 16.0 * freedom * np.median(squares) / 0.45)))
     cap = np.float32(64.0 * usual)
     rough = ndimage.uniform_filter(np.minimum(squares, cap), LOCAL_PX, mode="mirror")
@@ -314,7 +318,7 @@ DEFECTS = frozenset({"charge.defects", "signal.telegraph"})
 
 
 def fine_conditions(step: str, frames: Sequence[DarkStatistics], least_dn: float) -> list[DarkStatistics]:
-    """Conditions whose frames differ by at least so much noise; NotDetermined where there are none."""
+    """Conditions whose temporal noise is at least `least_dn`. Raises NotDetermined where there are none."""
     every = [f for f in frames if f.changing]
     if not every:
         raise NotDetermined(step, "no two dark frames of the same exposure and temperature")
@@ -325,7 +329,7 @@ def fine_conditions(step: str, frames: Sequence[DarkStatistics], least_dn: float
 
 
 def by_part(frames: Sequence[DarkStatistics]) -> dict[bool, list[DarkNoise]]:
-    """What changes from frame to frame, of what choice and fit may see and of what is held out; neither if there is none."""
+    """The temporal statistics by whether they are held out; without a part that has none."""
     parts = {out: [f.changing[out] for f in frames if out in f.changing] for out in (False, True)}
     return {out: part for out, part in parts.items() if part}
 

@@ -15,7 +15,7 @@ from sim.uniform import Uniform
 
 
 def dark_current_map(study: Study, effects: Effects, temperature_c: float | None) -> FloatArray:
-    """Dark current (e/s) of pixels as large as a cell's twelfth: laws are of whole frames, of which nothing is smaller here."""
+    """Dark current (e/s) on a coarse grid of 12 x 12 points a cell or more: the laws are smooth on this scale."""
     camera = study.camera
     down = max(min(camera.rows // (12 * CELLS[0]), camera.cols // (12 * CELLS[1])), 1)
     coarse = camera.model_copy(
@@ -29,14 +29,17 @@ def dark_current_map(study: Study, effects: Effects, temperature_c: float | None
 
 
 def added_dark_e_per_s(study: Study, effects: Effects, temperature_c: float | None) -> float:
-    """What effects add to the mean dark current of pixels that are like their neighbours."""
+    """Change of the mean dark current by effects, without defective pixels, e/s."""
     if not Uniform(study.camera, effects).changes_dark_current:
         return 0.0
     return float(dark_current_map(study, effects, temperature_c).mean()) - study.camera.dark_current_e_per_s
 
 
 def dark_level_block(study: Study) -> Block:
-    """Mean of every dark frame: black level and dark current are free; what remains is time, temperature and the frame before."""
+    """Mean of every dark frame, DN.
+
+    Nuisance parameters: black level and dark current. Effects change it with time, temperature and the frame before.
+    """
     frames = study.once(dark_frames)
     captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
     value = np.array([f.means[c.id] for f in frames for c in f.condition.captures])
@@ -52,10 +55,10 @@ def dark_level_block(study: Study) -> Block:
             mean[i] += gain * (more[condition.temperature_c] * capture.exposure_s + float(carried))
         return Prediction(mean, study.free_offsets(exposures))
 
-    # codes as coarse as all noise round a level up or down, with where it lies between two
+    # codes as coarse as the noise move a mean, depending on where it lies between two of them
     coarse = np.array([_rounding_dn(f) for f in frames for _ in f.condition.captures])
     same = np.array([[a[1] is b[1] for b in captures] for a in captures])
-    # smooth along the exposure at one temperature; ten degrees are as far as all exposures
+    # the position of smoothness: 10 degrees count as twice the range of exposures
     reach = float(max(np.ptp(exposures), 1e-3))
     warmer = np.array([0.0 if k.temperature_c is None or study.temperature_c is None else k.temperature_c - study.temperature_c for _, k, _ in captures])  # fmt: skip
     return Block(
@@ -67,7 +70,7 @@ def dark_level_block(study: Study) -> Block:
 
 
 def _rounding_dn(frames: DarkStatistics) -> float:
-    """By how much rounding may move a level: exp(-2 pi^2 variance) / pi codes at most."""
+    """Largest shift of a mean by rounding, DN: exp(-2 pi^2 variance) / pi."""
     changing = next((c.variance_dn2 for c in frames.changing.values()), None)
     if changing is None:
         return 0.1
@@ -75,7 +78,7 @@ def _rounding_dn(frames: DarkStatistics) -> float:
 
 
 def black_level_block(study: Study) -> Block:
-    """The black level that the darks show against the stated one: no effect is about a level that is wrong from the start."""
+    """The black level of the dark frames against the stated one, DN. No effect changes it: a wrong statement isn't physics."""
     stated = study.stated.black_level_dn
     if stated is None:
         raise NotDetermined("black_level", "the black level isn't stated: nothing to hold the dark frames against")

@@ -29,13 +29,13 @@ LINES = frozenset({"signal.lines"})
 
 
 def temporal_line_block(lines: Lines, study: Study) -> Block:
-    """Spectrum of what all pixels of a row (column) share in one frame and not in the next, over that of single pixels."""
+    """Spectrum of what the pixels of a row (column) share in one frame and not in the next, over that of single pixels; logarithms."""
     frames = study.once(dark_frames)
     name = "row_noise" if lines == "rows" else "column_noise"
     fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN)
     parts = by_part(fine)
     frequency = next(iter(parts.values()))[0].lines[lines][0]
-    # a ripple of some rows' period lies where noise that neighbouring rows share has its bend
+    # narrow bands at low frequencies: a ripple of some rows' period lies near the bend of correlated row noise
     bands = Bands.of(frequency, 8, 1.5)
     length = study.camera.cols if lines == "rows" else study.camera.rows
     value, variance, labels, inverse = [], [], [], []
@@ -67,7 +67,8 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
 
 
 def fixed_line_block(lines: Lines, study: Study) -> Block:
-    """The same of what they share in every frame: the shortest exposure's mean; and how odd lines differ from even ones."""
+    """Spectrum of what the pixels of a row (column) share in every frame, from the mean of the shortest exposure; and the mean of odd lines
+    less that of even ones."""
     frames = study.once(dark_frames)
     name = "row_pattern" if lines == "rows" else "column_pattern"
     first = next(f for f in frames if f.fixed)
@@ -135,7 +136,7 @@ def _fixed_share(frames: DarkStatistics) -> dict[bool, float]:
 
 
 def correlation_block(study: Study) -> Block:
-    """Spectrum within rows and columns at low frequencies, over that of the band above: white noise has none to spare."""
+    """Power within rows and columns at low frequencies over that at higher ones, logarithms: 0 where pixels are independent."""
     fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
     value, variance, labels = [], [], []
     for out, part in by_part(fine).items():
@@ -156,7 +157,7 @@ def correlation_block(study: Study) -> Block:
     if not labels:
         raise NotDetermined("dark_correlation", "the frames are too small to show noise that neighbours share")
     n = len(labels)
-    # what lines share leaves no trace within them: where there is one, it wasn't the lines
+    # noise of lines has no spectrum along them: an excess has another cause
     return Block(
         measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),
         covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,

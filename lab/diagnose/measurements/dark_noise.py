@@ -18,7 +18,7 @@ LEAST_NOISE_DN = 0.4  # below, codes are too coarse to say what the temporal noi
 
 
 def dark_noise_block(study: Study) -> Block:
-    """Temporal variance of dark frames by exposure and temperature: it grows with the dark charge, and not with an offset."""
+    """Temporal variance of dark frames by exposure and temperature, DN^2. It grows with the dark charge, and not with an offset."""
     frames = study.once(dark_frames)
     points = [(f, out, c) for f in frames for out, c in f.changing.items()]
     if not points:
@@ -36,7 +36,7 @@ def dark_noise_block(study: Study) -> Block:
             for *_, c in points
         ]
     )
-    # codes as coarse as the noise round it up or down, with where the level lies between two
+    # codes as coarse as the noise change its variance, depending on where the level lies between two of them
     bare = np.maximum(value - 1.0 / 12.0, 0.0)
     coarse = (4.0 * bare + 0.1) * np.exp(-2.0 * np.pi**2 * bare)
     covariance = np.diag(
@@ -45,7 +45,7 @@ def dark_noise_block(study: Study) -> Block:
     dark = noise.gain * noise.dark_dn_per_s * exposures
     shortest = float(value[int(np.argmin(exposures))])
     base = shortest + dark - float(dark.min())
-    # without flats nothing measures the gain; where it isn't stated either, it is anything
+    # the gain's prior: measured by flats, stated, or unknown
     flats = len(study.flat_levels()) > 1
     gain_std = 0.05 if flats else 0.3 if study.stated.conversion_gain_dn_per_e is not None else 10.0
 

@@ -29,7 +29,7 @@ LEAST_COUNTED_DN = 0.6  # the same of single pixels, whose far tail counts
 FLICKER_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
 FLICKER_CHANCE = 1e-5
 JUMPS = 256  # draws of which frames of a jumping pixel are high
-#: What a root of a count may be off by beside chance (about 1 where many are expected): one odd pixel more is no finding.
+#: Standard deviation of a count's root beside chance (which is about 1 where many are expected): one defective pixel more is no finding.
 COUNT_STD = 0.6
 
 
@@ -39,7 +39,7 @@ def _rooted(counts: FloatArray) -> FloatArray:
 
 
 def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
-    """Chance (1 where many are expected), and what the expected counts themselves are uncertain by."""
+    """Covariance of `_rooted` counts: Poisson noise (1 where many are expected), and the uncertainty of the expected counts."""
     number = np.arange(60.0)
     mean = np.minimum(expected, 20.0)[:, None]
     share = np.exp(xlogy(number, mean) - mean - gammaln(number + 1.0))
@@ -48,8 +48,10 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
 
 
 def defective_pixel_block(study: Study) -> Block:
-    """How many pixels lie far from their surroundings in the median of repeats, by how far and by exposure: hot pixels are the
-    same in every frame, and bright in proportion to the exposure."""
+    """Roots of the numbers of pixels that lie far from their surroundings in the median of repeats, by how far and by exposure.
+
+    Hot pixels are the same in every frame, and bright in proportion to the exposure.
+    """
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
     value = np.concatenate([_rooted(part.counts) for *_, part in points])
@@ -74,7 +76,7 @@ def defective_pixel_block(study: Study) -> Block:
         for b in range(bins)
     )
     base = expected(())
-    # a skewness says little of the far tail
+    # the skewness of the bulk doesn't determine the far tail
     uncertain = np.abs(expected((), 2.0) - expected((), 0.0)) + 0.2 * base
     return Block(
         measurement=DEFECTIVE_PIXELS, reach=1.0, value=value,
@@ -85,7 +87,7 @@ def defective_pixel_block(study: Study) -> Block:
 
 
 def _pixel_noise(study: Study, frames: DarkStatistics, part: DarkPattern) -> tuple[float, float]:
-    """(temporal, fixed) standard deviation of single pixels in DN: their median's spread less what the frames' noise leaves of it."""
+    """(temporal, fixed) standard deviation of single pixels, DN. The fixed one is the median frame's less its temporal noise."""
     moving = next((c.pixel_dn2 for c in frames.changing.values()), None)
     left = _order_moments(part.of_median)[1]
     if moving is None:  # of a lone frame all counts as noise
@@ -100,7 +102,7 @@ def _order_moments(n: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _DefectClass:
-    """Pixels of one kind: their share, additional dark signal and distance of two levels in DN."""
+    """Defective pixels of one size: their share of all pixels, additional dark signal (DN), and distance of two levels (DN)."""
 
     share: float
     more_dn: float
@@ -152,7 +154,7 @@ def _upper(z: FloatArray, skew: float) -> FloatArray:
 
 
 def flickering_pixel_block(study: Study) -> Block:
-    """How many pixels change from frame to frame far more than their surroundings, all dark frames together."""
+    """Roots of the numbers of pixels whose temporal variance is far above their surroundings', by how far: all dark frames together."""
     fine = fine_conditions("flickering_pixels", study.once(dark_frames), LEAST_COUNTED_DN)
     parts = {out: [f for f in fine if out in f.changing] for out in by_part(fine)}
     size = study.camera.rows * study.camera.cols
@@ -209,7 +211,7 @@ def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray
 def _hot_above(
     study: Study, part: Sequence[DarkStatistics], out: bool, rate: FloatArray, edges: FloatArray
 ) -> FloatArray:
-    """(rates, edges): hot pixels have more shot noise, the more the longer the exposure; by the first two moments."""
+    """Shares of hot pixels above the edges, (rates, edges), by their shot noise: chi-squared with the first two moments."""
     count = np.array([f.changing[out].contrasts for f in part], float)
     noise = np.array([f.changing[out].pixel_dn2 for f in part])
     charge = study.noise.gain**2 * rate[:, None] * np.array([f.condition.exposure_s for f in part])
@@ -229,7 +231,7 @@ def _jump_above(
     edges: FloatArray,
     freedom: int,
 ) -> FloatArray:
-    """(amplitudes, edges): mean over which of the frames are high."""
+    """Shares of pixels with two levels above the edges, (amplitudes, edges): mean over random sequences of levels."""
     unit = np.sum([draws[id(f)][out] / f.changing[out].pixel_dn2 for f in part], axis=0)
     found = []
     for amplitude in amplitude_e:
@@ -257,7 +259,7 @@ DEFECTIVE_PIXELS = Measurement(
     title="defective pixels",
     order=190,
     axis="deviation",
-    unit="sigma",
+    unit="standard deviations",
     make=defective_pixel_block,
     conditions="exposure and temperature",
 )

@@ -83,7 +83,7 @@ class Estimator:
 
     rows: FloatArray  # (contrast, shift, departures..., distances): of values at distances
     value: FloatArray  # (rows,): of the recording
-    scatter: FloatArray  # (rows, rows): its covariance over repeats
+    covariance: FloatArray  # (rows, rows): of `value`, over repeats
 
     @staticmethod
     def of(geometry: EdgeGeometry, spread: FloatArray, shapes: FloatArray) -> Estimator:
@@ -178,10 +178,10 @@ def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> F
     return np.asarray(np.bincount(left, amount - right_part, len(grid)) + np.bincount(left + 1, right_part, len(grid)))
 
 
-def relative_covariance(scatter: FloatArray, rows: FloatArray) -> FloatArray:
+def relative_covariance(covariance: FloatArray, rows: FloatArray) -> FloatArray:
     """Covariance of departures relative to the contrast, of what was reported."""
     departure = rows[2:] / rows[0]
     jacobian = (
         np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1) / rows[0]
     )
-    return np.asarray(jacobian @ scatter @ jacobian.T)
+    return np.asarray(jacobian @ covariance @ jacobian.T)

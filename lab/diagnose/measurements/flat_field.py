@@ -24,8 +24,8 @@ AXIS_STD, AXIS_STD_KNOWN = 0.01, 0.004  # of the frame's diagonal: the optical a
 MOST_FRAMES, MOST_LEVELS = 6, 2  # brightest levels, seen and held out each
 BLOCK_PX = 4  # of a channel's plane: at this scale its fixed pattern is measured
 ALIKE = 1.5  # times as much of it than of independent pixels' may be left in cells
-#: Beyond noise by this factor repeats' rows scatter by themselves: one healthy set in some thousands.
-SCATTERED = 4.0
+#: Ratio to the noise's variance from which on rows are said to vary from frame to frame: one healthy set in some thousands has it.
+VARYING = 4.0
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,14 @@ class _Plane:
     level_e: float
     noise: float  # relative variance of a cell by shot and read noise
     pattern: float  # and by the fixed pattern, which repeats share
-    row_scatter: FloatArray  # (ROWS, ROWS), relative covariance of what rows of cells do in common from frame to frame
+    row_covariance: FloatArray  # (ROWS, ROWS), relative covariance of what rows of cells share in one frame
 
 
 def shading_block(study: Study) -> Block:
-    """Brightest unclipped flats in 6 x 8 cells; fixed patterns as their own spread at a few pixels' scale says, the axis is free."""
+    """Means over 6 x 8 cells of the brightest unclipped flats, relative to their mean, by channel.
+
+    The fixed pattern's variance is measured at a scale of a few pixels. Nuisance parameters: the place of the optical axis.
+    """
     if study.stated.focal_length_mm is None or study.stated.pixel_pitch_um is None:
         raise NotDetermined(
             "flat_field", "the focal length or the pixel pitch isn't stated: the fall-off of the light isn't known"
@@ -104,7 +107,7 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plan
             total[channel] = total.get(channel, 0.0) + plane / len(captures)
             bands[channel].append(_cells(plane).mean(1))
     planes: list[_Plane] = []
-    scatter = np.zeros((ROWS, ROWS))
+    rows_dn2 = np.zeros((ROWS, ROWS))
     for channel, plane in total.items():
         count = len(mosaic.phases(study.camera.cfa)[channel])
         means = np.array([study.levels(c).mean[channel] or 0.0 for c in captures])
@@ -114,15 +117,17 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plan
         pixels = plane.size / (ROWS * COLS)
         cells = _cells(plane)
         # of the light, and so one for all channels
-        scatter = scatter + _row_scatter(np.array(bands[channel]), float(single.mean()) / (pixels * COLS)) / len(total)
+        rows_dn2 = rows_dn2 + _row_covariance(np.array(bands[channel]), float(single.mean()) / (pixels * COLS)) / len(
+            total
+        )
         planes.append(
             _Plane(
                 tuple(captures), channel, held_out, (cells / cells.mean()).ravel(), float(levels.mean()) / noise.gain, shot / pixels,
                 _pattern_variance(plane, shot) / pixels,
-                scatter,
+                rows_dn2,
             )
         )  # fmt: skip
-    return [replace(plane, row_scatter=scatter) for plane in planes]
+    return [replace(plane, row_covariance=rows_dn2) for plane in planes]
 
 
 def _pattern_variance(plane: FloatArray, shot: float) -> float:
@@ -141,16 +146,15 @@ def _adjacent(plane: FloatArray, size: int) -> float:
     return float(np.median(steps)) / 0.4549 / 2.0 * size**2
 
 
-def _row_scatter(bands: FloatArray, noise: float) -> FloatArray:
-    """What rows of cells do from frame to frame beside noise, (ROWS, ROWS): 0, or in a light that flickers their scatter's covariance, of
-    the mean of all frames."""
+def _row_covariance(bands: FloatArray, noise: float) -> FloatArray:
+    """Covariance of the rows of cells of the mean of all frames beside noise, (ROWS, ROWS): 0 unless the light flickers."""
     count = len(bands)
     if count < 2:
         return np.zeros((ROWS, ROWS))
     relative = bands / bands.mean(1, keepdims=True)
     away = relative - relative.mean(0)
     spread = away.T @ away / (count - 1)
-    if np.trace(spread) < SCATTERED * ROWS * noise:
+    if np.trace(spread) < VARYING * ROWS * noise:
         return np.zeros((ROWS, ROWS))
     # few frames tell of few directions: as much again in all of them
     return np.asarray((spread + np.trace(spread) / ROWS * np.eye(ROWS)) / count)
@@ -167,7 +171,7 @@ def _covariance(planes: Sequence[_Plane]) -> FloatArray:
             if i == j:
                 part += np.eye(cells) * a.noise
             if a.held_out == b.held_out:
-                part += np.kron(a.row_scatter, np.ones((COLS, COLS)))
+                part += np.kron(a.row_covariance, np.ones((COLS, COLS)))
     return covariance
 
 

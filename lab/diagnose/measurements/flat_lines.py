@@ -17,8 +17,8 @@ MEETING = (0.25, 0.5, 0.75)
 
 
 def line_block(study: Study) -> Block:
-    """Mean flats, each plane over its mean: steps in the lines' means at halves and quarters of a side, and what even and odd lines
-    of a plane differ by. How uncertain a step is, steps everywhere else say."""
+    """Steps in the means of lines at halves and quarters of a side, and the difference of even and odd lines of a plane, relative to the
+    mean flat. The standard deviation of a step is measured at all other places."""
     _, images = study.once(flats)
     if not images:
         raise NotDetermined("flat_lines", "no unclipped flat captures")

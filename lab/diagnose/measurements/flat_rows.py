@@ -24,7 +24,7 @@ WIDEN = 1.6  # from one band of frequencies to the next
 HIGHEST = 0.45  # cy/row
 #: Of the power in a band, alike at all levels: noise that neighbouring rows share.
 COLOUR_STD = 0.1  # and five times as much where a few rows are a period
-#: Relative amplitude of a change of the rows' pattern from one level to another, a share of whatever falls off towards the rims.
+#: Relative amplitude of a change of the rows' pattern from one level to another, a share of whatever falls off towards the borders.
 PATTERN_STD = 3e-5
 #: Of the read noise: offsets of rows, where no dark frames tell.
 ROW_SHARE = 0.15
@@ -48,7 +48,7 @@ def flicker_block(study: Study) -> Block:
 
     q = row means of a frame / those of all frames - 1; power |sum q exp(-2 pi i k r)|^2 / rows, over the pixels' variance. Its cube root
     is nearly normal (Wilson and Hilferty 1931): mean 1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. What the rows of
-    dark frames show beside noise (their offsets, in DN) is expected in light as well, and the noise's colour is free.
+    dark frames show beside noise (their offsets, in DN) is expected in light as well, and the spectrum of the noise is a nuisance parameter.
     """
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1]

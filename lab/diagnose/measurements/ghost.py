@@ -13,22 +13,22 @@ GHOST_FLOOR = 1.5e-4
 
 
 def ghost_block(study: Study) -> Block:
-    """How much of a pattern lies over it once more, turned by half a turn about the frame's middle."""
+    """Coefficient of the picture turned by half a turn about the frame's middle: the ghost's share of the light."""
     points = [(g, p, len(p.bands) + GHOST) for g, group in enumerate(patterns(study)) for p in group]
     value = np.array([p.value[b] for _, p, b in points])
 
     def predict(effects: Effects) -> Prediction:
         acting = any(act_on(effects, REFLECTIONS))
-        return Prediction(np.array([p.turned(effects) if acting else 0.0 for _, p, _ in points]), {})
+        return Prediction(np.array([p.ghost(effects) if acting else 0.0 for _, p, _ in points]), {})
 
     return Block(
         measurement=PATTERN_GHOST, reach=1e9, value=value,
         covariance=joint_covariance(points, study) + np.diag(np.full(len(value), GHOST_FLOOR**2)),
-        labels=tuple(Label(float(i), p.channel, "pattern turned over", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
+        labels=tuple(Label(float(i), p.channel, "ghost", p.captures, p.held_out) for i, (_, p, _) in enumerate(points)),
         reads=REFLECTIONS, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
 PATTERN_GHOST = Measurement(
-    "ghost", title="ghost of the pattern", order=430, axis="level", unit="1", make=ghost_block, places="copies"
+    "ghost", title="ghost of the pattern", order=430, axis="level", unit="1", make=ghost_block, places="ghosts"
 )

@@ -19,7 +19,7 @@ LOWEST = 48  # harmonics of a frame: all that a halo of a fifth of its half diag
 
 
 def halo_light(places: Sequence[Surroundings], effects: Effects, camera: CameraModel) -> FloatArray:
-    """What the effects' halos bring from around to places in planes of the mosaic, (places,), in the planes' unit."""
+    """Light that the effects' halos bring to places in planes of the mosaic from around, (places,), in the planes' unit."""
     step = mosaic.step(camera.cfa)
     found = np.zeros(len(places))
     for share, std_px in halos(camera, effects):

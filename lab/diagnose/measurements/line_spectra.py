@@ -19,7 +19,7 @@ LEVEL_BAND = 0.04, 0.2  # cy/px, along both axes: where a spectrum's level is ta
 
 @dataclass(frozen=True)
 class Periodogram:
-    """Periodogram of one image, of level sigma^2 for white noise; the rows' frequencies by the columns' (only from 0 on)."""
+    """Periodogram of one image, whose level is the variance for white noise; the rows' frequencies by the columns' (only from 0 on)."""
 
     table: FloatArray
     rows: FloatArray

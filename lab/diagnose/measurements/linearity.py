@@ -22,7 +22,10 @@ RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels, where
 
 
 def linearity_block(study: Study) -> Block:
-    """Mean of every flat frame by channel against the exposure; each channel's rate is free, the line's straightness isn't."""
+    """Mean of every flat frame by channel, DN, against the exposure.
+
+    Nuisance parameters: black level, dark current, each channel's rate, the radiometer's readings. What remains is nonlinearity.
+    """
     groups = study.flat_levels()
     if len({(g[0].exposure_s, g[0].photons_per_pixel) for g in groups}) < 3:
         raise NotDetermined("photon_transfer", "fewer than three levels of flat captures")
@@ -96,7 +99,7 @@ def beside_light_dn(study: Study, capture: Any, channel: str, effects: Effects) 
 
 
 def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
-    """Of flat frames' levels: shot and read noise, the lamp's scatter (one for a frame's channels), and what is one for repeats."""
+    """Of flat frames' levels: shot and read noise, the lamp's repeatability (common to a frame's channels), and what repeats share."""
     noise = study.noise
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
     group_of = {c.id: i for i, group in enumerate(groups) for c in group}
@@ -108,17 +111,17 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
     rounding = rounding_std_dn(noise.spread_dn2(signal))
     covariance += repeats * np.outer(rounding, rounding)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])
-    scatter = signal * _level_std(study, groups)[group]
-    covariance += same * (np.outer(scatter, scatter) + noise.jitter_dn**2)
+    lamp = signal * _level_std(study, groups)[group]
+    covariance += same * (np.outer(lamp, lamp) + noise.jitter_dn**2)
     return np.asarray(covariance)
 
 
-#: Repeats' worth of trust in the scatter of all flat frames beside that of one setting's.
+#: Weight of the repeatability of all flat frames beside that of one setting's, in repeats.
 _COMMON_REPEATS = 4
 
 
 def _level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
-    """Relative scatter of a frame's level by group: all flat frames', or more where a setting's own repeats scatter more, as in a
+    """Relative standard deviation of a frame's level by group: all flat frames', or a setting's own where that is larger, as in a
     flickering light that short exposures don't average."""
     noise = study.noise
     found = np.full(len(groups), noise.jitter_lamp)
@@ -126,7 +129,7 @@ def _level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
     for repeats in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
         moved = float(repeats.elapsed_s @ repeats.elapsed_s)
         left, free = repeats.away, len(repeats.away) - 1
-        if free > 1 and moved > 0:  # a trend with time is no scatter
+        if free > 1 and moved > 0:  # a trend with time isn't noise
             left, free = left - float(repeats.elapsed_s @ left) / moved * repeats.elapsed_s, free - 1
         elif moved > 0:
             continue

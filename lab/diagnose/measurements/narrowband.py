@@ -25,12 +25,15 @@ NARROWBAND_FLOOR = 1e-4  # of a level, each channel by itself, one for its repea
 
 READING_SAMPLE_STD = 1e-3  # of a narrowband reading, sample by sample, where no repeats tell
 MOST_SAMPLE_STD = 4e-3
-READING_STD = 1e-4  # what readings scatter at least
-_READINGS = 8  # wavelengths from which on their own scatter tells
+READING_STD = 1e-4  # least relative standard deviation of readings
+_READINGS = 8  # wavelengths from which on their standard deviation is measured
 
 
 def narrowband_block(study: Study) -> Block:
-    """Mean of every narrowband frame by channel against the maker's curves, of which a smooth few per cent are free."""
+    """Mean of every narrowband frame by channel, DN, against the maker's curves.
+
+    Nuisance parameters: black level, dark current, and a smooth few per cent of the curves.
+    """
     if not study.stated.quantum_efficiency:
         raise NotDetermined(
             "narrowband", "the maker's sensitivity curves aren't stated: nothing to hold the recordings against"
@@ -63,7 +66,7 @@ def narrowband_block(study: Study) -> Block:
     covariance = _narrowband_covariance(study, points, signal, curves)
 
     def jacobian_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
-        """By what is free; `share`: DN over electrons a second on axis."""
+        """By the nuisance parameters; `share`: DN over electrons a second on axis."""
         jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
         return jacobian | {k: v * share for k, v in curves.jacobian(effects).items()}
 
@@ -101,7 +104,7 @@ def narrowband_block(study: Study) -> Block:
 def _narrowband_covariance(
     study: Study, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveJacobian
 ) -> FloatArray:
-    """Of narrowband signals: shot and read noise, what is one for repeats, the radiometer's reading, the lamp's scatter."""
+    """Of narrowband signals: shot and read noise, what repeats share, the radiometer's reading, the lamp's repeatability."""
     noise = study.noise
     exposures = np.array([c.exposure_s for c, *_ in points])
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
@@ -120,17 +123,17 @@ def _narrowband_covariance(
         readings.setdefault(c.wavelength_nm, {})[c.radiance] = study.spectrum(c.radiance)
     sampled = curves.sample_shares * (_sample_std([*r.values()] for r in readings.values()) * signal)[:, None]
     covariance += (reading[:, None] == reading) * (np.outer(radiometer, radiometer) + sampled @ sampled.T)
-    scatter = signal * noise.jitter_lamp
-    covariance += (frame[:, None] == frame) * (np.outer(scatter, scatter) + noise.jitter_dn**2)
+    lamp = signal * noise.jitter_lamp
+    covariance += (frame[:, None] == frame) * (np.outer(lamp, lamp) + noise.jitter_dn**2)
     return np.asarray(covariance)
 
 
 def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expected: FloatArray) -> float:
-    """Relative scatter of a radiometer's readings that all channels share, from the second differences between neighbouring
-    wavelengths; at most RADIOMETER_STD, so that no structure of the light's or the filters' passes for scatter.
+    """Relative standard deviation of a radiometer's readings that all channels share, from the second differences between neighbouring
+    wavelengths; at most RADIOMETER_STD, so that no structure of the light's or the filters' passes for noise.
 
     Neighbours u_1, u_2, u_3 in relative deviation: u_2 - (u_1 + u_3) / 2 has variance 1.5 s^2 beside that of the noise; the median of
-    the magnitudes keeps a few odd wavelengths out.
+    the magnitudes leaves a few outlying wavelengths out.
     """
     deviation: dict[str, tuple[float, float, float]] = {}
     by_frame: dict[str, list[int]] = {}
@@ -155,7 +158,7 @@ def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expect
 
 
 def _sample_std(repeats: Iterable[Sequence[Spectrum]]) -> float:
-    """Relative scatter of a radiometer's readings from sample to sample, from those of one wavelength each: of the log ratio of two
+    """Relative standard deviation of a radiometer's readings from sample to sample, from those of one wavelength each: of the log ratio of two
     readings about its mean, over sqrt 2, where the light exceeds a tenth of its peak; the median of all pairs."""
     found = []
     for readings in repeats:

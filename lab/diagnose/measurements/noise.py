@@ -18,7 +18,7 @@ GAIN_STD, READ_STD = 0.3, 0.3  # of the first guesses of conversion gain and dar
 
 
 def variance_block(study: Study) -> Block:
-    """Temporal variance of flats by channel against their mean: gain and read noise are free, the line isn't."""
+    """Temporal variance of flats by channel, DN^2, against their mean. Nuisance parameters: gain and read noise."""
     of_channel = channel_planes(study)
     points: list[tuple[Repeats, str, float, float, float]] = []
     for repeats in study.once(flat_repeats):

@@ -29,7 +29,7 @@ ALIKE_C = 2.0  # dark captures whose temperatures are that close count as of one
 
 @dataclass(frozen=True)
 class NoiseGuess:
-    """First guesses, good to a few per cent: about these the free quantities are linear."""
+    """First guesses, good to a few per cent: nuisance parameters are linear about these."""
 
     black: float
     dark_dn_per_s: float
@@ -184,8 +184,8 @@ class RepeatedLevels:
 
 
 def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedLevels]:
-    """Of every flat setting with repeats, all unclipped channels together, frames that may hold what another level left behind
-    not among them; DN and DN/e."""
+    """Of every flat setting with repeats, all unclipped channels together, without frames that may hold image lag of another level. `black`
+    in DN, `gain` in DN/e."""
     found = []
     for group in map(study.settled, study.flat_levels()):
         planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
@@ -203,8 +203,8 @@ def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> 
 
 
 def level_repeatability(repeats: Sequence[RepeatedLevels]) -> float:
-    """Relative scatter of repeated flat frames' levels beyond pixels' noise, a common trend with time taken out: a lamp that drifts
-    doesn't scatter. Settings count by the inverse of their noise's variance."""
+    """Relative standard deviation of repeated flat frames' levels beyond pixels' noise, without a common trend with time (a lamp's drift).
+    Settings count by the inverse of their noise's variance."""
     weight = np.array([1.0 / (r.noise + LAMP_FLOOR**2) for r in repeats])
     moved = sum(w * float(r.elapsed_s @ r.elapsed_s) for w, r in zip(weight, repeats, strict=True))
     trend = 0.0

@@ -20,8 +20,8 @@ CORRELATION_FLOOR = 3e-4  # of a correlation: what the pixels' own shares of tak
 
 
 def neighbour_block(study: Study) -> Block:
-    """Correlation of the temporal noise of neighbouring pixels by level of light and in the dark: none where pixels are on their
-    own, whatever gain, noise and level are."""
+    """Correlation of the temporal noise of neighbouring pixels by level of light and in the dark: none where pixels are
+    independent, whatever gain, noise and level are."""
     points = [r for r in (*study.once(dark_repeats), *study.once(flat_repeats)) if np.all(np.isfinite(r.correlation))]
     if not points:
         raise NotDetermined(
@@ -75,7 +75,7 @@ def correlations(
     rounding_e2: float,
     kernel: FloatArray | None,
 ) -> FloatArray:
-    """What pairs of pixels have in common, by `PAIRS`, in light that is uniform but for the mosaic: the mean over the phases.
+    """Predicted correlations by `PAIRS` in uniform light: the mean over the mosaic's phases.
 
     By plane: shot noise's variance and the share of each neighbour's departure that a pixel takes over; read noise is each pixel's
     own; `kernel` filters both within a plane; rounding comes last and is each pixel's own.
@@ -119,7 +119,7 @@ def correlations(
 
 
 def _four_neighbours(values: FloatArray) -> FloatArray:
-    """Sum of each pixel's four neighbours, nothing beyond the rim."""
+    """Sum of each pixel's four neighbours, nothing beyond the border."""
     wide = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
     wide[1:-1, 1:-1] = values
     return np.asarray(wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:])

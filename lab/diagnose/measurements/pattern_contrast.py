@@ -15,13 +15,16 @@ from sim.spectrum import FloatArray
 
 LARGEST_STD = 0.04  # of a band's contrast: beyond, it says nothing
 CONTRAST_FLOOR = 0.0015  # of a band's contrast: drawing and registration
-CONTRAST_SCALE_STD = 0.01  # levels of screens are free: each channel of each part of the repeats
-SCREEN_BLUR_PX = 0.08  # a target's rims needn't be sharp: standard deviation of a Gaussian
+CONTRAST_SCALE_STD = 0.01  # of a screen's level, for each channel of each part of the repeats
+SCREEN_BLUR_PX = 0.08  # standard deviation of a Gaussian: cells of a target needn't have sharp borders
 PLACINGS = 4  # steps in which a shifted picture is found
 
 
 def contrast_block(study: Study) -> Block:
-    """Contrast that a random pattern keeps, over the baseline's, by frequency, orientation and channel."""
+    """Contrast of a random pattern over the baseline's, by frequency, orientation and channel.
+
+    Nuisance parameters: the screen's levels, and a blur of its cells.
+    """
     found = patterns(study)
     labels: list[Label] = []
     places: list[tuple[int, Pattern, int]] = []
@@ -38,7 +41,7 @@ def contrast_block(study: Study) -> Block:
     frequency = np.array([label.x for label in labels])
     covariance = joint_covariance(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
     scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
-    # drawn alike and seen in the same light, what is held out has its twin's prediction
+    # the held-out part of a pattern has the prediction of the seen part
     poses: list[dict[str, tuple[Pattern, list[int], list[int]]]] = [{} for _ in found]
     for k, (number, p, b) in enumerate(places):
         _, members, parts = poses[number].setdefault(p.channel, (p, [], []))
@@ -118,5 +121,5 @@ BERNOULLI = Measurement(
     unit="cy/px",
     make=contrast_block,
     conditions="orientation",
-    conditions_words="patterns' parts at",
+    conditions_words="bands at",
 )

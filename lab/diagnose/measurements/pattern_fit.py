@@ -74,13 +74,11 @@ class Pattern:
     shown_by: Callable[[Effects], FloatArray]  # as `value`: what screens that show greys otherwise change
     levels_e: tuple[float, float]  # electrons of black and of white
     light: Spectrum | None
-    turned: Callable[
-        [Effects], float
-    ]  # the coefficient of the turned picture that effects on the image as a whole make
+    ghost: Callable[[Effects], float]  # the coefficient of the ghost under effects on the image as a whole
     reach: float  # largest distance from the frame's middle in half diagonals
 
 
-#: Coefficients behind the bands', in their order: rim, turned, even, shift x, shift y, radial, radial^3, across.
+#: Coefficients behind the bands', in their order: cell borders, ghost, constant, shift x, shift y, radial, radial^3, across.
 BORDER, GHOST, CONSTANT, SHIFT_X, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 3, 5, 6, 7
 
 
@@ -197,7 +195,7 @@ def _measured(
             float(np.nanmean(black[window][design.mask])) * exposure / study.noise.gain,
             float(np.nanmean(white[window][design.mask])) * exposure / study.noise.gain,
         )
-        turned_by = _ghost_by(study, design, whole, window)
+        ghost_by = _ghost_by(study, design, whole, window)
         shown_by = _shown_by(study, design, drawn)
         solved = []
         for part, picture in zip(parts, seen, strict=True):
@@ -213,7 +211,7 @@ def _measured(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
                     value=value, shown=shown, common=common, mix=design.mix, shown_by=shown_by, levels_e=levels, light=light,
-                    turned=turned_by, reach=design.reach,
+                    ghost=ghost_by, reach=design.reach,
                 )
             )  # fmt: skip
     return found
@@ -230,7 +228,7 @@ def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> Float
 def _ghost_by(
     study: Study, design: _Design, seen: FloatArray, window: tuple[slice, slice]
 ) -> Callable[[Effects], float]:
-    """What effects on the whole image do to the coefficient of the turned picture: pattern and lit screen through them, levelled."""
+    """Change of the ghost's coefficient by effects on the whole image: of the pattern's picture through them, over that of the lit screen."""
     picture, lit = np.nan_to_num(seen), np.isfinite(seen).astype(float)
     weight = (design.inverse[len(design.bands) + GHOST] @ design.columns).astype(np.float32)
     before = picture[window][design.mask]
@@ -286,7 +284,7 @@ def _refined(
 
 @dataclass(frozen=True)
 class _Design:
-    """What a channel's pixels are explained by: columns (coefficients, pixels), and what isn't free, (pixels,)."""
+    """The linear model of a channel's pixels: columns (coefficients, pixels), and the part without a coefficient, (pixels,)."""
 
     mask: NDArray[np.bool_]
     bands: tuple[Band, ...]
@@ -375,7 +373,7 @@ class _Design:
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients; their covariance by `temporal`, the variance (pixels,) that repeats average out; and by the rest.
 
-        Pixels scatter unequally: the covariance is that of the residuals as they are (White 1980).
+        The pixels' variances differ: the covariance is that of the residuals as they are (White 1980).
         """
         value = self.coefficients(seen)
         left = seen - self.fixed - value @ self.columns

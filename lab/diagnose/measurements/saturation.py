@@ -15,10 +15,10 @@ CLIPPED_SHARE = 2e-4  # of a plane: with fewer clipped pixels its mean counts
 
 
 def clipping_level_dn(study: Study) -> float:
-    """DN from which on a pixel counts as clipped: the converter's highest code, or less where full wells pile up below it.
+    """DN from which on a pixel counts as clipped: the converter's highest code, or less where full wells come before it.
 
-    Wells that are full carry no shot noise: among the captures, planes whose highest quantiles lie closer together than a
-    third of what shot noise makes them do pile up, at full well.
+    Full wells have no shot noise: a plane whose highest quantiles lie closer together than a third of their distance by shot noise is
+    at full well.
     """
     white = study.camera.white_level_dn
     gain = study.stated.conversion_gain_dn_per_e
@@ -41,7 +41,7 @@ def clipping_level_dn(study: Study) -> float:
                     least = np.sqrt(gain * max(top - black, 1.0)) / 3.0
                 if (
                     top - high < 0.76 * least and high - middle < 0.45 * least
-                ):  # a normal distribution's quantiles, in sigmas
+                ):  # quantiles of a normal distribution, in standard deviations
                     piles.append((float(top), float(top - middle)))
     below = [(top, width) for top, width in piles if top < white - 1.0]
     if not below:

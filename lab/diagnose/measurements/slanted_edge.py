@@ -53,7 +53,7 @@ EDGE_FLOOR = 3e-4  # of the contrast: numerical floor of the edge estimator and 
 #: The highest frequency, cy/px, but not beyond this share of the lens's cutoff.
 HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE = 1.15, 0.95
 ASIDE, APART_CY_PER_PX = ", asymmetry", 100.0
-#: Of the light on the target, left free: its bend across the edge, of the level at `UNEVEN_PX` from it.
+#: Prior standard deviation of the bend of the light on the target across the edge, of the level at `UNEVEN_PX` from it.
 UNEVEN_STD, UNEVEN_PX = 0.003, 50.0
 UNEVEN_ORDER = 4  # of the polynomial that shading along the distance is
 #: Edges whose directions differ by less are of one direction, deg.
@@ -108,7 +108,7 @@ def edge_block(study: Study) -> Block:
         ),
         reads=TRANSFER | CHANGING | {"image.transmittance"}, predict=predict,
         scale=np.ones(edges.value.size),
-        # what is wrong with contrast says nothing of asymmetry
+        # discrepancies of the real part and of the imaginary part are independent
         along=np.tile(np.where(np.arange(len(x)) < len(REAL_AT), x, x + APART_CY_PER_PX), len(edges.edges)),
     )  # fmt: skip
 
@@ -154,7 +154,9 @@ class _Edges:
              for row in self._baseline]
         )  # fmt: skip
         self.value = self._numbers(self._recorded)
-        self._noise = [relative_covariance(e.scatter, row) for e, row in zip(estimators, self._recorded, strict=True)]
+        self._noise = [
+            relative_covariance(e.covariance, row) for e, row in zip(estimators, self._recorded, strict=True)
+        ]
 
     def _light(self, path: str | None) -> Spectrum | None:
         return self._study.spectrum(path) if path else None
@@ -406,8 +408,8 @@ class _Edges:
 
     @cached_property
     def jacobian(self) -> dict[str, FloatArray]:
-        """By what is free: the bend of the light on the target, one for each region, direction and light; and the colour of light of which
-        nothing is said."""
+        """Derivatives by the nuisance parameters: the bend of the light on the target, one for each region, direction and light; and the
+        spectrum of light that nobody states."""
         base = self.predict(())
         bend = self._light_profile * np.square(self._operators.distance / UNEVEN_PX) * UNEVEN_STD
         moved = self._numbers(self._reported((), bend))

@@ -14,9 +14,9 @@ NOISELESS_DN = 0.5  # a frame of less standard deviation may be like another by 
 
 
 def stale(recordings: RecordingSet, side: Side) -> tuple[tuple[str, str], ...]:
-    """(id, why) of every capture whose frame is bit for bit that of an earlier one, noise and all: it wasn't taken.
+    """(id, reason) of every capture whose frame equals an earlier one bit for bit, noise included: it wasn't taken anew.
 
-    Frames without noise are alike by nature: one code nearly throughout, or recordings of which most repeats are the same.
+    Frames without noise may be equal and don't count: those of nearly one code, and recordings of which most repeats are equal.
     """
     first: dict[bytes, Capture] = {}
     found: list[tuple[str, str]] = []

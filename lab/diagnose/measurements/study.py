@@ -40,17 +40,17 @@ class Levels:
 
 
 class Study:
-    """One side of a recording set, its frames summarised once; the blocks are made from it."""
+    """One side of a recording set, each frame summarised once. Measurements are made from it."""
 
     def __init__(
         self, recordings: RecordingSet, side: Side, camera: CameraModel, saturation_dn: float | None = None
     ) -> None:
-        #: What isn't looked at, as it wasn't taken: (capture's id, why), each in one line.
+        #: Captures that are left out, as their frames weren't taken: (id, reason in one line).
         self.stale: tuple[tuple[str, str], ...] = stale(recordings, side)
         left_out = {name for name, _ in self.stale}
         self.recordings = recordings.without(left_out) if left_out else recordings
         self.side, self.camera = side, camera
-        #: Pixels from here on say nothing of the light: the converter's highest code, or the full well where that comes first.
+        #: Clipping level: the converter's highest code, or the full well where that is lower.
         self.saturation_dn = min(camera.white_level_dn, saturation_dn or camera.white_level_dn)
         self.stated: DataSheet = recordings.camera(side)
         self.channels = camera.channels
@@ -126,13 +126,13 @@ class Study:
 
     @property
     def tail_std(self) -> float:
-        """Of the light that the baseline's point spread itself sends far, which is anything where the lens or the pitch aren't stated."""
+        """Relative standard deviation of the light that the baseline's point spread sends far; 1 where lens or pitch aren't stated."""
         return TAIL_STD if self.diffraction_is_known else 1.0
 
     @cached_property
     def lamps(self) -> dict[str, int]:
-        """Which lamp the flats' radiance files are readings of: one lamp where they differ by less than 1 % in shape and 5 % in
-        level, for a radiometer reads a lamp anew before every pass."""
+        """Radiance file of flats -> number of its lamp. Files are of one lamp where they differ by less than 1 % in shape and 5 % in level: a
+        radiometer reads the lamp anew before every pass."""
         found: list[tuple[FloatArray, FloatArray]] = []
         lamps: dict[str, int] = {}
         for capture in self.recordings.captures(FlatCapture, self.side):
@@ -167,7 +167,7 @@ class Study:
     # --- parts that several blocks share ---
 
     def once(self, make: Callable[[Study], T]) -> T:
-        """What `make` finds, or why it can't, made once: several blocks read different numbers off it."""
+        """`make(self)`, computed once for all measurements that need it; raises NotDetermined again where it did."""
         if make not in self._made:
             try:
                 self._made[make] = make(self)
@@ -187,14 +187,13 @@ class Study:
         return {c.id: before for before, c in pairwise(order)}
 
     def settled(self, group: Sequence[C]) -> list[C]:
-        """Of repeats those that follow another of them, and so hold nothing of another level that was left behind; all where these
-        are fewer than two."""
+        """Repeats that follow another of them, and so hold no image lag of another level; all where these are fewer than two."""
         names = {c.id for c in group}
         found = [c for c in group if c.id in self._before and self._before[c.id].id in names]
         return found if len(found) > 1 else list(group)
 
     def carried_e(self, capture: Capture, channel: str, effects: Effects) -> float:
-        """By how many electrons a channel's mean changes where charge is left behind, given what was read of it and of the capture
+        """By how many electrons image lag changes a channel's mean, given what was read of it and of the capture
         before: read is y_t = (1 - q) x_t + q y_(t-1), of which q (y_(t-1) - y_t) is new. The first one follows empty pixels."""
         if not any(act_on(effects, LAG)):
             return 0.0

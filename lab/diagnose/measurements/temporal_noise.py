@@ -102,7 +102,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     moving = min(variance.values()) > LEAST_DN2
     if not (moving and (all(clean.values()) or not lit)):
         correlation = np.full(len(PAIRS), np.nan)
-    # of coloured noise the estimates scatter more
+    # correlated noise has more uncertain estimates
     spread = 1.0 + float(np.sum(_NUMBER * np.square(np.where(np.abs(correlation) > 4.0 * std, correlation, 0.0))))
     return Repeats(
         captures=tuple(c.id for c in use),
@@ -140,7 +140,8 @@ _NUMBER = np.array([2.0 * len(lags) for lags in PAIRS.values()])
 
 
 def _correlations(frames: Sequence[Any], freedom: int, cfa: Cfa) -> tuple[FloatArray, FloatArray]:
-    """Of standardised departures; what the taking out of rows' and columns' means took is put back."""
+    """Correlations of standardised departures and their standard deviations, by `PAIRS`, corrected for the means of rows and columns that were
+    subtracted."""
     rows, cols = frames[0].shape
     value, std = [], []
     for lags in PAIRS.values():
