@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -32,12 +34,13 @@ def study_of(recordings: RecordingSet, side: Side = "left") -> Study:
     return Study(recordings, side, camera_model(recordings, side, None, maker_curves=True))
 
 
-def judged(recordings: RecordingSet, known: Geometry | None) -> Verdict:
-    study = study_of(recordings)
+def judged(study: Study, known: Geometry | None) -> Verdict:
+    """The boards are found once in a study."""
     study.camera = study.camera.model_copy(update={"geometry": known})
     return decide(MeasurementModel((board_block(study),), study.camera), np.random.default_rng(3), DecisionPolicy())
 
 
+@cache
 def calibrated() -> Geometry:
     found = calibration_of(study_of(recorded())).intrinsics
     a, b, c = (tuple(float(v) for v in row) for row in matrix_of(found))
@@ -46,7 +49,7 @@ def calibrated() -> Geometry:
 
 def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself() -> None:
     """2 % of the corner's distance: of 3 px there, half a pixel where boards reach, against 0.006 px of a cell's mean."""
-    bent = recorded(concealed.LensDistortionLaw(2.0, 0, 7), noise_draw=1)
+    bent = study_of(recorded(concealed.LensDistortionLaw(2.0, 0, 7), noise_draw=1))
     alone = judged(bent, None)
     assert not alone.named
     assert not alone.before
@@ -57,8 +60,8 @@ def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself()
 @pytest.mark.slow
 def test_the_same_lens_is_no_finding_and_one_that_slipped_is_decentred() -> None:
     known = calibrated()
-    assert not judged(recorded(noise_draw=1), known).named
-    slipped = judged(recorded(concealed.LensDecentreLaw(12.0, 0, 7), noise_draw=1), known)
+    assert not judged(study_of(recorded(noise_draw=1)), known).named
+    slipped = judged(study_of(recorded(concealed.LensDecentreLaw(12.0, 0, 7), noise_draw=1)), known)
     assert [c.effect.name for c in slipped.named] == ["decentre"]
 
 

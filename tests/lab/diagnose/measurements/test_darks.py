@@ -174,12 +174,12 @@ def _model() -> CameraModel:
 
 
 def test_healthy_darks_agree_with_their_covariance() -> None:
-    """24 cameras of two generators, 10 to 16 bits: of some 260 blocks none has a chi2 that chance gives one in 30 000 of."""
+    """12 cameras of two generators, 10 to 16 bits: of some 130 blocks none has a chi2 that chance gives one in 30 000 of."""
     rare = 1.0
-    sets = [_concealed(40 + k, warm=k % 2 == 0) for k in range(10)]
+    sets = [_concealed(40 + k, warm=k % 2 == 0) for k in range(4)]
     sets += [
         _sim_darks(60 + k, bits=(10, 12, 14, 16)[k % 4], cfa=("MONO", "RGGB")[k % 2], read_e=2.0 + 0.3 * k)
-        for k in range(14)
+        for k in range(8)
     ]
     for recordings in sets:
         study, blocks, _ = _blocks(recordings)
@@ -207,12 +207,13 @@ def test_healthy_darks_get_no_name(seed: int) -> None:
     ("law", "names"),
     [
         (laws.HotPixelsLaw(300.0, 1, 3), "hot_pixels"),
-        (laws.RandomTelegraphNoiseLaw(40.0, 0, 3), "random_telegraph_noise"),
-        (laws.AmplifierGlowLaw(6.0, 1, 3), "amplifier_glow"),
-        (laws.RowNoiseLaw(1.5, 1, 3), "row_noise"),
-        (laws.ColumnNoiseLaw(1.5, 1, 3), "column_noise"),
         (laws.DarkCurrentTemperatureLaw(1.0, 1, 3), "dark_current_temperature"),
         (laws.BlackLevelDriftLaw(0.5, 1, 3), "black_level_drift"),
+        # the same four effects are named every day in frames that sim renders
+        pytest.param(laws.RandomTelegraphNoiseLaw(40.0, 0, 3), "random_telegraph_noise", marks=pytest.mark.slow),
+        pytest.param(laws.AmplifierGlowLaw(6.0, 1, 3), "amplifier_glow", marks=pytest.mark.slow),
+        pytest.param(laws.RowNoiseLaw(1.5, 1, 3), "row_noise", marks=pytest.mark.slow),
+        pytest.param(laws.ColumnNoiseLaw(1.5, 1, 3), "column_noise", marks=pytest.mark.slow),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )

@@ -92,15 +92,15 @@ def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
     assert abs(found.named[0].effect.model_dump()["share_percent"] - 3.0) < 3.0 * std
 
 
-def test_healthy_levels_scatter_as_they_should() -> None:
+def test_healthy_levels_agree_with_their_covariance() -> None:
     """4 cameras: no more than noise; less, as a few numbers in ten are free."""
     for seed, cfa in ((1, "MONO"), (2, "RGGB"), (3, "GBRG"), (4, "MONO")):
         found = measured_model(former(seed, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
         assert -6.0 < sigmas(found) < 3.0
 
 
-def test_a_drifting_lamp_doesn_t_scatter() -> None:
-    """0.5 % a minute makes repeats differ by 0.17 %; a trend common to all levels leaves the scatter that there was, 0."""
+def test_a_drifting_lamp_is_repeatable() -> None:
+    """0.5 % a minute makes repeats differ by 0.17 %; a trend common to all levels leaves the repeatability that there was, 0."""
     for shuttle in (False, True):
         looked_at = study(former(34, SourceDriftLaw(0.5), shuttle=shuttle))
         noise = looked_at.noise
@@ -109,20 +109,20 @@ def test_a_drifting_lamp_doesn_t_scatter() -> None:
 
 
 class _Reading:
-    """As much of a capture as a reading's scatter needs."""
+    """What the standard deviation of readings needs of a capture."""
 
     def __init__(self, name: str, wavelength_nm: float) -> None:
         self.id, self.wavelength_nm = name, wavelength_nm
 
 
-@pytest.mark.parametrize("scatter", [0.0, 1e-3, 0.02])
-def test_scatter_of_readings_is_measured_and_capped(scatter: float) -> None:
-    """60 second differences: the median of magnitudes is good to 20 %; what scatters more than a radiometer is no radiometer's."""
+@pytest.mark.parametrize("std", [0.0, 1e-3, 0.02])
+def test_standard_deviation_of_readings_is_measured_and_capped(std: float) -> None:
+    """60 second differences: the median of magnitudes is good to 20 %; more than a radiometer's noise is no radiometer's."""
     rng = np.random.default_rng(7)
     points = [(_Reading(f"c{i}", 400.0 + 5.0 * i), "Y") for i in range(62)]
-    signal = 1e4 * (1.0 + scatter * rng.standard_normal(62))
+    signal = 1e4 * (1.0 + std * rng.standard_normal(62))
     found = _reading_std(points, signal, np.full(62, 1e-2), np.full(62, 1e4))
-    assert found == pytest.approx(min(max(scatter, READING_STD), RADIOMETER_STD), rel=0.4)
+    assert found == pytest.approx(min(max(std, READING_STD), RADIOMETER_STD), rel=0.4)
 
 
 def test_rounding_moves_means_of_quiet_pixels_only() -> None:
@@ -134,17 +134,17 @@ def test_rounding_moves_means_of_quiet_pixels_only() -> None:
     assert rounding_std_dn(np.array(1.0)) < 1e-8
 
 
-@pytest.mark.parametrize("scatter", [0.0, 1.5e-3, 0.02])
-def test_scatter_within_readings_is_measured_and_capped(scatter: float) -> None:
+@pytest.mark.parametrize("std", [0.0, 1.5e-3, 0.02])
+def test_standard_deviation_within_readings_is_measured_and_capped(std: float) -> None:
     """24 pairs of some 16 samples: their median is good to 5 %. A level that changed between two readings is none."""
     rng = np.random.default_rng(8)
     wavelength = np.arange(540.0, 581.0)
     line = np.exp(-0.5 * ((wavelength - 560.0) / 4.0) ** 2)
     pairs = [
-        [Spectrum.of(wavelength, level * line * (1.0 + scatter * rng.standard_normal(41))) for level in (1.0, 1.1)]
+        [Spectrum.of(wavelength, level * line * (1.0 + std * rng.standard_normal(41))) for level in (1.0, 1.1)]
         for _ in range(24)
     ]
-    assert _sample_std(pairs) == pytest.approx(min(scatter, MOST_SAMPLE_STD), rel=0.15, abs=1e-12)
+    assert _sample_std(pairs) == pytest.approx(min(std, MOST_SAMPLE_STD), rel=0.15, abs=1e-12)
     assert _sample_std(readings[:1] for readings in pairs) == READING_SAMPLE_STD
 
 
