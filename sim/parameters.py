@@ -34,7 +34,7 @@ class Quantity:
     """Declaration of one physical parameter.
 
     `prior` is (centre, one standard deviation) of a normal distribution in the parameter's own unit, or None for a
-    flat prior between the bounds. `absent` is the value that means that the effect isn't there. `slope_power` says in
+    flat prior between the bounds. `absent` is the value that means that the effect isn't there. `linear_power` says in
     which power of the parameter the prediction has a slope at `absent`: 2 for a displacement d, which acts as d^2.
     `dispensable`: a refinement, that stays at `absent` where a fit without it is worth nearly as much.
     """
@@ -45,7 +45,7 @@ class Quantity:
     upper: float | None = None
     prior: tuple[float, float] | None = None
     absent: float | None = None
-    slope_power: int = 1
+    linear_power: int = 1
     dispensable: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:

@@ -31,7 +31,7 @@ class AmbientLight(Effect):
             upper=10000000.0,
             prior=(0.0, 50.0),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
 

@@ -24,12 +24,12 @@ class Astigmatism(Effect):
     defocus_x_um: Annotated[
         float,
         Quantity("um", "distance of the sensor from the focus of detail along columns", lower=0.0, upper=200.0, prior=(0.0, 20.0),
-                 absent=0.0, slope_power=2),
+                 absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     defocus_y_um: Annotated[
         float,
         Quantity("um", "distance of the sensor from the focus of detail along rows, on the other side", lower=0.0, upper=200.0,
-                 prior=(0.0, 20.0), absent=0.0, slope_power=2),
+                 prior=(0.0, 20.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
 
     def on_image(self, image: Image) -> Image:

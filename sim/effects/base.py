@@ -20,7 +20,7 @@ STAGES = {"light": "on_light", "image": "on_image", "charge": "on_charge", "sign
 
 class Effect(Frozen):
     """Base of all effects. Parameters are fields annotated with `sim.parameters.Quantity` (unit, bounds, prior, `absent`,
-    `slope_power`), each with its `absent` value as default, so that `TheEffect()` is the baseline.
+    `linear_power`), each with its `absent` value as default, so that `TheEffect()` is the baseline.
 
     The methods that an effect may write; each default changes nothing:
 
@@ -61,14 +61,14 @@ class Effect(Frozen):
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | values)
 
     @classmethod
-    def from_slopes(cls, slopes: dict[str, float]) -> Self:
-        """The effect at given coordinates u = parameter ** slope_power (measured from `absent`)."""
+    def from_linear(cls, coordinates: dict[str, float]) -> Self:
+        """The effect at given coordinates u = parameter ** linear_power (measured from `absent`)."""
         values = {}
         for field, quantity in cls.quantities().items():
-            u = slopes.get(field, 0.0)
+            u = coordinates.get(field, 0.0)
             absent = quantity.absent or 0.0
             values[field] = absent + (
-                u if quantity.slope_power == 1 else np.sign(u) * abs(u) ** (1 / quantity.slope_power)
+                u if quantity.linear_power == 1 else np.sign(u) * abs(u) ** (1 / quantity.linear_power)
             )
         return cls(**values)
 

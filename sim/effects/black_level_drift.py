@@ -24,12 +24,12 @@ class BlackLevelDrift(Effect):
 
     drift_dn_per_min: Annotated[
         float,
-        Quantity("DN/min", "change with time", lower=-50.0, upper=50.0, prior=(0.0, 0.5), absent=0.0, slope_power=1),
+        Quantity("DN/min", "change with time", lower=-50.0, upper=50.0, prior=(0.0, 0.5), absent=0.0, linear_power=1),
     ] = 0.0
     drift_dn_per_c: Annotated[
         float,
         Quantity(
-            "DN/C", "change with temperature", lower=-50.0, upper=50.0, prior=(0.0, 0.5), absent=0.0, slope_power=1
+            "DN/C", "change with temperature", lower=-50.0, upper=50.0, prior=(0.0, 0.5), absent=0.0, linear_power=1
         ),
     ] = 0.0
 

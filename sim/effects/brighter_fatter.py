@@ -39,7 +39,7 @@ class BrighterFatter(Effect):
             upper=80.0,
             prior=(0.0, 5.0),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
     shared_percent: Annotated[

@@ -34,7 +34,7 @@ class ChargeDiffusion(Effect):
     length_um: Annotated[
         float,
         Quantity("um", "standard deviation of the sideways drift at 550 nm", lower=0.0, upper=10.0, prior=(0.0, 0.7), absent=0.0,
-                 slope_power=2),
+                 linear_power=2),
     ] = 0.0  # fmt: skip
     wavelength_power: Annotated[
         float,

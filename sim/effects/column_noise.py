@@ -49,7 +49,7 @@ class ColumnNoise(Effect):
             upper=1e4,
             prior=(0.0, 5.0),
             absent=0.0,
-            slope_power=2,
+            linear_power=2,
         ),
     ] = 0.0
     pattern_seed: int = 0

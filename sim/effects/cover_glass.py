@@ -31,7 +31,7 @@ class CoverGlass(Effect):
 
     thickness_mm: Annotated[
         float,
-        Quantity("mm", "thickness of the plate", lower=0.0, upper=20.0, prior=(0.0, 5.0), absent=0.0, slope_power=2),
+        Quantity("mm", "thickness of the plate", lower=0.0, upper=20.0, prior=(0.0, 5.0), absent=0.0, linear_power=2),
     ] = 0.0
     refractive_index: Annotated[float, Field(ge=1.0, le=3.0, description="refractive index of the plate")] = 1.52
     refocused: bool = True

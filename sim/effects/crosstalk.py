@@ -36,7 +36,7 @@ class Crosstalk(Effect):
             upper=20.0,
             prior=(0.0, 1.5),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
     row_excess: Annotated[

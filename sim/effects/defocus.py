@@ -31,7 +31,7 @@ class Defocus(Effect):
             upper=200.0,
             prior=(0.0, 20.0),
             absent=0.0,
-            slope_power=2,
+            linear_power=2,
         ),
     ] = 0.0
 

@@ -31,7 +31,7 @@ class ExposureOffset(Effect):
             upper=5000.0,
             prior=(0.0, 20.0),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
 

@@ -29,16 +29,16 @@ class FieldCurvature(Effect):
     curvature_um: Annotated[
         float,
         Quantity("um", "distance of sensor and focus half a diagonal from the centre, where it grows as the square", lower=-200.0,
-                 upper=200.0, prior=(0.0, 20.0), absent=0.0, slope_power=2),
+                 upper=200.0, prior=(0.0, 20.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     tilt_x_um: Annotated[
         float,
         Quantity("um", "the same along columns, where it grows in proportion", lower=-200.0, upper=200.0, prior=(0.0, 20.0),
-                 absent=0.0, slope_power=2),
+                 absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     tilt_y_um: Annotated[
         float,
-        Quantity("um", "the same along rows", lower=-200.0, upper=200.0, prior=(0.0, 20.0), absent=0.0, slope_power=2),
+        Quantity("um", "the same along rows", lower=-200.0, upper=200.0, prior=(0.0, 20.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
 
     @classmethod

@@ -34,13 +34,19 @@ class NonUniformIllumination(Effect):
             upper=50.0,
             prior=(0.0, 1.0),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
     gradient_y_percent: Annotated[
         float,
         Quantity(
-            "%", "slope along rows, centre to rim", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0, slope_power=1
+            "%",
+            "slope along rows, centre to rim",
+            lower=-50.0,
+            upper=50.0,
+            prior=(0.0, 1.0),
+            absent=0.0,
+            linear_power=1,
         ),
     ] = 0.0
 

@@ -28,7 +28,7 @@ class OnChipSharpening(OnChipFilter):
             upper=5.0,
             prior=(0.0, 0.3),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
     corner_share: CornerShare = 0.33

@@ -42,7 +42,7 @@ class OpticalLowPassFilter(Effect):
             upper=20.0,
             prior=(0.0, 2.0),
             absent=0.0,
-            slope_power=2,
+            linear_power=2,
         ),
     ] = 0.0
     displacement_y_um: Annotated[
@@ -54,7 +54,7 @@ class OpticalLowPassFilter(Effect):
             upper=20.0,
             prior=(0.0, 2.0),
             absent=0.0,
-            slope_power=2,
+            linear_power=2,
         ),
     ] = 0.0
 

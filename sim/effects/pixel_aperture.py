@@ -36,7 +36,7 @@ class PixelAperture(Effect):
             upper=5.0,
             prior=(0.0, 0.5),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
 

@@ -36,7 +36,7 @@ class RandomTelegraphNoise(Effect):
             upper=1e4,
             prior=(0.0, 60.0),
             absent=0.0,
-            slope_power=2,
+            linear_power=2,
         ),
     ] = 0.0
     share_percent: Annotated[

@@ -47,7 +47,7 @@ class ScreenGamma(Effect):
             upper=1.5,
             prior=(0.0, 0.3),
             absent=0.0,
-            slope_power=2,
+            linear_power=2,
             dispensable=True,
         ),
     ] = 0.0

@@ -35,7 +35,7 @@ class SourceBandwidth(Effect):
             upper=30.0,
             prior=(0.0, 4.0),
             absent=0.0,
-            slope_power=2,
+            linear_power=2,
         ),
     ] = 0.0
 

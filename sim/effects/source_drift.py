@@ -34,7 +34,7 @@ class SourceDrift(Effect):
             upper=20.0,
             prior=(0.0, 0.3),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
 

@@ -24,7 +24,7 @@ class SphericalAberration(Effect):
     w040_um: Annotated[
         float,
         Quantity(
-            "um", "path error at the pupil's rim", lower=0.0, upper=5.0, prior=(0.0, 0.3), absent=0.0, slope_power=2
+            "um", "path error at the pupil's rim", lower=0.0, upper=5.0, prior=(0.0, 0.3), absent=0.0, linear_power=2
         ),
     ] = 0.0
 

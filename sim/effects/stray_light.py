@@ -32,7 +32,7 @@ class StrayLight(Effect):
             upper=50.0,
             prior=(0.0, 0.3),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
 

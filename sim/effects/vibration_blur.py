@@ -27,11 +27,11 @@ class VibrationBlur(Effect):
 
     amplitude_x_um: Annotated[
         float,
-        Quantity("um", "amplitude along columns", lower=0.0, upper=20.0, prior=(0.0, 1.5), absent=0.0, slope_power=2),
+        Quantity("um", "amplitude along columns", lower=0.0, upper=20.0, prior=(0.0, 1.5), absent=0.0, linear_power=2),
     ] = 0.0
     amplitude_y_um: Annotated[
         float,
-        Quantity("um", "amplitude along rows", lower=-20.0, upper=20.0, prior=(0.0, 1.5), absent=0.0, slope_power=2),
+        Quantity("um", "amplitude along rows", lower=-20.0, upper=20.0, prior=(0.0, 1.5), absent=0.0, linear_power=2),
     ] = 0.0
 
     @classmethod

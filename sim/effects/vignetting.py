@@ -38,7 +38,7 @@ class Vignetting(Effect):
             upper=100.0,
             prior=(0.0, 3.0),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
 

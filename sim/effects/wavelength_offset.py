@@ -31,7 +31,7 @@ class WavelengthOffset(Effect):
             upper=15.0,
             prior=(0.0, 2.0),
             absent=0.0,
-            slope_power=1,
+            linear_power=1,
         ),
     ] = 0.0
 

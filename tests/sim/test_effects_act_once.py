@@ -35,7 +35,7 @@ def _one_deviation(kind: type[Effect]) -> Effect:
     """The effect at one standard deviation of its first parameter's prior."""
     name, quantity = next(iter(kind.quantities().items()))
     assert quantity.prior is not None
-    return kind.from_slopes({name: quantity.prior[1] ** quantity.slope_power})
+    return kind.from_linear({name: quantity.prior[1] ** quantity.linear_power})
 
 
 SPREADING = [

@@ -99,7 +99,7 @@ def _with_either_sign(
     both = {
         name: float(getattr(effect, name))
         for name, q in type(effect).quantities().items()
-        if q.slope_power == 2 and (q.lower is None or q.lower < 0.0)
+        if q.linear_power == 2 and (q.lower is None or q.lower < 0.0)
     }
     if not both:
         return candidate

@@ -32,7 +32,7 @@ DIFFERENCE_STEP = 0.02
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One parameter of one effect as u = sign(p - absent) |p - absent|^slope_power, in which predictions have a slope
+    """One parameter of one effect as u = sign(p - absent) |p - absent|^linear_power, in which predictions have a slope
     at `absent`."""
 
     index: int  # of the effect in its set
@@ -47,11 +47,11 @@ class Coordinate:
     def to_u(self, value: float) -> float:
         """u of a parameter's value."""
         away = value - self.absent
-        return float(np.sign(away) * abs(away) ** self.quantity.slope_power)
+        return float(np.sign(away) * abs(away) ** self.quantity.linear_power)
 
     def to_value(self, u: float) -> float:
         """The parameter's value of u, within its bounds."""
-        value = self.absent + float(np.sign(u) * abs(u) ** (1.0 / self.quantity.slope_power))
+        value = self.absent + float(np.sign(u) * abs(u) ** (1.0 / self.quantity.linear_power))
         low = self.quantity.lower if self.quantity.lower is not None else -np.inf
         high = self.quantity.upper if self.quantity.upper is not None else np.inf
         return min(max(value, low), high)
@@ -65,9 +65,9 @@ class Coordinate:
     def typical(self, value: float) -> float:
         """A typical size of u for a parameter at `value`."""
         width = self.quantity.prior[1] if self.quantity.prior is not None else 5.0
-        if self.quantity.slope_power == 1:
+        if self.quantity.linear_power == 1:
             return width
-        return max(abs(self.to_u(value)), 0.05 * width**self.quantity.slope_power)
+        return max(abs(self.to_u(value)), 0.05 * width**self.quantity.linear_power)
 
 
 @dataclass(frozen=True)
@@ -217,10 +217,10 @@ def _fit(
 def _prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
     """Centre and standard deviation of every coordinate's prior, infinite where none is declared."""
     centre = np.array(
-        [c.to_u(c.quantity.prior[0]) if c.quantity.prior and c.quantity.slope_power == 1 else 0.0 for c in coords]
+        [c.to_u(c.quantity.prior[0]) if c.quantity.prior and c.quantity.linear_power == 1 else 0.0 for c in coords]
     )
     width = np.array([PRIOR_WIDTH * c.quantity.prior[1] if c.quantity.prior else np.inf for c in coords])
-    return centre, np.array([w**c.quantity.slope_power for w, c in zip(width, coords, strict=True)])
+    return centre, np.array([w**c.quantity.linear_power for w, c in zip(width, coords, strict=True)])
 
 
 def _standard_deviations(
@@ -233,7 +233,7 @@ def _standard_deviations(
     std: list[dict[str, float | None]] = [{} for _ in range(effects)]
     for k, c in enumerate(coords):
         su = float(np.sqrt(max(covariance[k, k], 0.0)))
-        power = c.quantity.slope_power
+        power = c.quantity.linear_power
         away = abs(c.to_value(float(u[k])) - c.absent)
         std[c.index][c.name] = (
             su if power == 1 else min(su / max(power * away ** (power - 1), 1e-12), su ** (1.0 / power))

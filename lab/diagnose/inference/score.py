@@ -28,6 +28,10 @@ RIDGE = 1e-4
 INSIDE_BOUND = 0.9
 
 
+#: Length of a whitened signature, in standard deviations of the noise, from which on an effect is looked for.
+LEAST_SIGNATURE = 1e-6
+
+
 @dataclass(frozen=True)
 class Score:
     """S = |r|^2 - min over u >= 0 of |r - G u|^2, r the whitened residual, G the whitened signatures: the
@@ -166,7 +170,8 @@ def signatures(
             continue
         for prototypes in effect.prototypes(camera):
             table = whitened_changes(prototypes)
-            if np.any(table):
+            # smaller ones are rounding: scaled to unit length, they would count in the threshold as any other
+            if np.linalg.norm(table, axis=0).max(initial=0.0) > LEAST_SIGNATURE:
                 columns.append((effect, prototypes, table))
     return Signatures(white, columns, whitened_changes)
 
@@ -201,8 +206,8 @@ def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: Float
         total = 0.0
         for prototype, part in zip(prototypes, share, strict=True):
             away = float(getattr(prototype, name)) - absent
-            total += float(part) * np.sign(away) * abs(away) ** quantity.slope_power
-        step = np.sign(total) * abs(total) ** (1.0 / quantity.slope_power)
+            total += float(part) * np.sign(away) * abs(away) ** quantity.linear_power
+        step = np.sign(total) * abs(total) ** (1.0 / quantity.linear_power)
         values[name] = absent + float(step)
         if quantity.upper is not None:
             values[name] = min(values[name], absent + INSIDE_BOUND * (quantity.upper - absent))

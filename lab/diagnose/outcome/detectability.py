@@ -73,6 +73,6 @@ def _smallest(
                 continue
             ((field, quantity),) = moved.items()
             away = abs(float(getattr(prototype, field)) - (quantity.absent or 0.0))
-            least = away * (np.sqrt(needed) / size) ** (1.0 / quantity.slope_power)
+            least = away * (np.sqrt(needed) / size) ** (1.0 / quantity.linear_power)
             found[field] = min(found.get(field, np.inf), float(least))
     return {field: value for field, value in found.items() if np.isfinite(value)}

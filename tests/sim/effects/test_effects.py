@@ -140,13 +140,13 @@ def test_declares_what_the_diagnosis_reads(kind: type[Effect]) -> None:
 
 @pytest.mark.parametrize("kind", ALL, ids=lambda k: k.name)
 def test_slope_at_zero_is_finite_and_not_nil(kind: type[Effect]) -> None:
-    """In u = parameter ** slope_power the change is proportional to u near absent: halving u halves it."""
+    """In u = parameter ** linear_power the change is proportional to u near absent: halving u halves it."""
     base = _everything(())
     for name, quantity in kind.quantities().items():
         if name in kind.shapes:
             continue
-        scale = 0.05 * (quantity.prior[1] if quantity.prior else 1.0) ** quantity.slope_power
-        full, half = (_everything((kind.from_slopes({name: u}),)) - base for u in (scale, 0.5 * scale))
+        scale = 0.05 * (quantity.prior[1] if quantity.prior else 1.0) ** quantity.linear_power
+        full, half = (_everything((kind.from_linear({name: u}),)) - base for u in (scale, 0.5 * scale))
         assert np.abs(half).max() > 0
         # the next order in u is a few per cent of the first at 5 % of a prior's standard deviation
         assert np.linalg.norm(full - 2.0 * half) < 0.1 * np.linalg.norm(full)

@@ -151,7 +151,7 @@ def test_the_nearer_of_two_rivals_wins() -> None:
 class _Squared(_Curve):
     name: ClassVar[str] = "squared"
     size_dn: Annotated[
-        float, Quantity("DN", "size", lower=-5.0, upper=5.0, prior=(0.0, 1.0), absent=0.0, slope_power=2)
+        float, Quantity("DN", "size", lower=-5.0, upper=5.0, prior=(0.0, 1.0), absent=0.0, linear_power=2)
     ] = 0.0
     skew: ClassVar[float] = 0.0
 
