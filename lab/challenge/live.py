@@ -23,11 +23,14 @@ from lab.cli.bench_process import mock_bench
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult
 from sim.camera import Side
+from sim.effects.library import effects as library
+from sim.effects.library import typical
 from sim.parameters import Frozen
 
 Outcome = Literal["named", "among rivals", "not named", "wrong name", "healthy", "failed"]
 
-#: A typical size of every effect that the bench can show, on the left camera or on the rig.
+#: Sizes of effects at which a quick session shows them, on the left camera or on the rig. Effects that aren't here are concealed at
+#: `sim.effects.library.typical`.
 SIZES: dict[str, str] = {
     "adc_nonlinearity": "left:error_dn=4",
     "ambient_light": "both:rate_e_per_s=400,red_over_blue=3",
@@ -113,6 +116,9 @@ NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
     "other_f_number": frozenset(),
 }
 
+#: Effects that the mock bench can't show, and refuses to conceal.
+NOT_SHOWN_BY_BENCH = frozenset({"second_order_light", "stereo_time_offset"})
+
 #: Effects that one session can't show: its own boards give the distortion, so that only an earlier calibration tells that it changed.
 NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre"})
 
@@ -163,7 +169,18 @@ class LiveRun(Frozen):
     error: str | None = None
 
 
+def typical_spec(effect: str) -> str:
+    """`SIDE:EFFECT:PARAMETER=VALUE,...` of an effect at its typical size."""
+    kind = library()[effect]
+    of_rig = "light" in kind.stages()
+    one = typical(kind)
+    values = ",".join(f"{name}={getattr(one, name):g}" for name in kind.quantities())
+    return f"{'both' if of_rig else 'left'}:{effect}:{values}"
+
+
 def _spec(effect: str) -> str:
+    if effect not in SIZES:
+        return typical_spec(effect)
     side, values = SIZES[effect].split(":")
     return f"{side}:{effect}:{values}"
 
@@ -175,7 +192,7 @@ def _of(name: str, *effects: str) -> LiveCase:
 
 def every_case() -> dict[str, LiveCase]:
     """Name -> case: singles, pairs, healthy cameras, and benches to resolve."""
-    cases = [_of(effect, effect) for effect in SIZES]
+    cases = [_of(effect, effect) for effect in library() if effect not in NOT_SHOWN_BY_BENCH]
     cases += [_of("+".join(pair), *pair) for pair in PAIRS]
     cases += [LiveCase(name=f"healthy-{seed}", seed=seed) for seed in HEALTHY_SEEDS]
     cases += [LiveCase(name=f"resolve-{spec.split(':')[1]}", concealed=(spec,), resolve=True) for spec in RESOLVED]
@@ -184,7 +201,7 @@ def every_case() -> dict[str, LiveCase]:
 
 def drawn(seed: int, count: int = 3) -> tuple[LiveCase, ...]:
     """Some single effects at random, for a day's tests."""
-    single = [case for name, case in every_case().items() if name in SIZES and name not in NOT_IN_ONE_SESSION]
+    single = [case for name, case in every_case().items() if name in library() and name not in NOT_IN_ONE_SESSION]
     return tuple(random.Random(seed).sample(single, count))
 
 

@@ -62,3 +62,17 @@ def may_change(kind: type[Effect]) -> frozenset[str]:
     """Which quantities of the stages an effect changes at any of its prototypes."""
     every = (one for group in kind.prototypes(_CAMERA) for one in group)
     return frozenset().union(*(changed_by(one) for one in every))
+
+
+def typical(kind: type[Effect]) -> Effect:
+    """An instance of usual size: its first prototype, with each parameter that sizes it one standard deviation of its prior from `absent`.
+
+    Parameters without a prior stay at the prototype's value.
+    """
+    first = kind.prototypes(_CAMERA)[0][0]
+    sizes = {
+        name: (quantity.absent or 0.0) + quantity.prior[1]
+        for name, quantity in kind.quantities().items()
+        if name not in kind.shapes and quantity.prior is not None
+    }
+    return first.having(**sizes)

@@ -11,6 +11,7 @@ import pytest
 
 from lab.challenge.live import (
     HEALTHY_SEEDS,
+    NOT_SHOWN_BY_BENCH,
     PAIRS,
     SIZES,
     LiveCase,
@@ -20,6 +21,7 @@ from lab.challenge.live import (
     judged,
     run_all,
     run_case,
+    typical_spec,
 )
 from lab.challenge.live_page import drawing, table, write_page
 from lab.challenge.truth import store
@@ -27,6 +29,7 @@ from lab.formats.results import DiagnosisResult, NamedEffect, ParameterValue, Ri
 from mocks.conceal import NOT_SHOWN, parse
 from sim.camera import Side
 from sim.effects.library import effects as library
+from sim.effects.library import typical
 
 
 def day_seed() -> int:
@@ -55,10 +58,19 @@ def result(verdict: str, *effects: tuple[str, tuple[Side, ...], dict[str, float]
 
 
 def test_every_effect_that_the_bench_shows_has_a_case() -> None:
-    assert set(SIZES) == set(library()) - set(NOT_SHOWN)
+    shown = set(library()) - set(NOT_SHOWN)
+    assert set(NOT_SHOWN) == NOT_SHOWN_BY_BENCH
+    assert set(SIZES) <= shown <= set(every_case())
     assert len(PAIRS) == 10
     assert len(HEALTHY_SEEDS) == 6
-    assert len(set(every_case())) == len(SIZES) + 10 + 6 + 3
+    assert len(set(every_case())) == len(shown) + 10 + 6 + 3
+
+
+@pytest.mark.parametrize("effect", sorted(set(library()) - set(NOT_SHOWN)))
+def test_the_bench_takes_every_effect_at_its_typical_size(effect: str) -> None:
+    """An effect that `SIZES` doesn't list is concealed so."""
+    concealed = parse([typical_spec(effect)])
+    assert concealed["left"] == (typical(library()[effect]),)
 
 
 @pytest.mark.parametrize("case", every_case().values(), ids=lambda case: case.name)
