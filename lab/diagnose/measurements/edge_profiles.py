@@ -21,7 +21,7 @@ PLAIN = np.array([0.25])  # cy/px, of the estimator's own transfer function, whi
 
 @dataclass(frozen=True)
 class MeasuredEdge:
-    """One edge in one channel, of the repeats that choice may see or of those held out."""
+    """One edge in one channel, of the seen or of the held-out repeats."""
 
     part: tuple[SlantedEdgeCapture, ...]
     channel: str
@@ -38,7 +38,7 @@ class MeasuredEdge:
 
     @property
     def setting(self) -> tuple[Region, float, str]:
-        """Alike for edges that see the same pixels in the same way."""
+        """Equal for edges on the same pixels in the same direction."""
         return self.region, round(self.direction_deg), self.channel
 
 
@@ -84,7 +84,7 @@ def _found(study: Study, capture: SlantedEdgeCapture) -> list[Region]:
 
 
 def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, angle_deg: float) -> float:
-    """Of the edge's normal that points to the light."""
+    """Direction of the edge's normal towards the light, from x (columns) to y (rows)."""
     row0, col0, row1, col1 = region
     frame = np.asarray(study.recordings.frame(capture)[row0:row1, col0:col1], float)
     angle = np.deg2rad(angle_deg)

@@ -16,8 +16,7 @@ from sim.spectrum import FloatArray
 
 @dataclass(frozen=True)
 class FlatLevel:
-    """Frames of even light at one setting: means above black by plane (DN), over its frames; `relative`: their sum by pixel over
-    the planes' means, and how many DN of signal that holds."""
+    """Frames of uniform light at one setting: means above black by plane of the mosaic, DN, and ratios of the greens."""
 
     captures: tuple[Any, ...]
     held_out: bool
@@ -30,8 +29,8 @@ def _unclipped(study: Study, capture: Any) -> bool:
 
 
 def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, float]]]:
-    """Unclipped flats by level; and for what is seen (False) and what is held out the sum of their frames above black, each
-    plane over its mean, with weights by signal, and the variance of that by shot and read noise, a pixel."""
+    """Unclipped flats by level; and for seen (False) and held-out frames (True) their mean above black, each plane over its own mean and
+    weighted by signal, with the variance of a pixel in it by shot and read noise."""
     out = study.once(held_out_flats)
     levels: list[FlatLevel] = []
     total: dict[bool, Any] = {}
@@ -74,15 +73,15 @@ def dark_level_dn(study: Study, capture: Any) -> float:
 
 
 def _green_dark(study: Study) -> float:
-    """Mean of the greens on red rows less that of those on blue rows in the dark, DN: columns' offsets and the like."""
+    """Mean of the greens on red rows less that of the greens on blue rows in the dark, DN: fixed patterns of the read-out."""
     captures = study.recordings.captures(DarkCapture, study.side)[:16]
     pairs = [green_planes(study, np.asarray(study.recordings.frame(c), np.float32)) for c in captures]
     return float(np.mean([float(a.mean(dtype=float)) - float(b.mean(dtype=float)) for a, b in pairs])) if pairs else 0.0
 
 
 def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
-    """The green pixels on red rows, but for the outermost, and for each the mean of the four on blue rows across its corners: a slope
-    of the light falls on both alike."""
+    """The green pixels on red rows, without the outermost, and for each the mean of its four diagonal neighbours on blue rows: a gradient
+    of the light cancels in their ratio."""
     row, col = mosaic.phases(study.camera.cfa)["G"][0]
     red_rows = frame[row + 2 * (row == 0) : -1 : 2, col + 2 * (col == 0) : -1 : 2]
     first = row + 2 * (row == 0) - 1, col + 2 * (col == 0) - 1
@@ -93,7 +92,7 @@ def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
 
 
 def green_ratio(study: Study, frame: Any) -> float:
-    """Of a frame above black, less 1."""
+    """Ratio of the greens in a frame above black, less 1."""
     red_rows, blue_rows = green_planes(study, frame)
     below = max(float(blue_rows.mean(dtype=float)), 1e-3)
     return (float(red_rows.mean(dtype=float)) - study.once(_green_dark)) / below - 1.0

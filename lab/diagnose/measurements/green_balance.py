@@ -26,7 +26,7 @@ TILE_ROWS, TILE_COLS = 64, 4  # uniform light on which the effects act
 
 @dataclass(frozen=True)
 class _Ratio:
-    """One ratio of the greens less 1, with what makes it uncertain by itself."""
+    """One ratio of the greens less 1; `std` of its own noise."""
 
     value: float
     std: float
@@ -40,8 +40,8 @@ class _Ratio:
 
 
 def green_block(study: Study) -> Block:
-    """Signal of the green pixels on red rows over that of those on blue rows, less 1: by level of flats, by wavelength, and by
-    place relative to the frame's."""
+    """Signal of green pixels on red rows over that of green pixels on blue rows, less 1: by level of flats, by wavelength, and by place
+    relative to the frame's mean."""
     if study.camera.cfa == "MONO":
         raise NotDetermined("green_balance", "the camera has no colour mosaic")
     levels, images = study.once(flats)
@@ -86,8 +86,7 @@ def green_block(study: Study) -> Block:
 
 
 def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
-    """What the greens' difference in two frames of a level differs by beyond shot and read noise (DN^2): rows that are read with noise
-    of their own."""
+    """Variance of the greens' difference from frame to frame beyond shot and read noise, DN^2: row noise."""
     excess, weights = 0.0, 0.0
     for u in levels:
         signal = u.mean["G2"]

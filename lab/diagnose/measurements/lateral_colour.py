@@ -19,7 +19,7 @@ COLOUR_FLOOR_PX = (
 
 
 def colour_block(study: Study) -> Block:
-    """How far out red and blue detail of a pattern lies against green, at two distances from the frame's middle, and its turn."""
+    """Displacement of a pattern's red and blue detail from green's, px: radial at two distances from the frame's middle, and tangential."""
     if "G" not in study.channels:
         raise NotDetermined("lateral_colour", "one channel: nothing to hold it against")
     points: list[tuple[Pattern, Pattern]] = []
@@ -67,8 +67,8 @@ def colour_block(study: Study) -> Block:
 def colour_shift_px(
     study: Study, channel: str, distance: float, light: Spectrum | None, effects: Effects, kind: str = "bernoulli"
 ) -> float:
-    """How far a channel's detail lands outside of green's, px, at a distance from the middle in half diagonals: the mean of four
-    directions, by the light that each channel detects."""
+    """Radial displacement of a channel's detail from green's, px, at `distance` (half diagonals) from the middle: the mean of four
+    directions, weighted by the light that each channel detects."""
     camera = study.camera
     wavelength = np.arange(400.0, 721.0, 10.0)
     half_um = camera.half_diagonal_um

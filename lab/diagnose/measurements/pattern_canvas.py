@@ -24,10 +24,10 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
 OVERSAMPLE = 4
-LARGEST_PX = 320  # a side of the part that is looked at: enough for a band's contrast to 1e-3
-MARGIN_PX = 12  # of the frame and of that part: drawings there lack what lies beyond
+LARGEST_PX = 320  # largest side of the part that is fitted: enough for a band's contrast to 1e-3
+MARGIN_PX = 12  # border of the frame and of that part that is left out: drawings there lack light from outside
 MARGIN_CELLS = 2.0
-#: ... and what lies beyond, along the larger of both axes: not looked at, but there.
+#: Edges of the bands above half a cycle a pixel, by the larger of both frequencies: they are fitted, not measured.
 BEYOND_CY_PER_PX = (0.5, 0.62, 0.8, 4.0)
 LEAST_PIXELS = 1500
 

@@ -30,7 +30,7 @@ GRID_OF_CAMERA = 12.0  # of a flat's mean power: a line that flats have, too, is
 
 @dataclass(frozen=True)
 class _Line:
-    """The strongest line in a lit screen's spectrum, over what noise leaves anywhere."""
+    """The strongest line in a lit screen's spectrum."""
 
     channel: str
     captures: tuple[str, ...]
@@ -40,16 +40,18 @@ class _Line:
     places: int
 
     def normal(self, power: float) -> float:
-        """The standard normal number that is as rare as the largest of `places` exponential numbers being `power`."""
+        """The standard normal quantile of the probability that the largest of `places` exponential variables is `power` or less."""
         rare = np.log(self.places) - power  # logarithm of the probability, far out
         normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else -float(special.ndtri(-np.expm1(-np.exp(rare))))
-        # beyond any doubt what matters is the order of magnitude
+        # far out the logarithm is taken: only the order of magnitude matters
         return normal if normal < CERTAIN else CERTAIN * (1.0 + float(np.log(normal / CERTAIN)))
 
 
 def grid_block(study: Study) -> Block:
-    """The strongest line in the spectrum of the lit screen by channel, as a standard normal number: rows' and columns' lines, and
-    lines that uniform light shows as well, are the camera's and don't count."""
+    """Strength of the strongest line in the spectrum of the lit screen by channel, as a standard normal number.
+
+    Lines along rows and columns, and lines that uniform light shows as well, are the camera's and don't count.
+    """
     groups = study.groups(WhiteCapture, lambda c: (c.screen.pose, c.exposure_s))
     if not groups:
         raise NotDetermined("screen_grid", "no white captures")
@@ -127,7 +129,7 @@ def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatA
     smooth = ndimage.gaussian_filter(plane, GRID_DETREND_PX / step, mode="nearest")
     window = np.outer(np.hanning(plane.shape[0]), np.hanning(plane.shape[1]))
     relative = plane / np.maximum(smooth, 1e-12) - 1.0
-    # one pixel that is far off is no line
+    # outlying pixels are clipped: they aren't lines
     relative = np.clip(relative, *np.quantile(relative, [0.0005, 0.9995]))
     power = np.abs(fft.rfft2(relative * window)) ** 2
     fy, fx = fft.fftfreq(plane.shape[0])[:, None], fft.rfftfreq(plane.shape[1])[None, :]

@@ -64,7 +64,7 @@ class _Darks:
 
 
 def scene_gain_block(study: Study) -> Block:
-    """Right over left in every scene that both see, over the same of uniform light; natural logarithms, by channel."""
+    """ln(right / left) of the signals in every scene that both cameras see, less that in uniform light, by channel."""
     needs_both_sides(study, "stereo_gain")
     darks = {side: _Darks(study, side) for side in SIDES}
     uniform = [_uniform(study, side, darks[side]) for side in SIDES]
@@ -149,7 +149,7 @@ def _uniform(study: Study, side: Side, dark: _Darks) -> list[_Lamp]:
 
 
 def _means(study: Study, frame: Any, side: Side, mask: np.ndarray | None, white: float) -> dict[str, float]:
-    """Mean DN by channel of the frame's middle, or of a mask's pixels, with the lens's fall-off taken out; clipped ones left out."""
+    """Mean DN by channel of the frame's middle or of a mask's pixels, corrected for the lens's fall-off; without clipped channels."""
     rows, cols = frame.shape
     row, col = np.arange(rows)[:, None], np.arange(cols)[None, :]
     if mask is None:
@@ -185,7 +185,7 @@ def _rates(
 
 
 def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]]:
-    """What both sides saw, by name: each side's captures, and the pixels that show the same part of it."""
+    """Scenes that both sides saw, by name: each side's captures, and the pixels that show the same part of the scene."""
     found: dict[str, list[tuple[list[Any], np.ndarray | None]]] = {}
     views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
     for pose in views[0]:
@@ -210,8 +210,8 @@ def _screen_captures(study: Study, side: Side) -> dict[str, list[Any]]:
 
 
 def _same_colour(rates: dict[str, float], lamp: _Lamp) -> bool:
-    """Whether a grey scene is lit by the lamp of the flats, as far as the camera's own channels tell: another light's share of
-    what a filter takes away would pass for a gain. One channel tells nothing."""
+    """Whether a grey scene is lit by the lamp of the flats: the ratios of its channels agree. Under another light a difference of the
+    cameras' filters would look like a gain. A camera of one channel can't tell: False."""
     if len(lamp.level) < 2 or set(rates) != set(lamp.level):
         return False
     gap = np.array([np.log(rates[c] / lamp.level[c]) for c in rates])

@@ -31,7 +31,7 @@ POINTING_STD_PX = 2.0  # of the rig's turn and the cameras' axes, over the frame
 
 
 def time_block(study: Study) -> Block:
-    """Where the right camera sees a moving board, across the baseline, against where the left one's pose puts it."""
+    """Displacement of a moving board in the right picture from where the left camera's pose puts it, across the baseline, px."""
     needs_both_sides(study, "stereo_time")
     moving = _moving(study)
     views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
