@@ -1,4 +1,4 @@
-"""The code-density test of the converter: how often each code comes in uniform light.
+"""The code-density test of the converter: the histogram of codes in uniform light.
 
 Frames of uniform light, taken together, are spread over their codes as smoothly as their noise and shading make them: over more than
 the noise's standard deviation at that level. A departure from a smooth curve over that distance is the converter's, or of a
@@ -130,7 +130,7 @@ def code_block(study: Study) -> Block:
 
 @dataclass(frozen=True)
 class _Counts:
-    """How often each code comes in some frames, and how often it would by the light's own course and noise."""
+    """Counts of each code in some frames, and the counts expected from the light's own course and noise."""
 
     count: FloatArray
     expected: FloatArray
