@@ -68,11 +68,13 @@ class CaptureRequest:
 
     plan : the sequences of a new session; None: all that the station has the instruments and targets for
     quick : fewer exposures and repeats, where `plan` is None
+    only : names of the sequences to take, where `plan` is None; empty: all
     """
 
     session: str = ""
     plan: CapturePlan | None = None
     quick: bool = False
+    only: tuple[str, ...] = ()
     name: str = ""
     notes: str = ""
 
@@ -204,6 +206,7 @@ def capture_here(
 
     Raises what `CaptureSession.run` raises, and `Cancelled` if `tell` does: the session can then be resumed.
     """
+    from lab.capture.plan import full_plan
     from lab.capture.session import CaptureSession
     from lab.capture.station import drivers_of
 
@@ -226,7 +229,7 @@ def capture_here(
         session = CaptureSession.start(
             store,
             station,
-            request.plan,
+            request.plan or (full_plan(station, request.quick, request.only) if request.only else None),
             quick=request.quick,
             name=request.name,
             notes=request.notes,

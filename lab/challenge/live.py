@@ -18,8 +18,10 @@ from typing import Annotated, Literal
 
 import typer
 
+from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.challenge.truth import load, store
 from lab.cli.bench_process import mock_bench
+from lab.diagnose.visibility import visibility
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult
 from sim.camera import Side
@@ -124,12 +126,14 @@ NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre"})
 
 
 class LiveCase(Frozen):
-    """One bench: what it conceals (`--conceal`), its seed, and whether `run --resolve` is asked for."""
+    """One bench: what it conceals (`--conceal`), its seed, the sequences that are taken (empty: all), and whether `run --resolve` is
+    asked for."""
 
     name: str
     concealed: tuple[str, ...] = ()
     seed: int = 1
     warm_up_c: float = 0.0
+    only: tuple[str, ...] = ()
     resolve: bool = False
 
     @property
@@ -200,9 +204,21 @@ def every_case() -> dict[str, LiveCase]:
 
 
 def drawn(seed: int, count: int = 3) -> tuple[LiveCase, ...]:
-    """Some single effects at random, for a day's tests."""
+    """Some single effects at random, for a day's tests: of the session only darks, flats, and the sequences whose captures can show the
+    effect."""
     single = [case for name, case in every_case().items() if name in library() and name not in NOT_IN_ONE_SESSION]
-    return tuple(random.Random(seed).sample(single, count))
+    return tuple(
+        case.model_copy(update={"only": _showing(case.effects[0])})
+        for case in random.Random(seed).sample(single, count)
+    )
+
+
+def _showing(effect: str) -> tuple[str, ...]:
+    """Names of the sequences, in the order of a session, that a diagnosis of one effect needs."""
+    kinds = visibility()[effect].capture_kinds if effect in visibility() else ()
+    takers = (CAPTURES.models[kind].sequence for kind in kinds)
+    wanted = {"dark", "flat"} | {taker.name for taker in takers if taker is not None}
+    return tuple(name for name in SEQUENCES if name in wanted)
 
 
 def run_case(case: LiveCase, folder: Path) -> LiveRun:
@@ -213,6 +229,7 @@ def run_case(case: LiveCase, folder: Path) -> LiveRun:
     try:
         with mock_bench(case.concealed, options) as station:
             ends = ["--quick", "--station", str(station), "--out", str(folder), "--name", case.name]
+            ends += [f"--only={name}" for name in case.only]
             _command("run" if case.resolve else "capture", *ends, *(["--resolve"] if case.resolve else []))
         sessions = sorted((folder / "sessions").iterdir())
         file = folder / "diagnose.json" if not case.resolve else sessions[0] / "diagnose.json"

@@ -32,6 +32,10 @@ DataFolder = Annotated[
 ]
 Name = Annotated[str, typer.Option(help="what the session is called")]
 Resume = Annotated[str, typer.Option(metavar="SESSION", help="go on with this session")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(metavar="SEQUENCE", help="take this sequence only (dark, flat, ...); may be repeated"),
+]
 Conceal = Annotated[
     list[str] | None,
     typer.Option(
@@ -48,11 +52,14 @@ def capture(
     out_folder: DataFolder = None,
     name: Name = "",
     resume: Resume = "",
+    only: Only = None,
     conceal: Conceal = None,
 ) -> None:
     """Run the sequences of a station and keep what was captured. Without a station file: on the mock bench."""
     store = open_store(out_folder)
-    request = PipelineRequest("capture", capture=CaptureRequest(session=resume, quick=quick, name=name))
+    request = PipelineRequest(
+        "capture", capture=CaptureRequest(session=resume, quick=quick, only=tuple(only or ()), name=name)
+    )
     out.print(f"session: {run_here(request, store, _capturer(store, station, conceal)).session}")
 
 
@@ -69,13 +76,14 @@ def run(
             "--resolve", help="while rivals are left, take the capture that tells them apart and diagnose again"
         ),
     ] = False,
+    only: Only = None,
     conceal: Conceal = None,
 ) -> None:
     """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench."""
     from lab.report import words
 
     store = open_store(out_folder)
-    session = CaptureRequest(session=resume, quick=quick, name=name)
+    session = CaptureRequest(session=resume, quick=quick, only=tuple(only or ()), name=name)
     request = PipelineRequest("pipeline", capture=session, resolve=resolve)
     found = run_here(request, store, _capturer(store, station, conceal))
     assert found.fit is not None
