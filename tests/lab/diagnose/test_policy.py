@@ -24,7 +24,7 @@ def test_every_field_is_declared() -> None:
 
 
 def test_the_page_is_current() -> None:
-    """Else: `python docs/write_tables.py policy`."""
+    """Else: `python docs/write_tables.py decision-policy`."""
     page = runpy.run_path(str(DOCS / "write_tables.py"))["policy_page"]()
     assert (DOCS / "reference" / "decision-policy.md").read_text(encoding="utf-8") == page
 
