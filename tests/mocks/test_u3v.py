@@ -42,7 +42,7 @@ class Host:
     def out(self, packet: bytes) -> None:
         self.device.transfer(0x01, bytes(8), packet, 0, lambda: False)
 
-    def into(self, endpoint: int, length: int, patience_s: float = 1.0) -> bytes:
+    def into(self, endpoint: int, length: int, patience_s: float = 30.0) -> bytes:
         deadline = time.monotonic() + patience_s
         return self.device.transfer(endpoint, bytes(8), None, length, lambda: time.monotonic() > deadline)
 

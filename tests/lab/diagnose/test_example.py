@@ -44,11 +44,11 @@ def test_the_mtf_that_fell_short_and_the_red_end_have_names_and_then_fit() -> No
 
 
 @pytest.mark.skipif(not FLEA.is_dir(), reason="the shared recordings of a Flea3 aren't here")
-def test_real_frames_show_odd_pixels_filters_off_their_names_and_what_cant_be_judged(
+def test_real_frames_show_defective_pixels_filters_off_their_names_and_what_cant_be_judged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["llanos.py", str(FLEA), str(tmp_path)])
-    runpy.run_path(str(ROOT / "docs" / "llanos.py"), run_name="__main__")
+    monkeypatch.setattr(sys, "argv", ["convert_llanos.py", str(FLEA), str(tmp_path)])
+    runpy.run_path(str(ROOT / "docs" / "convert_llanos.py"), run_name="__main__")
     result = diagnose(read_foreign("raw-folder", tmp_path / "darks"))
     assert "defective_pixels" in {m.measurement for m in result.mismatches}
     assert {e.name for e in result.effects} <= {"hot_pixels"}  # nothing else may be named from these
