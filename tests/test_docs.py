@@ -111,10 +111,14 @@ def test_python_names_exist(page: Path) -> None:
                 found = getattr(found, part, None)
 
 
+#: Top folders in which one computer keeps its own files, a folder beside the checkout, and a registry's host.
+ONE_COMPUTERS = (*(f"/{folder}/" for folder in ("work", "home", "tmp")), "../shared", "pypi")
+
+
 @each_page
 def test_nothing_of_one_computer(page: Path) -> None:
     text = text_of(page)
-    for unwanted in ("../shared", "/work/", "/home/", "/tmp/", "pypi."):
+    for unwanted in ONE_COMPUTERS:
         assert unwanted not in text, unwanted
 
 
