@@ -30,6 +30,7 @@ from sim.sensor.electrons import FixedPattern, ReadOut
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Image, charge_of, codes_of, image_of, laws_of, light_of, signal_of
 from sim.traced_image import traced_image
+from sim.uniform import Uniform
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,7 @@ def scene_light(
     before_lens, image_state = light_of(camera, effects), image_of(camera, effects)
     x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
     y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
-    for law in (*before_lens.shading, *image_state.shading):
-        shade = shade * np.maximum(law(x_um, y_um), 0.0)
+    shade = Uniform(camera, effects).illuminated(shade, x_um, y_um)
     images = {channel: _reflected(image, image_state) * shade for channel, image in images.items()}
     if not before_lens.ambient_e_per_s:
         return SceneLight(mosaic.assemble(images, camera.cfa))
@@ -344,11 +344,6 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     charge, signal, codes = charge_of(camera, effects), signal_of(camera, effects), codes_of(camera, effects)
     disturbances = signal.random
 
-    def noise_e2(electrons: FloatArray, noise: FloatArray) -> FloatArray:
-        for law in charge.variance_e2:
-            noise = law(electrons, noise)
-        return noise
-
     def added(shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         return sum((one.draw(shape, rng) for one in disturbances), np.zeros((1, 1)))
 
@@ -356,7 +351,7 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     shape = camera.rows, camera.cols
     return ReadOut(
         signal.read if signal.response else None,
-        noise_e2 if charge.variance_e2 else None,
+        charge.shot_e2 if charge.variance_e2 else None,
         signal.shift_dn(exposure.elapsed_s, exposure.temperature_c),
         added if disturbances else None,
         sum((one.mean_e(shape) for one in disturbances), 0.0),

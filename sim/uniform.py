@@ -209,11 +209,6 @@ class Uniform:
         """How many of a frame's electrons stay for the next."""
         return self._charge.staying(electrons)
 
-    @property
-    def bends_shot_noise(self) -> bool:
-        """Whether shot noise is other than Poisson's."""
-        return bool(self._charge.variance_e2)
-
     def shot_e2(self, electrons: FloatArray) -> FloatArray:
         """Variance of the shot noise (e^2) at mean signals."""
         return self._charge.shot_e2(electrons)

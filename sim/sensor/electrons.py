@@ -32,7 +32,7 @@ class ReadOut:
     """Changes of the read-out by effects; by default a linear read-out.
 
     response      mean or noisy electrons -> electrons, point by point
-    noise_e2      (mean electrons, variance of their shot noise) -> variance
+    shot_e2       mean electrons -> variance of their shot noise
     added         (shape of the frame, generator) -> electrons that one frame's read-out adds, which broadcast to that shape, of mean `added_e`
                   and variance `added_e2`
     codes         DN before rounding -> DN
@@ -42,7 +42,7 @@ class ReadOut:
     """
 
     response: Callable[[FloatArray], FloatArray] | None = None
-    noise_e2: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+    shot_e2: Callable[[FloatArray], FloatArray] | None = None
     offset_dn: float = 0.0
     added: Callable[[tuple[int, ...], np.random.Generator], FloatArray] | None = None
     added_e: FloatArray | float = 0.0
@@ -223,7 +223,7 @@ def dn_moments(
     full = np.array(camera.full_well_e)
     full_dn = zero_dn + gain * float(full if read_out.response is None else read_out.response(full))
     by_charge = full_dn < camera.white_level_dn
-    noise = electrons if read_out.noise_e2 is None else np.maximum(read_out.noise_e2(electrons, electrons), 0.0)
+    noise = electrons if read_out.shot_e2 is None else np.maximum(read_out.shot_e2(electrons), 0.0)
     mean, variance = electrons, noise
     if by_charge:
         # to DN as it is, as the full well's own noise is none: what is clipped isn't clipped again
@@ -322,8 +322,8 @@ def _added_electrons(
 def _read_charge(mean: Float32Array, camera: CameraModel, rng: np.random.Generator, read_out: ReadOut) -> Float32Array:
     """Electrons after shot noise, full well, response and read noise."""
     charge = draw_electrons(mean, rng)
-    if read_out.noise_e2 is not None:
-        wanted = np.maximum(read_out.noise_e2(mean.astype(float), mean.astype(float)), 0.0)
+    if read_out.shot_e2 is not None:
+        wanted = np.maximum(read_out.shot_e2(mean.astype(float)), 0.0)
         charge = (mean + (charge - mean) * np.sqrt(wanted / np.maximum(mean, 1e-12))).astype(np.float32)
     if read_out.neighbours is not None:
         correlation = read_out.neighbours(mean.astype(float))

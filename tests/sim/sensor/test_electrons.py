@@ -106,7 +106,7 @@ def test_dark_frames_keep_their_mean_under_dsnu(colour_camera: CameraModel) -> N
 
 def test_the_read_out_bends_and_stirs(colour_camera: CameraModel) -> None:
     camera = colour_camera.model_copy(update={"rows": 200, "cols": 300})
-    read_out = ReadOut(lambda e: e * (1 - 1e-5 * e), lambda e, noise: noise * 0.9, 3.0)
+    read_out = ReadOut(lambda e: e * (1 - 1e-5 * e), lambda e: e * 0.9, 3.0)
     electrons = np.full((200, 300), 6000.0)
     mean, variance = (float(m[0, 0]) for m in dn_moments(electrons, camera, 0.0, read_out))
     assert mean == pytest.approx(243 + 0.35 * 6000 * 0.94)
