@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from lab.diagnose.measurements.block import Effects
-from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.reads import acting
 from lab.diagnose.measurements.study import Study
 from sim.effects.base import Effect
 from sim.spectrum import FloatArray, Spectrum, linear_shares
@@ -104,11 +104,11 @@ class CurveJacobian:
 
     def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
         """Rates (n,) and the modes' shares in them (n, modes)."""
-        spectral = tuple(e for e, acts in zip(effects, act_on(effects, SPECTRAL), strict=True) if acts)
+        spectral = acting(effects, SPECTRAL)
         if spectral not in self._kept:
             weight, level = self._weight, self._all_level
             model = Uniform(self.study.camera, spectral)
-            if any(act_on(spectral, frozenset({"light.spectrum"}))):
+            if acting(spectral, frozenset({"light.spectrum"})):
                 lit = {path: model.radiance(self.wavelength, r, self.kind) for path, r in self.radiance.items()}
                 changed = np.array([lit[path] for path, *_ in self.items])
                 weight, level = changed * self._curve, changed * self._level

@@ -17,7 +17,7 @@ from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.halo_light import Surroundings, halo_light, harmonics
 from lab.diagnose.measurements.held_out import held_out_of
-from lab.diagnose.measurements.reads import REFLECTIONS, act_on
+from lab.diagnose.measurements.reads import REFLECTIONS, acting
 from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -98,7 +98,7 @@ def screen_block(study: Study) -> Block:
             low = np.maximum(tail, 0.0) / noise.gain
             base = np.array([p.black for p in points]) / noise.gain
             shift = (model.response(base + low) - model.response(base)) * noise.gain - tail
-        if any(act_on(effects, REFLECTIONS)):
+        if acting(effects, REFLECTIONS):
             shift = shift + np.array([_copied(p, effects, camera) for p in points])
         return Prediction(wide_contrast(camera, effects) * tail + even_share(camera, effects) * lift + shift, {})
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.reads import acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.effects.base import Effect
@@ -75,7 +75,7 @@ def flicker_block(study: Study) -> Block:
     band = np.tile(np.arange(len(bands)), len(levels))
 
     def predict(effects: Effects) -> Prediction:
-        moving = any(act_on(effects, FLICKER))
+        moving = acting(effects, FLICKER)
         power, spread = 1.0 + offsets, np.zeros(len(value))
         if moving:
             found = [_modulation(study, level, effects, bands, step) for level in levels]

@@ -6,7 +6,7 @@ import numpy as np
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.pattern_fit import GHOST, joint_covariance, patterns
-from lab.diagnose.measurements.reads import REFLECTIONS, act_on
+from lab.diagnose.measurements.reads import REFLECTIONS, acting
 from lab.diagnose.measurements.study import Study
 
 GHOST_FLOOR = 1.5e-4
@@ -18,8 +18,8 @@ def ghost_block(study: Study) -> Block:
     value = np.array([p.value[b] for _, p, b in points])
 
     def predict(effects: Effects) -> Prediction:
-        acting = any(act_on(effects, REFLECTIONS))
-        return Prediction(np.array([p.ghost(effects) if acting else 0.0 for _, p, _ in points]), {})
+        reflecting = acting(effects, REFLECTIONS)
+        return Prediction(np.array([p.ghost(effects) if reflecting else 0.0 for _, p, _ in points]), {})
 
     return Block(
         measurement=PATTERN_GHOST, reach=1e9, value=value,

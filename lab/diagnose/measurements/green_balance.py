@@ -11,7 +11,7 @@ from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.even_flats import FlatLevel, dark_level_dn, flats, green_planes, green_ratio
 from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
-from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.reads import acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.frame import collected_mosaic
@@ -75,8 +75,8 @@ def green_block(study: Study) -> Block:
     cells = len(value) - len(ratios)
 
     def predict(effects: Effects) -> Prediction:
-        acting = any(act_on(effects, GREENS))
-        found = [_predicted_ratio(r, effects, study) if acting else 0.0 for r in ratios]
+        differing = acting(effects, GREENS)
+        found = [_predicted_ratio(r, effects, study) if differing else 0.0 for r in ratios]
         return Prediction(np.concatenate([found, np.zeros(cells)]), {})
 
     return Block(

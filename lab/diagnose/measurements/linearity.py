@@ -9,7 +9,7 @@ import numpy as np
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.noise_guess import repeated_levels
-from lab.diagnose.measurements.reads import LAG, act_on
+from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -55,7 +55,7 @@ def linearity_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         changed = relative
-        if any(act_on(effects, SPECTRAL)):
+        if acting(effects, SPECTRAL):
             changed = {}
             for (path, channel), share in relative.items():
                 below = electron_rate(study.camera, channel, study.spectrum(path))

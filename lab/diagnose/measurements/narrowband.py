@@ -13,7 +13,7 @@ from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, 
 from lab.diagnose.measurements.curves import CurveJacobian
 from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, beside_light_dn
-from lab.diagnose.measurements.reads import LAG, act_on
+from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -72,7 +72,7 @@ def narrowband_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
-        if not any(act_on(effects, LEVEL | LAG)):
+        if not acting(effects, LEVEL | LAG):
             # what acts on the light's colours alone leaves signals in proportion to its rates
             share = noise.gain * float(study.field.light.mean()) * exposures
             return Prediction(

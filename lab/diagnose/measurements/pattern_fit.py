@@ -39,7 +39,7 @@ from lab.diagnose.measurements.pattern_canvas import (
     mask_points,
     pattern_window,
 )
-from lab.diagnose.measurements.reads import SHOWN, act_on
+from lab.diagnose.measurements.reads import SHOWN, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.psf.screen_registration import ScreenWarp, register
@@ -247,13 +247,13 @@ def _shown_by(study: Study, design: _Design, canvas: Canvas) -> Callable[[Effect
     none = np.zeros(len(design.inverse))
 
     @lru_cache(maxsize=8)
-    def changed(acting: tuple[Effect, ...]) -> FloatArray:
-        change = canvas.picture((canvas.as_shown(acting, study.camera) - canvas.low) * design.passed)
+    def changed(showing: tuple[Effect, ...]) -> FloatArray:
+        change = canvas.picture((canvas.as_shown(showing, study.camera) - canvas.low) * design.passed)
         return np.asarray(design.inverse @ (design.columns @ change[design.mask]))
 
     def coefficients(effects: Effects) -> FloatArray:
-        acting = tuple(e for e, on in zip(effects, act_on(effects, SHOWN), strict=True) if on)
-        return changed(acting) if acting else none
+        showing = acting(effects, SHOWN)
+        return changed(showing) if showing else none
 
     return coefficients
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lab.diagnose.measurements.block import Effects
+from sim.effects.base import Effect
 from sim.effects.library import changed_by
 
 #: Of measurements in whose prediction the frame before enters.
@@ -14,6 +15,6 @@ REFLECTIONS = frozenset({"image.copies"})
 SHIFT = frozenset({"image.shift"})
 
 
-def act_on(effects: Effects, reads: frozenset[str]) -> list[bool]:
-    """Of each effect, whether it changes any of these quantities of the stages."""
-    return [not reads.isdisjoint(changed_by(effect)) for effect in effects]
+def acting(effects: Effects, reads: frozenset[str]) -> tuple[Effect, ...]:
+    """Those of the effects that change any of these quantities of the stages."""
+    return tuple(effect for effect in effects if not reads.isdisjoint(changed_by(effect)))

@@ -30,7 +30,7 @@ from lab.diagnose.measurements.edge_estimator import (
     spread_operator,
 )
 from lab.diagnose.measurements.edge_profiles import MeasuredEdge, measured_edges
-from lab.diagnose.measurements.reads import act_on
+from lab.diagnose.measurements.reads import acting
 from lab.diagnose.measurements.study import Study
 from lab.fit.rounding import rounding_waves_dn
 from sim.effects.base import Effect
@@ -71,11 +71,6 @@ KERNELS = frozenset({"charge.kernels"})
 K = TypeVar("K")
 V = TypeVar("V")
 _Key = tuple[Effect, ...]
-
-
-def _acting(effects: tuple[Effect, ...], reads: frozenset[str]) -> tuple[Effect, ...]:
-    """Those of the effects that change any of these quantities of the stages."""
-    return tuple(e for e, acts in zip(effects, act_on(effects, reads), strict=True) if acts)
 
 
 def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
@@ -268,11 +263,11 @@ class _Edges:
 
     def _sights_otf(self, effects: tuple[Effect, ...], place_um: tuple[float, float]) -> ComplexArray:
         """(sights, directions, nodes) at a place."""
-        spectral = _acting(effects, SPECTRAL)
+        spectral = acting(effects, SPECTRAL)
         nodes, shares, kink = self._wavelengths(spectral)
         fx, fy = self._frequencies
-        moving = _acting(effects, KERNELS) if self._camera.cfa != "MONO" else ()
-        optical = _acting(tuple(e for e in effects if e not in moving), TRANSFER)
+        moving = acting(effects, KERNELS) if self._camera.cfa != "MONO" else ()
+        optical = acting(tuple(e for e in effects if e not in moving), TRANSFER)
 
         def blurred() -> ComplexArray:
             whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical, place_um=place_um) for w in nodes])
@@ -342,12 +337,12 @@ class _Edges:
 
     def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
         """Change of the profiles (edges, distances) by the effects' shading, by responses that bend and by halos."""
-        changing = _acting(effects, CHANGING)
+        changing = acting(effects, CHANGING)
         return _kept(self._changes, changing, lambda: self._changed(changing))
 
     def _changed(self, effects: tuple[Effect, ...]) -> FloatArray | None:
         model = Uniform(self._camera, effects)
-        shading = _acting(effects, SHADING)
+        shading = acting(effects, SHADING)
         spread = halos(self._camera, effects)
         if not shading and model.is_linear and not spread:
             return None

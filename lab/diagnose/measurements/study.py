@@ -14,7 +14,7 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.noise_guess import NoiseGuess, noise_guess
-from lab.diagnose.measurements.reads import LAG, act_on
+from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE, clipping_level_dn
 from lab.diagnose.measurements.stale_frames import stale
 from lab.errors import NotDetermined
@@ -195,7 +195,7 @@ class Study:
     def carried_e(self, capture: Capture, channel: str, effects: Effects) -> float:
         """By how many electrons image lag changes a channel's mean, given what was read of it and of the capture
         before: read is y_t = (1 - q) x_t + q y_(t-1), of which q (y_(t-1) - y_t) is new. The first one follows empty pixels."""
-        if not any(act_on(effects, LAG)):
+        if not acting(effects, LAG):
             return 0.0
         model = Uniform(self.camera, effects)
         before = self._before.get(capture.id)
