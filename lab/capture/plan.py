@@ -42,6 +42,8 @@ def full_plan(station: Equipment, quick: bool = False, only: Collection[str] | N
     possible = [planned for kind in SEQUENCES.values() if (planned := kind.planned(station, quick)) is not None]
     if only is None:
         return CapturePlan(tuple(possible))
+    if unknown := set(only) - SEQUENCES.keys():
+        raise InputError(f"sequences: there is no {', '.join(sorted(unknown))}; name some of {', '.join(SEQUENCES)}")
     if missing := set(only) - {sequence.name for sequence in possible}:
         raise InputError(
             f"sequences: the station lacks instruments or targets for {', '.join(sorted(missing))}; "

@@ -219,6 +219,14 @@ def test_cancelling_ends_the_pipeline_before_the_next_step(
     assert [kept.kind for kept in reversed(store.results("s"))] == done  # what was done stays
 
 
+def test_a_session_takes_only_the_sequences_that_are_named(store: Store) -> None:
+    request = CaptureRequest(quick=True, only=("dark",))
+    found = run_pipeline(PipelineRequest("capture", capture=request), store=store, capturer=Bench(store))
+    assert found.session is not None
+    captures = store.captures(found.session)
+    assert captures and {capture.kind for capture in captures} == {"dark"}
+
+
 def test_only_with_a_station_is_anything_captured(store: Store) -> None:
     with pytest.raises(InputError, match="no station to capture on"):
         run_pipeline(PipelineRequest("capture", capture=CaptureRequest()), store=store)

@@ -135,3 +135,12 @@ def test_specs_refuse_unknown_axes() -> None:
     with pytest.raises(ValueError, match="need an exposure"):
         captures = DarkSequence(exposures_s=(1.0,), frames=1).steps(STATION)[0].captures
         Step(id="x", what="x", setting=Setting(target="cap"), captures=captures)
+
+
+def test_only_the_sequences_that_are_named_are_planned_in_their_order() -> None:
+    assert full_plan(STATION, only=["flat", "dark"]).names == ("dark", "flat")
+    with pytest.raises(InputError, match="there is no moon; name some of dark, flat, narrowband"):
+        full_plan(STATION, only=["dark", "moon"])
+    without_screen = STATION.model_copy(update={"display": None})
+    with pytest.raises(InputError, match="lacks instruments or targets for screen; leave it out"):
+        full_plan(without_screen, only=["dark", "screen"])
