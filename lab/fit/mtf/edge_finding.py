@@ -116,7 +116,8 @@ def refined_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
         change = np.linalg.lstsq(kept_columns @ columns.T, kept_columns @ residual, rcond=1e-10)[0][: terms + 1]
         # Profile and edge have a shift in common: the edge is put where the profile is half way.
         grid = np.linspace(-limit, limit, 401)
-        offset = half_way_px(grid, spline.design(grid) @ (esf - esf[0]) / (esf[-1] - esf[0]))
+        # The values are levelled: half way is 1/2. The outermost coefficients are of few samples and are no levels.
+        offset = half_way_px(grid, spline.design(grid) @ esf)
         change[0] = edge.sign * offset * tilt
         change = np.clip(change, -0.25 * limit, 0.25 * limit)
         edge = edge.shifted(np.concatenate([change, np.zeros(EDGE_ORDER - terms)]))

@@ -8,6 +8,7 @@ from scipy.special import erf, ndtr
 
 from lab.errors import NotDetermined
 from lab.fit.mtf import edge_mtf
+from lab.fit.mtf.edge_finding import half_way_px
 from lab.fit.mtf.estimate_mtf import planes_mtf
 from lab.fit.mtf.samples import Plane
 from tests.lab.fit.mtf.drawn_edges import edge, gaussian_mtf, gaussian_mtf50, noisy, squares
@@ -156,6 +157,17 @@ def test_edges_along_the_pixels_rows_and_diagonals(angle_deg):
     # where all samples fall on few distances the interval is wide, and it holds
     assert found.mtf50_cy_per_px == pytest.approx(gaussian_mtf50(0.55), abs=4 * found.mtf50_cy_per_px_std)
     assert found.mtf50_cy_per_px_std < 0.1 * found.mtf50_cy_per_px
+
+
+@pytest.mark.parametrize("offset_px", [-1.7, 0.0, 0.3, 2.6])
+def test_the_edge_lies_half_way_where_its_samples_fall_on_few_distances(offset_px):
+    """At atan(3/4) the distances of one colour's pixels are multiples of 0.4 px, and few are as far out as the last of them."""
+    rng = np.random.default_rng(5)
+    for _ in range(10):
+        image = noisy(edge(60, np.degrees(np.arctan2(3, 4)), 0.7, offset_px=offset_px, step=2), rng)
+        found = planes_mtf([Plane(image, step=2)])
+        # its standard deviation is 0.01 px; a tenth of the blur's width is next to nothing for the estimator
+        assert abs(half_way_px(found.distance_px, found.esf)) < 0.07
 
 
 def test_greens_of_an_edge_at_45_deg_are_refused():
