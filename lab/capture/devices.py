@@ -260,6 +260,7 @@ class CamerasDevice(Device):
         self.frames: dict[Side, Frame] = {}
         self.levels: dict[Side, float] = dict.fromkeys(self.cameras, 0.0)
         self.stored: dict[Side, StoredFile] = {}
+        self.in_series = False  # whether the frame before is kept and nothing has moved since
 
     def prepare(self, shot: Shot) -> Status:
         self.shot, self.frames, self.stored = shot, {}, {}
@@ -274,6 +275,7 @@ class CamerasDevice(Device):
         shot = self.shot
 
         def take() -> None:
+            self.in_series = False
             try:
                 together = capture_together(list(self.cameras.values()))
             except NoAnswer:
@@ -290,6 +292,7 @@ class CamerasDevice(Device):
             self.levels = {side: level_of(frame.raw, self.sheets[side]) for side, frame in frames.items()}
             self.stored = {side: self.write(path, side, frames[side].raw) for side, path in shot.paths.items()}
             self.frames = frames
+            self.in_series = bool(shot.paths)
 
         return Status("cameras", take, 2 * max(shot.exposure_s.values()) + READOUT_S)
 

@@ -25,6 +25,10 @@ Plan = Generator[Msg, Any, T]
 SATURATED, UNLIT = 0.9, 0.01
 TRIES = 14
 
+#: Frames that are read and not kept before a capture in new light, or after a test exposure. What a camera of image lag q holds of
+#: the light before falls to q^3.
+DUMMY_FRAMES = 2
+
 
 @dataclass(frozen=True)
 class Taken:
@@ -37,31 +41,30 @@ class Taken:
 
 def arrange(step: Step, instruments: Instruments) -> Plan[None]:
     """Set the bench for the step, moving only what differs. Raises InputError for a missing instrument."""
-    setting = step.setting
-    group = "arrange"
+    setting, light, cameras = step.setting, instruments.light, instruments.cameras
+    moves: list[tuple[Any, Any]] = []
     if setting.target is not None:
         if instruments.target is None:
             raise InputError(
                 f"station: step {step.id!r} needs target {setting.target!r} and there is no [stage]; add one (driver 'prompt' asks you)"
             )
-        if instruments.target.value != setting.target:
-            yield from bps.abs_set(instruments.target, setting.target, group=group)
-    if instruments.light is not None and instruments.shutter is not None:
-        lit = setting.wavelength_nm is not None
-        if not lit and instruments.shutter.value is not False:
-            yield from bps.abs_set(instruments.shutter, False, group=group)
-        if setting.wavelength_nm is not None:
-            light = LightSetting(setting.wavelength_nm, setting.slit_um)
-            if instruments.light.value != light:
-                yield from bps.abs_set(instruments.light, light, group=group)
+        moves.append((instruments.target, setting.target))
+    if light is not None and instruments.shutter is not None:
+        if setting.wavelength_nm is None:
+            moves.append((instruments.shutter, False))
+        else:
+            moves.append((light, LightSetting(setting.wavelength_nm, setting.slit_um)))
     if instruments.screen is not None:
-        pattern = ShownPattern(setting.pattern, setting.cell_px if setting.pattern else 1)
-        if instruments.screen.value != pattern:
-            yield from bps.abs_set(instruments.screen, pattern, group=group)
-    yield from bps.wait(group=group)
+        moves.append((instruments.screen, ShownPattern(setting.pattern, setting.cell_px if setting.pattern else 1)))
+    moves = [(device, value) for device, value in moves if device.value != value]
+    for device, value in moves:
+        yield from bps.abs_set(device, value, group="arrange")
+    yield from bps.wait(group="arrange")
     # Last: before the grating has arrived, the light has another wavelength.
-    if instruments.shutter is not None and setting.wavelength_nm is not None and not instruments.shutter.value:
+    opens = instruments.shutter is not None and setting.wavelength_nm is not None and not instruments.shutter.value
+    if opens:
         yield from bps.abs_set(instruments.shutter, True, wait=True)
+    cameras.in_series = cameras.in_series and not moves and not opens
 
 
 def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
@@ -153,9 +156,12 @@ def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str
             instruments.limits.gain_db,
             {capture.side: capture.frame for capture in step.captures},
         )
+        dummies = 0 if cameras.in_series or not step.captures else DUMMY_FRAMES
+        for _ in range(dummies):
+            yield from _shoot(instruments, Shot(shot.exposure_s, shot.gain_db, {}))
         yield from _shoot(instruments, shot)
         files += cameras.stored.values()
-        captures = _completed(step, instruments)
+        captures = _completed(step, instruments, dummies)
         result |= {"level": dict(cameras.levels)}
     yield from bps.create(name=step.sequence)
     for device in instruments.devices:
@@ -183,8 +189,8 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
     }
 
 
-def _completed(step: Step, instruments: Instruments) -> tuple[Capture, ...]:
-    """The step's captures with the keys that the trigger and the instruments tell."""
+def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
+    """The step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
     readings = {key: value for device in instruments.devices for key, value in device.readings().items()}
     completed = []
     for capture in step.captures:
@@ -194,6 +200,7 @@ def _completed(step: Step, instruments: Instruments) -> tuple[Capture, ...]:
             "gain_db": frame.gain_db,
             "temperature_c": frame.temperature_c,
             "time": frame.time,
+            "dummy_frames": dummies or None,
         }
         for key, field in type(capture).model_fields.items():
             for mark in field.metadata:

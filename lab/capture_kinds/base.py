@@ -86,6 +86,7 @@ class Capture(Open):
     gain_db: float | None = None
     temperature_c: float | None = None
     time: datetime | None = None
+    dummy_frames: int | None = Field(default=None, ge=0)  # of the same light and exposure, directly before; not kept
 
     @classmethod
     def unsupported(cls, document: dict[str, Any]) -> str | None:

@@ -180,11 +180,12 @@ class Study:
 
     @cached_property
     def _before(self) -> dict[str, Capture]:
-        """The capture before each, in the order of their times where all have one, else in the manifest's."""
+        """The capture before each, in the order of their times where all have one, else in the manifest's. A capture after
+        dummy frames follows one like itself."""
         order: list[Capture] = list(self.recordings.captures(side=self.side))
         if all(c.time is not None for c in order):
             order.sort(key=self.elapsed_s)
-        return {c.id: before for before, c in pairwise(order)}
+        return {c.id: before for before, c in pairwise(order)} | {c.id: c for c in order if c.dummy_frames}
 
     def settled(self, group: Sequence[C]) -> list[C]:
         """Repeats that follow another of them, and so hold no image lag of another level; all where these are fewer than two."""

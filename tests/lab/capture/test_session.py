@@ -21,6 +21,7 @@ from drivers.instrument import Identity
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.store import Store
+from lab.capture.take_step import DUMMY_FRAMES
 from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandSequence
@@ -116,6 +117,19 @@ def test_exposures_are_found_for_each_camera(store: Store) -> None:
         recordings = store.recording_set(session.id)
         flat = next(c for c in recordings.captures("flat", side) if "level-02" in c.id)  # type: ignore[arg-type]
         assert recordings.frame(flat).mean() == pytest.approx(BLACK + 0.5 * (4095 - BLACK), rel=0.08)
+
+
+def test_no_capture_follows_a_frame_of_other_light_that_is_not_kept(store: Store) -> None:
+    """Image lag of such a frame couldn't be predicted: dummy frames come first, and the manifest says how many."""
+    bench = Bench()
+    plan = CapturePlan((*LIT.sequences, NarrowbandSequence(from_nm=500, to_nm=510, step_nm=10, passes=2)))
+    session = begin(store, bench, plan)
+    session.run()
+    dummies = {c.id: c.dummy_frames for c in store.recording_set(session.id).captures(side="left")}
+    in_series = {name for name in dummies if name.startswith("flat-")} - {"flat-level-01-1-left"}
+    in_series |= {"narrowband-510nm-2-left"}  # the way back begins where the way there ended
+    assert {name for name, count in dummies.items() if count is None} == in_series
+    assert set(dummies.values()) == {None, DUMMY_FRAMES}
 
 
 @pytest.mark.parametrize("slope", [1.0, 500.0, 1e7])

@@ -28,6 +28,7 @@ from mocks.former.laws import (
     StrayLightLaw,
     WavelengthOffsetLaw,
 )
+from sim.effects.image_lag import ImageLag
 from sim.effects.second_order_light import SecondOrderLight
 from sim.spectrum import Spectrum
 from tests.lab.diagnose.on_blocks import UNIFORM, former, measured_model, names, rendered, sigmas, study, verdict
@@ -159,3 +160,15 @@ def test_a_warmer_frame_s_dark_current_is_free() -> None:
     assert slope == pytest.approx([0.0, 0.3 * looked_at.noise.dark_dn_per_s * capture.exposure_s])
     looked_at.temperature_c = None
     assert looked_at.free_warmth([capture]) == {}
+
+
+def test_after_dummy_frames_image_lag_holds_nothing_of_the_capture_before() -> None:
+    at = study(rendered(3))
+    bright, dark = at.recordings.captures("flat", "left")[-1], at.recordings.captures("dark", "left")[0]
+    assert at.carried_e(bright, at.channels[0], (ImageLag(lag_percent=2.0),)) != 0.0
+    manifest = at.recordings.manifest
+    after = [c.model_copy(update={"dummy_frames": 2}) for c in manifest.captures]
+    at.recordings.manifest = manifest.model_copy(update={"captures": tuple(after)})
+    again = study(at.recordings)
+    for capture in (bright, dark):
+        assert again.carried_e(capture, again.channels[0], (ImageLag(lag_percent=2.0),)) == 0.0
