@@ -252,9 +252,10 @@ class Bench:
         """Air temperature at the bench: 23 degrees, within 0.1."""
         return AIR_C + 0.1 * float(np.sin(2 * np.pi * (self.clock.now() - self._started_s) / 5400.0))
 
-    def sensor_temperature_c(self, side: Side) -> float:
-        """Temperature of one camera's sensor, as the camera itself reports it."""
-        warmer = -self._warm_up_c * float(np.expm1(-(self.clock.now() - self._started_s) / WARMING_S))
+    def sensor_temperature_c(self, side: Side, at_s: float | None = None) -> float:
+        """Temperature of one camera's sensor at a virtual time, None: now, as the camera itself reports it."""
+        since_s = (self.clock.now() if at_s is None else at_s) - self._started_s
+        warmer = -self._warm_up_c * float(np.expm1(-since_s / WARMING_S))
         return self.temperature_c + SELF_HEATING_C[side] + warmer
 
     def sensor(self, side: Side) -> tuple[int, int, float]:
@@ -285,7 +286,11 @@ class Bench:
         if side == "right" and not (isinstance(seen, UniformField) and seen.kind != "black"):
             source *= right_over_left(camera.model, camera.acting)
         exposure = Exposure(
-            seen, exposure_s, gain_db, self.sensor_temperature_c(side), elapsed_s=self._elapsed_s(begin_s)
+            seen,
+            exposure_s,
+            gain_db,
+            self.sensor_temperature_c(side, begin_s + 0.5 * exposure_s),
+            elapsed_s=self._elapsed_s(begin_s),
         )
         with self._camera_locks[side]:
             held = collected_electrons(light, camera.model, exposure, camera.acting, source=source)

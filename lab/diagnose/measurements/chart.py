@@ -9,8 +9,10 @@ import numpy as np
 from lab.capture_kinds.chart import ChartCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.curves import CurveJacobian
+from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.halo_light import Surroundings, halo_light, harmonics
 from lab.diagnose.measurements.held_out import held_out_of
+from lab.diagnose.measurements.reads import DARK_CURRENT
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE
 from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
@@ -82,8 +84,10 @@ def chart_block(study: Study) -> Block:
         electrons = electrons * _mixing(study, points, electrons, model)
         veil = even_share(camera, effects) * surround + halo_light([p.around for p in points], effects, camera)
         electrons = wide_contrast(camera, effects) * electrons + (veil + tail) / noise.gain + ambient
-        out = model.response(electrons + noise.dark_dn_per_s / noise.gain * exposures)
-        lit = out * noise.gain - noise.dark_dn_per_s * exposures
+        more = added_dark_dn(study, effects)
+        dark = noise.dark_dn_per_s * exposures + np.array([more(p.captures[0]) for p in points])
+        out = model.response(electrons + dark / noise.gain)
+        lit = out * noise.gain - dark
         shift = np.array([study.offset(p.captures[0], effects) for p in points])
         jacobian = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
         jacobian |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.jacobian(effects).items()}
@@ -101,7 +105,7 @@ def chart_block(study: Study) -> Block:
         labels=tuple(
             Label(float(names[p.name]), p.channel, p.name, tuple(c.id for c in p.captures), p.held_out) for p in points
         ),
-        reads=(LEVEL - {"light.level"}) | SPECTRAL | {"image.veils"},
+        reads=(LEVEL - {"light.level"}) | SPECTRAL | DARK_CURRENT | {"image.veils"},
         predict=predict,
         scale=signal,
     )

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 
+from lab.capture_kinds.base import Capture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_frames import CELLS, DarkStatistics, conditions, dark_frames
+from lab.diagnose.measurements.dark_frames import DarkStatistics, conditions, dark_frames
 from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
-from lab.diagnose.measurements.reads import LAG
+from lab.diagnose.measurements.reads import DARK_CURRENT, LAG
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
+#: Points of the grid on which a dark current over the field is evaluated, at most. A grid that is much coarser than the pixels
+#: moves the laws' origin and the cells' borders: at 50 DN of glow in a corner by a hundred standard deviations of a cell's mean.
+MOST_POINTS = 1e6
+
 
 def dark_current_map(study: Study, effects: Effects, temperature_c: float | None) -> FloatArray:
-    """Dark current (e/s) on a coarse grid of 12 x 12 points a cell or more: the laws are smooth on this scale."""
+    """Dark current (e/s) by pixel, or by squares of pixels where the frame has more than `MOST_POINTS`."""
     camera = study.camera
-    down = max(min(camera.rows // (12 * CELLS[0]), camera.cols // (12 * CELLS[1])), 1)
+    down = math.ceil(math.sqrt(camera.rows * camera.cols / MOST_POINTS))
     coarse = camera.model_copy(
         update={
             "rows": camera.rows // down,
@@ -35,6 +44,14 @@ def added_dark_e_per_s(study: Study, effects: Effects, temperature_c: float | No
     return float(dark_current_map(study, effects, temperature_c).mean()) - study.camera.dark_current_e_per_s
 
 
+def added_dark_dn(study: Study, effects: Effects) -> Callable[[Capture], float]:
+    """By how many DN effects change the mean dark signal of a capture."""
+    if not Uniform(study.camera, effects).changes_dark_current:
+        return lambda capture: 0.0
+    rate_at = cache(lambda temperature_c: added_dark_e_per_s(study, effects, temperature_c))
+    return lambda capture: study.noise.gain * rate_at(capture.temperature_c) * capture.exposure_s
+
+
 def dark_level_block(study: Study) -> Block:
     """Mean of every dark frame, DN.
 
@@ -49,10 +66,10 @@ def dark_level_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         mean = base + np.array([study.offset(c, effects) for c, *_ in captures])
-        more = {t: added_dark_e_per_s(study, effects, t) for t in {k.temperature_c for _, k, _ in captures}}
-        for i, (capture, condition, _) in enumerate(captures):
+        more = added_dark_dn(study, effects)
+        for i, (capture, _, _) in enumerate(captures):
             carried = np.mean([study.carried_e(capture, c, effects) for c in study.channels])
-            mean[i] += gain * (more[condition.temperature_c] * capture.exposure_s + float(carried))
+            mean[i] += more(capture) + gain * float(carried)
         return Prediction(mean, study.free_offsets(exposures))
 
     # codes as coarse as the noise move a mean, depending on where it lies between two of them
@@ -60,12 +77,12 @@ def dark_level_block(study: Study) -> Block:
     same = np.array([[a[1] is b[1] for b in captures] for a in captures])
     # the position of smoothness: 10 degrees count as twice the range of exposures
     reach = float(max(np.ptp(exposures), 1e-3))
-    warmer = np.array([0.0 if k.temperature_c is None or study.temperature_c is None else k.temperature_c - study.temperature_c for _, k, _ in captures])  # fmt: skip
+    warmer = np.array([0.0 if k.temperature_c is None or noise.dark_c is None else k.temperature_c - noise.dark_c for _, k, _ in captures])  # fmt: skip
     return Block(
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
         covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | {"signal.offset_dn", "charge.dark_current"}, predict=predict, scale=np.ones(len(value)),
+        reads=LAG | DARK_CURRENT | {"signal.offset_dn"}, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from lab.capture_kinds.base import Capture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.noise_guess import repeated_levels
-from lab.diagnose.measurements.reads import LAG, acting
+from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -61,7 +64,7 @@ def linearity_block(study: Study) -> Block:
                 below = electron_rate(study.camera, channel, study.spectrum(path))
                 above = electron_rate(study.camera, channel, study.spectrum(path), effects)
                 changed[path, channel] = share * (above / below if below > 0 else 1.0)
-        model = Uniform(study.camera, effects)
+        model, beside = Uniform(study.camera, effects), beside_light_dn(study, effects)
         field = model.field(study.field)
         mean, lit = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
@@ -72,7 +75,7 @@ def linearity_block(study: Study) -> Block:
                 collected = model.electrons(rates, capture.exposure_s, field=field, elapsed_s=elapsed)
                 done[capture.id] = model.mean_dn(collected)
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
-            mean[i] = done[capture.id][channel] + beside_light_dn(study, capture, channel, effects)
+            mean[i] = done[capture.id][channel] + beside(capture, channel)
         jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
         for lamp, channel in rate:
             jacobian[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
@@ -88,14 +91,20 @@ def linearity_block(study: Study) -> Block:
     return Block(
         measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
-        reads=LEVEL | LAG, predict=predict, scale=signal,
+        reads=LEVEL | LAG | DARK_CURRENT, predict=predict, scale=signal,
     )  # fmt: skip
 
 
-def beside_light_dn(study: Study, capture: Any, channel: str, effects: Effects) -> float:
-    """DN of a channel's mean that isn't light's: black level, image lag, offsets."""
-    lag_dn = study.noise.gain * study.carried_e(capture, channel, effects)
-    return study.noise.black + lag_dn + study.offset(capture, effects)
+def beside_light_dn(study: Study, effects: Effects) -> Callable[[Capture, str], float]:
+    """DN of a capture's mean by channel that are neither of light nor of the camera's own dark current: black level, image lag,
+    offsets, additional dark current."""
+    more = added_dark_dn(study, effects)
+
+    def beside(capture: Capture, channel: str) -> float:
+        lag_dn = study.noise.gain * study.carried_e(capture, channel, effects)
+        return study.noise.black + lag_dn + study.offset(capture, effects) + more(capture)
+
+    return beside
 
 
 def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:

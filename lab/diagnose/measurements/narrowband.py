@@ -13,7 +13,7 @@ from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, 
 from lab.diagnose.measurements.curves import CurveJacobian
 from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, beside_light_dn
-from lab.diagnose.measurements.reads import LAG, acting
+from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -72,7 +72,7 @@ def narrowband_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
-        if not acting(effects, LEVEL | LAG):
+        if not acting(effects, LEVEL | LAG | DARK_CURRENT):
             # what acts on the light's colours alone leaves signals in proportion to its rates
             share = noise.gain * float(study.field.light.mean()) * exposures
             return Prediction(
@@ -81,6 +81,7 @@ def narrowband_block(study: Study) -> Block:
         lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
         model = Uniform(study.camera, effects)
         field = model.field(study.field)
+        beside = beside_light_dn(study, effects)
         mean, share = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
         for i, (capture, channel, _, _) in enumerate(points):
@@ -90,14 +91,14 @@ def narrowband_block(study: Study) -> Block:
                     by_channel, capture.exposure_s, field=field, elapsed_s=study.elapsed_s(capture)
                 )
                 done[capture.id] = model.mean_dn(electrons)
-            mean[i] = done[capture.id][channel] + beside_light_dn(study, capture, channel, effects)
+            mean[i] = done[capture.id][channel] + beside(capture, channel)
             share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
         return Prediction(mean, jacobian_of(effects, share))
 
     return Block(
         measurement=NARROWBAND, reach=25.0, value=value, covariance=covariance,
         labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
-        reads=LEVEL | LAG | SPECTRAL, predict=predict, scale=np.maximum(signal, 1.0),
+        reads=LEVEL | LAG | DARK_CURRENT | SPECTRAL, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
 
 

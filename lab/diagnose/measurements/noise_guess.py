@@ -33,6 +33,7 @@ class NoiseGuess:
 
     black: float
     dark_dn_per_s: float
+    dark_c: float | None  # the sensor's temperature at which the dark current holds
     gain: float  # 1 where nothing tells it
     gain_is_known: bool
     read_dn: float
@@ -51,6 +52,7 @@ def noise_guess(study: Study) -> NoiseGuess:
     recordings, stated = study.recordings, study.stated
     black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
     dark, read, jitter = 0.0, 1.0, BLACK_FLOOR_DN
+    dark_c = study.temperature_c
     # the dark current is anything: within reason, what a data sheet says or some tens of electrons
     expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
     dark_std = max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5)
@@ -69,7 +71,10 @@ def noise_guess(study: Study) -> NoiseGuess:
         if len(t) > 1 and np.ptp(t) > 0:
             dark, black = (float(v) for v in np.polyfit(t, level, 1))
             dark = max(dark, 0.0)
-            dark_std = max(0.2 * dark, 0.5)
+            warm = [c for i in near for c in darks[i] if c.temperature_c is not None]
+            if warm:  # the longest ones tell
+                dark_c = float(np.average([c.temperature_c for c in warm], weights=[c.exposure_s for c in warm]))
+            dark_std = max(dark, 0.5)  # effects (a glow, hot pixels) may be all of it
         else:
             black = float(level[0])
             black_std += dark_std * float(t[0])
@@ -89,7 +94,7 @@ def noise_guess(study: Study) -> NoiseGuess:
         gain = _scene_gain(study, black, read)
     known = gain is not None and gain > 0
     gain = gain if gain is not None and known else 1.0
-    return NoiseGuess(black, dark, gain, known, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
+    return NoiseGuess(black, dark, dark_c, gain, known, read, prnu, jitter, max(lamp, LAMP_FLOOR), black_std, dark_std)
 
 
 def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:

@@ -8,6 +8,8 @@ from sim.effects.library import changed_by
 
 #: Of measurements in whose prediction the frame before enters.
 LAG = frozenset({"charge.lag"})
+#: Of measurements in which dark current is a nuisance parameter.
+DARK_CURRENT = frozenset({"charge.dark_current"})
 #: Of measurements of patterns: what a screen shows of what it is asked for, and reflections of the whole image.
 SHOWN = frozenset({"light.screen"})
 REFLECTIONS = frozenset({"image.copies"})

@@ -74,8 +74,8 @@ class Study:
                 "read_noise_e": self.noise.read_dn / self.noise.gain,
                 "full_well_e": (self.saturation_dn - self.noise.black) / self.noise.gain,
                 "dark_current_reference_c": camera.dark_current_reference_c
-                if self.temperature_c is None
-                else self.temperature_c,
+                if self.noise.dark_c is None
+                else self.noise.dark_c,
             }
         )
 
@@ -218,11 +218,11 @@ class Study:
         }
 
     def free_warmth(self, captures: Sequence[Capture]) -> dict[str, FloatArray]:
-        """Jacobian by the change of dark current per degree, for captures at another temperature than most. Dark frames don't take it:
+        """Jacobian by the change of dark current per degree, for captures at another temperature than the dark frames. Dark frames don't take it:
         they measure the change."""
-        if self.temperature_c is None:
+        if self.noise.dark_c is None:
             return {}
-        warmer = [0.0 if c.temperature_c is None else c.temperature_c - self.temperature_c for c in captures]
+        warmer = [0.0 if c.temperature_c is None else c.temperature_c - self.noise.dark_c for c in captures]
         exposures = np.array([c.exposure_s for c in captures])
         return {"warmth": WARMTH_STD * self.noise.dark_dn_per_s * exposures * np.array(warmer)}
 

@@ -81,7 +81,7 @@ def test_a_gain_that_only_scenes_show_is_named(gain: float) -> None:
         found = verdict.named[0]
         std = found.std["gain_percent"]
         assert std is not None
-        assert abs(found.effect.gain_percent - laws[0].a) < 3 * std  # type: ignore[attr-defined]
+        assert abs(found.effect.gain_percent - laws[0].signed_strength) < 3 * std  # type: ignore[attr-defined]
     with pytest.raises(NotDetermined, match="less than 1 s apart"):
         time_block(study)
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from lab.diagnose.measurements.dark_frames import cell_means
+from lab.diagnose.measurements.dark_level import added_dark_dn, dark_current_map
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, linearity_block
 from lab.diagnose.measurements.narrowband import (
     MOST_SAMPLE_STD,
@@ -28,9 +32,11 @@ from mocks.former.laws import (
     StrayLightLaw,
     WavelengthOffsetLaw,
 )
+from sim.effects.amplifier_glow import AmplifierGlow
 from sim.effects.image_lag import ImageLag
 from sim.effects.second_order_light import SecondOrderLight
 from sim.spectrum import Spectrum
+from sim.uniform import Uniform
 from tests.lab.diagnose.on_blocks import UNIFORM, former, measured_model, names, rendered, sigmas, study, verdict
 
 LEVELS: list[tuple[Law, bool]] = [
@@ -150,15 +156,15 @@ def test_standard_deviation_within_readings_is_measured_and_capped(std: float) -
 
 
 def test_a_warmer_frame_s_dark_current_is_free() -> None:
-    """A tenth of the dark current for each degree above the session's median; nothing where no temperature is stated."""
+    """A tenth of the dark current for each degree above the dark frames; nothing where no temperature is stated."""
     recordings = former(35, kinds=UNIFORM)
     looked_at = study(recordings)
     capture = recordings.captures("narrowband")[0]
-    assert looked_at.temperature_c is not None
-    warm = capture.model_copy(update={"temperature_c": looked_at.temperature_c + 3.0})
+    assert looked_at.noise.dark_c is not None
+    warm = capture.model_copy(update={"temperature_c": looked_at.noise.dark_c + 3.0})
     slope = looked_at.free_warmth([capture.model_copy(update={"temperature_c": None}), warm])["warmth"]
     assert slope == pytest.approx([0.0, 0.3 * looked_at.noise.dark_dn_per_s * capture.exposure_s])
-    looked_at.temperature_c = None
+    looked_at.noise = replace(looked_at.noise, dark_c=None)
     assert looked_at.free_warmth([capture]) == {}
 
 
@@ -172,3 +178,26 @@ def test_after_dummy_frames_image_lag_holds_nothing_of_the_capture_before() -> N
     again = study(at.recordings)
     for capture in (bright, dark):
         assert again.carried_e(capture, again.channels[0], (ImageLag(lag_percent=2.0),)) == 0.0
+
+
+def test_a_glow_that_brightens_darks_brightens_light_frames_as_much() -> None:
+    """Dark current is one nuisance parameter of darks, flats and narrowband light: what an effect adds is the same in all."""
+    at = study(rendered(3))
+    glow = (AmplifierGlow(glow_e_per_s=40.0, reach_mm=0.3),)
+    more = added_dark_dn(at, glow)
+    block = linearity_block(at)
+    change = block.predict(glow).mean - block.predict(()).mean
+    captures = {c.id: c for c in at.recordings.captures("flat", "left")}
+    wanted = [more(captures[label.captures[0]]) for label in block.labels]
+    assert min(wanted) > 0.0
+    np.testing.assert_allclose(change, wanted, rtol=1e-9)
+
+
+def test_a_dark_current_over_the_field_is_that_of_the_pixels() -> None:
+    """A coarse grid would move the glow's corner and the cells' borders: by 4 % of a cell's mean at 8 px a point."""
+    at = study(rendered(3))
+    glow = (AmplifierGlow(glow_e_per_s=60.0, reach_mm=0.5, corner="bottom_right"),)
+    at.camera = at.camera.model_copy(update={"rows": 384, "cols": 512})
+    found = cell_means(dark_current_map(at, glow, None).astype(np.float32))
+    expected = cell_means(Uniform(at.camera, glow).dark_e_per_s(None).astype(np.float32))
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
