@@ -92,12 +92,17 @@ def board(
 
 
 def pattern(
-    camera: ConcealedCamera, target: Array, radiance: Array, dark: float, cell_px: float = 4.0
+    camera: ConcealedCamera,
+    target: Array,
+    radiance: Array,
+    dark: float,
+    cell_px: float = 4.0,
+    turn_deg: float = TURN_DEG,
 ) -> dict[str, Array]:
-    """Cells on a screen, turned by 0.6 degrees, of brightness `dark` to 1."""
+    """Cells of `cell_px` on a screen, turned by `turn_deg`, of brightness `dark` to 1."""
     r = ((np.arange(camera.rows * FINE) + 0.5) / FINE - 0.5 - (camera.rows - 1) / 2)[:, None]
     c = ((np.arange(camera.cols * FINE) + 0.5) / FINE - 0.5 - (camera.cols - 1) / 2)[None, :]
-    t = np.deg2rad(TURN_DEG)
+    t = np.deg2rad(turn_deg)
     # each fine sample is a mean over its square: else the cells' turned borders would be jagged
     inside = (np.arange(PARTS) + 0.5) / PARTS / FINE - 0.5 / FINE
     middle = (camera.rows - 1) / 2, (camera.cols - 1) / 2

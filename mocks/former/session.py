@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mocks.former.camera import STEP_S, ConcealedCamera
 from mocks.former.law import FULL_CODE_DN, WAVELENGTH_NM, Array
-from mocks.former.scenes import BoardPose, board, chart, edge, pattern
+from mocks.former.scenes import TURN_DEG, BoardPose, board, chart, edge, pattern
 
 BEGIN = datetime(2026, 3, 2, 9, tzinfo=UTC)
 LINE_SIGMA_NM = 4.2466  # a full width of 10 nm
@@ -34,6 +34,7 @@ class Plan:
     warm        darks at two higher temperatures, too
     shuttle     flats up and down again
     exposures   edges at a quarter of the exposure in four times the light, too
+    screen_cell_px, screen_turn_deg   the size of a screen's cells in the camera, and how far the screen is turned
     """
 
     kinds: tuple[str, ...] = ("dark", "flat", "narrowband", "chart", "slanted_edge", "screen")
@@ -42,6 +43,8 @@ class Plan:
     shuttle: bool = False
     exposures: bool = False
     repeats: int = 3
+    screen_cell_px: float = 4.0
+    screen_turn_deg: float = TURN_DEG
 
 
 WHOLE_SESSION = Plan()
@@ -210,9 +213,14 @@ class _Recorder:
         noise = np.zeros((80, 104), np.uint8)
         noise[4:-4, 4:-4] = np.random.default_rng([camera.seed, 4]).integers(0, 2, (72, 96))
         exposure_s = camera.exposure_for(light, 0.8)
-        where: Any = {"screen": {"pose": "p0", "cell_camera_px": 4.0, "radiance": path}}
-        self.take("white", pattern(camera, np.ones((80, 104)), light, SCREEN_BLACK), exposure_s, 3, **where)
-        self.take("black", pattern(camera, np.zeros((80, 104)), light, SCREEN_BLACK), exposure_s, 3, **where)
+        as_placed = plan.screen_cell_px, plan.screen_turn_deg
+        where: Any = {"screen": {"pose": "p0", "cell_camera_px": plan.screen_cell_px, "radiance": path}}
+        self.take("white", pattern(camera, np.ones((80, 104)), light, SCREEN_BLACK, *as_placed), exposure_s, 3, **where)
+        self.take(
+            "black", pattern(camera, np.zeros((80, 104)), light, SCREEN_BLACK, *as_placed), exposure_s, 3, **where
+        )
         self.targets |= {"targets/0.npy": checkerboard, "targets/1.npy": noise}
         for kind, (file, target) in zip(("checkerboard", "bernoulli"), self.targets.items(), strict=True):
-            self.take(kind, pattern(camera, target, light, SCREEN_BLACK), exposure_s, 3, target=file, **where)
+            self.take(
+                kind, pattern(camera, target, light, SCREEN_BLACK, *as_placed), exposure_s, 3, target=file, **where
+            )

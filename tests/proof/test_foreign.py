@@ -53,6 +53,18 @@ def test_two_effects_of_another_image_former_are_named() -> None:
     assert result.held_out.chi2_after < 1.3 * result.held_out.n
 
 
+@pytest.mark.slow  # half a minute; a screen of the second former is placed likewise in tests of the measurement
+def test_a_filter_before_an_aligned_screen_is_named() -> None:
+    """Truth: 1.9 um along rows and columns; the screen stands within 0.04 degrees, its cells are 4.0 px."""
+    result = _shared("foreign_screen_aligned")
+    assert result.verdict == "explained"
+    assert [e.name for e in result.effects] == ["optical_low_pass_filter"]
+    for field in ("displacement_x_um", "displacement_y_um"):
+        found = result.effects[0].parameters[field]
+        assert found.std is not None
+        assert abs(found.value - 1.9) < 2.0 * found.std
+
+
 CASES: list[tuple[str, tuple[Law, ...], str]] = [
     ("healthy mono", (), "MONO"),
     ("glare", (VeilingGlareLaw(2.0, 0),), "GRBG"),

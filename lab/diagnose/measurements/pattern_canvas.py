@@ -28,7 +28,8 @@ LARGEST_PX = 320  # largest side of the part that is fitted: enough for a band's
 MARGIN_PX = 12  # border of the frame and of that part that is left out: drawings there lack light from outside
 MARGIN_CELLS = 2.0
 #: Edges of the bands above half a cycle a pixel, by the larger of both frequencies: they are fitted, not measured.
-BEYOND_CY_PER_PX = (0.5, 0.62, 0.8, 4.0)
+#: Rings beyond the bands, each with the finer rings at whose middles an effect's transfer is taken.
+BEYOND_CY_PER_PX = ((0.5, 0.54, 0.58, 0.62), (0.62, 0.68, 0.74, 0.8), (0.8, 0.9, 1.0, 1.15, 1.35, 4.0))
 LEAST_PIXELS = 1500
 
 
@@ -61,6 +62,22 @@ def pattern_window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -
         low -= low % 2  # mosaics keep their phase
         slices.append(slice(low, low + size))
     return slices[0], slices[1]
+
+
+@dataclass(frozen=True)
+class BeyondPart:
+    """A part of the drawing beyond the bands: its picture, and the two frequencies (the same, mirrored) at which its power lies in the
+    mean."""
+
+    picture: FloatArray
+    fx: tuple[float, float]
+    fy: tuple[float, float]
+
+    @staticmethod
+    def of(picture: FloatArray, fx: FloatArray, fy: FloatArray, power: FloatArray) -> BeyondPart:
+        """`power` (rows, cols / 2 + 1) of the part at the frequencies `fx` (1, cols / 2 + 1) and `fy` (rows, 1)."""
+        x, y = (float(np.average(np.broadcast_to(np.abs(f), power.shape), weights=power)) for f in (fx, fy))
+        return BeyondPart(picture, (x, x), (y, -y))
 
 
 @dataclass(frozen=True)
@@ -134,8 +151,9 @@ class Canvas:
         """Back to the window's pixels."""
         return np.asarray(fft.irfft2(spectrum, self.shape))
 
-    def beyond(self, otf: CubicSpline, fill_factor: float) -> list[FloatArray]:
-        """What the lens passes above half a cycle a pixel, at the pixels: by ring and by whether it lies nearer to rows or columns.
+    def beyond(self, otf: CubicSpline, fill_factor: float) -> list[list[BeyondPart]]:
+        """What the lens passes above half a cycle a pixel, at the pixels: by ring and by whether it lies nearer to rows or columns, each
+        in finer rings.
 
         Cells of whole pixels repeat their spectrum: what aliases is coherent with what doesn't.
         """
@@ -153,15 +171,24 @@ class Canvas:
         high *= np.exp(1j * np.pi * fx * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fx / OVERSAMPLE)
         high *= np.exp(1j * np.pi * fy * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fy / OVERSAMPLE)
         largest, across = np.maximum(np.abs(fy), fx), fx >= np.abs(fy)
+        passes = np.hypot(fy, fx) < highest
         found = []
-        for low, end in pairwise(BEYOND_CY_PER_PX):
+        for edges in BEYOND_CY_PER_PX:
             for side in (across, ~across):
-                part = np.where((largest >= low) & (largest < end) & (np.hypot(fy, fx) < highest) & side, high, 0.0)
-                spread = np.zeros((rows, part.shape[1]), complex)
-                spread[keep] = part
-                folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
-                folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
-                found.append(np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE]))
+                parts = []
+                for low, end in pairwise(edges):
+                    part = np.where((largest >= low) & (largest < end) & passes & side, high, 0.0)
+                    power = np.abs(part) ** 2
+                    if not power.any():
+                        continue
+                    spread = np.zeros((rows, part.shape[1]), complex)
+                    spread[keep] = part
+                    folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
+                    folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
+                    picture = np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
+                    parts.append(BeyondPart.of(picture, fx, fy, power))
+                if parts:
+                    found.append(parts)
         return found
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.pattern_fit import Pattern, joint_covariance, patterns
+from lab.diagnose.measurements.pattern_fit import EVEN_TERMS, Pattern, even_powers, joint_covariance, patterns
 from lab.diagnose.measurements.reads import SHOWN
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -57,8 +57,11 @@ def contrast_block(study: Study) -> Block:
             for sights, before in zip(poses, plain, strict=True):
                 changed = _transfers(study, sights, effects) / np.where(np.abs(before) > 1e-3, before, np.inf)
                 for (p, members, parts), ratio in zip(sights.values(), changed, strict=True):
-                    placed, (real, imaginary) = _in_place(p, ratio), weights[id(p)]
-                    kept = real @ np.real(placed) + imaginary @ np.imag(placed) + p.shown_by(effects)[: len(real)]
+                    real, imaginary, outside = weights[id(p)]
+                    within, beyond = np.split(ratio, [real.shape[1]])
+                    placed = _in_place(p, within)
+                    kept = real @ np.real(placed) + imaginary @ np.imag(placed) + outside @ (np.real(beyond) - 1.0)
+                    kept = kept + p.shown_by(effects)[: len(real)]
                     mean[members] = kept[parts]
             mean[~np.isfinite(mean)] = 1.0
         jacobian = {"pattern:blur": -2.0 * np.square(np.pi * SCREEN_BLUR_PX * frequency) * mean}
@@ -76,19 +79,25 @@ def contrast_block(study: Study) -> Block:
 def _transfers(
     study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
 ) -> NDArray[np.complex128]:
-    """Of a pose's channels at the frequencies of all bands, one after another: (channels, nodes)."""
+    """Of a pose's channels at the frequencies of all bands and of the parts beyond, one after another: (channels, nodes)."""
     first = next(iter(sights.values()))[0]
-    fx, fy = np.concatenate([b.fx for b in first.bands]), np.concatenate([b.fy for b in first.bands])
+    fx = np.concatenate([*(b.fx for b in first.bands), first.beyond[:, 0].ravel()])
+    fy = np.concatenate([*(b.fy for b in first.bands), first.beyond[:, 1].ravel()])
     lit = [(channel, first.light) for channel in sights]
     nodes, shares = common_wavelengths(study.camera, lit, effects, "bernoulli")
     whole = [transfer_at(study.camera, float(w), fx, fy, effects) for w in nodes]
     return np.asarray(np.tensordot(shares, np.array(whole), 1), complex)
 
 
-def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray]:
-    """What a transfer's real and its imaginary part at all bands' nodes do to the bands' coefficients, (bands, nodes) each: by its means
-    over the lower and the upper half of every band."""
-    halves = np.zeros((2 * len(p.bands), sum(len(b.fx) for b in p.bands)))
+def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What a transfer's real and its imaginary part at all bands' nodes, and its real part at the places beyond the bands, do to the
+    bands' coefficients, (bands, nodes) each.
+
+    The real part is a sum of even powers of the frequency, by least squares over the nodes, and a rest. The rest and the imaginary part
+    act by their means over the lower and the upper half of every band.
+    """
+    fx, fy = (np.concatenate([getattr(band, name) for band in p.bands]) for name in ("fx", "fy"))
+    halves = np.zeros((2 * len(p.bands), len(fx)))
     start = 0
     for k, band in enumerate(p.bands):
         own = slice(start, start + len(band.fx))
@@ -96,7 +105,13 @@ def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray]:
         for row, use in zip(halves[2 * k : 2 * k + 2], (~band.upper, band.upper), strict=True):
             share = np.where(use, band.share, 0.0)
             row[own] = share / share.sum() if share.sum() > 0 else band.share
-    return p.mix[:, : len(halves)] @ halves, p.mix[:, len(halves) :] @ halves
+    ends = np.cumsum([EVEN_TERMS, len(halves), len(halves)])
+    smooth, by_half, by_phase, by_part = np.split(p.mix, ends, axis=1)
+    powers = np.transpose(even_powers(fx, fy))
+    weight = np.sqrt(np.concatenate([band.power * band.share for band in p.bands]))
+    fit = np.linalg.pinv(weight[:, None] * powers) * weight
+    outside = 0.5 * np.repeat(by_part, 2, axis=1)  # of two places each
+    return smooth @ fit + by_half @ (halves - halves @ powers @ fit), by_phase @ halves, outside
 
 
 def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex128]:

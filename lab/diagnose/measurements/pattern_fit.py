@@ -13,7 +13,7 @@ alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -31,6 +31,7 @@ from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.pattern_canvas import (
+    BeyondPart,
     Canvas,
     below_nyquist,
     channel_pixels,
@@ -52,6 +53,11 @@ from sim.spectrum import FloatArray, Spectrum
 RINGS_CY_PER_PX = (0.0, 0.03, 0.08, 0.14, 0.2, 0.27, 0.34, 0.42, 0.5)
 SECTORS = 4  # orientations of a half turn: about 0, 45, 90, 135 degrees
 NODES = (4, 3)  # of a band, in radius and angle, at which an effect's transfer is taken
+#: Even powers of the frequency, up to this order in both directions together, in which a transfer's change is smooth over all bands; the
+#: rest acts by halves of bands. A pattern is strongest at low frequencies, and where its cells are a whole number of pixels, a mosaic's
+#: red and blue pixels see the same numbers at f and 1/2 cy/px - f: what is drawn wrongly within a strong band leaks into a weak one.
+EVEN_ORDER = 8
+EVEN_TERMS = sum(order + 1 for order in range(0, EVEN_ORDER + 1, 2))
 GHOST_BLUR_PX = 3.0
 LEAST_BEYOND = 5e-4  # of the contrast: weaker parts beyond the bands are taken as drawn
 REFINEMENTS = 2
@@ -70,7 +76,8 @@ class Pattern:
     value: FloatArray  # (bands + MORE + parts beyond the bands,)
     shown: FloatArray  # covariance by what differs from repeat to repeat
     common: FloatArray  # ... and by what white, black and drawing share
-    mix: FloatArray  # (bands, 4 bands): what the halves of the bands, then their phases, contribute to the bands' coefficients
+    mix: FloatArray  # (bands, EVEN_TERMS + 4 bands + parts): what even powers of the frequency, halves of bands, their phases, and parts beyond do to them
+    beyond: FloatArray  # (parts, 2, 2): frequencies (fx of two places, fy of two places) of the parts beyond the bands
     shown_by: Callable[[Effects], FloatArray]  # as `value`: what screens that show greys otherwise change
     levels_e: tuple[float, float]  # electrons of black and of white
     light: Spectrum | None
@@ -179,16 +186,21 @@ def _measured(
     found = []
     for channel in camera.channels:
         design = _Design.of(study, canvas, channel, light, whole, turned, laid)
-        moved = design.coefficients(whole[window][design.mask])[design.shifts]
+        picture = whole[window]
+        moved = design.coefficients(picture[design.mask])[design.shifts]
         points = mask_points(design.mask, window)
         field = _field(camera, points, moved)
+        drawn = canvas
         if channel != reference and np.abs(field).max() > MOVED_PX:
             # too far for a linear step: the pattern is drawn anew at the shifted place
             there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
-            drawn = Canvas.of(target, warp.displaced(there), window)
-            design = _Design.of(study, drawn, channel, light, whole, turned, laid)
-        else:
-            drawn, moved = canvas, np.zeros(len(moved))
+            displaced = Canvas.of(target, warp.displaced(there), window)
+            anew = _Design.of(study, displaced, channel, light, whole, turned, laid)
+            # where cells are a whole number of pixels, a loss of contrast looks like a shift
+            if anew.left_rms(picture) < design.left_rms(picture):
+                design, drawn = anew, displaced
+        if drawn is canvas:
+            moved = np.zeros(len(moved))
         area = contrast[window][design.mask]
         exposure = group[0].exposure_s
         levels = (
@@ -210,7 +222,7 @@ def _measured(
             found.append(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
-                    value=value, shown=shown, common=common, mix=design.mix, shown_by=shown_by, levels_e=levels, light=light,
+                    value=value, shown=shown, common=common, mix=design.mix, beyond=design.beyond, shown_by=shown_by, levels_e=levels, light=light,
                     ghost=ghost_by, reach=design.reach,
                 )
             )  # fmt: skip
@@ -275,11 +287,36 @@ def _refined(
     picture, across, down = (
         canvas.picture(part * spectrum)[mask] for part in (below_nyquist(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
     )
-    picture = picture + np.sum(canvas.beyond(otf, study.camera.fill_factor), axis=0)[mask]
+    picture = (
+        picture
+        + np.sum([p.picture for parts in canvas.beyond(otf, study.camera.fill_factor) for p in parts], axis=0)[mask]
+    )
     terms = warp.basis(mask_points(mask, window))
-    columns = np.concatenate([across * terms, down * terms, [picture, np.ones_like(picture)]])
-    step = np.linalg.lstsq(columns @ columns.T, columns @ (seen[window][mask] - picture), rcond=1e-12)[0]
-    return warp.displaced(step[:-2].reshape(2, -1))
+    # with contrasts of their own: where cells are a whole number of pixels, a loss of contrast looks like a displacement
+    bands = [canvas.picture(np.where(part, spectrum, 0.0))[mask] for *_, part in _band_masks(canvas)]
+    columns = np.concatenate([across * terms, down * terms, bands, [np.ones_like(picture)]])
+    scale = np.sqrt(np.mean(columns**2, axis=1))[:, None]
+    columns = columns / scale
+    step = np.linalg.lstsq(columns @ columns.T, columns @ (seen[window][mask] - picture), rcond=1e-12)[0] / scale[:, 0]
+    return warp.displaced(step[: 2 * len(terms)].reshape(2, -1))
+
+
+def _band_masks(canvas: Canvas) -> Iterator[tuple[tuple[float, float], float | None, NDArray[np.bool_]]]:
+    """Every band that has frequencies: the ends of its ring, the middle of its sector (none: the whole ring), and where it lies."""
+    fy, fx = canvas.frequencies
+    radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
+    for i, (low, high) in enumerate(pairwise(RINGS_CY_PER_PX)):
+        ring = (radius >= low) & (radius < high)
+        for k in range(SECTORS if i else 1):
+            away = _away(angle, k * np.pi / SECTORS)
+            part = ring & (np.abs(away) <= 0.5 * np.pi / SECTORS) if i else ring
+            if part.any():
+                yield (low, high), k * np.pi / SECTORS if i else None, part
+
+
+def _away(angle: FloatArray, middle: float) -> FloatArray:
+    """Angles from the middle of a sector, of directions without a sense: -pi/2..pi/2."""
+    return np.asarray(np.mod(angle - middle + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -291,7 +328,8 @@ class _Design:
     columns: FloatArray
     fixed: FloatArray
     inverse: FloatArray  # of the normal matrix
-    mix: FloatArray  # (bands, 4 bands): what the halves of the bands, then their phases, contribute to the bands' coefficients
+    mix: FloatArray  # (bands, EVEN_TERMS + 4 bands + parts): what even powers of the frequency, halves of bands, their phases, and parts beyond do to them
+    beyond: FloatArray  # (parts, 2, 2): frequencies (fx of two places, fy of two places) of the parts beyond the bands
     passed: FloatArray  # the transfer that the picture was drawn with: (rows, cols / 2 + 1)
     reach: float
 
@@ -315,28 +353,28 @@ class _Design:
         mask = channel_pixels(study, canvas, channel, seen)
         power = np.abs(spectrum) ** 2
         bands, columns, halves, turned_halves = [], [], [], []
+        inside = radius < RINGS_CY_PER_PX[-1]
+        smooth = [canvas.picture(np.where(inside, term * spectrum, 0.0))[mask] for term in even_powers(fx, fy)]
         low_part = np.zeros(canvas.shape)
-        for i, (low, high) in enumerate(pairwise(RINGS_CY_PER_PX)):
-            ring = (radius >= low) & (radius < high)
-            for k in range(SECTORS if i else 1):
-                middle = k * np.pi / SECTORS
-                away = np.mod(angle - middle + 0.5 * np.pi, np.pi) - 0.5 * np.pi
-                part = ring & (np.abs(away) <= 0.5 * np.pi / SECTORS) if i else ring
-                if not part.any():
-                    continue
-                # in two halves, so that what a transfer does within the band is known
-                sides = [part & (radius < 0.5 * (low + high)), part & (radius >= 0.5 * (low + high))]
-                pieces = [canvas.picture(np.where(side, spectrum, 0.0)) for side in sides]
-                # a quarter of a period on along the band's direction: what a transfer's phase adds
-                on = 1j * np.where(np.cos(angle - middle) >= 0, spectrum, -spectrum)
-                turned_halves += [canvas.picture(np.where(side, on, 0.0))[mask] for side in sides]
-                picture = pieces[0] + pieces[1]
-                low_part += picture
-                columns.append(picture[mask])
-                halves += [piece[mask] for piece in pieces]
-                bands.append(_band(part, radius, away, middle, laid, power, (low, high), whole=not i))
-        beyond = [canvas.picture(np.where((radius >= RINGS_CY_PER_PX[-1]) & below_nyquist(canvas), spectrum, 0.0))]
-        beyond += canvas.beyond(otf, camera.fill_factor)
+        for (low, high), sector, part in _band_masks(canvas):
+            middle = sector or 0.0
+            away = _away(angle, middle)
+            # in two halves, so that what a transfer does within the band is known
+            sides = [part & (radius < 0.5 * (low + high)), part & (radius >= 0.5 * (low + high))]
+            pieces = [canvas.picture(np.where(side, spectrum, 0.0)) for side in sides]
+            # a quarter of a period on along the band's direction: what a transfer's phase adds
+            on = 1j * np.where(np.cos(angle - middle) >= 0, spectrum, -spectrum)
+            turned_halves += [canvas.picture(np.where(side, on, 0.0))[mask] for side in sides]
+            picture = pieces[0] + pieces[1]
+            low_part += picture
+            columns.append(picture[mask])
+            halves += [piece[mask] for piece in pieces]
+            bands.append(_band(part, radius, away, middle, laid, power, (low, high), whole=sector is None))
+        corner = (radius >= RINGS_CY_PER_PX[-1]) & below_nyquist(canvas)
+        parts = [[BeyondPart.of(canvas.picture(np.where(corner, spectrum, 0.0)), fx, fy, np.where(corner, power, 0.0))]]
+        parts += canvas.beyond(otf, camera.fill_factor)
+        beyond = [np.sum([part.picture for part in together], axis=0) for together in parts]
+        outside = [part for together in parts for part in together]
         picture = (low_part + np.sum(beyond, axis=0))[mask]
         across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
         u, v, r2 = from_middle(camera, mask_points(mask, canvas.window))
@@ -359,8 +397,10 @@ class _Design:
         scale = np.sqrt(np.mean(table**2, axis=1))
         normal = (table / scale[:, None]) @ (table / scale[:, None]).T
         inverse = np.linalg.inv(normal) / np.outer(scale, scale)
-        mix = (inverse @ (table @ np.array(halves + turned_halves).T))[: len(bands)]
-        return _Design(mask, tuple(bands), table, fixed, inverse, mix, passed, float(np.sqrt(r2.max())))
+        pieces = [*smooth, *halves, *turned_halves, *(part.picture[mask] for part in outside)]
+        mix = (inverse @ (table @ np.array(pieces).T))[: len(bands)]
+        beyond_f = np.array([part.fx + part.fy for part in outside]).reshape(len(outside), 2, 2)
+        return _Design(mask, tuple(bands), table, fixed, inverse, mix, beyond_f, passed, float(np.sqrt(r2.max())))
 
     @property
     def shifts(self) -> slice:
@@ -369,6 +409,12 @@ class _Design:
 
     def coefficients(self, seen: FloatArray) -> FloatArray:
         return np.asarray(self.inverse @ (self.columns @ (seen - self.fixed)))
+
+    def left_rms(self, picture: FloatArray) -> float:
+        """Root mean square of what the fit leaves of the window's picture, at the channel's pixels."""
+        seen = picture[self.mask]
+        left = seen - self.fixed - self.coefficients(seen) @ self.columns
+        return float(np.sqrt(np.mean(np.square(left))))
 
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coefficients; their covariance by `temporal`, the variance (pixels,) that repeats average out; and by the rest.
@@ -381,6 +427,12 @@ class _Design:
         shown = self.inverse @ ((self.columns * temporal) @ self.columns.T) @ self.inverse
         share = max(1.0 - float(temporal.mean() / np.mean(left**2)), 0.0)
         return value, shown, share * spread
+
+
+def even_powers(fx: FloatArray, fy: FloatArray) -> list[FloatArray]:
+    """fx^i fy^j of even i + j up to `EVEN_ORDER`, in units of the highest frequency of the bands."""
+    x, y = fx / RINGS_CY_PER_PX[-1], fy / RINGS_CY_PER_PX[-1]
+    return [x ** (n - k) * y**k for n in range(0, EVEN_ORDER + 1, 2) for k in range(n + 1)]
 
 
 def _band(

@@ -13,6 +13,7 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import Verdict, decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.refit import refit
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.cell_borders import cell_border_block
 from lab.diagnose.measurements.dark_squares import screen_block
@@ -28,8 +29,10 @@ from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former import laws as concealed
+from sim.effects.charge_diffusion import ChargeDiffusion
 from sim.effects.defocus import Defocus
 from sim.effects.ghost import Ghost
+from sim.effects.optical_low_pass_filter import OpticalLowPassFilter
 from sim.effects.screen_gamma import ScreenGamma
 
 OF_SCREENS = [one for one in measurements() if 400 < one.order < 500]
@@ -144,6 +147,34 @@ def test_defocus_changes_the_contrast_as_predicted() -> None:
         n = len(residual)
         chi2 = float(residual @ np.linalg.solve(gaussian.covariance, residual))
         assert low * n < chi2 < high * n + 4 * np.sqrt(2 * n)  # 4 sigma of a chi2 of n numbers
+
+
+@pytest.mark.parametrize(
+    ("cell_px", "turn_deg"),
+    [(4.0, 0.04), pytest.param(3.0, 0.0, marks=pytest.mark.slow), pytest.param(5.3, 1.7, marks=pytest.mark.slow)],
+)
+def test_a_filter_is_predicted_on_a_screen_of_any_geometry(cell_px: float, turn_deg: float) -> None:
+    """Cells of 4.0 px, hardly turned: red and blue pixels see f and 1/2 cy/px - f as the same numbers. chi2 of n numbers is at most
+    n + 3 sqrt(2 n), and a filter fits better than what else blurs."""
+    law = concealed.OpticalLowPassFilterLaw(1.9, 0)
+    plan = Plan(kinds=("dark", "flat", "screen"), screen_cell_px=cell_px, screen_turn_deg=turn_deg)
+    camera = ConcealedCamera(61, (law,), cfa="BGGR", f_number=5.6, rows=288, cols=384)
+    study = study_of(recordings_of(camera, plan))
+    model = measured_model(study, contrast_block)
+    fits = {
+        effect.name: refit(model, (effect,), DecisionPolicy())
+        for effect in (
+            OpticalLowPassFilter(displacement_x_um=1.9, displacement_y_um=1.9),
+            ChargeDiffusion(length_um=1.0),
+        )
+    }
+    found = fits["optical_low_pass_filter"]
+    n = int(model.seen.sum())
+    assert model.seen_gaussian(found.effects).chi2(model.seen_value) < n + 3.0 * np.sqrt(2.0 * n)
+    assert found.log_posterior > fits["charge_diffusion"].log_posterior
+    for name, std in found.std[0].items():
+        assert std is not None
+        assert abs(getattr(found.effects[0], name) - 1.9) < 3.0 * std
 
 
 def test_what_was_measured_dies_with_its_study() -> None:
