@@ -11,8 +11,9 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import DarkStatistics, conditions, dark_frames
+from lab.diagnose.measurements.line_means import line_mean_jacobian
 from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
-from lab.diagnose.measurements.reads import DARK_CURRENT, LAG
+from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
@@ -70,7 +71,8 @@ def dark_level_block(study: Study) -> Block:
         for i, (capture, _, _) in enumerate(captures):
             carried = np.mean([study.carried_e(capture, c, effects) for c in study.channels])
             mean[i] += more(capture) + gain * float(carried)
-        return Prediction(mean, study.free_offsets(exposures))
+        lines = line_mean_jacobian(study, [(c, None) for c, *_ in captures], effects)
+        return Prediction(mean, study.free_offsets(exposures) | lines)
 
     # codes as coarse as the noise move a mean, depending on where it lies between two of them
     coarse = np.array([_rounding_dn(f) for f in frames for _ in f.condition.captures])
@@ -82,7 +84,7 @@ def dark_level_block(study: Study) -> Block:
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
         covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | DARK_CURRENT | {"signal.offset_dn"}, predict=predict, scale=np.ones(len(value)),
+        reads=LAG | DARK_CURRENT | LINES | {"signal.offset_dn"}, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 

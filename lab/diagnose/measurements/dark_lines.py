@@ -16,6 +16,7 @@ from lab.diagnose.measurements.dark_frames import (
     fine_conditions,
 )
 from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance
+from lab.diagnose.measurements.reads import LINES
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor.lines import Lines
@@ -25,7 +26,6 @@ from sim.uniform import Uniform
 BANDS = 6  # of a spectrum over lines
 POWER_FLOOR = 0.02  # of a band's power: what isn't quite white in a healthy read-out
 LEAST_LINE_DN = 0.3  # the same of lines' means
-LINES = frozenset({"signal.lines"})
 
 
 def temporal_line_block(lines: Lines, study: Study) -> Block:

@@ -11,8 +11,9 @@ from lab.capture_kinds.base import Capture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.line_means import line_mean_jacobian
 from lab.diagnose.measurements.noise_guess import repeated_levels
-from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, acting
+from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -57,13 +58,7 @@ def linearity_block(study: Study) -> Block:
     covariance = _level_covariance(study, groups, points, signal)
 
     def predict(effects: Effects) -> Prediction:
-        changed = relative
-        if acting(effects, SPECTRAL):
-            changed = {}
-            for (path, channel), share in relative.items():
-                below = electron_rate(study.camera, channel, study.spectrum(path))
-                above = electron_rate(study.camera, channel, study.spectrum(path), effects)
-                changed[path, channel] = share * (above / below if below > 0 else 1.0)
+        changed = _changed(study, relative, effects)
         model, beside = Uniform(study.camera, effects), beside_light_dn(study, effects)
         field = model.field(study.field)
         mean, lit = np.empty(len(points)), np.empty(len(points))
@@ -77,6 +72,7 @@ def linearity_block(study: Study) -> Block:
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
             mean[i] = done[capture.id][channel] + beside(capture, channel)
         jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+        jacobian |= line_mean_jacobian(study, [(c, channel) for c, channel, *_ in points], effects)
         for lamp, channel in rate:
             jacobian[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
         if len(lights) > len(set(study.lamps.values())):
@@ -91,8 +87,20 @@ def linearity_block(study: Study) -> Block:
     return Block(
         measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
-        reads=LEVEL | LAG | DARK_CURRENT, predict=predict, scale=signal,
+        reads=LEVEL | LAG | DARK_CURRENT | LINES, predict=predict, scale=signal,
     )  # fmt: skip
+
+
+def _changed(study: Study, relative: dict[tuple[str, str], float], effects: Effects) -> dict[tuple[str, str], float]:
+    """Rates of light in each channel, by (spectrum, channel), over those of the lamp's first reading, as effects change them."""
+    if not acting(effects, SPECTRAL):
+        return relative
+    changed = {}
+    for (path, channel), share in relative.items():
+        below = electron_rate(study.camera, channel, study.spectrum(path))
+        above = electron_rate(study.camera, channel, study.spectrum(path), effects)
+        changed[path, channel] = share * (above / below if below > 0 else 1.0)
+    return changed
 
 
 def beside_light_dn(study: Study, effects: Effects) -> Callable[[Capture, str], float]:

@@ -12,8 +12,9 @@ from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.curves import CurveJacobian
 from lab.diagnose.measurements.held_out import held_out_of
+from lab.diagnose.measurements.line_means import line_mean_jacobian
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, beside_light_dn
-from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, acting
+from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -68,6 +69,7 @@ def narrowband_block(study: Study) -> Block:
     def jacobian_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
         """By the nuisance parameters; `share`: DN over electrons a second on axis."""
         jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
+        jacobian |= line_mean_jacobian(study, [(c, channel) for c, channel, *_ in points], effects)
         return jacobian | {k: v * share for k, v in curves.jacobian(effects).items()}
 
     def predict(effects: Effects) -> Prediction:
@@ -98,7 +100,7 @@ def narrowband_block(study: Study) -> Block:
     return Block(
         measurement=NARROWBAND, reach=25.0, value=value, covariance=covariance,
         labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
-        reads=LEVEL | LAG | DARK_CURRENT | SPECTRAL, predict=predict, scale=np.maximum(signal, 1.0),
+        reads=LEVEL | LAG | DARK_CURRENT | LINES | SPECTRAL, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
 
 

@@ -10,6 +10,8 @@ from sim.effects.library import changed_by
 LAG = frozenset({"charge.lag"})
 #: Of measurements in which dark current is a nuisance parameter.
 DARK_CURRENT = frozenset({"charge.dark_current"})
+#: Of measurements of single frames' means.
+LINES = frozenset({"signal.lines"})
 #: Of measurements of patterns: what a screen shows of what it is asked for, and reflections of the whole image.
 SHOWN = frozenset({"light.screen"})
 REFLECTIONS = frozenset({"image.copies"})
