@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
-from lab.challenge.live import NOT_LOOKED_FOR, FoundParameter, LiveRun, every_case
+from lab.challenge.live import FoundParameter, LiveRun, every_case, names_of
 from lab.challenge.proof import ABSTAINED, RIGHT, WRONG, placed
 from sim.effects.library import effects as library
 
@@ -38,9 +38,9 @@ def summary(runs: Mapping[str, LiveRun]) -> str:
     for name, group in groups.items():
         counts = ", ".join(f"{outcome} {n}" for outcome, n in Counter(run.outcome for run in group).most_common())
         lines.append(f"| {name} | {len(group)} | {counts or '-'} |")
-    unseen = sorted(name for name in NOT_LOOKED_FOR if name in runs)
+    unseen = sorted(name for name in runs if name in library() and name not in names_of(name))
     if unseen:
-        lines.append(f"\nNot looked for, so that no name is right: {', '.join(unseen)}.")
+        lines.append(f"\nNot looked for, or shown by no measurement, so that no name is right: {', '.join(unseen)}.")
     return "\n".join(lines)
 
 
