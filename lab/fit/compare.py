@@ -126,7 +126,6 @@ def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
     """
     if isinstance(model, POINTS):
         return
-    std_factor = _model_error(model) if isinstance(model, GeometryFit) else 1.0
     axis_name = next((name for name in AXES if name in type(model).model_fields), "")
     axis = np.array(getattr(model, axis_name), dtype=float) if axis_name else None
     for field in type(model).model_fields:
@@ -141,30 +140,20 @@ def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
             continue
         elif isinstance(value, dict):
             for key in value.keys() & std.keys():
-                yield _listed(f"{name} {key}", value[key], std[key], axis_name, axis, std_factor)
+                yield _listed(f"{name} {key}", value[key], std[key], axis_name, axis)
         else:
-            yield _listed(name, value, std, axis_name, axis, std_factor)
+            yield _listed(name, value, std, axis_name, axis)
 
 
-def _listed(
-    name: str, value: Any, std: Any, axis_name: str, axis: Array | None, std_factor: float
-) -> tuple[str, _Numbers]:
+def _listed(name: str, value: Any, std: Any, axis_name: str, axis: Array | None) -> tuple[str, _Numbers]:
     values, stds = np.atleast_1d(np.array(value, dtype=float)), np.atleast_1d(np.array(std, dtype=float))
     along = axis if axis is not None and values.shape == axis.shape else None
-    return name, _Numbers(name, values, std_factor * stds, axis_name if along is not None else "", along)
+    return name, _Numbers(name, values, stds, axis_name if along is not None else "", along)
 
 
 def _identity(model: Frozen) -> str:
     """Name of a model in a list: its text fields."""
     return " ".join(str(value) for field in type(model).model_fields if isinstance(value := getattr(model, field), str))
-
-
-def _model_error(geometry: GeometryFit) -> float:
-    """Factor by which the uncertainties of a geometry are too small, where its own halves differ beyond them; else
-    1.
-    """
-    own = geometry.cross_validation
-    return max(1.0, own.difference_px / own.expected_px) if own is not None and own.model_error_px > 0 else 1.0
 
 
 def _compared(
@@ -254,7 +243,7 @@ def _covariance(fit: GeometryFit) -> Array | None:
     found = np.zeros((COUNT, COUNT))
     at = [NAMES.index(name) for name in fit.parameters if name in NAMES]
     found[np.ix_(at, at)] = np.array(fit.covariance)[: len(at), : len(at)]
-    return found * _model_error(fit) ** 2
+    return found
 
 
 def _projection(a: GeometryFit, b: GeometryFit, side: Side) -> ProjectionChange | Skipped:

@@ -46,6 +46,7 @@ from lab.fit.geometry.pinhole import (
     unproject,
 )
 from lab.fit.geometry.projection_errors import grid, grid_points
+from lab.fit.geometry.recordings import corner_errors
 from lab.fit.tuples import numbers, rows, triple, triples
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
@@ -112,6 +113,7 @@ def fit_pairs(
         reason = f"rms {of_pairs[worst]:.2f} px, where the other pairs have {np.median(of_pairs):.2f} px"
         rejected.append(Skipped(step=f"pose {pairs[worst].left.capture.pose}", reason=reason))
         pairs = [pair for k, pair in enumerate(pairs) if k != worst]
+    solution = BundleAdjustment(rig_observations(pairs), solution.free, shapes[0]).with_correlated_errors(solution)
     alone = max(left.rms_px, right.rms_px)
     if not solution.rms_px < max(NO_RIG * alone, 1.0) or not solution.determined:
         raise NotDetermined(
@@ -153,18 +155,26 @@ def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
     return np.append(np.ones(8, dtype=bool), intrinsics_of_fit(fit)[8:] != 0.0)
 
 
+def rig_observations(pairs: Sequence[StereoPair]) -> list[Observation]:
+    """Pair by pair, left then right; pairs of equal boards share the board."""
+    keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
+    found = []
+    for k, pair in enumerate(pairs):
+        board = keys.index(board_key(pair.left))
+        found += [Observation(pair.left, k, board, 0), Observation(pair.right, k, board, 1)]
+    return found
+
+
 def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit, shape: tuple[int, int]) -> Solution:
     """Joint least squares of the rig, the intrinsics of both cameras, the warps of the boards and their poses.
 
-    It starts from the fits of the single cameras. Observations are pair by pair, left then right. `shape`: (rows,
+    It starts from the fits of the single cameras. Its covariance takes corners as independent. Observations are pair by pair, left then right. `shape`: (rows,
     cols).
     """
     cameras = np.array([intrinsics_of_fit(left), intrinsics_of_fit(right)])
-    keys = list(dict.fromkeys(board_key(pair.left) for pair in pairs))
-    observations, poses, turns, translations = [], [], [], []
-    for k, pair in enumerate(pairs):
-        board = keys.index(board_key(pair.left))
-        observations += [Observation(pair.left, k, board, 0), Observation(pair.right, k, board, 1)]
+    observations = rig_observations(pairs)
+    poses, turns, translations = [], [], []
+    for pair in pairs:
         (rotation_one, translation_one), (rotation_two, translation_two) = (
             board_pose(view, camera) for view, camera in zip((pair.left, pair.right), cameras, strict=True)
         )
@@ -176,7 +186,7 @@ def solve_rig(pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
         intrinsics=cameras,
         rotation=Rotation.from_rotvec(np.median(turns, axis=0)).as_matrix(),
         translation_mm=np.median(translations, axis=0),
-        warps_mm=np.zeros((len(keys), 3)),
+        warps_mm=np.zeros((1 + max(one.board for one in observations), 3)),
         rotations=np.array([turn for turn, _ in poses]),
         translations_mm=np.array([shift for _, shift in poses]),
     )
@@ -213,6 +223,7 @@ def _result(
         parameters=solution.names,
         covariance=rows(solution.covariance),
         corner_px_std=solution.noise_px,
+        corner_errors=corner_errors(solution),
         rejected=rejected,
         rectification=rectification(state, pairs, shapes[0]) if shapes[0] == shapes[1] else None,
         depth=tuple(depth_uncertainty(solution, depth_mm, shapes) for depth_mm in depths_mm),

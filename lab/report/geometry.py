@@ -219,6 +219,14 @@ def facts(geometry: GeometryFit) -> list[tuple[str, str]]:
     if geometry.corner_px_std is not None:
         noise = f", {geometry.corner_noise_px:.4f} px expected from image noise" if geometry.corner_noise_px else ""
         rows.append(("standard deviation of a corner's coordinate", f"{geometry.corner_px_std:.4f} px{noise}"))
+    if geometry.corner_errors is not None:
+        parts_px = geometry.corner_errors
+        rows.append(
+            (
+                "of it, each corner by itself; shared by neighbours",
+                f"{parts_px.noise_px:.4f} px (sampling error); {parts_px.model_error_px:.4f} px (model error)",
+            )
+        )
     own = geometry.cross_validation
     if own is not None:
         error = f"model error {own.model_error_px:.3f} px" if own.model_error_px > 0 else "no model error"

@@ -24,6 +24,12 @@ from scipy.spatial.transform import Rotation
 
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView
+from lab.fit.geometry.correlated_errors import (
+    CorrelatedErrors,
+    PoseErrors,
+    fit_correlated_errors,
+    sandwich_covariance,
+)
 from lab.fit.geometry.pinhole import (
     COUNT,
     NAMES,
@@ -86,7 +92,9 @@ class Solution:
     `names` and `covariance` (n, n) are of the shared parameters, poses marginalised: the free intrinsics of each
     camera ("fx", or "left fx", "right fx" of two), rotation (about the axes of the second camera) and translation of
     the rig, and the warps. `free` (cameras, 12): which intrinsics were fitted. `residuals`: (n, 2) for each
-    observation, seen less predicted, px. `noise_px`: standard deviation of one coordinate.
+    observation, seen less predicted, px. `noise_px`: standard deviation of one coordinate. `errors`: what neighbouring
+    corners share, in `covariance`; None where corners are independent. `sampling_covariance` (n, n): by the independent
+    part alone; None where this is `covariance`.
     """
 
     state: RigParameters
@@ -95,6 +103,14 @@ class Solution:
     covariance: Array
     residuals: tuple[Array, ...]
     noise_px: float
+    errors: CorrelatedErrors | None = None
+    sampling_covariance: Array | None = None
+
+    @property
+    def model_error_px(self) -> float:
+        """Standard deviation of a coordinate beyond the independent noise of the corners; 0 where there is none."""
+        own = 0.0 if self.errors is None else self.noise_px**2 - self.errors.noise_px**2
+        return float(np.sqrt(max(own, 0.0)))
 
     @property
     def rms_px(self) -> float:
@@ -113,11 +129,17 @@ class Solution:
         found[self.free[camera]] = np.sqrt(np.diag(self.covariance)[self._of_camera(camera)])
         return found
 
-    def of_camera(self, camera: int = 0) -> Array:
+    @property
+    def covariance_by_sampling(self) -> Array:
+        """Covariance (n, n) by the independent noise of the corners alone."""
+        return self.covariance if self.sampling_covariance is None else self.sampling_covariance
+
+    def of_camera(self, camera: int = 0, *, only_sampling: bool = False) -> Array:
         """Covariance (12, 12) of the intrinsics of a camera, 0 where they were held."""
         found = np.zeros((COUNT, COUNT))
         part = self._of_camera(camera)
-        found[np.ix_(self.free[camera], self.free[camera])] = self.covariance[part, part]
+        covariance = self.covariance_by_sampling if only_sampling else self.covariance
+        found[np.ix_(self.free[camera], self.free[camera])] = covariance[part, part]
         return found
 
     def _of_camera(self, camera: int) -> slice:
@@ -364,6 +386,37 @@ class BundleAdjustment:
             residuals=tuple(residual[part] for part in self.parts),
             noise_px=noise,
         )
+
+    def with_correlated_errors(self, solution: Solution, errors: CorrelatedErrors | None = None) -> Solution:
+        """The solution with a covariance that holds the errors which neighbouring corners share: those given, or those
+        that its residuals show. The same solution where they show none.
+        """
+        if not solution.determined:
+            return solution
+        poses, prior = self._pose_errors(solution), (solution.noise_px / self.prior_std) ** 2
+        errors = fit_correlated_errors(poses, prior) if errors is None else errors
+        if errors is None:
+            return solution
+        share = (errors.noise_px / max(solution.noise_px, 1e-9)) ** 2
+        return replace(
+            solution,
+            covariance=sandwich_covariance(poses, errors, prior),
+            sampling_covariance=share * solution.covariance,
+            errors=errors,
+        )
+
+    def _pose_errors(self, solution: Solution) -> list[PoseErrors]:
+        self._set_distortion_prior(solution.state.intrinsics)
+        shared, by_pose = self.jacobian(solution.state)
+        squares = np.concatenate(
+            [one.view.board_mm[:, :2] / one.view.capture.square_mm for one in self.observations]
+        ).astype(float)
+        residuals = np.concatenate(solution.residuals)
+        pose = np.concatenate([np.full(len(one.view.index), one.pose) for one in self.observations])
+        return [
+            PoseErrors(squares[at], self.of_camera[at], residuals[at], shared[at], by_pose[at])
+            for at in (np.flatnonzero(pose == number) for number in np.unique(pose))
+        ]
 
     def _covariance(self, state: RigParameters, residual: Array, noise_px: float) -> Array:
         if self.only_poses:

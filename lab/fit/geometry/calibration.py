@@ -21,6 +21,7 @@ from lab.fit.geometry.bundle_adjustment import (
     first_state,
     with_boards,
 )
+from lab.fit.geometry.correlated_errors import CorrelatedErrors
 from lab.fit.geometry.distortion_model import MODELS, choose_model, free_intrinsics
 from lab.fit.geometry.projection_errors import points_at, projection_std
 from lab.formats.results import DistortionModel, Skipped
@@ -100,9 +101,18 @@ def calibrate(views: Sequence[BoardView], shape: tuple[int, int], coefficients: 
     return BundleAdjustment(observations, free_intrinsics(coefficients)[None, :], shape).solve(rough.state)
 
 
+def with_model_error(
+    views: Sequence[BoardView], shape: tuple[int, int], solution: Solution, errors: CorrelatedErrors | None = None
+) -> Solution:
+    """The solution of `calibrate` with the errors that neighbouring corners share in its covariance: `errors`, or those
+    that its residuals show.
+    """
+    return BundleAdjustment(observations_of(views), solution.free, shape).with_correlated_errors(solution, errors)
+
+
 def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side: Side | None = None) -> Calibration:
     """`calibrate` without the corners and views that don't fit, with the distortion model that predicts unseen views
-    best.
+    best. The errors that neighbouring corners share are in its covariance.
 
     A corner is left out beyond 5 standard deviations of the others. A view is left out where its rms is beyond 3 times
     the median, or where a quarter of its corners would go. Raises `NotDetermined` where too few views are left, where
@@ -136,6 +146,7 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
     coefficients, models = choose_model(kept, shape, solution)
     if coefficients != MODELS[-1]:
         solution = calibrate(kept, shape, coefficients)
+    solution = with_model_error(kept, shape, solution)
     _check_focal_length(solution)
     corners = tuple(
         Skipped(step=capture, reason=_corner_reason(numbers, solution.noise_px), side=side)

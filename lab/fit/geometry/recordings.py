@@ -13,7 +13,7 @@ from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView, channel_corners, find_boards
 from lab.fit.geometry.bundle_adjustment import Solution, warp_prior_mm
 from lab.fit.geometry.calibration import MIN_VIEWS, Calibration, calibrate_robustly
-from lab.fit.geometry.cross_validation import cross_validation
+from lab.fit.geometry.cross_validation import DIFFERENCE_SIGMA, cross_validation, widened
 from lab.fit.geometry.distortion_model import first_view_of_boards
 from lab.fit.geometry.lateral_colour import channel_geometry
 from lab.fit.geometry.pinhole import distortion_of, matrix_of
@@ -23,6 +23,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import (
     BoardWarp,
     ChannelGeometry,
+    CornerErrors,
     CrossValidation,
     GeometryFit,
     ProjectionUncertainty,
@@ -64,8 +65,9 @@ def geometry_result(
     channels: tuple[ChannelGeometry, ...] = (),
 ) -> GeometryFit:
     """A calibration with its errors as a result; `missed`: captures in which no board was found."""
-    solution = calibration.solution
     validation = cross_validation(calibration)
+    calibration = widened(calibration, validation)
+    solution = calibration.solution
     noises = [view.std_px for view in calibration.views if view.std_px is not None]
     of_pictures = float(np.sqrt(np.mean(np.concatenate(noises) ** 2))) if noises else None
     std = solution.std()
@@ -86,6 +88,7 @@ def geometry_result(
         covariance=rows(solution.covariance),
         corner_px_std=solution.noise_px,
         corner_noise_px=of_pictures,
+        corner_errors=corner_errors(solution),
         board_warp=board_warps(calibration.views, solution.state.warps_mm, warps),
         distortion_models=calibration.models,
         cross_validation=validation,
@@ -93,6 +96,18 @@ def geometry_result(
         channels=channels,
         residuals=view_residuals(calibration),
         remarks=tuple(_remarks(solution, validation, of_pictures)),
+    )
+
+
+def corner_errors(solution: Solution) -> CornerErrors:
+    """The errors of the corners of a solve as a result: sampling and model apart."""
+    errors = solution.errors
+    return CornerErrors(
+        noise_px=solution.noise_px if errors is None else errors.noise_px,
+        model_error_px=solution.model_error_px,
+        length_squares=None if errors is None else errors.length_squares,
+        between_cameras=None if errors is None or len(solution.free) == 1 else errors.between_cameras,
+        sampling_std=numbers(np.sqrt(np.diag(solution.covariance_by_sampling))),
     )
 
 
@@ -154,6 +169,13 @@ def view_residuals(calibration: Calibration) -> tuple[ViewResiduals, ...]:
 
 def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures: float | None) -> list[str]:
     remarks = []
+    if solution.errors is not None:
+        along_x, along_y = solution.errors.length_squares
+        remarks.append(
+            f"Corners depart from the model together: {solution.model_error_px:.3f} px (standard deviation) over about "
+            f"{along_x:.1f} x {along_y:.1f} squares of a view, beside {solution.errors.noise_px:.3f} px of each by itself. The "
+            "standard uncertainties include it, as an error that is new in every view."
+        )
     if of_pictures is not None and solution.noise_px > 2.0 * max(of_pictures, 1e-3):
         remarks.append(
             f"The corners depart from the model by {solution.noise_px:.3f} px (standard deviation), where the pictures' noise accounts for "
@@ -161,10 +183,10 @@ def _remarks(solution: Solution, validation: CrossValidation | None, of_pictures
         )
     if validation is None:
         remarks.append(f"Fewer than {2 * MIN_VIEWS} views: the model's own error can't be told from the sampling's.")
-    elif validation.model_error_px > 0:
+    elif validation.significance_sigma > DIFFERENCE_SIGMA:
         remarks.append(
-            f"Two halves of the views differ by {validation.difference_px:.3f} px over the frame, where the corners' noise lets "
-            f"them differ by {validation.expected_px:.3f} px: the model is off by about {validation.model_error_px:.3f} px, which "
-            "the standard uncertainties leave out."
+            f"Two halves of the views differ by {validation.difference_px:.3f} px over the frame, where the corners let them "
+            f"differ by {validation.expected_px:.3f} px: the model is off by about {validation.model_error_px:.3f} px. The standard "
+            "uncertainties are widened by as much."
         )
     return remarks

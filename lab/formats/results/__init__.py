@@ -26,6 +26,7 @@ from lab.formats.results.fit import CameraFit, FitResult
 from lab.formats.results.geometry import (
     BoardWarp,
     ChannelGeometry,
+    CornerErrors,
     CrossValidation,
     DepthUncertainty,
     DistortionModel,
@@ -58,6 +59,7 @@ __all__ = [
     "ChannelNoise",
     "Check",
     "ComparisonResult",
+    "CornerErrors",
     "CrossValidation",
     "CurveComparison",
     "DarkCurrentLaws",

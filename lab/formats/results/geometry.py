@@ -37,14 +37,35 @@ class CrossValidation(Frozen):
     """Comparison of two calibrations, each from one half of the views.
 
     `difference_px`: rms difference of their projections over the frame, after the implied motion is removed. `expected_px`: the
-    same from the noise of the corners alone. An excess is an error of the model.
+    same from all that `corner_errors` knows of. `sampling_px`: from the independent noise of the corners alone.
+    `significance_sigma`: of the difference beyond `expected_px`. Above 2.6 (1 %) the covariance of the fit has been multiplied
+    by (difference_px / expected_px)^2.
     """
 
     difference_px: float
     expected_px: float
+    sampling_px: float | None = None
     significance_sigma: float
-    #: The excess for one half; 0 where the halves agree.
+    #: The error of the model in the projection of one half: what `expected_px`, or the difference where it is significant, has
+    #: beyond `sampling_px`. It is in the standard deviations of the fit.
     model_error_px: float
+
+
+class CornerErrors(Frozen):
+    """What the corners depart from the model by, px, as standard deviations of one coordinate.
+
+    `noise_px`: the part that each corner has by itself, the sampling error. `model_error_px`: the part that neighbouring corners
+    share (board, print, lens, motion), the error of the model; 0 where none is significant. Both are in `covariance`.
+    """
+
+    noise_px: float
+    model_error_px: float
+    #: Along the rows and the columns of the board; None without a model error.
+    length_squares: tuple[float, float] | None = None
+    #: Of a pair: correlation of the model error in the left frame with that in the right.
+    between_cameras: float | None = None
+    #: Standard deviations of `parameters` by the sampling error alone.
+    sampling_std: tuple[float, ...] = ()
 
 
 class ViewResiduals(Frozen):
@@ -104,6 +125,8 @@ class GeometryFit(Frozen):
     #: Standard deviation of one coordinate of a corner: from the residuals, and from the frames' noise alone.
     corner_px_std: float | None = None
     corner_noise_px: float | None = None
+    #: `corner_px_std`, in its two parts.
+    corner_errors: CornerErrors | None = None
     board_warp: tuple[BoardWarp, ...] = ()
     distortion_models: tuple[DistortionModel, ...] = ()
     cross_validation: CrossValidation | None = None
@@ -162,6 +185,7 @@ class StereoFit(Frozen):
     parameters: tuple[str, ...] = ()
     covariance: Rows | None = None
     corner_px_std: float | None = None
+    corner_errors: CornerErrors | None = None
     rejected: tuple[Skipped, ...] = ()
     rectification: Rectification | None = None
     depth: tuple[DepthUncertainty, ...] = ()

@@ -142,5 +142,14 @@ def test_public_stereo_pairs():
     bends = [camera.board_warp[0] for camera in (left, right)]
     assert abs(bends[0].bend_y_mm - bends[1].bend_y_mm) < 4 * np.hypot(bends[0].bend_y_mm_std, bends[1].bend_y_mm_std)
     assert bends[0].bend_y_mm > 5 * bends[0].bend_y_mm_std
+    # the board ripples: both cameras see the same, and neighbouring corners are displaced alike
+    assert fit.corner_errors.between_cameras > 0.8
+    for errors in (left.corner_errors, right.corner_errors, fit.corner_errors):
+        assert errors.model_error_px > errors.noise_px
+    # each camera alone and in the pair, from the same corners: two estimates with a common part differ by less than the
+    # larger standard deviation in two of three cases, by less than twice of it in 95 %
+    for alone, matrix in ((left, fit.camera_matrix_left), (right, fit.camera_matrix_right)):
+        gap = np.abs(np.array(alone.camera_matrix) - matrix)
+        assert np.all(gap <= 2 * np.array(alone.camera_matrix_std))
     # OpenCV's own focal length of these pairs, 534.8 px, was found with one focal length for both cameras
     assert left.camera_matrix[0][0] == pytest.approx(534.8, rel=0.01)

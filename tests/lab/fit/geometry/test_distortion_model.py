@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.cross_validation import cross_validation
@@ -32,7 +33,9 @@ def test_a_model_that_is_too_simple_is_not_chosen():
 
 
 def test_an_error_of_the_model_is_told_from_the_samplings():
-    """A board that takes another shape in every view: the halves differ by more than the corners' noise lets them."""
+    """A board that takes another shape in every view: the halves differ by more than the corners' noise lets them, and by
+    no more than is stated.
+    """
     rng = np.random.default_rng(3)
     at = poses(14)
     floppy = [tuple(rng.normal(0, 2.0, 3)) for _ in at]
@@ -40,4 +43,7 @@ def test_an_error_of_the_model_is_told_from_the_samplings():
     right = cross_validation(calibrate_robustly(seen(rng, at, noise_px=0.03), SHAPE))
     assert right.model_error_px == 0.0 or right.significance_sigma < 3.3  # 1 in 1000
     assert wrong.difference_px > 2 * right.difference_px
-    assert wrong.significance_sigma > right.significance_sigma
+    assert wrong.difference_px > 3 * wrong.sampling_px
+    assert wrong.significance_sigma < 3.3
+    assert right.expected_px == pytest.approx(right.sampling_px)
+    assert wrong.model_error_px > 3 * right.expected_px
