@@ -35,6 +35,7 @@ from lab.fit.geometry.bundle_adjustment import (
     board_pose,
     rms_px,
 )
+from lab.fit.geometry.calibration import listed
 from lab.fit.geometry.pinhole import (
     NAMES,
     cross_matrices,
@@ -57,6 +58,7 @@ Array = NDArray[np.floating[Any]]
 MIN_PAIRS = 2
 OUTLYING_PAIR = 3.0  # times the median rms of the pairs
 OUTLYING_PAIR_PX = 0.1
+REVERSED_DEG = 10.0  # turn beside the other pairs, below which the renumbered view explains a pair
 NO_RIG = 5.0  # times the single cameras' rms (and at least 1 px), above which no rig explains the pairs
 DEPTHS_MM = (500.0, 1000.0, 2000.0)
 
@@ -79,7 +81,7 @@ def fit_stereo(
 
     `rms_px` is the root mean square of the distances of all corners of both cameras from their predictions. The
     corners are those that the fits of the single cameras rest on. A pair whose rms is more than 3 times the median of
-    the pairs is left out. `depths_mm`: where the uncertainty of the depth is mapped. Raises `NotDetermined` below 2
+    the pairs is left out, and one whose views are numbered from opposite ends. `depths_mm`: where the uncertainty of the depth is mapped. Raises `NotDetermined` below 2
     pairs, or where no rig explains them.
     """
     shapes = tuple((recordings.camera(side).rows, recordings.camera(side).cols) for side in ("left", "right"))
@@ -100,7 +102,9 @@ def fit_pairs(
             f"{len(pairs)} poses of the board were found by both cameras, {MIN_PAIRS} are needed: capture charuco poses with "
             "both, under the same pose name",
         )
-    rejected: list[Skipped] = []
+    pairs, rejected = _numbered_alike(pairs, left, right)
+    if len(pairs) < MIN_PAIRS:
+        raise NotDetermined("stereo", f"{len(pairs)} pairs can be used, {MIN_PAIRS} are needed{listed(rejected)}")
     while True:
         solution = solve_rig(pairs, left, right, shapes[0])
         of_pairs = [
@@ -118,8 +122,9 @@ def fit_pairs(
     if not solution.rms_px < max(NO_RIG * alone, 1.0) or not solution.determined:
         raise NotDetermined(
             "stereo",
-            f"no rig explains the pairs (rms {solution.rms_px:.1f} px, each camera alone {alone:.2f} px): check that equal poses are "
-            "the same pose of the board, that the rig was rigid, and that neither camera's frames are mirrored",
+            f"no rig explains the pairs (rms {solution.rms_px:.1f} px, each camera alone {alone:.2f} px; worst: pose "
+            f"{pairs[worst].left.capture.pose}, {of_pairs[worst]:.1f} px{listed(rejected)}): check that equal poses are the same "
+            "pose of the board, that the rig was rigid, and that neither camera's frames are mirrored",
         )
     return _result(solution, pairs, shapes, depths_mm, tuple(rejected))
 
@@ -153,6 +158,40 @@ def free_of(fit: GeometryFit) -> NDArray[np.bool_]:
     if fit.parameters:
         return np.array([name in fit.parameters for name in NAMES])
     return np.append(np.ones(8, dtype=bool), intrinsics_of_fit(fit)[8:] != 0.0)
+
+
+def _numbered_alike(
+    pairs: Sequence[StereoPair], left: GeometryFit, right: GeometryFit
+) -> tuple[list[StereoPair], list[Skipped]]:
+    """The pairs in which both cameras number the board from the same corner, and those in which they don't.
+
+    A plain board looks alike from both ends. Numbered from the other one, it is rotated by 180 deg about its normal, and
+    so is the rig of this pair: most pairs say which is right.
+    """
+    turns, reversed_turns = [], []
+    half_turn = Rotation.from_rotvec([0.0, 0.0, np.pi])
+    for pair in pairs:
+        of_left, of_right = (
+            Rotation.from_matrix(board_pose(view, intrinsics_of_fit(fit))[0])
+            for view, fit in ((pair.left, left), (pair.right, right))
+        )
+        turns.append(of_right * of_left.inv())
+        reversed_turns.append(of_right * half_turn * of_left.inv())
+    apart = np.array([[(one.inv() * two).magnitude() for one in turns] for two in turns])
+    typical = turns[int(np.argmin(apart.sum(axis=1)))]  # the one nearest to all others
+    kept: list[StereoPair] = []
+    rejected: list[Skipped] = []
+    for pair, turn, reverse in zip(pairs, turns, reversed_turns, strict=True):
+        off, off_reversed = (float(np.rad2deg((typical.inv() * one).magnitude())) for one in (turn, reverse))
+        if len(pairs) == MIN_PAIRS or off < 90.0 or off_reversed > REVERSED_DEG:
+            kept.append(pair)
+            continue
+        reason = (
+            f"the cameras number its corners from opposite ends: the rig would be turned by {off:.0f} deg beside the other pairs, "
+            f"and by {off_reversed:.1f} deg with one view renumbered; use a board with markers, or an odd number of rows plus columns"
+        )
+        rejected.append(Skipped(step=f"pose {pair.left.capture.pose}", reason=reason))
+    return kept, rejected
 
 
 def rig_observations(pairs: Sequence[StereoPair]) -> list[Observation]:

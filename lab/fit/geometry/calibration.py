@@ -19,6 +19,7 @@ from lab.fit.geometry.bundle_adjustment import (
     board_pose,
     first_intrinsics,
     first_state,
+    rms_px,
     with_boards,
 )
 from lab.fit.geometry.correlated_errors import CorrelatedErrors
@@ -37,6 +38,7 @@ OUTLYING_CORNER_SHARE = 0.25  # of the corners of a view, above which the view i
 LARGEST_RMS_SHARE = 0.005  # rms over the diagonal of the frame, above which no camera explains the corners
 LARGEST_FOCAL_STD = 0.1  # relative; above it the focal length isn't determined
 PARALLEL_DEG = 5.0
+MOST_LISTED = 3  # views named in a refusal
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,9 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
     outliers: dict[str, list[tuple[int, float]]] = {}
     while True:
         if len(kept) < MIN_VIEWS:
-            why = f"; {rejected[0].step}: {rejected[0].reason}" if rejected else ""
-            raise NotDetermined("geometry", f"{len(kept)} views of the board can be used, {MIN_VIEWS} are needed{why}")
+            raise NotDetermined(
+                "geometry", f"{len(kept)} views of the board can be used, {MIN_VIEWS} are needed{listed(rejected)}"
+            )
         solution = calibrate(kept, shape)
         outlying = _outlying_view(kept, solution)
         if outlying is not None:
@@ -142,7 +145,7 @@ def calibrate_robustly(views: Sequence[BoardView], shape: tuple[int, int], side:
             continue
         if not _remove_outlying_corners(kept, solution, outliers):
             break
-    _check_board(kept, solution, shape)
+    _check_board(kept, solution, shape, rejected)
     coefficients, models = choose_model(kept, shape, solution)
     if coefficients != MODELS[-1]:
         solution = calibrate(kept, shape, coefficients)
@@ -201,14 +204,25 @@ def _corner_reason(numbers: list[tuple[int, float]], noise_px: float) -> str:
     return f"corners {which} lie off, where the others have a standard deviation of {noise_px:.3f} px"
 
 
-def _check_board(views: Sequence[BoardView], solution: Solution, shape: tuple[int, int]) -> None:
+def listed(rejected: Sequence[Skipped]) -> str:
+    """What was left out and why, for the end of a sentence: the first three, and how many more."""
+    more = f"; and {len(rejected) - MOST_LISTED} more" if len(rejected) > MOST_LISTED else ""
+    return "".join(f"; {one.step}: {one.reason}" for one in rejected[:MOST_LISTED]) + more
+
+
+def _check_board(
+    views: Sequence[BoardView], solution: Solution, shape: tuple[int, int], rejected: Sequence[Skipped]
+) -> None:
     """Raise `NotDetermined` where the rms is too large for any camera."""
     diagonal = float(np.hypot(*shape))
     if not solution.rms_px < LARGEST_RMS_SHARE * diagonal:
         capture = views[0].capture
+        of_views = [rms_px(residual) for residual in solution.residuals]
+        worst = int(np.argmax(of_views))
         raise NotDetermined(
             "geometry",
-            f"no camera explains the corners (rms {solution.rms_px:.1f} px): check that the board has {capture.squares[0]} x "
+            f"no camera explains the corners (rms {solution.rms_px:.1f} px, worst: {views[worst].capture.id}, "
+            f"{of_views[worst]:.1f} px{listed(rejected)}): check that the board has {capture.squares[0]} x "
             f"{capture.squares[1]} squares, that it is flat, and that it didn't move while it was exposed",
         )
 

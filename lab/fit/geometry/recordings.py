@@ -12,7 +12,7 @@ from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView, channel_corners, find_boards
 from lab.fit.geometry.bundle_adjustment import Solution, warp_prior_mm
-from lab.fit.geometry.calibration import MIN_VIEWS, Calibration, calibrate_robustly
+from lab.fit.geometry.calibration import MIN_VIEWS, Calibration, calibrate_robustly, listed
 from lab.fit.geometry.cross_validation import DIFFERENCE_SIGMA, cross_validation, widened
 from lab.fit.geometry.distortion_model import first_view_of_boards
 from lab.fit.geometry.lateral_colour import channel_geometry
@@ -49,8 +49,9 @@ def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
     camera = recordings.camera(side)
     shape = (camera.rows, camera.cols)
     if len(views) < MIN_VIEWS:
-        why = f"; {missed[0].step}: {missed[0].reason}" if missed else ""
-        raise NotDetermined("geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{why}")
+        raise NotDetermined(
+            "geometry", f"{len(views)} views of the board can be used, {MIN_VIEWS} are needed{listed(missed)}"
+        )
     calibration = calibrate_robustly(views, shape, side)
     channels: tuple[ChannelGeometry, ...] = ()
     if camera.cfa != "MONO":

@@ -12,6 +12,7 @@ import pytest
 
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
+from lab.fit.geometry.board_detection import board_points
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.recordings import fit_geometry, geometry_result
 from lab.fit.stereo import StereoPair, fit_pairs, fit_stereo, rectification_maps
@@ -98,6 +99,13 @@ def test_a_mirrored_camera_makes_no_rig():
         fit_pairs([StereoPair(p.left, m) for p, m in zip(pairs, mirrored, strict=True)], left, right, (SHAPE, SHAPE))
 
 
+def test_a_refusal_names_the_worst_pair():
+    pairs, left, right = drawn_pairs()
+    mirrored = [replace(p.right, image_px=np.array([SHAPE[1] - 1.0, 0.0]) + p.right.image_px * [-1, 1]) for p in pairs]
+    with pytest.raises(NotDetermined, match=r"worst: pose pose-\d, "):
+        fit_pairs([StereoPair(p.left, m) for p, m in zip(pairs, mirrored, strict=True)], left, right, (SHAPE, SHAPE))
+
+
 def test_a_pair_that_is_not_one_is_left_out():
     """One pose under another's name."""
     pairs, left, right = drawn_pairs()
@@ -105,6 +113,21 @@ def test_a_pair_that_is_not_one_is_left_out():
     fit = fit_pairs([*pairs[:3], wrong, *pairs[4:]], left, right, (SHAPE, SHAPE))
     assert fit.pairs == len(pairs) - 1
     assert [item.step for item in fit.rejected] == ["pose pose-3"]
+
+
+def test_pairs_numbered_from_opposite_ends_are_left_out_and_named():
+    """A checkerboard of 9 x 12 squares rotated by 180 deg: corner k is corner 87 - k."""
+    pairs, left, right = drawn_pairs()
+    turned = []
+    for k, pair in enumerate(pairs):
+        index = 87 - pair.right.index if k in (1, 4, 6) else pair.right.index
+        view = replace(pair.right, index=index, board_mm=board_points(pair.right.capture, index))
+        turned.append(StereoPair(pair.left, view))
+    fit = fit_pairs(turned, left, right, (SHAPE, SHAPE))
+    assert [item.step for item in fit.rejected] == [f"pose {pairs[k].left.capture.pose}" for k in (1, 4, 6)]
+    assert all("opposite ends" in item.reason for item in fit.rejected)
+    clean = fit_pairs([p for k, p in enumerate(pairs) if k not in (1, 4, 6)], left, right, (SHAPE, SHAPE))
+    assert fit.baseline_mm == pytest.approx(clean.baseline_mm, rel=1e-9)
 
 
 @pytest.mark.skipif(not PAIRS.is_dir(), reason="the public stereo pairs aren't here")
