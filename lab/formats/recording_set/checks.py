@@ -12,7 +12,14 @@ from lab.capture_kinds.base import Capture, Names, Open, names_in
 from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.errors import InputError
-from lab.formats.recording_set.clipping import CLIPPED_LIMIT, ClippedLevel, clipped_share, flat_level, saturated_flats
+from lab.formats.recording_set.clipping import (
+    CLIPPED_LIMIT,
+    ClippedLevel,
+    clipped_share,
+    flat_level,
+    saturated_flats,
+    wrong_lights,
+)
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
 from sim.camera import Side
@@ -64,6 +71,7 @@ def _check_frames(recordings: RecordingSet, found: Findings) -> None:
             clipped_of[capture.side, capture.kind].append(capture.id)
     for side, levels in flats.items():
         found.problems += saturated_flats(levels, recordings.manifest.cameras[side])
+        found.warnings += wrong_lights(levels, recordings.manifest.cameras[side])
     for (side, kind), ids in clipped_of.items():
         named = ", ".join(ids[:3]) + (f" .. {ids[-1]}" if len(ids) > 3 else "")
         found.warnings.append(

@@ -15,8 +15,14 @@ from lab.formats.recording_set.recordings import RecordingSet
 
 #: Share of clipped pixels above which a channel's level isn't measured.
 CLIPPED_LIMIT = 0.5
+#: Scale of a light that is stated as a number of photons.
+PHOTONS = "photons"
 #: Least number of unsaturated levels below a saturated flat for it to be the top of an exposure ladder.
 LADDER_LEVELS = 3
+#: Share of the levels of a light whose stated light may contradict the others: these are left out, and a warning names them.
+WRONG_SHARE = 0.2
+#: Factor between the stated light of an unsaturated level and that which the others' median slope gives its mean, above which it contradicts them.
+WRONG_FACTOR = 1.5
 #: Least share of the flat's signal that these levels must predict for it. Below 1, as lamps and sensors aren't exactly linear.
 LADDER_REACH = 0.85
 
@@ -65,7 +71,8 @@ def clipped_share(frame: Frame, camera: DataSheet) -> dict[str, float]:
 def _light(recordings: RecordingSet, flat: FlatCapture) -> tuple[float, str]:
     """The light of a flat, and the name of its scale: photons, exposure times radiance, or exposure alone."""
     if flat.photons_per_pixel is not None:
-        return flat.photons_per_pixel, f"photons at {flat.wavelength_nm}"
+        at = "" if flat.wavelength_nm is None else f" at {flat.wavelength_nm:g} nm"
+        return flat.photons_per_pixel, f"{PHOTONS}{at}"
     if flat.radiance is None:
         return flat.exposure_s, "exposure"
     spectrum = recordings.spectrum(flat.radiance)
@@ -92,6 +99,8 @@ def _why_not_a_ladder(level: ClippedLevel, channel: str, levels: list[ClippedLev
         for other in levels
         if (other.gain_db, other.scale) == (level.gain_db, level.scale) and other.clipped[channel] <= CLIPPED_LIMIT
     ]
+    wrong = set(map(id, contradicting_levels(unclipped, channel, black)))
+    unclipped = [other for other in unclipped if id(other) not in wrong]
     for other in unclipped:
         if other.light >= level.light and other.clipped[channel] < CLIPPED_LIMIT / 5:
             return f"but {other.id} with as much light isn't; recapture it"
@@ -104,12 +113,84 @@ def _why_not_a_ladder(level: ClippedLevel, channel: str, levels: list[ClippedLev
     return None
 
 
+def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: float) -> list[ClippedLevel]:
+    """Unclipped flats of one gain and light whose stated light contradicts the others by more than `WRONG_FACTOR`.
+
+    The median slope of signal against light tells which: it holds while fewer than half of the levels are wrong. None where more
+    than `WRONG_SHARE` of the levels are off: then no majority says what the light is. `black`: DN; where it isn't known, the
+    offset of a line through the levels (Theil and Sen) stands for it.
+    """
+    signals: dict[float, float] = {}
+    for other in unclipped:
+        if other.light > 0:
+            signals.setdefault(other.light, other.mean_dn[channel])
+    light, mean = np.array(list(signals)), np.array(list(signals.values()))
+    if light.size < 1 / WRONG_SHARE:
+        return []
+    first, second = np.triu_indices(light.size, 1)
+    slope = float(np.median((mean[second] - mean[first]) / (light[second] - light[first])))
+    offset = black if black > 0 else float(np.median(mean - slope * light))
+    if slope <= 0:
+        return []
+    span = float(np.ptp(mean))
+    off = [
+        other
+        for other in unclipped
+        if other.light > 0
+        and abs(other.mean_dn[channel] - offset - slope * other.light)
+        > max((1.0 - 1.0 / WRONG_FACTOR) * max(slope * other.light, other.mean_dn[channel] - offset), 0.1 * span)
+    ]
+    return off if len({other.light for other in off}) <= WRONG_SHARE * light.size else []
+
+
+def wrong_lights(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
+    """One line for each level of flats whose stated light contradicts the others."""
+    for key in dict.fromkeys((level.gain_db, level.scale) for level in levels):
+        own = [level for level in levels if (level.gain_db, level.scale) == key]
+        for channel in own[0].clipped:
+            unclipped = [level for level in own if level.clipped[channel] <= CLIPPED_LIMIT]
+            off = contradicting_levels(unclipped, channel, camera.black_level_dn or 0.0)
+            for light in dict.fromkeys(level.light for level in off):
+                of = [level for level in off if level.light == light]
+                yield (
+                    f"{of[0].where}: {len(of)} flats of a stated light of {light:.6g} ({of[0].scale}) have {of[0].mean_dn[channel]:.4g} DN, "
+                    "which contradicts the other levels; the fits judge that; correct the photon number or the exposure"
+                )
+            if off:
+                break
+    misplaced = list(_misplaced(levels, camera))
+    forgiven = _forgiven(misplaced, levels)
+    for light, first in {level.light: level for level, *_ in reversed(misplaced) if id(level) in forgiven}.items():
+        yield (
+            f"{first.where}: saturated though its stated {light:.6g} photons are fewer than those of levels that aren't: left out by the "
+            "fits; correct the photon number"
+        )
+
+
 def saturated_flats(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
-    """One line for each clipped flat that isn't the top of an exposure ladder."""
+    """One line for each clipped flat that isn't the top of an exposure ladder, unless its photon number may be wrong."""
+    misplaced = list(_misplaced(levels, camera))
+    forgiven = _forgiven(misplaced, levels)
+    for level, channel, why in misplaced:
+        if id(level) not in forgiven:
+            share = level.clipped[channel]
+            yield f"{level.where}: saturated flat, {100 * share:.0f} % of the {channel} pixels are clipped; {why}"
+
+
+def _misplaced(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[tuple[ClippedLevel, str, str]]:
+    """Clipped flats that aren't the top of an exposure ladder, with the channel and why."""
     for level in levels:
         for channel, share in level.clipped.items():
             if share <= CLIPPED_LIMIT:
                 continue
             if why := _why_not_a_ladder(level, channel, levels, camera.black_level_dn or 0.0):
-                yield f"{level.where}: saturated flat, {100 * share:.0f} % of the {channel} pixels are clipped; {why}"
+                yield level, channel, why
                 break
+
+
+def _forgiven(misplaced: list[tuple[ClippedLevel, str, str]], levels: list[ClippedLevel]) -> set[int]:
+    """Ids of the misplaced flats that state photons, where few enough levels do: a statement may be wrong, unlike a shutter."""
+    photons = [level for level, *_ in misplaced if level.scale.startswith(PHOTONS)]
+    lights = {level.light for level in levels if level.scale.startswith(PHOTONS)}
+    few = len({level.light for level in photons}) <= WRONG_SHARE * len(lights)
+    return {id(level) for level in photons} if few else set()

@@ -230,3 +230,22 @@ def test_a_real_camera(tmp_path: Path) -> None:
     assert noise.read_noise_e == pytest.approx(10.9, rel=0.10)
     assert noise.quantum_efficiency == pytest.approx(0.453, rel=0.03)
     assert any("lamp drifted" in remark for remark in noise.remarks)
+
+
+@pytest.mark.parametrize("photons", [150.0, 12000.0], ids=["too few", "too many"])
+@pytest.mark.parametrize("level", [2, 7])
+def test_a_wrong_photon_number_at_one_level_does_not_refuse_the_set(tmp_path: Path, photons: float, level: int) -> None:
+    """Seven levels of 500 DN for each 500 photons, the last two saturated at 2047 DN; one states a wrong number."""
+    lines = ["v 4.0\nn 11 30 20\n"]
+    for number in range(1, 8):
+        lines.append(f"b {1000 * number} {photons if number == level else 500.0 * number}\n")
+        for snap in range(2):
+            image(tmp_path / f"in/images/b_{number}_{snap}.png", 100 + 380 * number, bits=11, seed=10 * number + snap)
+            lines.append(f"i images\\b_{number}_{snap}.png\n")
+    (tmp_path / "in/data.txt").write_text("".join(lines))
+    recordings = recording.read(recording.write(read_emva1288(tmp_path / "in"), tmp_path / "out"))
+    assert len(recordings.captures("flat")) == 14
+    named = [line for line in recordings.warnings if "photon number" in line]
+    # A saturated level may have any light above that of saturation
+    assert len(named) == (0 if (level, photons) == (7, 12000.0) else 1)
+    assert all(f"b_{level}_0" in line for line in named)
