@@ -19,6 +19,7 @@ def print_skipped(skipped: tuple[Skipped, ...]) -> None:
 def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
     from lab.report.figures import by_side, stereo_figures
 
+    _print_emva1288(fit)
     sides = list(fit.cameras)
     table = Table(box=None, pad_edge=False)
     table.add_column("quantity")
@@ -36,6 +37,25 @@ def print_fit(recordings: RecordingSet, fit: FitResult) -> None:
             for remark in part.remarks if part else ():
                 out.print(f"{side}: {escape(remark)}")
     print_skipped(fit.skipped)
+
+
+def _print_emva1288(fit: FitResult) -> None:
+    """The standard's own figures of each camera, by plane of its mosaic, and what the standard's recordings lack."""
+    from lab.report.emva import table_rows
+
+    for side, camera in fit.cameras.items():
+        if camera.noise is None or not camera.noise.emva1288:
+            continue
+        planes = camera.noise.emva1288
+        table = Table(box=None, pad_edge=False)
+        for heading in (f"EMVA 1288, {side}", "", *(f"{name} (± one standard deviation)" for name in planes)):
+            table.add_column(heading)
+        for row in table_rows(planes):
+            table.add_row(row.quantity, row.symbol, *row.values)
+        out.print(table)
+        for remark in dict.fromkeys(remark for plane in planes.values() for remark in plane.remarks):
+            out.print(f"{side}: EMVA 1288: {escape(remark)}")
+        out.print()
 
 
 def print_validation(validation: ValidationResult) -> None:
