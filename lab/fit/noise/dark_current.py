@@ -50,7 +50,11 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
             weights.append(1.0 / line.covariance[1, 1])
     try:
         flats = transfer_of(
-            e.levels, e.dark, e.saturation, [level for level in repeated if level.exposure_s == exposure.min()]
+            e.levels,
+            e.dark,
+            e.saturation,
+            [level for level in repeated if level.exposure_s == exposure.min()],
+            e.consistency.series,
         )[0]
     except NotDetermined:
         return None, None

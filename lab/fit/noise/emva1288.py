@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 
 from lab.fit.noise.frame_sums import BoolArray
 from lab.fit.noise.level_statistics import MeasuredLevel, PlaneStatistics, SpatialVariance
@@ -23,6 +24,9 @@ from sim.spectrum import FloatArray
 
 HIDDEN_DN2 = 0.24  # temporal variance below which rounding hides the noise
 HIDDEN_DN = 0.40  # the limit that is stated then
+LEAST_SIGNAL = 0.01  # of the range of the line: below, the variance is that of the dark
+EXCESS_CHANCE = 0.01  # probability below which variances aren't on a straight line
+SIGNIFICANT_SIGMA = 3.0  # standard deviations by which two slopes of one line differ
 LINE_LIMIT = 0.7  # of saturation: range of responsivity and system gain
 LINEARITY_RANGE = (0.05, 0.95)  # of saturation
 SPATIAL_IMAGES = 16  # with fewer, the row and column parts contain temporal noise; the standard asks for more
@@ -32,8 +36,9 @@ SPATIAL_IMAGES = 16  # with fewer, the row and column parts contain temporal noi
 class EmvaInput:
     """What `emva1288_figures` needs.
 
-    `darks`: of one temperature; `flats`: of one lamp in ascending light, two or more of each. `in_photons`: `light`
-    counts photons per pixel. `saturation_dn`: signal above dark taken for saturation where the flats don't reach it.
+    `darks`: of one temperature; `flats`: the level series, of one lamp in ascending light, two or more of each;
+    `spatial`: levels that the spatial figures may come from, all flats where it is empty. `in_photons`: `light` counts
+    photons per pixel. `saturation_dn`: signal above dark taken for saturation where the flats don't reach it.
     `variance_error`, `lamp_error`: relative errors of a temporal variance beyond sampling, and of a mean.
     """
 
@@ -45,6 +50,7 @@ class EmvaInput:
     saturation_dn: float
     variance_error: float = 0.0
     lamp_error: float = 0.0
+    spatial: tuple[MeasuredLevel, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,12 +91,12 @@ class EmvaLevels:
         )
         # The dark of the same exposure where there is one, else the line through all darks
         self.source = [self._taken(level.exposure_s) for level in self.flats]
-        self.below_mean = self._below(self.dark_mean, self.mean_line)
-        self.below_variance = self._below(self.dark_variance, self.variance_line)
+        self.below_mean = self.below(self.dark_mean, self.mean_line)
+        self.below_variance = self.below(self.dark_variance, self.variance_line)
         self.signal = self.mean - self.below_mean
         self.signal_std = np.hypot(
             [plane.mean_std for plane in own],
-            np.hypot(self._below(self.dark_mean_std, None), given.lamp_error * self.signal),
+            np.hypot(self.below(self.dark_mean_std, None), given.lamp_error * self.signal),
         )
 
     def _taken(self, exposure_s: float) -> int | None:
@@ -99,7 +105,7 @@ class EmvaLevels:
         nearest = int(np.argmin(np.abs(self.dark_exposure - exposure_s)))
         return nearest if abs(self.dark_exposure[nearest] - exposure_s) <= 1e-6 * exposure_s else None
 
-    def _below(self, stack_of: FloatArray, line: DarkLine | None) -> FloatArray:
+    def below(self, stack_of: FloatArray, line: DarkLine | None) -> FloatArray:
         """Dark value at the exposure of each level; where none was taken, that of the line, or (None) the smallest of
         all.
         """
@@ -148,6 +154,23 @@ def mean_std(planes: Sequence[PlaneStatistics]) -> FloatArray:
     return np.hypot(widened / repeats, [plane.mean_rounding_std for plane in planes])
 
 
+def mean_ratio(x: FloatArray, y: FloatArray, std: FloatArray, slope: Measured) -> float | None:
+    """Mean of y / x (levels,), where it or the single levels contradict the line y = `slope` x by more than the noise
+    `std` (levels,) of y; None where they don't.
+
+    It is the slope of the same line with equal relative weights: where y is proportional to x, both are the same.
+    """
+    chosen = x > LEAST_SIGNAL * np.max(x, initial=0.0)
+    if np.count_nonzero(chosen) < 3:
+        return None
+    x, y, std = x[chosen], y[chosen], std[chosen]
+    chi2 = float(np.sum(((y - slope.value * x) / std) ** 2))
+    ratio = float(np.mean(y / x))
+    ratio_std = float(np.sqrt(np.sum((std / x) ** 2))) / x.size
+    alike = abs(ratio - slope.value) < SIGNIFICANT_SIGMA * math.hypot(ratio_std, slope.std)
+    return None if alike and special.chdtrc(x.size - 1, chi2) > EXCESS_CHANCE else ratio
+
+
 Figures = dict[str, Measured]
 
 
@@ -167,6 +190,7 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     gain = at.gain(used)
     if not gain.value > 3.0 * gain.std:
         return "the temporal variance doesn't grow with the signal: no system gain"
+    gain = _widened_gain(at, used, gain, remarks)
     if at.signal.size < 50:
         remarks.append(f"{at.signal.size} levels; the standard asks for 50")
     missing = sum(source is None for source in at.source)
@@ -176,7 +200,7 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
         )
     found: Figures = {}
     if given.in_photons:
-        found |= _responsivity(at, used, gain)
+        found |= _responsivity(at, used, gain, remarks)
     dark, limit_e = _dark_noise(at, gain, remarks)
     found |= dark
     found |= _sensitivity(at, top, gain, found)
@@ -219,13 +243,33 @@ def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[f
     return given.saturation_dn, None
 
 
-def _responsivity(at: EmvaLevels, used: BoolArray, gain: Measured) -> Figures:
+def _widened_gain(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Measured:
+    """The system gain with what its line leaves of the variances in its standard deviation."""
+    std = np.hypot(at.variance_std, at.below(at.dark_variance_std, None))
+    ratio = mean_ratio(at.signal[used], (at.variance - at.below_variance)[used], std[used], gain)
+    if ratio is None:
+        return gain
+    remarks.append(
+        f"the temporal variances don't lie on the standard's straight line by more than noise: the line has {gain.value:.4g} DN/e, the "
+        f"mean of variance over signal {ratio:.4g} DN/e; the difference is in the uncertainties of K and of what is divided by it"
+    )
+    return Measured(gain.value, math.hypot(gain.std, ratio - gain.value))
+
+
+def _responsivity(at: EmvaLevels, used: BoolArray, gain: Measured, remarks: list[str]) -> Figures:
     light = np.where(used, at.light, 0.0)
     norm = float(np.sum(light * light))
     if norm <= 0:
         return {}
     std = math.sqrt(float(np.sum((light * at.signal_std) ** 2))) / norm
     responsivity = Measured(float(np.sum(light * at.signal)) / norm, std)
+    ratio = mean_ratio(at.light[used], at.signal[used], at.signal_std[used], responsivity)
+    if ratio is not None:
+        remarks.append(
+            f"the signals aren't proportional to the light within noise: the standard's line has {responsivity.value:.5g} DN/photon, the "
+            f"mean of signal over light {ratio:.5g} DN/photon; the difference is in the uncertainties of R and of the quantum efficiency"
+        )
+        responsivity = Measured(responsivity.value, math.hypot(std, ratio - responsivity.value))
     return {"responsivity_dn_per_photon": responsivity, "quantum_efficiency": responsivity.over(gain)}
 
 
@@ -316,10 +360,13 @@ def _dark_current(at: EmvaLevels, gain: Measured, remarks: list[str]) -> Figures
         return {}
     found: Figures = {}
     mean, variance = at.mean_line, at.variance_line
-    if mean.rate is not None:
+    hidden = float(at.dark_variance.min()) < HIDDEN_DN2
+    if hidden and mean.rate is not None and abs(mean.rate) < 3.0 * math.sqrt(float(mean.covariance[1, 1])):
+        remarks.append("rounding hides the dark current, which the means of the darks don't show")
+    elif mean.rate is not None:
         rate = Measured(mean.rate, math.sqrt(float(mean.covariance[1, 1])))
         found["dark_current_from_mean_e_per_s"] = rate.over(gain)
-    if variance.rate is not None and float(at.dark_variance.min()) >= HIDDEN_DN2:
+    if variance.rate is not None and not hidden:
         rate = Measured(variance.rate, math.sqrt(float(variance.covariance[1, 1])))
         square = Measured(gain.value**2, 2.0 * gain.value * gain.std)
         found["dark_current_from_variance_e_per_s"] = rate.over(square)
@@ -337,11 +384,13 @@ class _Stacks:
 def _stacks(given: EmvaInput, at: EmvaLevels, saturation: float, remarks: list[str]) -> _Stacks:
     """The level of most images near half of saturation, and the dark of most images nearest to its exposure."""
 
-    def half(number: int) -> tuple[int, float]:
-        return at.flats[number].repeats, -abs(at.signal[number] / saturation - 0.5)
+    every = EmvaLevels(replace(given, flats=given.spatial)) if given.spatial else at
 
-    near = [k for k in range(at.signal.size) if 0.3 <= at.signal[k] / saturation <= 0.7]
-    bright = at.flats[max(near, key=half)] if near else None
+    def half(number: int) -> tuple[int, float]:
+        return every.flats[number].repeats, -abs(every.signal[number] / saturation - 0.5)
+
+    near = [k for k in range(every.signal.size) if 0.3 <= every.signal[k] / saturation <= 0.7]
+    bright = every.flats[max(near, key=half)] if near else None
     exposure_s = bright.exposure_s if bright is not None else 0.0
     dark = max(at.darks, key=lambda level: (level.repeats, -abs(level.exposure_s - exposure_s)), default=None)
     if bright is None:

@@ -11,6 +11,7 @@ import numpy as np
 from lab.errors import NotDetermined
 from lab.fit.noise.dark_signal import DarkSignal, dark_lines, refuse_light_darks
 from lab.fit.noise.lamp_drift import LampDrift, lamp_drift
+from lab.fit.noise.level_consistency import LevelConsistency, level_consistency
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.photon_transfer import TransferFit, fit_transfer
 from lab.fit.noise.recorded_levels import RecordedLevels, Remarks
@@ -27,6 +28,7 @@ class Evaluation:
     levels: RecordedLevels
     dark: DarkSignal
     saturation: Saturation
+    consistency: LevelConsistency
     transfer: TransferFit
     points: list[tuple[MeasuredLevel, str]]
     remarks: Remarks
@@ -41,6 +43,23 @@ class Evaluation:
     def drift(self) -> LampDrift:
         """Drift of the lamp between repeats."""
         return lamp_drift(self.levels, self.dark, self.saturation)
+
+    @cached_property
+    def dark_drift_dn(self) -> float:
+        """Standard deviation of the means of repeated dark frames about that of their level, DN."""
+        rests = [
+            np.array(level.plane[name].frame_means) - level.plane[name].mean
+            for level in self.levels.darks
+            for name in self.levels.names
+            if level.repeats > 1
+        ]
+        freedom = sum(rest.size - 1 for rest in rests)
+        return float(np.sqrt(sum(float(rest @ rest) for rest in rests) / freedom)) if freedom else 0.0
+
+    @property
+    def light_scatter(self) -> float:
+        """Relative standard deviation of a level's mean beyond noise: between its repeats, or about a smooth response."""
+        return max(self.drift.relative, self.consistency.scatter)
 
 
 def evaluate(
@@ -57,23 +76,28 @@ def evaluate(
     dark = DarkSignal(recorded.darks, dark_lines(recorded, remarks))
     refuse_light_darks(recorded, dark)
     saturation = saturation_of(recorded, dark)
-    transfer, points = transfer_of(recorded, dark, saturation, recorded.darks)
-    evaluation = Evaluation(recorded, dark, saturation, transfer, points, remarks)
+    consistency = level_consistency(recorded, dark, saturation, remarks)
+    transfer, points = transfer_of(recorded, dark, saturation, recorded.darks, consistency.series)
+    evaluation = Evaluation(recorded, dark, saturation, consistency, transfer, points, remarks)
     _remark_on_transfer(evaluation)
     return evaluation
 
 
 def transfer_of(
-    recorded: RecordedLevels, dark: DarkSignal, saturation: Saturation, darks: Sequence[MeasuredLevel]
+    recorded: RecordedLevels,
+    dark: DarkSignal,
+    saturation: Saturation,
+    darks: Sequence[MeasuredLevel],
+    series: Sequence[MeasuredLevel],
 ) -> tuple[TransferFit, list[tuple[MeasuredLevel, str]]]:
-    """Photon transfer of `darks` and the unsaturated flats with repeats, and its points (level, plane).
+    """Photon transfer of `darks` and the unsaturated flats with repeats of the `series`, and its points (level, plane).
 
     Raises `NotDetermined` where fewer than three unsaturated flat levels have repeats, or where the variance doesn't
     grow with the signal.
     """
     points: list[tuple[MeasuredLevel, str]] = []
     x, v, s, plane, light = [], [], [], [], []
-    for level in (*darks, *recorded.flats):
+    for level in (*darks, *series):
         bright = level.lamp != "dark"
         for index, name in enumerate(recorded.names):
             own = level.plane[name]

@@ -149,7 +149,7 @@ class PlaneStatistics:
 class MeasuredLevel:
     """One level of light (0: dark): its setting, and the statistics of its planes by name.
 
-    `light` is proportional to the photons among the levels of the same `lamp`.
+    `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames.
     """
 
     exposure_s: float
@@ -157,6 +157,7 @@ class MeasuredLevel:
     lamp: Hashable
     plane: dict[str, PlaneStatistics]
     temperature_c: float | None = None
+    captures: tuple[str, ...] = ()
 
     @property
     def repeats(self) -> int:

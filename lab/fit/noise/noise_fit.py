@@ -15,7 +15,13 @@ from lab.fit.noise.evaluation import Evaluation, evaluate
 from lab.fit.noise.fixed_pattern import dsnu, prnu, remark_on_shading
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.read_noise import black_level, read_noise
-from lab.fit.noise.response import full_well, linearity_by_plane, main_lamp_levels, quantum_efficiency, remark_on_lamp
+from lab.fit.noise.response import (
+    full_well,
+    linearity_by_plane,
+    main_lamp_levels,
+    quantum_efficiency,
+    remark_on_scatter,
+)
 from lab.fit.noise.variance_curvature import variance_curvature_figures
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import ChannelNoise, Emva1288, NoiseFit, PhotonTransfer
@@ -43,7 +49,7 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
     """All figures. The order of the steps is that of the remarks."""
     t = e.transfer
     scale = 10.0 ** (-e.levels.gain_db / 20.0)
-    remark_on_lamp(e)
+    remark_on_scatter(e)
     remark_on_levels(e)
     remark_on_shading(e)
     principal = principal_figures(e)
@@ -64,6 +70,8 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
         dark_current_temperature=dark_current_temperature(e),
         read_noise_distribution=read_noise_distribution(pixels, t.gain) if dark and pixels is not None else None,
         defects=pixels.defects(t.gain) if dark and pixels is not None else None,
+        inconsistent_levels=e.consistency.inconsistent,
+        response_scatter_percent=100.0 * e.consistency.scatter,
         channels=channel_figures(e, principal),
         emva1288=emva1288_by_plane(e),
         photon_transfer=photon_transfer_points(e, linearity_by_plane(e)[1]),
@@ -76,7 +84,7 @@ def principal_figures(e: Evaluation) -> dict[str, float | None]:
     scale = 10.0 ** (-e.levels.gain_db / 20.0)
     errors = list(linearity_by_plane(e)[0].values())
     # Planes see the same lamp: where it drifts, their errors are fully correlated
-    together = 1.0 if e.drift.relative > 0 else float(np.sqrt(max(len(errors), 1)))
+    together = 1.0 if e.light_scatter > 0 else float(np.sqrt(max(len(errors), 1)))
     found: dict[str, tuple[float | None, float | None]] = {
         "conversion_gain_dn_per_e": (e.transfer.gain * scale, e.transfer.gain_std * scale),
         "read_noise_e": read_noise(e),
@@ -129,7 +137,8 @@ def emva1288_by_plane(e: Evaluation) -> dict[str, Emva1288]:
             wavelength_nm=lamp[2] if photons and isinstance(lamp, tuple) else None,
             saturation_dn=e.saturation.signal_dn[name],
             variance_error=e.transfer.model_error,
-            lamp_error=e.drift.relative,
+            lamp_error=e.light_scatter,
+            spatial=tuple(level for level in e.levels.flats if level.lamp == lamp and level.light > 0),
         )
         own = emva1288_figures(given)
         if isinstance(own, str):

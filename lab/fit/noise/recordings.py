@@ -55,6 +55,7 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
             lamps[group[0].id],
             stack_of(recordings, group, pixels.bad).statistics(),
             group[0].temperature_c,
+            tuple(flat.id for flat in group),
         )
         for group in _grouped(flats, lambda flat: (flat.exposure_s, _light(flat), lamps[flat.id]))
     ]

@@ -10,7 +10,7 @@ from lab.fit.noise.evaluation import Evaluation, in_electrons
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.photon_transfer import LINE_LIMIT
 from lab.fit.rounding import QUANTISATION_DN2
-from lab.fit.weighted_lines import Linearity, least_squares, linearity
+from lab.fit.weighted_lines import Linearity, linearity
 from sim.spectrum import FloatArray
 
 LINEARITY_RANGE = (0.05, 0.95)  # of saturation: range of the linearity line of EMVA 1288
@@ -36,10 +36,10 @@ def linearity_by_plane(e: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[
 
 
 def main_lamp_levels(e: Evaluation) -> list[MeasuredLevel]:
-    """Flats of the lamp with most levels."""
-    lamps = [level.lamp for level in e.levels.flats]
+    """Flats of the series of the lamp with most levels."""
+    lamps = [level.lamp for level in e.consistency.series]
     lamp = max(dict.fromkeys(lamps), key=lamps.count)
-    return [level for level in e.levels.flats if level.lamp == lamp]
+    return [level for level in e.consistency.series if level.lamp == lamp]
 
 
 def levels_in_range(e: Evaluation, name: str, low: float, high: float) -> list[MeasuredLevel]:
@@ -58,14 +58,14 @@ def levels_in_range(e: Evaluation, name: str, low: float, high: float) -> list[M
 def response_to_light(
     e: Evaluation, name: str, levels: Sequence[MeasuredLevel]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Light, signal (DN above dark) and its standard deviation, (levels,) each: by noise, and by the drift of the lamp
-    between repeats.
+    """Light, signal (DN above dark) and its standard deviation, (levels,) each: by noise, and by what the levels
+    scatter beyond it.
     """
     signal = np.array([level.plane[name].mean - e.dark.mean_dn(name, level.exposure_s) for level in levels])
     noise = np.array([level.plane[name].mean_std for level in levels])
     shot = e.transfer.gain * np.maximum(signal, 0.0) + QUANTISATION_DN2
     noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
-    return np.array([level.light for level in levels]), signal, np.hypot(noise, e.drift.relative * signal)
+    return np.array([level.light for level in levels]), signal, np.hypot(noise, e.light_scatter * signal)
 
 
 def full_well(e: Evaluation) -> tuple[float | None, float | None]:
@@ -109,28 +109,26 @@ def quantum_efficiency(e: Evaluation) -> tuple[float | None, float | None, float
     return value, std, lamp[2]
 
 
-def remark_on_lamp(e: Evaluation) -> None:
-    """Report a drift of the lamp between repeats, or else between levels."""
-    drift = e.drift
+def remark_on_scatter(e: Evaluation) -> None:
+    """Report means that differ beyond noise: between the repeats of a level, or else about a smooth response.
+
+    Repeats have the same stated light and the same response: what is left is the light itself, or a dark level that
+    moves, which the darks show. Levels differ in all of these, so that no cause is named.
+    """
+    drift, scatter = e.drift, e.consistency.scatter
     if drift.relative > 0:
+        cause = (
+            "the dark level moved"
+            if e.dark_drift_dn > 0.5 * drift.std_dn
+            else "the lamp drifted, or the time of exposure varied"
+        )
         e.remarks.add(
-            f"the lamp drifted: the means of repeated flat frames differ by {drift.std_dn:.2g} DN (rms) where noise explains "
+            f"{cause}: the means of repeated flat frames differ by {drift.std_dn:.2g} DN (rms) where noise explains "
             f"{drift.noise_dn:.2g} DN ({100 * drift.relative:.2g} % of the signal)"
         )
-        return
-    # Drift between levels: the residual of a cubic through the means, all planes together
-    rests, noises = [], []
-    for name in e.levels.names:
-        levels = levels_in_range(e, name, *LINEARITY_RANGE)
-        if len({level.light for level in levels}) < 7:
-            continue
-        light, signal, std = response_to_light(e, name, levels)
-        basis = np.polynomial.legendre.legvander(2.0 * (light - light.min()) / np.ptp(light) - 1.0, 3)
-        solution, _, _ = least_squares(basis, signal, std)
-        rests.append(np.sqrt(np.sum((signal - basis @ solution) ** 2) / (len(levels) - 4)))
-        noises.append(np.sqrt(np.mean(std**2)))
-    if rests and np.mean(rests) > 4.0 * np.mean(noises):
+    if scatter > 1.5 * drift.relative:
         e.remarks.add(
-            f"the lamp drifted between levels: their means depart by {np.mean(rests):.2g} DN (rms) from a smooth response where noise "
-            f"explains {np.mean(noises):.2g} DN"
+            f"the means of the levels scatter by {100 * scatter:.2g} % of the signal about a smooth response, where noise explains "
+            f"{100 * e.consistency.noise:.1g} %: it is in the uncertainties; a light that varies, exposures or photon numbers that are "
+            "stated wrong and a response with steps all do that"
         )

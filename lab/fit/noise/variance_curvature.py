@@ -8,7 +8,11 @@ from lab.fit.noise.evaluation import Evaluation
 from lab.fit.noise.photon_transfer import CURVE_LIMIT
 from lab.fit.noise.response import levels_in_range, response_to_light
 from lab.fit.weighted_lines import chi2_factor, least_squares
+from sim.spectrum import FloatArray
 
+LARGEST_MISFIT = 1.0  # of what a bend brings: a law that leaves more than that doesn't describe the means
+LARGEST_SCATTER = 0.05  # of the signal: beyond it, errors of the stated light make a bend where there is none
+LARGEST_BEND_STD = 0.5  # of saturation: a bend that is less certain says nothing
 #: Planes that the pixels of a plane adjoin along rows and columns.
 ADJACENT = {"Y": ("Y",), "R": ("G1", "G2"), "B": ("G1", "G2"), "G1": ("R", "B"), "G2": ("R", "B")}
 
@@ -33,6 +37,8 @@ def variance_curvature_figures(e: Evaluation) -> dict[str, float]:
     # v = K (dy/de)^2 e: a response of curvature b at saturation gives the variance a curvature of 3 b
     missing = 3.0 * response[0] - t.relative_curvature
     missing_std = float(np.hypot(3.0 * response[1], t.relative_curvature_std))
+    if missing_std > LARGEST_BEND_STD:
+        return found
     found["brighter_fatter_percent"], found["brighter_fatter_percent_std"] = 100.0 * missing, 100.0 * missing_std
     causes = []
     if abs(response[0]) > 4.0 * response[1] and abs(3.0 * response[0]) > 2.0 * missing_std:
@@ -55,8 +61,14 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
     together.
 
     x = o + S l + q l^2, with an offset for light that the clock of the exposure doesn't count; the result is q x_sat /
-    S^2.
+    S^2. None, and a remark, where the means don't follow this law.
     """
+    if e.consistency.scatter > LARGEST_SCATTER:
+        e.remarks.add(
+            f"the levels scatter by {100.0 * e.consistency.scatter:.2g} % of the signal about every smooth response: the curvature of the "
+            "response isn't given"
+        )
+        return None
     values, weights, highest = [], [], max(e.saturation.signal_dn.values())
     for name in e.levels.names:
         levels = levels_in_range(e, name, 0.0, CURVE_LIMIT)
@@ -71,7 +83,18 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
             basis = np.stack([np.ones_like(light), charge, charge**2], axis=1)
             solution, covariance, chi2 = least_squares(basis, signal + below, std)
             slope = float(solution[1])
-        covariance *= chi2_factor(chi2, len(levels) - 3)
+        # Share of the signal's rms that the law leaves, and that which its bend brings beyond a straight line
+        rest = _rms((signal + below - basis @ solution) / std)
+        straight, _, _ = least_squares(basis[:, :2], basis[:, 2] * solution[2], std)
+        brought = _rms((basis[:, 2] * solution[2] - basis[:, :2] @ straight) / std)
+        factor = chi2_factor(chi2, len(levels) - 3)
+        covariance *= factor
+        if factor > 1.0 and rest > LARGEST_MISFIT * brought:
+            e.remarks.add(
+                f"the means of the levels don't follow a response that bends like a parabola: they depart from it by {rest:.2g} times "
+                f"their noise, its bend brings {brought:.2g} times; no curvature of the response is given"
+            )
+            return None
         _, slope, square = solution
         gradient = highest * np.array([0.0, -2.0 * square / slope**3, 1.0 / slope**2])
         values.append(float(square * highest / slope**2))
@@ -80,7 +103,17 @@ def response_curvature(e: Evaluation) -> tuple[float, float] | None:
         return None
     mean = float(np.average(values, weights=weights))
     chi2 = float(np.sum(np.array(weights) * (np.array(values) - mean) ** 2))
-    return mean, float(np.sqrt(chi2_factor(chi2, len(values) - 1) / np.sum(weights)))
+    mean_std = float(np.sqrt(chi2_factor(chi2, len(values) - 1) / np.sum(weights)))
+    if mean_std > LARGEST_BEND_STD:
+        e.remarks.add(
+            f"the levels leave the curvature of the response uncertain to {100.0 * mean_std:.2g} % at saturation: it isn't given"
+        )
+        return None
+    return mean, mean_std
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def neighbour_covariance(e: Evaluation) -> tuple[float, float] | None:

@@ -58,12 +58,33 @@ class NoiseFit(ChannelNoise):
     dark_current_temperature: DarkCurrentLaws | None = None
     read_noise_distribution: ReadNoiseDistribution | None = None
     defects: PixelDefects | None = None
+    #: Flats whose stated light contradicts the others: left out of responsivity, linearity and gain.
+    inconsistent_levels: tuple[InconsistentLevel, ...] = ()
+    #: Standard deviation of the levels' means about a smooth response beyond noise, percent of the signal; 0 where noise explains
+    #: them. It is part of the uncertainties of responsivity, quantum efficiency and linearity.
+    response_scatter_percent: float | None = None
     channels: dict[str, ChannelNoise] = {}
     #: By plane of the mosaic (`R`, `G1`, `G2`, `B`, or `Y`), by the letter of the standard.
     emva1288: dict[str, Emva1288] = {}
     photon_transfer: PhotonTransfer | None = None
     #: What the recordings show of the bench, in sentences ("the lamp drifted by ...").
     remarks: tuple[str, ...] = ()
+
+
+class InconsistentLevel(Frozen):
+    """A flat level whose stated light contradicts the other levels; signals are above dark, means over the planes.
+
+    `light`: as stated, in `light_unit`; `expected_light`: at which the others have its signal; `expected_signal_dn`: that they
+    have at its stated light, at most saturation.
+    """
+
+    captures: tuple[str, ...]
+    exposure_s: float
+    light: float
+    light_unit: Literal["photons", "s"]
+    expected_light: float
+    signal_dn: float
+    expected_signal_dn: float
 
 
 class DarkCurrentLaws(Frozen):

@@ -1,0 +1,218 @@
+"""A robust response to light: which levels contradict the others, and how far the rest scatter about a smooth law.
+
+The signal of a level is measured; its light is stated (a number of photons, or an exposure) and may be wrong. The law
+is therefore one of the stated light against the measured signal x, in which no error has leverage:
+
+    log(light / x) = a + b u + c u^2 + ... + o / u,   u = x / saturation
+
+o is an offset (light that the clock of the exposure doesn't count, an error of the dark), with a normal prior.
+Least trimmed squares finds the law (Rousseeuw, J. Am. Stat. Assoc. 79, 871 (1984)): the quarter of the levels that
+fits worst doesn't count. Which of these are outliers is tested from the many to the few (Rosner, Technometrics 25,
+165 (1983)), so that outliers don't hide each other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, special, stats
+
+from lab.fit.weighted_lines import least_squares
+from sim.spectrum import FloatArray
+
+LEAST_LEVELS = 5  # with fewer, one wrong level can't be told from the others
+TRIMMED_SHARE = 0.25  # of the levels; a fifth may be wrong
+LAW_RANGE = (0.01, 0.9)  # of saturation: levels that determine the law
+SQUARE_FROM, CUBE_FROM = 8, 16  # levels from which the law has a square, a cube: the trimmed rest still determines it
+OFFSET_STD = 1e-3  # of saturation
+FALSE_ALARM = 1e-3  # probability that one of the levels of a sound series is called an outlier
+LEAST_DEPARTURE = 0.005  # of the light: smaller departures are scatter
+DIM_DEPARTURE = 4.0 * OFFSET_STD  # of saturation, of levels below the range of the law
+BRIGHT_DEPARTURE = 0.05  # of the light, of levels above it that state too little
+BRIGHT_EXCESS = 1.25  # light over that expected, of levels above it: the response may roll off there
+SUBSETS = 600  # elemental subsets; 20 % wrong levels leave 250 of them clean with four numbers to determine
+EXCESS_CHANCE = 1e-3  # probability below which residuals are more than the stated noise
+
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class RobustResponse:
+    """The law, and the levels (n,) against it.
+
+    `outlier`: stated light contradicts the other levels. `expected_light`: light at which the others have the measured
+    signal; `expected_signal`: signal that they have at the stated light, at most saturation. `scatter`: relative
+    standard deviation of the sound levels beyond the stated noise, 0 where noise explains them; `noise`: their
+    relative rms by that noise.
+    """
+
+    outlier: BoolArray
+    expected_light: FloatArray
+    expected_signal: FloatArray
+    scatter: float
+    noise: float
+
+
+def robust_response(
+    light: FloatArray,
+    signal: FloatArray,
+    signal_std: FloatArray,
+    saturation: float,
+    clipped: BoolArray,
+    rng: np.random.Generator,
+) -> RobustResponse | None:
+    """The response that most of the levels (n,) follow; None with fewer than five unsaturated levels.
+
+    `light`: as stated, in any unit; `signal`, `signal_std`, `saturation`: DN above dark; `clipped`: levels that
+    saturate. `rng` draws the subsets of the levels.
+    """
+    low, high = LAW_RANGE
+    inside = ~clipped & (light > 0) & (signal >= low * saturation) & (signal <= high * saturation)
+    if np.count_nonzero(inside) < LEAST_LEVELS:
+        return None
+    law = _Law.of(light[inside], signal[inside], signal_std[inside], saturation)
+    sound = law.sound_levels(rng)
+    solution, scatter = law.fitted(sound)
+    outlier = np.zeros(light.size, bool)
+    outlier[inside] = ~sound
+    expected_light = _light_at(signal / saturation, solution)
+    u = np.linspace(-0.05, 1.0, 4201)
+    expected = saturation * np.interp(light, np.maximum.accumulate(_light_at(u, solution)), u)
+    dim = ~clipped & (signal < low * saturation)
+    outlier |= dim & (np.abs(signal - expected) > DIM_DEPARTURE * saturation)
+    bright = ~clipped & (signal > high * saturation)
+    short = expected_light > (1.0 + BRIGHT_DEPARTURE) * light  # too little light for the signal
+    outlier |= bright & (short | (light > BRIGHT_EXCESS * expected_light))
+    outlier |= clipped & (expected < (1.0 - 4.0 * BRIGHT_DEPARTURE) * saturation)
+    noise = float(np.sqrt(np.mean(law.noise[sound] ** 2)))
+    return RobustResponse(outlier, expected_light, expected, scatter, noise)
+
+
+def _light_at(u: FloatArray, solution: FloatArray) -> FloatArray:
+    """Light at the signals u (of saturation); `solution`: offset, then the polynomial's coefficients."""
+    return np.asarray((u + solution[0]) * np.exp(np.polynomial.polynomial.polyval(u, solution[1:])))
+
+
+@dataclass(frozen=True)
+class _Law:
+    """The levels (n,) of the law: basis (n, 1 + p), offset first; log(light / u); relative noise of the signal."""
+
+    basis: FloatArray
+    value: FloatArray
+    noise: FloatArray
+
+    @classmethod
+    def of(cls, light: FloatArray, signal: FloatArray, signal_std: FloatArray, saturation: float) -> _Law:
+        u = signal / saturation
+        degree = 1 + (u.size >= SQUARE_FROM) + (u.size >= CUBE_FROM)
+        basis = np.concatenate([1.0 / u[:, None], np.polynomial.polynomial.polyvander(u, degree)], axis=1)
+        return cls(basis, np.log(light / u), signal_std / signal)
+
+    def solved(self, chosen: BoolArray, scatter: float) -> tuple[FloatArray, FloatArray]:
+        """Solution and covariance over the levels `chosen` (n,), with `scatter` added to their noise."""
+        prior = np.zeros((1, self.basis.shape[1]))
+        prior[0, 0] = 1.0
+        solution, covariance, _ = least_squares(
+            np.concatenate([self.basis[chosen], prior]),
+            np.append(self.value[chosen], 0.0),
+            np.append(np.hypot(self.noise[chosen], scatter), OFFSET_STD),
+        )
+        return solution, covariance
+
+    def freedom(self, chosen: BoolArray, covariance: FloatArray, std: FloatArray) -> float:
+        """Degrees of freedom of the residuals of the levels `chosen`."""
+        taken = np.einsum("ij,jk,ik->i", self.basis[chosen], covariance, self.basis[chosen]) / std[chosen] ** 2
+        return max(float(np.count_nonzero(chosen) - taken.sum()), 1.0)
+
+    def scattered(self, chosen: BoolArray) -> tuple[FloatArray, FloatArray, float, float]:
+        """Solution, covariance, scatter and degrees of freedom of the levels `chosen`: the scatter with which chi2 has
+        its expected value (Paule and Mandel).
+        """
+
+        def excess(log_scatter: float) -> float:
+            scatter = math.exp(log_scatter)
+            solution, covariance = self.solved(chosen, scatter)
+            std = np.hypot(self.noise, scatter)
+            rest = ((self.value - self.basis @ solution) / std)[chosen]
+            return float(rest @ rest) / self.freedom(chosen, covariance, std) - 1.0
+
+        least, most = math.log(1e-7), math.log(10.0)
+        scatter = 1e-7
+        if excess(least) > 0:
+            scatter = math.exp(optimize.brentq(excess, least, most, xtol=1e-2)) if excess(most) < 0 else 10.0
+        solution, covariance = self.solved(chosen, scatter)
+        return solution, covariance, scatter, self.freedom(chosen, covariance, np.hypot(self.noise, scatter))
+
+    def fitted(self, sound: BoolArray) -> tuple[FloatArray, float]:
+        """Solution over the `sound` levels, and their scatter where noise doesn't explain their residuals."""
+        solution, covariance = self.solved(sound, 0.0)
+        rest = ((self.value - self.basis @ solution) / self.noise)[sound]
+        freedom = self.freedom(sound, covariance, self.noise)
+        if special.chdtrc(freedom, float(rest @ rest)) > EXCESS_CHANCE:
+            return solution, 0.0
+        solution, _, scatter, _ = self.scattered(sound)
+        return solution, scatter
+
+    def sound_levels(self, rng: np.random.Generator) -> BoolArray:
+        """Levels (n,) that aren't outliers: the largest number of outliers that are all significant is left out."""
+        count = self.value.size
+        wrong = max(int(TRIMMED_SHARE * count), 1)
+        start = self._trimmed(count - wrong, rng)
+        for number in range(wrong, 0, -1):
+            chosen = self._concentrated(start, count - number)
+            solution, covariance, scatter, freedom = self.scattered(chosen)
+            out = ~chosen
+            rest = np.abs(self.value - self.basis @ solution)[out]
+            leverage = np.einsum("ij,jk,ik->i", self.basis[out], covariance, self.basis[out])
+            std = np.sqrt(self.noise[out] ** 2 + scatter**2 + leverage)
+            # With `number` levels out, one of `count - number + 1` is the next candidate
+            limit = stats.t.isf(FALSE_ALARM / (2.0 * (count - number + 1)), freedom)
+            if np.all((rest > limit * std) & (rest > LEAST_DEPARTURE)):
+                return chosen
+        return np.ones(count, bool)
+
+    def _trimmed(self, kept: int, rng: np.random.Generator) -> BoolArray:
+        """The `kept` levels of least trimmed squares."""
+        count, terms = self.value.size, self.basis.shape[1] - 1
+        if math.comb(count, terms) <= SUBSETS:
+            subsets = np.array(list(combinations(range(count), terms)))
+        else:
+            subsets = np.array([rng.choice(count, terms, replace=False) for _ in range(SUBSETS)])
+        polynomial = self.basis[:, 1:]
+        parts = polynomial[subsets]
+        usable = np.abs(np.linalg.det(parts)) > 1e-12
+        solutions = np.linalg.solve(parts[usable], self.value[subsets[usable]][..., None])[..., 0]
+        squares = (self.value - solutions @ polynomial.T) ** 2
+        best = np.argsort(np.sort(squares, axis=1)[:, :kept].sum(axis=1))[:5]
+        found: tuple[float, BoolArray] | None = None
+        for row in squares[best]:
+            chosen = self._concentrated(_smallest(row, kept), kept)
+            scatter = self.scattered(chosen)[2]
+            if found is None or scatter < found[0]:
+                found = scatter, chosen
+        if found is None:  # levels of one signal
+            return np.ones(count, bool)
+        return found[1]
+
+    def _concentrated(self, chosen: BoolArray, kept: int) -> BoolArray:
+        """The `kept` levels nearest to the law of the levels `chosen`, and so on until these don't change."""
+        scatter = 0.0
+        for _ in range(10):
+            solution, _ = self.solved(chosen, scatter)
+            rest = np.abs(self.value - self.basis @ solution)
+            scatter = float(np.sqrt(np.mean(rest[chosen] ** 2)))
+            nearer = _smallest(rest / np.hypot(self.noise, scatter), kept)
+            if np.array_equal(nearer, chosen):
+                break
+            chosen = nearer
+        return chosen
+
+
+def _smallest(values: FloatArray, kept: int) -> BoolArray:
+    chosen = np.zeros(values.size, bool)
+    chosen[np.argsort(values, kind="stable")[:kept]] = True
+    return chosen
