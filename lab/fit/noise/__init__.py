@@ -5,6 +5,7 @@ Definitions: EMVA Standard 1288, release 4.0 (linear). The steps, one module eac
 - `frame_sums`, `level_statistics`: means, temporal and spatial variances of the repeats of one level; `shading`,
   `defective_pixels`;
 - `dark_signal`: dark means against exposure; `saturation`: which flats clip, and where;
+- `robust_response`, `level_consistency`: which flats serve the lines, and what their means scatter;
 - `photon_transfer`: conversion gain and curvature from variances against means; `evaluation`: the state that these
   leave for the rest;
 - `read_noise`, `dark_current`, `fixed_pattern` (DSNU, PRNU, shading), `response` (linearity, full well, quantum
