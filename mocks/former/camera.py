@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import ndtr, pdtrik
 
-from mocks.former.law import FULL_CODE_DN, WAVELENGTH_NM, Array, Law
+from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Array, Law
 from mocks.former.transfer import Transfer
 
 HC_J_NM = 1.98644586e-16
@@ -29,11 +29,12 @@ class ConcealedCamera:
     side                "left" or "right" of a pair
     offset_mm           distance to the right of the pair's left camera
     pair_middle_mm      where boards stand that both cameras see
+    bit_depth           of the converter; a code of another depth than 12 has as much more or less charge, so that the full well stays
     """
 
     def __init__(
         self, seed: int, laws: Sequence[Law] = (), *, cfa: str | None = None, f_number: float | None = None, rows: int = 384, cols: int = 512, noise_draw: int = 0,
-        side: str = "left", offset_mm: float = 0.0, pair_middle_mm: float = 0.0,
+        side: str = "left", offset_mm: float = 0.0, pair_middle_mm: float = 0.0, bit_depth: int = BIT_DEPTH,
     ) -> None:  # fmt: skip
         self.side, self.offset_mm, self.pair_middle_mm = side, offset_mm, pair_middle_mm
         self.seed, self.noise_draw, self.rows, self.cols = seed, noise_draw, rows, cols
@@ -46,13 +47,16 @@ class ConcealedCamera:
         self.f_number = f_number or drawn_f_number
         self.focal_length_mm = float(rng.choice([6.0, 8.0, 12.0]))
         self.lens_transmittance = float(rng.uniform(0.85, 0.95))
-        self.gain_dn_per_e = float(rng.uniform(0.3, 0.6))
+        self.bit_depth = bit_depth
+        self.full_code_dn = 2**bit_depth - 1
+        codes = 2.0 ** (bit_depth - BIT_DEPTH)
+        self.gain_dn_per_e = codes * float(rng.uniform(0.3, 0.6))
         self.read_noise_e = float(rng.uniform(1.5, 5.0))
         self.dark_e_per_s = float(rng.uniform(2.0, 20.0))
         self.dsnu_e = float(rng.uniform(0.5, 1.5))
         self.prnu_percent = float(rng.uniform(0.4, 1.0))
-        self.black_level_dn = float(rng.choice([64.0, 128.0, 168.0, 240.0]))
-        self.full_well_e = (FULL_CODE_DN - self.black_level_dn) / self.gain_dn_per_e
+        self.black_level_dn = codes * float(rng.choice([64.0, 128.0, 168.0, 240.0]))
+        self.full_well_e = (self.full_code_dn - self.black_level_dn) / self.gain_dn_per_e
         peaks = (
             {"Y": (540, 95, 0.62)}
             if self.cfa == "MONO"
@@ -163,7 +167,7 @@ class ConcealedCamera:
         dn = self.black_level_dn + self.gain_dn_per_e * e + offset_dn
         for law in laws:
             dn = law.processed_dn(law.adc_output(dn))
-        return np.clip(np.round(dn), 0, FULL_CODE_DN).astype(np.uint16)
+        return np.clip(np.round(dn), 0, self.full_code_dn).astype(np.uint16)
 
     def _photoelectrons(self, images: dict[str, Array], exposure_s: float, elapsed_s: float, draw: int) -> Array:
         """Mean photoelectrons of the mosaic."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 Array = Any
 WAVELENGTH_NM: NDArray[np.float64] = np.arange(380.0, 781.0)
-FULL_CODE_DN = 4095
+BIT_DEPTH = 12  # of a converter that nobody asks otherwise
 REFERENCE_NM = 550.0  # at which laws that depend on the wavelength have their stated strength
 
 #: Kinds of capture that show a law; by default flats.

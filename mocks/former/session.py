@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mocks.former.camera import STEP_S, ConcealedCamera
-from mocks.former.law import FULL_CODE_DN, WAVELENGTH_NM, Array
+from mocks.former.law import WAVELENGTH_NM, Array
 from mocks.former.scenes import TURN_DEG, BoardPose, board, chart, edge, pattern
 
 BEGIN = datetime(2026, 3, 2, 9, tzinfo=UTC)
@@ -111,7 +111,7 @@ class _Recorder:
             steps[kind](plan)
         stated = {
             "rows": camera.rows, "cols": camera.cols, "pixel_pitch_um": camera.pitch_um, "fill_factor": camera.fill_factor, "cfa": camera.cfa,
-            "bit_depth": 12, "black_level_dn": camera.black_level_dn, "white_level_dn": FULL_CODE_DN, "f_number": camera.f_number,
+            "bit_depth": camera.bit_depth, "black_level_dn": camera.black_level_dn, "white_level_dn": camera.full_code_dn, "f_number": camera.f_number,
             "focal_length_mm": camera.focal_length_mm, "lens_transmittance": camera.lens_transmittance, "quantum_efficiency": curves,
         }  # fmt: skip
         manifest = {"name": name, "cameras": {camera.side: stated}, "captures": self.captures}
