@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.study import Study
@@ -31,7 +32,7 @@ def neighbour_block(study: Study) -> Block:
     lit = [r.level > max(20.0 * abs(noise.dark_dn_per_s) * r.exposure_s, 4.0 * noise.read_dn) for r in points]
     level = np.array([max(r.level, 1.0) for r in points])
     value = np.concatenate([r.correlation for r in points])
-    std = np.concatenate([r.correlation_std for r in points])
+    covariance = block_diag(*(r.correlation_covariance for r in points))
     names = list(PAIRS)
 
     def predict(effects: Effects) -> Prediction:
@@ -59,7 +60,7 @@ def neighbour_block(study: Study) -> Block:
 
     return Block(
         measurement=NOISE_NEIGHBOURS, reach=LEVEL_REACH, along=np.repeat(np.log(level), len(names)),
-        value=value, covariance=np.diag(np.square(std) + CORRELATION_FLOOR**2),
+        value=value, covariance=covariance + CORRELATION_FLOOR**2 * np.eye(len(value)),
         labels=tuple(Label(r.level if bright else 0.0, name, f"{r.exposure_s:.4g} s" if bright else f"dark, {r.exposure_s:.4g} s", r.captures, r.held_out)
                      for r, bright in zip(points, lit, strict=True) for name in names),
         reads=frozenset({"signal.filters", "charge.correlation"}), predict=predict, scale=np.ones(len(value)),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ PAIRS: dict[str, tuple[tuple[int, int], ...]] = {
 @dataclass(frozen=True)
 class Repeats:
     """Temporal noise of the repeats of one setting: by plane of the mosaic the mean above black and the variance (DN, DN^2; None
-    where it is clipped), the variance's standard uncertainty as a share of it; by `PAIRS` the correlation and its uncertainty."""
+    where it is clipped), the variance's standard uncertainty as a share of it; by `PAIRS` the correlation and its covariance."""
 
     captures: tuple[str, ...]
     exposure_s: float
@@ -49,7 +50,7 @@ class Repeats:
     variance: dict[str, float | None]
     relative_std: dict[str, float]
     correlation: FloatArray
-    correlation_std: FloatArray
+    correlation_covariance: FloatArray
 
     @property
     def level(self) -> float:
@@ -97,12 +98,14 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
         for plane in planes:
             np.divide(plane, np.float32(np.sqrt(max(variance[name], 1e-12))), out=plane)
             plane[np.abs(plane) > OUTLIER] = 0.0
-    correlation, std = _correlations(frames, freedom, cfa)
+    correlation = _correlations(frames, freedom, cfa)
+    covariance = independent_correlations(first.shape, freedom, cfa)[1]
     clean = {name: share < 0.1 * CLIPPED_SHARE for name, share in clipped.items()}
     moving = min(variance.values()) > LEAST_DN2
     if not (moving and (all(clean.values()) or not lit)):
         correlation = np.full(len(PAIRS), np.nan)
     # correlated noise has more uncertain estimates
+    std = np.sqrt(np.diag(covariance))
     spread = 1.0 + float(np.sum(_NUMBER * np.square(np.where(np.abs(correlation) > 4.0 * std, correlation, 0.0))))
     return Repeats(
         captures=tuple(c.id for c in use),
@@ -111,9 +114,11 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
         held_out=held_out,
         signal=signal,
         variance={n: v if clean[n] and moving else None for n, v in variance.items()},
-        relative_std={n: float(np.sqrt(2.0 * spread / (freedom * rows * cols))) for n, (rows, cols) in sizes.items()},
+        relative_std={
+            n: float(np.sqrt(2.0 * spread / (freedom * (rows - 1) * (cols - 1)))) for n, (rows, cols) in sizes.items()
+        },
         correlation=correlation,
-        correlation_std=std * np.sqrt(spread),
+        correlation_covariance=covariance * spread,
     )
 
 
@@ -139,22 +144,99 @@ def _level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
 _NUMBER = np.array([2.0 * len(lags) for lags in PAIRS.values()])
 
 
-def _correlations(frames: Sequence[Any], freedom: int, cfa: Cfa) -> tuple[FloatArray, FloatArray]:
-    """Correlations of standardised departures and their standard deviations, by `PAIRS`, corrected for the means of rows and columns that were
-    subtracted."""
-    rows, cols = frames[0].shape
-    value, std = [], []
+def _correlations(frames: Sequence[Any], freedom: int, cfa: Cfa) -> FloatArray:
+    """Correlations of standardised departures by `PAIRS`, less what independent pixels show of them."""
+    found = []
     for lags in PAIRS.values():
-        total, count = 0.0, 0
+        total = 0.0
         for down, right in lags:
-            here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
-            there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
+            here, there = _moved(frames[0].shape, down, right)
             total += sum(float(np.einsum("ij,ij->", f[here], f[there], dtype=np.float64)) for f in frames)
-            count += (rows - down) * (cols - abs(right))
-        down, right = lags[0]
-        period = 1 if cfa == "MONO" else 2
-        same = down % period == 0 and right % period == 0
-        lost = (period / cols if down == 0 else period / rows) if same and 0 in (down, right) else 0.0
-        value.append(total / count / freedom + lost)
-        std.append(1.0 / np.sqrt(count * freedom))
-    return np.array(value), np.array(std)
+        found.append(total / (freedom * _count(frames[0].shape, lags)))
+    return np.array(found) - independent_correlations(frames[0].shape, freedom, cfa)[0]
+
+
+@cache
+def independent_correlations(shape: tuple[int, int], freedom: int, cfa: Cfa) -> tuple[FloatArray, FloatArray]:
+    """Expectation (k,) and covariance (k, k), by `PAIRS`, of the correlations of normal, independent pixels of `shape` after the means of rows and
+    columns were taken out of each plane of the mosaic.
+
+    The departures are P z with P = G_rows x G_cols and G = 1 - sum_a u_a u_a' / n_a, where u_a marks the n_a places of phase a of the
+    mosaic. A number is z'PAPz / count with A the sum of shifts S_down x S_right: its expectation is tr(PA), the covariance of two
+    tr(PAPB) + tr(PAPB'), and these traces factor by rows and columns. Pairs within a plane are divided by the plane's measured variance with
+    M = freedom (rows - 1) (columns - 1) degrees of freedom. Direction and length of a normal vector are independent, so that the
+    expectation stays and the second moments take the factor M / (M + 2): exact for planes of one size.
+    """
+    period = mosaic.step(cfa)
+    pairs = list(PAIRS.values())
+    count = np.array([_count(shape, lags) for lags in pairs], float)
+    rows, cols = (_MeansTakenOut(n, period) for n in shape)
+    expected = np.array([sum(rows.trace(d) * cols.trace(r) for d, r in lags) for lags in pairs]) / count
+    covariance = np.array(
+        [
+            [
+                sum(
+                    rows.trace(d, sign * e) * cols.trace(r, sign * s)
+                    for d, r in one
+                    for e, s in other
+                    for sign in (1, -1)
+                )
+                for other in pairs
+            ]
+            for one in pairs
+        ]
+    ) / np.outer(count, count)  # fmt: skip
+    within = np.array([all(d % period == 0 and r % period == 0 for d, r in lags) for lags in pairs])
+    m = freedom * float(np.prod([n // period - 1 for n in shape]))
+    both = np.outer(within, within)
+    planes = period**2
+    share = np.where(both, m / (m + 2.0), 1.0)
+    lost = np.where(both, 2.0 / (m + 2.0) * freedom * np.outer(expected, expected) / planes, 0.0)
+    return expected, (share * covariance - lost) / freedom
+
+
+class _MeansTakenOut:
+    """Along one side of n places: G = 1 - sum_a u_a u_a' / n_a takes out the mean of every phase a of the mosaic."""
+
+    def __init__(self, n: int, period: int) -> None:
+        self.n = n
+        self._marks = np.zeros((n, period))
+        for a in range(period):
+            self._marks[a::period, a] = 1.0 / np.sqrt(len(range(a, n, period)))
+
+    def trace(self, *steps: int) -> float:
+        """tr(G S_a) or tr(G S_a G S_b), S_a the shift by a places with nothing beyond the ends."""
+        u = self._marks
+        if len(steps) == 1:
+            return self._shifts(steps[0]) - float(np.sum(u * _shifted(u, steps[0])))
+        a, b = steps
+        ab = float(np.sum(u * _shifted(_shifted(u, b), a)))
+        ba = float(np.sum(u * _shifted(_shifted(u, a), b)))
+        inner = (u.T @ _shifted(u, a)) @ (u.T @ _shifted(u, b))
+        return self._shifts(a, b) - ab - ba + float(np.trace(inner))
+
+    def _shifts(self, *steps: int) -> float:
+        """tr(S_a) or tr(S_a S_b)."""
+        return float(max(self.n - abs(steps[0]), 0)) if sum(steps) == 0 else 0.0
+
+
+def _shifted(values: FloatArray, step: int) -> FloatArray:
+    """S_step values, (n, k): row i is row i + step of `values`, zero beyond."""
+    out = np.zeros_like(values)
+    n = len(values)
+    if abs(step) < n:
+        out[max(-step, 0) : n - max(step, 0)] = values[max(step, 0) : n + min(step, 0)]
+    return out
+
+
+def _moved(shape: tuple[int, int], down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Of pairs `down` rows and `right` columns apart, where the one and the other stand."""
+    rows, cols = shape
+    here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
+    there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
+    return here, there
+
+
+def _count(shape: tuple[int, int], lags: Sequence[tuple[int, int]]) -> int:
+    """How many such pairs a frame has."""
+    return sum((shape[0] - down) * (shape[1] - abs(right)) for down, right in lags)

@@ -16,7 +16,7 @@ from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
 from lab.diagnose.measurements.noise_neighbours import correlations, neighbour_block
 from lab.diagnose.measurements.study import Study
-from lab.diagnose.measurements.temporal_noise import PAIRS
+from lab.diagnose.measurements.temporal_noise import PAIRS, independent_correlations, repeats_of
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
@@ -29,6 +29,8 @@ from sim.frame import Exposure, dark_electrons, expected_electrons, read_out
 from sim.scene.scenes import Darkness, UniformField
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
+
+SETS = 400  # of frames
 
 LIGHT = Spectrum.of([400.0, 700.0], [2e-3, 2e-3])
 
@@ -175,3 +177,31 @@ def test_few_repeats_hold_whole_levels_out_and_many_their_last_third() -> None:
 
 def test_pairs_are_all_within_two_pixels() -> None:
     assert all(max(abs(d) for d in lag) <= 2 for lags in PAIRS.values() for lag in lags)
+
+
+@pytest.mark.parametrize(
+    ("cfa", "shape", "frames"), [("MONO", (8, 12), 3), ("RGGB", (16, 16), 5), ("GBRG", (12, 16), 2)]
+)
+def test_correlations_of_independent_pixels_in_small_frames_are_none(
+    cfa: str, shape: tuple[int, int], frames: int
+) -> None:
+    """What taking out the means of rows and columns does to independent pixels is exact: the mean of many sets is 0 and their covariance as stated."""
+    rng = np.random.default_rng(8)
+    study = _concealed(1, cfa=cfa)
+    dark = study.recordings.captures("dark", "left")[:frames]
+    captures = [dark[0].model_copy(update={"id": f"d{k}"}) for k in range(frames)]
+    drawn: dict[str, np.ndarray] = {}
+    study.recordings.frame = lambda c: drawn[c.id]  # type: ignore[method-assign, assignment, return-value]
+    found = []
+    for _ in range(SETS):
+        drawn.update({c.id: 1000.0 + 30.0 * rng.standard_normal(shape) for c in captures})
+        found.append(repeats_of(study, captures, False).correlation)
+    value = np.array(found)
+    covariance = independent_correlations(shape, frames - 1, study.camera.cfa)[1]
+    std = np.sqrt(np.diag(covariance))
+    # 6 means at 4.5 sigma
+    assert np.all(np.abs(value.mean(0)) < 4.5 * std / np.sqrt(SETS))
+    # a covariance from SETS sets: sqrt(2 / SETS) of the variances at most; near-normal numbers
+    assert np.cov(value.T) / np.outer(std, std) == pytest.approx(
+        covariance / np.outer(std, std), abs=5.0 * np.sqrt(2.0 / SETS)
+    )
