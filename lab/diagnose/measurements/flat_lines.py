@@ -14,6 +14,8 @@ from sim.spectrum import FloatArray
 LINE_FLOOR = 1e-4  # of a step in an even field's lines
 #: Where read-outs meet, as shares of a side.
 MEETING = (0.25, 0.5, 0.75)
+LEAST_LINES = 8  # of a plane of the mosaic, along a side: half of them tell the light's slope
+LEAST_PLACES = 8  # at fewer, the spread of lines is what pixels' noise and response make of it
 
 
 def line_block(study: Study) -> Block:
@@ -23,6 +25,12 @@ def line_block(study: Study) -> Block:
     if not images:
         raise NotDetermined("flat_lines", "no unclipped flat captures")
     period = mosaic.step(study.camera.cfa)
+    side_px = min(study.camera.rows, study.camera.cols)
+    if side_px < LEAST_LINES * period:
+        raise NotDetermined(
+            "flat_lines",
+            f"frames of {side_px} px: lines are told from the light's slope from {LEAST_LINES * period} px on",
+        )
     levels = study.once(flats)[0]
     values: list[float] = []
     labels: list[Label] = []
@@ -32,11 +40,12 @@ def line_block(study: Study) -> Block:
         for axis, name in ((0, "column"), (1, "row")):
             line = np.asarray(image.mean(axis=axis, dtype=float))
             shot = noise / image.shape[axis]
-            for share, value, std, size in _steps(line, period, study.noise.prnu / np.sqrt(image.shape[axis])):
+            least = float(np.sqrt(study.noise.prnu**2 / image.shape[axis] + shot))
+            for share, value, std, size in _steps(line, period, least):
                 values.append(value)
                 whole.append((std**2 + LINE_FLOOR**2, shot * size))
                 labels.append(Label(share * len(line), name, f"{name} {share * len(line):.0f}", members, held_out))
-            value, std = _stripes(line, period, study.noise.prnu / np.sqrt(image.shape[axis]))
+            value, std = _stripes(line, period, least)
             values.append(value)
             whole.append((std**2 + LINE_FLOOR**2, shot * 4.0 / len(line)))
             labels.append(Label(0.0, name, f"even and odd {name}s", members, held_out))
@@ -66,7 +75,7 @@ def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, flo
     for b in at.values():
         far[max(b - 2 * width, 0) : max(b, 0) + 1] = False
     others = every[::period][far[::period]]
-    spread = 1.4826 * float(np.median(np.abs(others - np.median(others)))) if len(others) >= 8 else 0.0
+    spread = 1.4826 * float(np.median(np.abs(others - np.median(others)))) if len(others) >= LEAST_PLACES else 0.0
     std = max(spread, least * np.sqrt(size))
     return [(share, float(every[b - width]), std, size) for share, b in at.items() if 0 <= b - width < len(every)]
 
@@ -80,7 +89,8 @@ def _stripes(line: FloatArray, period: int, least: float) -> tuple[float, float]
     # the light's slope from a line to the next of the plane
     slope = float(np.mean(line[-lag:] - line[:lag])) / (len(line) - lag) * period
     bend = line[2 * lag :] - 2.0 * line[lag:-lag] + line[: -2 * lag]
-    one = max(1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0), least)
+    spread = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0) if len(bend) >= LEAST_PLACES else 0.0
+    one = max(spread, least)
     return value + slope, one * 2.0 / np.sqrt(len(line))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -50,8 +51,7 @@ def green_block(study: Study) -> Block:
     ratios = [r for r in every if r.std < GREEN_NOISE]
     if not ratios:
         raise NotDetermined("green_balance", "no unclipped flat or narrowband captures")
-    pixels = (study.camera.rows // 2) * (study.camera.cols // 2)
-    common = 2.0 * study.noise.prnu**2 / pixels
+    common = study.noise.prnu**2 * _share(*_green_shape(study))
     value = np.array([r.value for r in ratios])
     covariance = np.diag([r.std**2 + GREEN_FLOOR**2 for r in ratios]) + common
     labels = [Label(r.x, "G", r.condition, r.captures, r.held_out) for r in ratios]
@@ -62,15 +62,16 @@ def green_block(study: Study) -> Block:
         members = tuple(c.id for u in levels if u.held_out == held_out for c in u.captures)
         value = np.concatenate([value, (place / place.mean() - 1.0).ravel()])
         labels += [Label(0.0, "G", f"cell {k // CELLS[1]},{k % CELLS[1]}", members, held_out) for k in range(number)]
-        size, one = len(covariance), 2.0 * number / pixels
+        size = len(covariance)
+        centring = np.eye(number) - 1.0 / number
+        one = centring @ np.diag(_cell_shares(red_rows.shape)) @ centring
         bigger = np.zeros((size + number, size + number))
         bigger[:size, :size] = covariance
-        centred = np.eye(number) - 1.0 / number
-        bigger[size:, size:] = one * (study.noise.prnu**2 + noise) * centred + GREEN_FLOOR**2 * np.eye(number)
+        bigger[size:, size:] = (study.noise.prnu**2 + noise) * one + GREEN_FLOOR**2 * np.eye(number)
         if held_out and False in images:
             # the pixels' own responses are the same in both
-            bigger[size:, size - number : size] = one * study.noise.prnu**2 * centred
-            bigger[size - number : size, size:] = one * study.noise.prnu**2 * centred
+            bigger[size:, size - number : size] = study.noise.prnu**2 * one
+            bigger[size - number : size, size:] = study.noise.prnu**2 * one
         covariance = bigger
     cells = len(value) - len(ratios)
 
@@ -101,8 +102,25 @@ def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
 
 def _shot_dn2(study: Study, signal: float) -> float:
     """Variance of the difference of the greens' means in one frame by shot and read noise, DN^2."""
-    pixels = (study.camera.rows // 2) * (study.camera.cols // 2)
-    return 2.0 * (study.noise.gain * signal + study.noise.read_dn**2) / pixels
+    return (study.noise.gain * signal + study.noise.read_dn**2) * _share(*_green_shape(study))
+
+
+def _green_shape(study: Study) -> tuple[int, int]:
+    """Rows and columns of the green pixels that `green_planes` compares."""
+    return study.camera.rows // 2 - 1, study.camera.cols // 2 - 1
+
+
+def _share(rows: FloatArray | int, cols: FloatArray | int) -> Any:
+    """Variance, of pixels of variance 1, of the mean of rows x cols green pixels less that of their four neighbours' means: 1 / n of the one;
+    of the other, whose (rows + 1) x (cols + 1) pixels count half at a border, the squared weights' sum, (m - 1/2) / m^2 along each side."""
+    count = rows * cols
+    return 1.0 / count + (rows - 0.5) * (cols - 0.5) / count**2
+
+
+def _cell_shares(shape: tuple[int, int]) -> FloatArray:
+    """`_share` of each of the CELLS, (cells,)."""
+    rows, cols = (np.diff(np.linspace(0, n, k + 1).astype(int)) for n, k in zip(shape, CELLS, strict=True))
+    return np.asarray(_share(rows[:, None], cols[None, :])).ravel()
 
 
 def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> list[_Ratio]:

@@ -24,6 +24,10 @@ STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # of a stated black level: what
 BLACK_FLOOR_DN = 0.01  # of a frame's mean: rounding of a quiet camera
 USUAL_JITTER_DN = 0.02  # of a dark frame's mean, from repeat to repeat
 USUAL_PRNU = 0.008
+#: Local mean of a plane of the mosaic: box and border left out, px, and the plane's least side from which the box is taken. In smaller planes than
+#: LEAST_PLANE_PX the pixels' own response can't be told.
+WIDE_WINDOW_PX, NARROW_WINDOW_PX = (9, 6), (3, 1)
+WIDE_PLANE_PX, LEAST_PLANE_PX = 24, 6
 ALIKE_C = 2.0  # dark captures whose temperatures are that close count as of one
 
 
@@ -78,10 +82,11 @@ def noise_guess(study: Study) -> NoiseGuess:
         else:
             black = float(level[0])
             black_std += dark_std * float(t[0])
-        jitter = max(_jitter(study, darks, frames_mean), BLACK_FLOOR_DN)
         first = min((darks[i] for i in near), key=lambda g: g[0].exposure_s)
         if len(first) > 1:
             read = float(np.sqrt(pair_variance([recordings.frame(c) for c in first[:4]])))
+        own_dn2 = read**2 / recordings.frame(first[0]).size if len(first) > 1 else 0.0
+        jitter = max(_jitter(study, darks, frames_mean, own_dn2), BLACK_FLOOR_DN)
     gain, lamp = stated.conversion_gain_dn_per_e, 3e-4
     signal, variance, prnu = _transfer_points(study, black)
     if len(signal) > 1:
@@ -116,10 +121,18 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
             if 0.3 < signal[-1] / (study.saturation_dn - black) < 0.8:
                 row, col = mosaic.phases(study.camera.cfa)[channel][0]
                 plane = np.mean(frames, axis=0)[row::step, col::step]
-                rough = (plane - ndimage.uniform_filter(plane, 9))[6:-6, 6:-6]
-                fixed = max(rough.var() - variance[-1] / len(frames), 0.0)
-                prnu = float(np.sqrt(fixed) / signal[-1]) * 1.006  # of 81 pixels' mean, 1/81 of the variance is missing
+                if min(plane.shape) >= LEAST_PLANE_PX:
+                    fixed = max(variance_between_pixels(plane) - variance[-1] / len(frames), 0.0)
+                    prnu = float(np.sqrt(fixed) / signal[-1])
     return signal, variance, prnu
+
+
+def variance_between_pixels(plane: FloatArray) -> float:
+    """Variance (DN^2) of a plane (rows, cols) about its local mean over w x w pixels, in which each pixel has a share of 1 / w^2: that much of the
+    variance is put back. Planes too small for the wide window get the narrow one."""
+    width, border = WIDE_WINDOW_PX if min(plane.shape) >= WIDE_PLANE_PX else NARROW_WINDOW_PX
+    rough = (plane - ndimage.uniform_filter(plane, width))[border:-border, border:-border]
+    return float(rough.var() / (1.0 - 1.0 / width**2))
 
 
 def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
@@ -157,10 +170,11 @@ def _even_rows(frame: Any, step: int) -> FloatArray:
     return even
 
 
-def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray]) -> float:
+def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float) -> float:
     """Standard deviation of the repeats' means, less what changes evenly with time in all groups alike: that is a drift.
 
-    Of few repeats it is pulled towards what is usual: `USUAL_JITTER_DN` counts as two repeats.
+    Of few repeats it is pulled towards what is usual: `USUAL_JITTER_DN` beside the pixels' own noise, whose variance in a frame's mean is
+    `own_dn2`, counts as two repeats.
     """
     away, elapsed, freedom = [], [], 0
     for group, mean in zip(groups, means, strict=True):
@@ -175,7 +189,7 @@ def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[F
     if freedom > 2 and np.any(time):
         rest = rest - time * float(time @ rest) / float(time @ time)
         freedom -= 1
-    return float(np.sqrt((rest @ rest + 2.0 * USUAL_JITTER_DN**2) / (freedom + 2.0)))
+    return float(np.sqrt((rest @ rest + 2.0 * (USUAL_JITTER_DN**2 + own_dn2)) / (freedom + 2.0)))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lab.challenge.recordings import recordings_of
+from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import cell_means
 from lab.diagnose.measurements.dark_level import added_dark_dn, dark_current_map
 from lab.diagnose.measurements.linearity import RADIOMETER_STD, linearity_block
@@ -18,9 +21,16 @@ from lab.diagnose.measurements.narrowband import (
     _sample_std,
     narrowband_block,
 )
-from lab.diagnose.measurements.noise_guess import level_repeatability, repeated_levels
+from lab.diagnose.measurements.noise_guess import (
+    NARROW_WINDOW_PX,
+    WIDE_PLANE_PX,
+    WIDE_WINDOW_PX,
+    level_repeatability,
+    repeated_levels,
+    variance_between_pixels,
+)
 from lab.fit.rounding import rounding_std_dn
-from mocks.former import Law
+from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (
     AbsorptionBandLaw,
     CoverGlassFringeLaw,
@@ -201,3 +211,27 @@ def test_a_dark_current_over_the_field_is_that_of_the_pixels() -> None:
     found = cell_means(dark_current_map(at, glow, None).astype(np.float32))
     expected = cell_means(Uniform(at.camera, glow).dark_e_per_s(None).astype(np.float32))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("side_px", [8, 12, 30])
+def test_response_between_pixels_is_measured_on_small_planes(side_px: int) -> None:
+    """Its variance on a slope of the light, the mean of 200 planes; the box's own pixel is put back."""
+    rng, planes = np.random.default_rng(5), 200
+    slope = np.linspace(0.0, 20.0, side_px)[:, None]
+    found = [
+        variance_between_pixels(1000.0 + slope + 8.0 * rng.standard_normal((side_px, side_px))) for _ in range(planes)
+    ]
+    left = side_px - 2 * (WIDE_WINDOW_PX if side_px >= WIDE_PLANE_PX else NARROW_WINDOW_PX)[1]
+    # 4 sigma; neighbours of one box share it, and the plane's mean takes 1 / left^2 at most
+    assert np.mean(found) == pytest.approx(64.0, rel=4.0 * np.sqrt(2.0 / left**2 / planes) * 1.2 + 1.0 / left**2)
+
+
+@pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
+@pytest.mark.parametrize("side_px", [16, 24])
+def test_frames_of_few_pixels_are_judged_or_skipped(cfa: str, side_px: int) -> None:
+    camera = ConcealedCamera(4, cfa=cfa, rows=side_px, cols=side_px)
+    recordings = recordings_of(camera, Plan(UNIFORM))
+    model, _ = measurement_model(recordings, "left")
+    assert model is not None
+    gaussian = model.gaussian()
+    assert np.isfinite(chi2(model.value - gaussian.mean, gaussian.covariance))

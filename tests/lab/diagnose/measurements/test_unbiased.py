@@ -1,0 +1,176 @@
+"""Every measurement of healthy cameras: its numbers scatter about their prediction as their covariance says, whatever the frames' size, number, mosaic
+and depth. Where frames are too small for that, a measurement is skipped. Measurements are taken from their library: a new one is covered.
+
+Cameras are the second image former's: it shares no code with the measurements.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from lab.challenge.recordings import recordings_of
+from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from lab.predict.camera_model import camera_model
+from mocks.former import ConcealedCamera, Plan
+
+#: Probability that a healthy measurement fails a whole test, over all its comparisons (Bonferroni).
+CHANCE = 1e-3
+#: Covariances are estimated from the same frames: of about 100 degrees of freedom they are known to 2 / sqrt(200) = 14 %.
+COVARIANCE_SHARE = 0.15
+#: A mean pull of that size moves chi2 of a number by 0.01 and no decision: laws that are linear to first order leave as much.
+NEGLIGIBLE_PULL = 0.1
+EVEN = ("dark", "flat")
+SPECTRAL = (*EVEN, "narrowband")
+SCENES = (*SPECTRAL, "chart", "slanted_edge", "charuco", "screen")
+
+
+@dataclass(frozen=True)
+class Healthy:
+    """Recordings of healthy cameras, one a draw."""
+
+    side_px: int
+    repeats: int
+    cfa: str
+    bit_depth: int
+    draws: int
+    kinds: tuple[str, ...] = EVEN
+
+    def __str__(self) -> str:
+        return f"{self.side_px}px-{self.repeats}x-{self.cfa}-{self.bit_depth}bit-{self.kinds[-1]}"
+
+
+@dataclass
+class Pulls:
+    """Pulls of one measurement's numbers."""
+
+    one: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by number
+    together: dict[str, list[float]] = field(
+        default_factory=lambda: defaultdict(list)
+    )  # of a channel's mean, by channel
+    chi2_share: list[float] = field(default_factory=list)  # by draw: chi2 over its degrees of freedom
+    numbers: list[int] = field(default_factory=list)  # by draw
+
+
+#: Small, quick recordings for every day: where biases were.
+FEW = (
+    Healthy(16, 6, "RGGB", 12, 8),
+    Healthy(16, 2, "MONO", 8, 8),
+    Healthy(24, 3, "GBRG", 14, 4),
+    Healthy(40, 8, "MONO", 12, 3),
+)
+#: Every pair of values of size, repeats, mosaic and depth that costs most differs from a neighbour's in one of them.
+GRID = (
+    *(Healthy(side, 3, cfa, 12, 40) for side in (16, 24, 32, 64) for cfa in ("MONO", "RGGB", "BGGR", "GRBG", "GBRG")),
+    *(Healthy(side, 10, cfa, bits, 20) for side in (16, 32) for cfa in ("MONO", "RGGB") for bits in (8, 10, 14, 16)),
+    *(Healthy(side, repeats, "RGGB", 12, 12) for side in (16, 32, 64) for repeats in (2, 50, 200)),
+    *(Healthy(side, 3, cfa, 12, 10, SPECTRAL) for side in (32, 128) for cfa in ("MONO", "RGGB", "GRBG")),
+    *(Healthy(side, 3, cfa, 12, 6, SCENES) for side in (256, 384, 512) for cfa in ("MONO", "RGGB", "BGGR")),
+)
+
+
+def _study(case: Healthy, seed: int) -> Study:
+    camera = ConcealedCamera(seed, cfa=case.cfa, rows=case.side_px, cols=case.side_px, bit_depth=case.bit_depth)
+    recordings = recordings_of(camera, Plan(case.kinds, repeats=case.repeats))
+    return Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
+
+
+def _drawn(case: Healthy) -> dict[str, Pulls]:
+    """Pulls by measurement; a measurement may be skipped, and nothing else."""
+    found: dict[str, Pulls] = defaultdict(Pulls)
+    for draw in range(case.draws):
+        looked_at = _study(case, 1000 + draw)
+        for measurement in measurements():
+            try:
+                block = measurement.make(looked_at)
+            except NotDetermined as refused:
+                assert refused.reason, measurement.name
+                continue
+            _add(found[measurement.name], block)
+    return found
+
+
+def _add(pulls: Pulls, block: Block) -> None:
+    prediction = block.predict(())
+    jacobian = np.reshape(list(prediction.jacobian.values()), (-1, len(block.value)))
+    covariance = block.covariance + jacobian.T @ jacobian
+    away = block.value - prediction.mean
+    assert np.all(np.isfinite(away)), f"{block.measurement.name}: a number isn't finite"
+    assert np.all(np.isfinite(covariance)), f"{block.measurement.name}: a covariance isn't finite"
+    std = np.sqrt(np.diag(covariance))
+    assert np.all(std > 0), f"{block.measurement.name}: a number without uncertainty"
+    place: Counter[str] = Counter()
+    channels = np.array([label.channel for label in block.labels])
+    for channel, pull in zip(channels, away / std, strict=True):
+        pulls.one[f"{channel} {place[channel]}"].append(float(pull))
+        place[channel] += 1
+    for channel in dict.fromkeys(channels):
+        pull = np.where(channels == channel, 1.0 / std, 0.0)
+        pulls.together[channel].append(float(pull @ away / np.sqrt(pull @ covariance @ pull)))
+    correlation = covariance / np.outer(std, std)
+    # directions in which rounding of the covariance is all there is don't count
+    size, direction = np.linalg.eigh(correlation)
+    use = size > 1e-6
+    chi2 = np.sum(np.square(direction.T[use] @ (away / std)) / size[use])
+    pulls.chi2_share.append(float(chi2) / int(use.sum()))
+    pulls.numbers.append(int(use.sum()))
+
+
+def _faults(drawn: dict[str, Pulls]) -> list[str]:
+    """What departs from its prediction by more than chance, one line each."""
+    tests = sum(len(p.one) + len(p.together) + 1 for p in drawn.values())
+    limit = float(-ndtri(CHANCE / (2.0 * max(tests, 1))))
+    faults = []
+    for name, pulls in drawn.items():
+        for label, values in (*pulls.one.items(), *pulls.together.items()):
+            z = np.array(values)
+            # a pull has variance 1 at most where the covariance is right: its own spread counts where that is larger
+            tolerance = limit * max(1.0, _spread(z)) / np.sqrt(len(z))
+            if abs(z.mean()) > tolerance + NEGLIGIBLE_PULL:
+                faults.append(f"{name} {label}: mean pull {z.mean():+.2f} of {len(z)} draws, limit {tolerance:.2f}")
+        share, numbers = np.array(pulls.chi2_share), np.array(pulls.numbers)
+        # chi2 / n has the variance 2 / n in a draw; heavier tails show in its spread from draw to draw
+        tolerance = limit * max(float(np.sqrt(np.mean(2.0 / numbers))), _spread(share)) / np.sqrt(len(share))
+        if share.mean() > 1.0 + COVARIANCE_SHARE + tolerance:
+            faults.append(
+                f"{name}: chi2 over its degrees of freedom {share.mean():.2f}, limit {1 + COVARIANCE_SHARE + tolerance:.2f}"
+            )
+    return faults
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else 0.0
+
+
+@pytest.mark.parametrize("case", FEW, ids=str)
+def test_small_healthy_frames_are_predicted(case: Healthy) -> None:
+    drawn = _drawn(case)
+    assert "noise_neighbours" in drawn
+    assert not _faults(drawn)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("case", GRID, ids=str)
+def test_healthy_frames_are_predicted(case: Healthy) -> None:
+    drawn = _drawn(case)
+    assert drawn
+    assert not _faults(drawn)
+
+
+def test_a_bias_and_an_understated_variance_are_faults() -> None:
+    rng = np.random.default_rng(3)
+    for shift, scale, expected in ((0.0, 1.0, 0), (1.5, 1.0, 1), (0.0, 2.0, 1)):
+        pulls = Pulls()
+        z = shift + scale * rng.standard_normal(40)
+        pulls.together["all"] = list(z)
+        pulls.chi2_share, pulls.numbers = list(np.square(z - shift)), [1] * len(z)
+        assert len(_faults({"made_up": pulls})) == expected
