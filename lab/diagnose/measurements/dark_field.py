@@ -12,6 +12,8 @@ from lab.errors import NotDetermined
 from sim.sensor.lines import Lines
 from sim.uniform import Uniform
 
+CELL_PX = 4  # the least side of a cell
+
 
 def dark_field_block(study: Study) -> Block:
     """Means over cells of the mean dark frame by exposure, DN. Each frame's level is a nuisance parameter."""
@@ -19,8 +21,11 @@ def dark_field_block(study: Study) -> Block:
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
     rows, cols = CELLS
     count = rows * cols
-    if min(study.camera.rows // rows, study.camera.cols // cols) < 4:
-        raise NotDetermined("dark_field", "the frames are too small to be split into cells")
+    if min(study.camera.rows // rows, study.camera.cols // cols) < CELL_PX:
+        raise NotDetermined(
+            "dark_field",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: too small to be split into cells, which need {rows * CELL_PX} x {cols * CELL_PX} px",
+        )
     value = np.concatenate([part.cells.ravel() - part.cells.mean() for *_, part in points])
     row, col = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij"))
     size = study.camera.rows * study.camera.cols / count

@@ -23,6 +23,7 @@ from sim.spectrum import FloatArray
 
 TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures are that close are repeats
 CELLS = 4, 6  # of a frame: rows, columns
+LEAST_CELL_PX = 2  # a side of the smallest frame's cells
 CELL_FLOOR_DN = 0.005
 MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
 CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
@@ -147,8 +148,13 @@ def conditions(study: Study) -> list[DarkCondition]:
 
 
 def dark_frames(study: Study) -> list[DarkStatistics]:
-    """Every dark capture, read once."""
+    """Every dark capture, read once. Raises NotDetermined where there are none, or the frames are too small to be split into cells."""
     every = conditions(study)
+    least_px = LEAST_CELL_PX * max(CELLS)
+    if min(study.camera.rows, study.camera.cols) < least_px:
+        raise NotDetermined(
+            "dark", f"frames of {study.camera.rows} x {study.camera.cols} px: their cells need {least_px} px a side"
+        )
     usual = [c for c in every if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0] or every  # fmt: skip
     warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
     picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]

@@ -15,7 +15,7 @@ from lab.diagnose.measurements.dark_frames import (
     dark_frames,
     fine_conditions,
 )
-from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance
+from lab.diagnose.measurements.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
 from lab.diagnose.measurements.reads import LINES
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -155,7 +155,10 @@ def correlation_block(study: Study) -> Block:
             variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
             labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
     if not labels:
-        raise NotDetermined("dark_correlation", "the frames are too small to show noise that neighbours share")
+        raise NotDetermined(
+            "dark_correlation",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share shows from {int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
+        )
     n = len(labels)
     # noise of lines has no spectrum along them: an excess has another cause
     return Block(

@@ -51,6 +51,12 @@ def shading_block(study: Study) -> Block:
         raise NotDetermined(
             "flat_field", "the focal length or the pixel pitch isn't stated: the fall-off of the light isn't known"
         )
+    least_px = max(ROWS, COLS, 2 * BLOCK_PX) * mosaic.step(study.camera.cfa)
+    if min(study.camera.rows, study.camera.cols) < least_px:
+        raise NotDetermined(
+            "flat_field",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: {ROWS} x {COLS} cells need {least_px} px a side",
+        )
     planes = _planes(study)
     if not planes:
         raise NotDetermined("flat_field", "no unclipped flat captures")

@@ -30,6 +30,7 @@ PATTERN_STD = 3e-5
 ROW_SHARE = 0.15
 #: Instants at which a light's phase is looked at: golden sections of a second, no period's multiples.
 INSTANTS = 0.6180339887 * np.arange(24) % 1.0
+LEAST_ROWS = 24  # of a plane of the mosaic
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,10 @@ def flicker_block(study: Study) -> Block:
     groups = [groups[i] for i in np.unique(np.linspace(0, len(groups) - 1, min(MOST_LEVELS, len(groups))).astype(int))]
     step = mosaic.step(study.camera.cfa)
     rows = study.camera.rows // step
-    if rows < 24:
-        raise NotDetermined("flicker", f"frames of {study.camera.rows} rows: too few to see bands in")
+    if rows < LEAST_ROWS:
+        raise NotDetermined(
+            "flicker", f"frames of {study.camera.rows} rows: too few to see bands in, which takes {LEAST_ROWS * step}"
+        )
     bands = _bands(rows, HIGHEST * step)
     levels = _measured(study, groups, bands)
     dark, dark_std = _dark_power(study, bands)

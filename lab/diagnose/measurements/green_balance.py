@@ -45,6 +45,12 @@ def green_block(study: Study) -> Block:
     relative to the frame's mean."""
     if study.camera.cfa == "MONO":
         raise NotDetermined("green_balance", "the camera has no colour mosaic")
+    if any(n < cells for n, cells in zip(_green_shape(study), CELLS, strict=True)):
+        least = " x ".join(str(2 * (cells + 1)) for cells in CELLS)
+        raise NotDetermined(
+            "green_balance",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: {CELLS[0]} x {CELLS[1]} cells of greens need {least} px",
+        )
     levels, images = study.once(flats)
     rows_dn2 = _rows_dn2(study, levels)
     every = *_by_level(study, levels, rows_dn2), *_by_wavelength(study, rows_dn2)

@@ -18,6 +18,7 @@ import numpy as np
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE
 from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
 from sim.camera import Cfa
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
@@ -25,6 +26,7 @@ from sim.spectrum import FloatArray
 OUTLIER = 6.0
 #: Values that a level is repeats_of by; frames beyond them cost time and teach nothing.
 ENOUGH = 3_000_000
+LEAST_PLANE_PX = 4  # of a plane of the mosaic, a side
 LEAST_DN2 = 0.02  # a temporal variance below which nothing but rounding is seen
 #: Pairs of pixels on the mosaic, by how the report calls them: (rows down, columns to the right).
 PAIRS: dict[str, tuple[tuple[int, int], ...]] = {
@@ -75,9 +77,15 @@ def dark_repeats(study: Study) -> list[Repeats]:
 
 
 def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats:
-    """The noise of two repeats or more."""
+    """The noise of two repeats or more. Raises NotDetermined where the frames are too small."""
     cfa, lit = study.camera.cfa, captures[0].kind != "dark"
     first = study.recordings.frame(captures[0])
+    least_px = LEAST_PLANE_PX * mosaic.step(cfa)
+    if min(first.shape) < least_px:
+        raise NotDetermined(
+            "temporal_noise",
+            f"frames of {first.shape[0]} x {first.shape[1]} px: without rows' and columns' means too few numbers are left; {least_px} px a side are enough",
+        )
     use = list(captures)[: max(2, int(np.ceil(ENOUGH / first.size)) + 1)]
     frames = [np.array(study.recordings.frame(c), np.float32) for c in use]
     signal, clipped = {}, {}

@@ -157,6 +157,20 @@ def test_small_healthy_frames_are_predicted(case: Healthy) -> None:
     assert not _faults(drawn)
 
 
+@pytest.mark.parametrize("cfa", ["MONO", "RGGB"])
+@pytest.mark.parametrize("side_px", [4, 8, 10, 12])
+def test_frames_too_small_are_skipped_saying_so(side_px: int, cfa: str) -> None:
+    """What is left is finite, which `_drawn` checks; what isn't there says how many px it needs."""
+    case = Healthy(side_px, 3, cfa, 12, 1)
+    drawn = _drawn(case)
+    looked_at = _study(case, 1000)
+    for measurement in measurements():
+        if measurement.name == "noise_neighbours" and side_px < 8 and cfa != "MONO":
+            with pytest.raises(NotDetermined, match=r"4 x 4 px.*8 px a side"):
+                measurement.make(looked_at)
+    assert ("noise_neighbours" in drawn) == (side_px >= (4 if cfa == "MONO" else 8))
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("case", GRID, ids=str)
