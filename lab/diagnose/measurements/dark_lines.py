@@ -43,7 +43,7 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
         weight = np.array([min(c.contrasts, 6) for c in part], float)
         power = np.average([c.lines[lines][1] for c in part], axis=0, weights=weight)
         modes, level = bands.modes * weight.sum(), sum(c.lines[lines][2] for c in part)
-        value.append(np.log(bands.mean(power)) - log_mean_bias(modes))
+        value.append(np.log(bands.mean(power)) - log_mean_bias(modes) - log_mean_bias(level))
         variance.append(log_mean_variance(modes) + 1.0 / level + POWER_FLOOR**2)
         inverse.append(np.full(len(modes), float(np.average([1.0 / c.white_dn2 for c in part], weights=weight))))
         ids = tuple(i for f in fine if out in f.changing for i in captures_of(f, out))
@@ -85,8 +85,8 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     factor: list[FloatArray] = []
     share = _fixed_share(first)
     for out, part in first.fixed.items():
-        _, power, _ = part.lines[lines]
-        value.append(np.log(bands.mean(power)) - log_mean_bias(bands.modes))
+        _, power, level = part.lines[lines]
+        value.append(np.log(bands.mean(power)) - log_mean_bias(bands.modes) - log_mean_bias(level))
         labels += [Label(float(x), "all", "fixed", part.captures, out) for x in bands.middle]
         factor.append(np.full(len(bands.middle), study.noise.gain**2 * length / part.white_dn2))
     pieces = len(first.fixed)
@@ -151,7 +151,7 @@ def correlation_block(study: Study) -> Block:
             level = sum(c.lines[lines][2] for c in part)
             bands = Bands.of(frequency, 3)
             total = np.array([modes[a:b].sum() for a, b in zip(bands.first, bands.last, strict=True)])
-            value.append(np.log(bands.mean(power)))
+            value.append(np.log(bands.mean(power)) - log_mean_bias(total) - log_mean_bias(level))
             variance.append(1.0 / total + 1.0 / level + POWER_FLOOR**2)
             labels += [Label(float(x), "all", f"along {lines}", ids, out) for x in bands.middle]
     if not labels:

@@ -38,11 +38,16 @@ class Periodogram:
     def level(self) -> float:
         return max(float(self._level.mean()), 1e-12)
 
+    def _relative(self, power: FloatArray) -> FloatArray:
+        """Power over the level, 1 for white noise: the mean of 1 / level over L modes is L / (L - 1), as the level is gamma-distributed."""
+        modes = self._level.size
+        return np.asarray(power / self.level * (1.0 - 1.0 / modes if modes > 1 else 1.0))
+
     def line(self, lines: Lines) -> tuple[FloatArray, FloatArray, float]:
         """(frequency, power over the level) of the lines' means, up to and without 0.5 cy/px; number of the level's modes."""
         table, frequency = (self.table[:, 0], self.rows) if lines == "rows" else (self.table[0], self.cols)
         use = (frequency > 0) & (frequency < 0.4999)
-        return frequency[use], table[use] / self.level, float(self._level.size)
+        return frequency[use], self._relative(table[use]), float(self._level.size)
 
     def along(self, lines: Lines) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(frequency, power over the level, modes) within rows (columns), mean over these without what a line has in common."""
@@ -56,7 +61,7 @@ class Periodogram:
             power = 0.5 * (power + np.roll(power[::-1], 1))
             modes *= 2.0
         use = (frequency > 0) & (frequency <= LEVEL_BAND[0])
-        return frequency[use], power[use] / self.level, np.full(int(use.sum()), modes)
+        return frequency[use], self._relative(power[use]), np.full(int(use.sum()), modes)
 
 
 def periodogram(image: Image) -> Periodogram:

@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.library import measurements
+from lab.diagnose.measurements.line_spectra import Bands, log_mean_bias, log_mean_variance, periodogram
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.predict.camera_model import camera_model
@@ -178,6 +179,20 @@ def test_healthy_frames_are_predicted(case: Healthy) -> None:
     drawn = _drawn(case)
     assert drawn
     assert not _faults(drawn)
+
+
+def test_line_spectra_of_white_noise_are_unbiased_on_16_rows() -> None:
+    """Logarithm of the power in bands over the level of 18 modes, mean of eight images."""
+    rng, sets, images, found = np.random.default_rng(2), 1000, 8, []
+    for _ in range(sets):
+        lines = [periodogram(rng.standard_normal((16, 16)).astype(np.float32)).line("rows") for _ in range(images)]
+        bands, level = Bands.of(lines[0][0], 8, 1.5), images * lines[0][2]
+        power = np.mean([relative for _, relative, _ in lines], axis=0)
+        modes = bands.modes * images
+        found.append(np.log(bands.mean(power)) - log_mean_bias(modes) - log_mean_bias(level))
+    std = np.sqrt(log_mean_variance(modes) + 1.0 / level)
+    # 4 sigma of the mean: 0.13; without the level's own bias 0.25 are left
+    assert np.all(np.abs(np.mean(found, axis=0) / std) < 4.0 / np.sqrt(sets))
 
 
 def test_a_bias_and_an_understated_variance_are_faults() -> None:
