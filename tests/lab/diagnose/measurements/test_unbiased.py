@@ -32,6 +32,8 @@ NEGLIGIBLE_PULL = 0.1
 EVEN = ("dark", "flat")
 SPECTRAL = (*EVEN, "narrowband")
 SCENES = (*SPECTRAL, "chart", "slanted_edge", "charuco", "screen")
+#: Measurements of two cameras: this contract draws one (test_board.py has pairs).
+OF_PAIRS = {"stereo_gain", "stereo_time"}
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ FEW = (
     Healthy(24, 3, "GBRG", 14, 4),
     Healthy(40, 8, "MONO", 12, 3),
 )
-#: Every pair of values of size, repeats, mosaic and depth that costs most differs from a neighbour's in one of them.
+#: Sizes by mosaics, depths and repeats where frames are small, and whole sessions where they are large.
 GRID = (
     *(Healthy(side, 3, cfa, 12, 40) for side in (16, 24, 32, 64) for cfa in ("MONO", "RGGB", "BGGR", "GRBG", "GBRG")),
     *(Healthy(side, 10, cfa, bits, 20) for side in (16, 32) for cfa in ("MONO", "RGGB") for bits in (8, 10, 14, 16)),
@@ -179,6 +181,14 @@ def test_healthy_frames_are_predicted(case: Healthy) -> None:
     drawn = _drawn(case)
     assert drawn
     assert not _faults(drawn)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_contract_reaches_every_measurement() -> None:
+    """A new measurement whose captures no case takes would escape it."""
+    drawn = _drawn(Healthy(256, 3, "RGGB", 12, 1, SCENES))
+    assert {m.name for m in measurements()} - set(drawn) == OF_PAIRS
 
 
 def test_line_spectra_of_white_noise_are_unbiased_on_16_rows() -> None:
