@@ -41,9 +41,9 @@ def validate(source: Source, json: Json = None, fit_file: FitFile = None, model:
     request = PipelineRequest("validate", recordings=recordings, fit=read_fit(fit_file), models=models)
     result = run_here(request).validation
     assert result is not None
+    write_json(result, json)
     if str(json) != "-":
         print_validation(result)
-    write_json(result, json)
     if not all(check.passed for check in result.checks):
         raise typer.Exit(EXIT_CHECK)
 
@@ -85,11 +85,11 @@ def diagnose(
     )
     found = run_here(request)
     assert found.diagnosis is not None
-    if str(json) != "-":
-        print_diagnosis(found.diagnosis)
     write_json(found.diagnosis, json)
     if save is not None:
         _save_models(found, save)
+    if str(json) != "-":
+        print_diagnosis(found.diagnosis)
 
 
 def _save_models(found: PipelineResult, path: Path) -> None:

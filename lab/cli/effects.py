@@ -27,12 +27,12 @@ def effects(
 
     check_writable(json)
     told = EffectList(effects=(effect_description(name),)) if name else effect_list()
+    write_json(told, json)
     if str(json) != "-":
         for number, effect in enumerate(told.effects):
             if number:
                 out.print()
             _print_effect(effect)
-    write_json(told, json)
 
 
 def _print_effect(effect: EffectDescription) -> None:

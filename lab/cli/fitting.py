@@ -41,13 +41,13 @@ def fit(
     check_writable(json)
     recordings = recordings_of(source)
     result = _fit(recordings)
-    if str(json) != "-":
-        print_fit(recordings, result)
     write_json(result, json)
     if cameras is not None:
         _write_cameras(recordings, result, cameras)
     if maps is not None:
         _write_maps(recordings, maps)
+    if str(json) != "-":
+        print_fit(recordings, result)
 
 
 def _fit(recordings: RecordingSet) -> FitResult:
@@ -99,13 +99,13 @@ def compare(
 
     check_writable(json)
     result = compared(_calibration(a), _calibration(b))
-    if str(json) != "-":
-        print_comparison(result, every)
     write_json(result, json)
     if report_folder is not None:
         from lab.report.compare import write_comparison
 
         err.print(f"report: {escape(str(write_comparison(report_folder, result)))}")
+    if str(json) != "-":
+        print_comparison(result, every)
     if check and result.changed:
         raise typer.Exit(EXIT_CHECK)
 

@@ -52,9 +52,9 @@ def lens(
             progress=advance,
         )
     warn(traced.result.warnings)
+    write_json(traced.result, json)
     if str(json) != "-":
         _print_lens(traced.result)
-    write_json(traced.result, json)
     if report_folder is not None:
         from lab.report.lens import write_lens_report
 

@@ -1,11 +1,13 @@
 """The command line: exit codes, one line for each problem and no traceback, nothing half-written."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -225,6 +227,40 @@ def test_diagnosis_with_a_stored_fit(
     (tmp_path / "fit.json").write_text('{"format": "calibench-fit"}')
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 2
     assert "not what --json wrote" in capsys.readouterr().err
+
+
+def test_a_result_is_on_disk_before_anything_is_printed(tmp_path: Path) -> None:
+    """A pipe that nobody reads from, as of `| head -0`: the JSON is whole all the same."""
+    file = tmp_path / "effects.json"
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "lab.cli", "effects", "--json", str(file)]
+    ended = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, check=False)
+    os.close(write_end)
+    assert ended.returncode != 0  # something was printed, and lost
+    assert EffectList.model_validate_json(file.read_text()) == effect_list()
+
+
+@pytest.mark.parametrize(
+    ("command", "module", "printer"),
+    [
+        ("fit", fitting, "print_fit"),
+        ("validate", diagnosis, "print_validation"),
+        ("diagnose", diagnosis, "print_diagnosis"),
+    ],
+)
+def test_every_command_writes_before_it_prints(
+    flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, module: ModuleType, printer: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise BrokenPipeError
+
+    healthy = DiagnosisResult(source="x", verdict="no_mismatch")
+    monkeypatch.setattr(lab.diagnose, "examine", lambda *_, **__: Diagnosis(healthy, {}))
+    monkeypatch.setattr(module, printer, refuse)
+    file = tmp_path / "result.json"
+    assert cli.main([command, str(flats), "--json", str(file)]) == 1
+    assert json.loads(file.read_text())["source"]
 
 
 def test_effects_tells_of_the_whole_library(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
