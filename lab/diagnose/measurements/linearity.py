@@ -12,8 +12,8 @@ from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, 
 from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.line_means import line_mean_jacobian
-from lab.diagnose.measurements.noise_guess import repeated_levels
 from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
+from lab.diagnose.measurements.repeatability import level_std
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -128,32 +128,9 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
     rounding = rounding_std_dn(noise.spread_dn2(signal))
     covariance += repeats * np.outer(rounding, rounding)
     same = np.array([[a[0].id == b[0].id for b in points] for a in points])
-    lamp = signal * _level_std(study, groups)[group]
+    lamp = signal * level_std(study, groups)[group]
     covariance += same * (np.outer(lamp, lamp) + noise.jitter_dn**2)
     return np.asarray(covariance)
-
-
-#: Weight of the repeatability of all flat frames beside that of one setting's, in repeats.
-_COMMON_REPEATS = 4
-
-
-def _level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
-    """Relative standard deviation of a frame's level by group: all flat frames', or a setting's own where that is larger, as in a
-    flickering light that short exposures don't average."""
-    noise = study.noise
-    found = np.full(len(groups), noise.jitter_lamp)
-    place = {c.id: i for i, group in enumerate(groups) for c in group}
-    for repeats in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
-        moved = float(repeats.elapsed_s @ repeats.elapsed_s)
-        left, free = repeats.away, len(repeats.away) - 1
-        if free > 1 and moved > 0:  # a trend with time isn't noise
-            left, free = left - float(repeats.elapsed_s @ left) / moved * repeats.elapsed_s, free - 1
-        elif moved > 0:
-            continue
-        own = max(float(np.sum(np.square(left))) / free - repeats.noise, 0.0)
-        pooled = (_COMMON_REPEATS * noise.jitter_lamp**2 + free * own) / (_COMMON_REPEATS + free)
-        found[place[repeats.captures[0].id]] = np.sqrt(max(pooled, noise.jitter_lamp**2))
-    return found
 
 
 def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:

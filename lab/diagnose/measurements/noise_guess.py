@@ -11,6 +11,13 @@ import numpy as np
 from scipy import ndimage
 
 from lab.capture_kinds.base import Capture
+from lab.diagnose.measurements.repeatability import (
+    LAMP_FLOOR,
+    Repeats,
+    level_repeatability,
+    repeated_levels,
+    steady,
+)
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE
 from lab.fit.rounding import unrounded
 from sim.sensor import mosaic
@@ -19,7 +26,6 @@ from sim.spectrum import FloatArray
 if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
-LAMP_FLOOR = 1.0e-4  # of a level, common to the channels of a capture
 STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # of a stated black level: what a data sheet may be off by
 BLACK_FLOOR_DN = 0.01  # of a frame's mean: rounding of a quiet camera
 USUAL_JITTER_DN = 0.02  # of a dark frame's mean, from repeat to repeat
@@ -173,65 +179,23 @@ def _even_rows(frame: Any, step: int) -> FloatArray:
 def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float) -> float:
     """Standard deviation of the repeats' means, less what changes evenly with time in all groups alike: that is a drift.
 
-    Of few repeats it is pulled towards what is usual: `USUAL_JITTER_DN` beside the pixels' own noise, whose variance in a frame's mean is
-    `own_dn2`, counts as two repeats.
+    Settings that scatter out of line don't count (`steady`). Of few repeats it is pulled towards what is usual: `USUAL_JITTER_DN` beside
+    the pixels' own noise, whose variance in a frame's mean is `own_dn2`, counts as two repeats.
     """
-    away, elapsed, freedom = [], [], 0
+    repeats = []
     for group, mean in zip(groups, means, strict=True):
         if len(group) > 1:
             time = np.array([study.elapsed_s(c) for c in group])
-            away.append(mean - mean.mean())
-            elapsed.append(time - time.mean())
-            freedom += len(group) - 1
+            repeats.append(Repeats(tuple(group), mean - mean.mean(), time - time.mean(), USUAL_JITTER_DN**2 + own_dn2))
+    repeats = steady(repeats)
+    freedom = sum(len(r.away) - 1 for r in repeats)
     if freedom == 0:
         return 0.05
-    rest, time = np.concatenate(away), np.concatenate(elapsed)
-    if freedom > 2 and np.any(time):
-        rest = rest - time * float(time @ rest) / float(time @ time)
+    rest, elapsed = np.concatenate([r.away for r in repeats]), np.concatenate([r.elapsed_s for r in repeats])
+    if freedom > 2 and np.any(elapsed):
+        rest = rest - elapsed * float(elapsed @ rest) / float(elapsed @ elapsed)
         freedom -= 1
     return float(np.sqrt((rest @ rest + 2.0 * (USUAL_JITTER_DN**2 + own_dn2)) / (freedom + 2.0)))
-
-
-@dataclass(frozen=True)
-class RepeatedLevels:
-    """Frames of one flat setting: their levels less the mean, relative; seconds less the mean; relative variance by pixels' noise."""
-
-    captures: tuple[Capture, ...]
-    away: FloatArray
-    elapsed_s: FloatArray
-    noise: float
-
-
-def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedLevels]:
-    """Of every flat setting with repeats, all unclipped channels together, without frames that may hold image lag of another level. `black`
-    in DN, `gain` in DN/e."""
-    found = []
-    for group in map(study.settled, study.flat_levels()):
-        planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
-        if len(group) < 2 or not planes:
-            continue
-        size = np.array([study.levels(group[0]).pixels[c] for c in planes], float)
-        levels = np.array([[study.levels(k).mean[c] or 0.0 for c in planes] for k in group]) - black
-        total = levels @ size
-        if total.mean() <= 0:
-            continue
-        noise = float(((gain * np.maximum(levels.mean(0), 0.0) + read_dn**2) * size).sum()) / total.mean() ** 2
-        elapsed = np.array([study.elapsed_s(k) for k in group])
-        found.append(RepeatedLevels(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
-    return found
-
-
-def level_repeatability(repeats: Sequence[RepeatedLevels]) -> float:
-    """Relative standard deviation of repeated flat frames' levels beyond pixels' noise, without a common trend with time (a lamp's drift).
-    Settings count by the inverse of their noise's variance."""
-    weight = np.array([1.0 / (r.noise + LAMP_FLOOR**2) for r in repeats])
-    moved = sum(w * float(r.elapsed_s @ r.elapsed_s) for w, r in zip(weight, repeats, strict=True))
-    trend = 0.0
-    if moved > 0:
-        trend = sum(w * float(r.elapsed_s @ r.away) for w, r in zip(weight, repeats, strict=True)) / moved
-    left = [float(np.sum(np.square(r.away - trend * r.elapsed_s))) - (len(r.away) - 1) * r.noise for r in repeats]
-    free = float(sum(w * (len(r.away) - 1) for w, r in zip(weight, repeats, strict=True)))
-    return float(np.sqrt(max(float(weight @ left) / free, 0.0))) if free > 0 else 0.0
 
 
 def pair_variance(frames: Sequence[Any]) -> float:

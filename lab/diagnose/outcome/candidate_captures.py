@@ -16,7 +16,8 @@ from lab.capture_kinds.slanted_edge import EdgeSequence
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
 from lab.diagnose.measurements.narrowband import NARROWBAND_FLOOR
-from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, LAMP_FLOOR
+from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
+from lab.diagnose.measurements.repeatability import LAMP_FLOOR
 from lab.formats.recording_set import RecordingSet
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect

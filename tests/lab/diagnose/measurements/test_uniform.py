@@ -25,10 +25,9 @@ from lab.diagnose.measurements.noise_guess import (
     NARROW_WINDOW_PX,
     WIDE_PLANE_PX,
     WIDE_WINDOW_PX,
-    level_repeatability,
-    repeated_levels,
     variance_between_pixels,
 )
+from lab.diagnose.measurements.repeatability import level_repeatability, repeated_levels
 from lab.fit.rounding import rounding_std_dn
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import (

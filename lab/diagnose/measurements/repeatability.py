@@ -1,0 +1,129 @@
+"""How repeatable levels are: the scatter of repeats of one setting beyond pixels' noise.
+
+Nobody states it, so the recordings have to tell. It is a tolerance of every level, and mustn't be set by one capture whose
+shutter or light isn't what is stated: settings that scatter out of line with the others don't count (`steady`), so that what they
+hold stays a departure that the diagnosis finds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import optimize, stats
+
+from lab.capture_kinds.base import Capture
+from sim.spectrum import FloatArray
+
+if TYPE_CHECKING:
+    from lab.diagnose.measurements.study import Study
+
+LAMP_FLOOR = 1.0e-4  # of a level, common to the channels of a capture
+#: Probability, over all settings, that a scatter as large is chance; and the share of the settings that may be out of line: of
+#: more, the scatter is the light's.
+OUT_OF_LINE_PROBABILITY, OUT_OF_LINE_SHARE = 1.0e-3, 0.25
+#: Efficiency of the median of squares beside their mean: as many degrees of freedom it is worth.
+MEDIAN_EFFICIENCY = 0.37
+#: Weight of the repeatability of all flat frames beside that of one setting's, in repeats.
+COMMON_REPEATS = 4
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Frames of one setting: their levels less the mean; seconds less the mean; variance by pixels' noise."""
+
+    captures: tuple[Capture, ...]
+    away: FloatArray
+    elapsed_s: FloatArray
+    noise: float
+
+
+def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[Repeats]:
+    """Of every flat setting with repeats, all unclipped channels together, relative to the mean level, without frames that may hold image
+    lag of another level. `black` in DN, `gain` in DN/e."""
+    found = []
+    for group in map(study.settled, study.flat_levels()):
+        planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
+        if len(group) < 2 or not planes:
+            continue
+        size = np.array([study.levels(group[0]).pixels[c] for c in planes], float)
+        levels = np.array([[study.levels(k).mean[c] or 0.0 for c in planes] for k in group]) - black
+        total = levels @ size
+        if total.mean() <= 0:
+            continue
+        noise = float(((gain * np.maximum(levels.mean(0), 0.0) + read_dn**2) * size).sum()) / total.mean() ** 2
+        elapsed = np.array([study.elapsed_s(k) for k in group])
+        found.append(Repeats(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
+    return found
+
+
+def steady(repeats: Sequence[Repeats]) -> list[Repeats]:
+    """Those settings whose scatter is in line with the others'.
+
+    With the settings' common trend b with time (weighted median of their slopes) taken out, S_g = sum((a - b t)^2) of n_g repeats is
+    (s_g^2 + s^2) chi2_f, f = n_g - 1, s_g^2 the pixels' noise. s^2 is where the median over settings of S_g / (s_g^2 + s^2) over the
+    median of chi2_f is 1. A setting is out of line where S_g / f over s_g^2 + s^2 exceeds the F distribution's quantile at
+    `OUT_OF_LINE_PROBABILITY` over the number of settings. Where more than `OUT_OF_LINE_SHARE` of the settings are, all count.
+    """
+    if len(repeats) * OUT_OF_LINE_SHARE < 1.0:
+        return list(repeats)
+    noise = np.array([r.noise for r in repeats])
+    free = np.array([len(r.away) - 1 for r in repeats], float)
+    size = np.array([float(r.elapsed_s @ r.elapsed_s) for r in repeats])
+    slope = np.array([float(r.elapsed_s @ r.away) for r in repeats]) / np.where(size > 0, size, 1.0)
+    trend = _weighted_median(slope, size / (noise + LAMP_FLOOR**2)) if size.any() else 0.0
+    square = np.array([float(np.sum(np.square(r.away - trend * r.elapsed_s))) for r in repeats])
+    usual = square / stats.chi2.median(free)
+
+    def excess(variance: float) -> float:
+        return float(np.median(usual / np.maximum(noise + variance, 1e-30))) - 1.0
+
+    common = optimize.brentq(excess, 0.0, float(usual.max())) if usual.max() > 0 and excess(0.0) > 0 else 0.0
+    ratio = square / free / (noise + max(common, LAMP_FLOOR**2))
+    worth = MEDIAN_EFFICIENCY * (free.sum() - free)
+    limit = stats.f.isf(OUT_OF_LINE_PROBABILITY / len(repeats), free, worth)
+    out = ratio > limit
+    if out.sum() > OUT_OF_LINE_SHARE * len(repeats):
+        return list(repeats)
+    return [r for r, is_out in zip(repeats, out, strict=True) if not is_out]
+
+
+def _weighted_median(value: FloatArray, weight: FloatArray) -> float:
+    order = np.argsort(value)
+    below = np.cumsum(weight[order])
+    return float(value[order][int(np.searchsorted(below, 0.5 * below[-1]))])
+
+
+def level_repeatability(repeats: Sequence[Repeats]) -> float:
+    """Relative standard deviation of repeated flat frames' levels beyond pixels' noise, without a common trend with time (a lamp's drift),
+    over the settings that are in line. Settings count by the inverse of their noise's variance."""
+    repeats = steady(repeats)
+    weight = np.array([1.0 / (r.noise + LAMP_FLOOR**2) for r in repeats])
+    moved = sum(w * float(r.elapsed_s @ r.elapsed_s) for w, r in zip(weight, repeats, strict=True))
+    trend = 0.0
+    if moved > 0:
+        trend = sum(w * float(r.elapsed_s @ r.away) for w, r in zip(weight, repeats, strict=True)) / moved
+    left = [float(np.sum(np.square(r.away - trend * r.elapsed_s))) - (len(r.away) - 1) * r.noise for r in repeats]
+    free = float(sum(w * (len(r.away) - 1) for w, r in zip(weight, repeats, strict=True)))
+    return float(np.sqrt(max(float(weight @ left) / free, 0.0))) if free > 0 else 0.0
+
+
+def level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
+    """Relative standard deviation of a frame's level by group: all flat frames', or a setting's own where that is larger, as in a
+    flickering light that short exposures don't average; of a setting out of line, all flat frames'."""
+    noise = study.noise
+    found = np.full(len(groups), noise.jitter_lamp)
+    place = {c.id: i for i, group in enumerate(groups) for c in group}
+    for repeats in steady(repeated_levels(study, noise.black, noise.gain, noise.read_dn)):
+        moved = float(repeats.elapsed_s @ repeats.elapsed_s)
+        left, free = repeats.away, len(repeats.away) - 1
+        if free > 1 and moved > 0:  # a trend with time isn't noise
+            left, free = left - float(repeats.elapsed_s @ left) / moved * repeats.elapsed_s, free - 1
+        elif moved > 0:
+            continue
+        own = max(float(np.sum(np.square(left))) / free - repeats.noise, 0.0)
+        pooled = (COMMON_REPEATS * noise.jitter_lamp**2 + free * own) / (COMMON_REPEATS + free)
+        found[place[repeats.captures[0].id]] = np.sqrt(max(pooled, noise.jitter_lamp**2))
+    return found
