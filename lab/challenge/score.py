@@ -185,11 +185,11 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     both_strong = Rate.over(set(s.truth) <= set(s.named) for s in strong)
     cover = Rate.over(truth in names for truth, names in sets)
     size = fmean(len(names) for _, names in sets) if sets else None
-    alarms = Rate.over(s.verdict not in {"no_mismatch", "failed"} for s in healthy)
+    alarms = Rate.over(s.verdict not in {"no_mismatch", "nothing_judged", "failed"} for s in healthy)
     names = Rate.over(bool(s.named) for s in healthy)
     abstained = Rate.over(s.right for s in outside)
     located = Rate.over(
-        s.verdict not in {"no_mismatch", "failed"}
+        s.verdict not in {"no_mismatch", "nothing_judged", "failed"}
         for s in outside
         if s.fault is None and max(s.noncentrality, default=0.0) > SEEN
     )

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from lab.cli.console import check_writable, err, make_folder, out, write_json
-from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.exit_codes import EXIT_CHECK, EXIT_INPUT
 from lab.cli.sources import (
     FitFile,
     Json,
@@ -66,7 +66,7 @@ def diagnose(
         ),
     ] = 0,
 ) -> None:
-    """Name the physics that the model left out, where the recordings show any."""
+    """Name the physics that the model left out, where the recordings show any. Exit code 2 where nothing could be judged."""
     if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
         raise InputError(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
@@ -90,6 +90,8 @@ def diagnose(
         _save_models(found, save)
     if str(json) != "-":
         print_diagnosis(found.diagnosis)
+    if found.diagnosis.verdict == "nothing_judged":
+        raise typer.Exit(EXIT_INPUT)
 
 
 def _save_models(found: PipelineResult, path: Path) -> None:

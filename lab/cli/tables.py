@@ -85,6 +85,18 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
         held = diagnosis.held_out
         captures = f"{len(held.captures)} held-out captures"
         out.print(f"{captures}: chi2 {held.chi2_before:.0f} before, {held.chi2_after:.0f} after, n = {held.n}")
+    departing = {(m.side, m.measurement) for m in diagnosis.mismatches}
+    departing |= {(u.side, u.measurement) for u in diagnosis.unexplained}
+    table = Table(box=None, pad_edge=False)
+    for heading in ("departing", "side", "n", "chi2 before", "after", "held out", "chi2 before", "after"):
+        table.add_column(heading)
+    for fit in diagnosis.measurements:
+        if (fit.side, fit.measurement) in departing:
+            seen = (str(fit.n), f"{fit.chi2_before:.0f}", f"{fit.chi2_after:.0f}")
+            held_out = (str(fit.held_out_n), f"{fit.held_out_before:.0f}", f"{fit.held_out_after:.0f}")
+            table.add_row(fit.measurement, fit.side, *seen, *(held_out if fit.held_out_n else ("-", "-", "-")))
+    if table.row_count:
+        out.print(table)
     if diagnosis.next_capture:
         out.print(f"next: {escape(diagnosis.next_capture)}")
     print_skipped(diagnosis.skipped)

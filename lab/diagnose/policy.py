@@ -63,6 +63,24 @@ class DecisionPolicy(Frozen):
             "half of `false_alarm_rate`: slices add at most half as many false alarms as scores",
         ),
     ] = 0.005
+    held_out_false_alarm_rate: Annotated[
+        float,
+        Rule(
+            "significance",
+            "1",
+            "probability, corrected for the number of measurements, below which held-out numbers contradict the model",
+            "as `slice_false_alarm_rate`",
+        ),
+    ] = 0.005
+    held_out_veto_sigma: Annotated[
+        float,
+        Rule(
+            "significance",
+            "standard deviations",
+            "quantile z of noise: by a right name the held-out chi2 rises by no more than z^2",
+            "one-sided 99 % of a normal distribution, 1 - `false_alarm_rate`",
+        ),
+    ] = 2.33
     covariance_slack: Annotated[
         float,
         Rule(

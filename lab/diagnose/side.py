@@ -17,7 +17,7 @@ from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
-from lab.diagnose.outcome.mismatches import located, shown_in, unexplained
+from lab.diagnose.outcome.mismatches import located, shown_in, unexplained, vetoed_names
 from lab.diagnose.outcome.next_capture import Proposal, proposals
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.policy import DecisionPolicy
@@ -33,6 +33,7 @@ from lab.formats.results import (
     ResidualPicture,
     Skipped,
     Unexplained,
+    VetoedName,
     Visibility,
 )
 from sim.camera import Side
@@ -64,6 +65,7 @@ class SideFindings:
     named: tuple[NamedCandidate, ...] = ()
     abstained: tuple[Candidate, ...] = ()
     unexplained: tuple[Unexplained, ...] = ()
+    vetoed: tuple[VetoedName, ...] = ()
     held_out: HeldOut | None = None
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
@@ -115,7 +117,8 @@ def diagnose_side(
         mismatches=tuple(located(side, verdict)),
         named=tuple(NamedCandidate(c, shown_in(verdict, c, policy)) for c in verdict.named),
         abstained=verdict.abstained,
-        unexplained=tuple(unexplained(side, verdict, corrections)),
+        unexplained=tuple(unexplained(recordings, side, verdict, corrections, policy)),
+        vetoed=tuple(vetoed_names(side, verdict)),
         held_out=held_out(verdict),
         curves=tuple(residual_curves(side, verdict)),
         improved=improved,

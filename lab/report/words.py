@@ -11,6 +11,7 @@ from lab.report.figures import measured
 #: Verdict -> (what stands on the badge, its mood, the headline).
 VERDICTS = {
     "no_mismatch": ("no mismatch", "good", "The baseline model explains these recordings."),
+    "nothing_judged": ("nothing judged", "open", "No measurement of these recordings could be looked at."),
     "explained": ("explained", "told", "The baseline model leaves physics out; the named effects account for it."),
     "partly_explained": (
         "partly explained",

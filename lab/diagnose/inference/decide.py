@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lab.diagnose.inference.discrepancy import Discrepancy, likeliest_discrepancy, predictive_discrepancy
+from lab.diagnose.inference.discrepancy import (
+    Discrepancy,
+    likeliest_discrepancy,
+    no_discrepancy,
+    predictive_discrepancy,
+)
+from lab.diagnose.inference.held_out import VetoedCandidate, held_out_mismatches, predicts_held_out, vetoed
 from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import named_members
+from lab.diagnose.inference.outlying import OutlyingLevel, outlying_levels
 from lab.diagnose.inference.refit import log_likelihood
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import Search
@@ -26,7 +33,9 @@ class Verdict:
     """What one side shows.
 
     `before`, `after`: mismatches of the baseline, and with the named effects. `named`: most significant first.
-    `abstained`: candidates that weren't named. `discrepancies`: of the blocks that have a mismatch left.
+    `abstained`: candidates that weren't named. `discrepancies`: of the blocks that have a mismatch left. `held_out`: measurements whose
+    held-out numbers contradict the model with the named effects, of those that have no other mismatch. `vetoed`: names that held-out
+    numbers contradict. `outlying`: captures whose levels aren't those of what is stated, by the block that they alone disturb.
     """
 
     model: MeasurementModel
@@ -37,6 +46,9 @@ class Verdict:
     abstained: tuple[Candidate, ...]
     after: tuple[Slice, ...]
     discrepancies: tuple[Discrepancy, ...]
+    held_out: tuple[Slice, ...] = ()
+    vetoed: tuple[VetoedCandidate, ...] = ()
+    outlying: Mapping[int, tuple[OutlyingLevel, ...]] = field(default_factory=dict)
 
     @property
     def kernels(self) -> dict[int, FloatArray]:
@@ -69,9 +81,15 @@ def decide(
     named, abstained = named_members(search, search.best(report), report)
     if top > threshold + policy.lone_score_margin and not named and not before and not abstained:
         abstained.append(Candidate(scores[0].start, {}, 0.0, ((UNKNOWN, 1.0),), 0.5 * top))
+    refused: list[VetoedCandidate] = []
     while True:
         named.sort(key=lambda c: -c.log_odds)
         effects = tuple(c.effect for c in named)
+        losing = next((v for c in reversed(named) for v in (_veto(search, named, c),) if v is not None), None)
+        if losing is not None:
+            refused.append(losing)
+            named = _refitted(search, named, losing.candidate)
+            continue
         after = mismatches(model, model.gaussian(effects), policy)
         left = list(dict.fromkeys(model.blocks.index(s.block) for s in after))
         if abstained and not left:
@@ -81,13 +99,52 @@ def decide(
         parts = [c for c in named if after and _is_part_of_unknown(model, c, effects, likeliest, policy)]
         if not parts:
             told = tuple(_with_either_sign(model, c, effects, policy) for c in named)
-            discrepancies = tuple(predictive_discrepancy(model, gaussian, i, policy) for i in left)
-            return Verdict(model, threshold, top, before, told, tuple(abstained), after, discrepancies)
+            return _verdict(
+                Verdict(model, threshold, top, before, told, tuple(abstained), after, ()), left, refused, policy
+            )
         # the weakest goes first: without it, what is left may be within the other laws' tolerances
         abstained.append(parts[-1])
-        rest = search.fitted(tuple(c.effect for c in named if c is not parts[-1]), converged=True)
-        kept = {c.effect.name: c for c in named}
-        named = [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]
+        named = _refitted(search, named, parts[-1])
+
+
+def _verdict(told: Verdict, left: Sequence[int], refused: Sequence[VetoedCandidate], policy: DecisionPolicy) -> Verdict:
+    """The verdict with what is left without a name, in the blocks `left` and where held-out numbers contradict the model: single
+    captures that are outlying, or a discrepancy that predicts held-out captures."""
+    model, effects = told.model, told.effects
+    gaussian = model.seen_gaussian(effects)
+    outlying = {i: found for i in left for found in (outlying_levels(model, i, effects, policy),) if found}
+    discrepancies = []
+    for index in left:
+        one = no_discrepancy(model.blocks[index], index)
+        if index not in outlying:
+            likely = predictive_discrepancy(model, gaussian, index, policy)
+            one = likely if predicts_held_out(model, effects, index, likely.kernel) else one
+        discrepancies.append(one)
+    kernels = {d.index: d.kernel for d in discrepancies if d.log_odds > 0}
+    contradicting = held_out_mismatches(model, effects, kernels, policy)
+    held_out = tuple(s for s in contradicting if model.blocks.index(s.block) not in left)
+    for part in held_out:
+        index = model.blocks.index(part.block)
+        discrepancies.append(no_discrepancy(part.block, index))
+        found = outlying_levels(model, index, effects, policy)
+        if found:
+            outlying[index] = found
+    return replace(
+        told, discrepancies=tuple(discrepancies), held_out=held_out, vetoed=tuple(refused), outlying=outlying
+    )
+
+
+def _refitted(search: Search, named: Sequence[Candidate], gone: Candidate) -> list[Candidate]:
+    """The named candidates without one of them, fitted again."""
+    rest = search.fitted(tuple(c.effect for c in named if c is not gone), converged=True)
+    kept = {c.effect.name: c for c in named}
+    return [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]
+
+
+def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> VetoedCandidate | None:
+    """The held-out captures' veto on one of the named candidates."""
+    without = search.fitted(tuple(c.effect for c in named if c is not candidate), converged=True)
+    return vetoed(search.model, candidate, tuple(c.effect for c in named), without.effects, search.policy)
 
 
 def _with_either_sign(

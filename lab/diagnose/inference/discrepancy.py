@@ -60,7 +60,7 @@ def predictive_discrepancy(
     What was left out is judged by the covariance without the discrepancy, so that larger variances gain nothing.
     """
     block, seen = model.blocks[index], model.seen[model.slices[index]]
-    none = _none(block, index)
+    none = no_discrepancy(block, index)
     tried = [d for d in _fitted(model, gaussian, index, PREDICTIVE_LENGTHS, policy, points=True) if d.log_odds > 0]
     likeliest = max(tried, key=lambda d: d.log_odds, default=none)
     parts = _left_out(block, seen, policy.left_out_parts)
@@ -124,7 +124,7 @@ def _fitted(
     x = np.zeros_like(block.position) if block.measurement.places else block.position
     lower = cholesky(gaussian.block_covariance(index), lower=True)
     white = solve_triangular(lower, residual, lower=True)
-    yield _none(block, index)
+    yield no_discrepancy(block, index)
 
     def likeliest(factor: FloatArray, length: float, grouping: str) -> Discrepancy:
         # With the eigenvalues e of the whitened factor, an amplitude a changes the log-likelihood by
@@ -168,7 +168,8 @@ def _groupings(block: Block) -> dict[str, NDArray[np.intp]]:
     return found
 
 
-def _none(block: Block, index: int) -> Discrepancy:
+def no_discrepancy(block: Block, index: int) -> Discrepancy:
+    """None, with log odds of 0."""
     n = len(block.value)
     return Discrepancy(index, 0.0, 0.0, block.reach, "none", np.zeros((n, n)))
 

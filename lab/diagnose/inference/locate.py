@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import special
 
-from lab.diagnose.inference.gaussian import Gaussian, chi2
+from lab.diagnose.inference.gaussian import ROUNDING, Gaussian, chi2, conditional
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.policy import DecisionPolicy
@@ -53,7 +53,7 @@ def chi2_by_slice(model: MeasurementModel, gaussian: Gaussian, policy: DecisionP
         value = chi2(residual[members], gaussian.covariance[np.ix_(members, members)])
         value /= (1.0 + policy.covariance_slack) ** 2
         n = len(members)
-        log_p = min(_log_tail(value, n) + np.log(len(candidates)), 0.0)
+        log_p = min(log_tail(value, n) + np.log(len(candidates)), 0.0)
         found.append(Slice(block, axis, where, members, value, n, log_p))
     return sorted(found, key=lambda s: s.log_probability)
 
@@ -64,7 +64,7 @@ def mismatches(model: MeasurementModel, gaussian: Gaussian, policy: DecisionPoli
     return tuple(s for s in chi2_by_slice(model, gaussian, policy) if s.log_probability < limit)
 
 
-def _log_tail(value: float, n: int) -> float:
+def log_tail(value: float, n: int) -> float:
     """log P(chi2_n > value); far out by the tail's leading term."""
     exact = float(special.chdtrc(n, value))
     if exact > 0.0:
@@ -112,7 +112,7 @@ def _range(block: Block, x: FloatArray) -> str:
 
 
 def describe(model: MeasurementModel, gaussian: Gaussian, part: Slice) -> tuple[str, tuple[str, ...]]:
-    """A mismatch in words, and the captures concerned.
+    """A mismatch in words, and the captures concerned: of held-out numbers, where the slice is of those.
 
     The words give range, channels and conditions of the numbers whose residuals are largest: at least 3 standard
     deviations and 0.3 of the largest; where all are smaller, by noise alone, 2 standard deviations and 0.5 of the
@@ -121,10 +121,17 @@ def describe(model: MeasurementModel, gaussian: Gaussian, part: Slice) -> tuple[
     block = part.block
     at = model.slices[model.blocks.index(block)]
     index = np.arange(at.start, at.stop)
-    index = index[model.seen[index]]
+    is_held_out = not model.seen[part.members].any()
+    index = index[model.seen[index] != is_held_out]
     residual = (model.value - gaussian.mean)[index]
-    total = np.abs(residual / np.sqrt(np.diag(gaussian.covariance)[index]))
+    std = np.sqrt(np.diag(gaussian.covariance)[index])
     noise = np.abs(residual / np.sqrt(np.diag(block.covariance))[index - at.start])
+    if is_held_out:  # by what the seen numbers say of them
+        of = np.isin(np.arange(len(model.value)), index)
+        residual, covariance = conditional(model.value - gaussian.mean, gaussian.covariance, of, model.seen)
+        std = np.sqrt(np.maximum(np.diag(covariance), ROUNDING * np.square(std)))
+        noise = np.abs(residual / std)
+    total = np.abs(residual / std)
     strong = total > max(3.0, 0.3 * float(total.max()))
     if not strong.any():
         strong = noise >= max(2.0, 0.5 * float(noise.max()))

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from lab.diagnose.inference.decide import Verdict
-from lab.diagnose.inference.gaussian import ROUNDING, chi2, conditional
+from lab.diagnose.inference.gaussian import chi2
+from lab.diagnose.inference.held_out import held_out_residual
 from lab.diagnose.inference.locate import chi2_by_slice
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
@@ -62,12 +63,7 @@ def _chi2_by_block(
     model, seen = verdict.model, verdict.model.seen
     gaussian = model.gaussian(effects)
     residual = model.value - gaussian.mean - model.discrepancy_mean(effects, discrepancies)
-    left, covariance = (
-        conditional(residual, gaussian.covariance, ~seen, seen) if (~seen).any() else (np.zeros(0), np.zeros((0, 0)))
-    )
-    # held-out numbers that the seen ones fix to the last digit have a variance of rounding, which may be negative
-    covariance = 0.5 * (covariance + covariance.T)
-    covariance += np.diag(ROUNDING * np.diag(gaussian.covariance)[~seen])
+    left, covariance = held_out_residual(model, effects, discrepancies)
     found = []
     for index in range(len(model.blocks)):
         mine = model.mask(index)

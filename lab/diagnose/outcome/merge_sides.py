@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -13,17 +12,20 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.formats.results import (
     DiagnosisResult,
+    DiagnosisVerdict,
     HeldOut,
     Mismatch,
     NamedEffect,
     ParameterValue,
     Rival,
     Unexplained,
+    VetoedName,
 )
 from sim.camera import Side
 from sim.effects.library import effects as library
 
-Word = Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+#: What to add to recordings in which no measurement can be looked at.
+LEAST_CAPTURES = "Add dark frames at two exposures, and flat frames at three levels or more with the light's radiance: the measurements begin with these."
 
 
 def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -> DiagnosisResult:
@@ -31,8 +33,11 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
     mismatches = tuple(m for f in found for m in f.mismatches)
     effects = tuple(_named(found, policy))
     unexplained = tuple(u for f in found for u in f.unexplained)
-    verdict: Word = "unexplained"
-    if not effects and not unexplained and not mismatches:
+    vetoed = tuple(v for f in found for v in f.vetoed)
+    verdict: DiagnosisVerdict = "unexplained"
+    if not any(f.is_judged for f in found):
+        verdict = "nothing_judged"
+    elif not effects and not unexplained and not mismatches:
         verdict = "no_mismatch"
     elif effects:
         verdict = "partly_explained" if unexplained else "explained"
@@ -44,8 +49,11 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         mismatches=mismatches,
         effects=effects,
         unexplained=unexplained,
+        vetoed=vetoed,
         held_out=held_out,
-        next_capture=next_sentence(offered, bool(unexplained), policy),
+        next_capture=LEAST_CAPTURES
+        if verdict == "nothing_judged"
+        else next_sentence(offered, bool(unexplained), policy),
         next_captures=offered,
         places=tuple(p for f in found for p in f.places),
         measurements=tuple(m for f in found for m in f.measurements),
@@ -57,7 +65,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         skipped=tuple(  # parts of one measurement give the same reason
             dict.fromkeys(s for f in found for s in f.skipped)
         ),
-        summary=tuple(_summary(verdict, mismatches, effects, unexplained, held_out, policy)),
+        summary=tuple(_summary(verdict, mismatches, effects, unexplained, vetoed, held_out, policy)),
         policy=policy.told(),
     )
 
@@ -135,18 +143,22 @@ def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:
 
 
 def _summary(
-    verdict: Word,
+    verdict: DiagnosisVerdict,
     mismatches: Sequence[Mismatch],
     effects: Sequence[NamedEffect],
     unexplained: Sequence[Unexplained],
+    vetoed: Sequence[VetoedName],
     held_out: HeldOut | None,
     policy: DecisionPolicy,
 ) -> list[str]:
     """The diagnosis in sentences."""
     lines = []
+    if verdict == "nothing_judged":
+        lines.append("No measurement of these recordings could be looked at, so nothing is said of the camera.")
     if verdict == "no_mismatch":
+        agree = ", and held-out captures agree" if held_out is not None else "; no captures are held out"
         lines.append(
-            f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * policy.false_alarm_rate:.0f} %."
+            f"The baseline explains everything that could be judged, at a false-alarm rate of {100 * policy.false_alarm_rate:.0f} %{agree}."
         )
     lines += [
         f"{measurement_title(m.measurement)} of the {m.side} camera departs from the baseline: {m.where} ({m.significance_sigma:.1f} sigma)."
@@ -158,8 +170,10 @@ def _summary(
         for u in unexplained
     ]
     lines += dict.fromkeys(u.check for u in unexplained if u.check)
-    if held_out is not None and held_out.chi2_after < held_out.chi2_before:
+    lines += [v.statement for v in vetoed]
+    if held_out is not None and held_out.chi2_after != held_out.chi2_before:
+        way = "falls" if held_out.chi2_after < held_out.chi2_before else "rises"
         lines.append(
-            f"On captures that neither choice nor fit has seen, chi2 falls from {held_out.chi2_before:.0f} to {held_out.chi2_after:.0f} for {held_out.n} numbers."
+            f"On captures that neither choice nor fit has seen, chi2 {way} from {held_out.chi2_before:.0f} to {held_out.chi2_after:.0f} for {held_out.n} numbers."
         )
     return lines

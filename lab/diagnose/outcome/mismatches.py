@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import stats
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.discrepancy import Discrepancy
+from lab.diagnose.inference.gaussian import Gaussian, chi2
 from lab.diagnose.inference.locate import Slice, describe
-from lab.diagnose.inference.weigh import Candidate
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.outlying import OutlyingLevel
+from lab.diagnose.inference.weigh import UNKNOWN, Candidate
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.results import Mismatch, Unexplained
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import Mismatch, Unexplained, VetoedName
 from sim.camera import Side
 from sim.effects.base import Effect
 
@@ -21,6 +26,8 @@ from sim.effects.base import Effect
 WHOLE_AXIS = "along the whole axis"
 #: Rivals that are listed beside a candidate.
 LISTED_RIVALS = 3
+#: Probability from which on a rival is told beside the nearest law.
+LEAST_TOLD = 0.05
 
 
 def located(side: Side, verdict: Verdict) -> list[Mismatch]:
@@ -49,7 +56,37 @@ def located(side: Side, verdict: Verdict) -> list[Mismatch]:
                 significance_sigma=round(float(np.sqrt(max(2.0 * candidate.log_odds, 0.0))), 2),
                 captures=model.captures(False, model.mask(model.blocks.index(block))),
             )
+    for part in verdict.held_out:
+        name = part.block.measurement.name
+        if name not in found:
+            where, captures = describe(model, model.gaussian(verdict.effects), part)
+            found[name] = Mismatch(
+                side=side,
+                measurement=name,
+                axis=part.axis,
+                where=f"{where}, in held-out captures",
+                significance_sigma=_sigma(part),
+                captures=captures,
+            )
     return list(found.values())
+
+
+def vetoed_names(side: Side, verdict: Verdict) -> list[VetoedName]:
+    """The names that held-out captures contradict, in words."""
+    return [
+        VetoedName(
+            side=side,
+            name=one.candidate.effect.name,
+            probability=one.candidate.probability,
+            captures=one.captures,
+            chi2_before=one.chi2_without,
+            chi2_after=one.chi2_with,
+            n=one.n,
+            statement=f"{one.candidate.effect.name} is not named for the {side} camera: the captures that the choice used suggest it, but on "
+            f"held-out captures chi2 rises by it from {one.chi2_without:.0f} to {one.chi2_with:.0f} for {one.n} numbers, more than chance allows.",
+        )
+        for one in verdict.vetoed
+    ]
 
 
 def shown_in(verdict: Verdict, candidate: Candidate, policy: DecisionPolicy) -> tuple[str, ...]:
@@ -69,34 +106,57 @@ def _change_chi2(verdict: Verdict, effect: Effect, block: Block) -> float:
     return verdict.model.change_chi2(effect, others, verdict.model.blocks.index(block))
 
 
-def unexplained(side: Side, verdict: Verdict, corrections: Sequence[Correction]) -> list[Unexplained]:
-    """Every mismatch that is left: where, how its discrepancy looks, which effects come nearest, and chi2 with and
-    without the discrepancy's covariance. `corrections` of the improved model, one for each."""
+def unexplained(
+    recordings: RecordingSet,
+    side: Side,
+    verdict: Verdict,
+    corrections: Sequence[Correction],
+    policy: DecisionPolicy,
+) -> list[Unexplained]:
+    """Every mismatch that is left: where, how its discrepancy looks, which law comes nearest, and chi2 with and
+    without the discrepancy's covariance, of what only held-out captures show that of theirs; the captures, and what is to be checked of
+    them. `corrections` of the improved model, one for each."""
     model = verdict.model
     gaussian = model.gaussian(verdict.effects)
     found = []
     for one, correction in zip(verdict.discrepancies, corrections, strict=True):
         block, at = model.blocks[one.index], model.slices[one.index]
-        part = next((s for s in verdict.after if s.block is block), None)
+        part = next((s for s in (*verdict.after, *verdict.held_out) if s.block is block), None)
+        is_held_out = part is not None and part in verdict.held_out
         index = np.arange(at.start, at.stop)[model.seen[at]]
-        only = np.ix_(index, index)
-        residual = (model.value - gaussian.mean)[index]
-        with_kernel = gaussian.with_discrepancy(one.index, one.kernel)
-        near = [c for c in verdict.abstained if block.touched_by(type(c.effect))]
+        before = _seen_chi2(model, gaussian, index)
+        after = _seen_chi2(model, gaussian.with_discrepancy(one.index, one.kernel), index)
+        if is_held_out and part is not None:
+            before = after = part.chi2 * (1.0 + policy.covariance_slack) ** 2
+        where, captures = (
+            describe(model, gaussian, part)
+            if part is not None
+            else (WHOLE_AXIS, model.captures(False, model.mask(one.index)))
+        )
+        outlying = verdict.outlying.get(one.index, ())
+        if outlying:
+            captures = tuple(sorted({name for level in outlying for name in level.captures}))
+        checks = [_level_check(recordings, level) for level in outlying]
+        near = [] if is_held_out or outlying else [c for c in verdict.abstained if block.touched_by(type(c.effect))]
         remarked = max((c for c in near if c.remark), key=lambda c: c.log_odds, default=None)
+        if remarked is not None:
+            checks.append(f"The {side} camera looks {remarked.remark}: check what is stated of both.")
         found.append(
             Unexplained(
                 side=side,
                 measurement=block.measurement.name,
                 axis=part.axis if part is not None else block.measurement.axis,
-                where=describe(model, gaussian, part)[0] if part is not None else WHOLE_AXIS,
-                shape=_shape(one, block, near),
+                where=where,
+                shape=_shape(one, verdict, near, before, outlying, policy)
+                if not is_held_out
+                else _held_out_shape(outlying),
                 significance_sigma=_sigma(part),
-                chi2_before=float(residual @ np.linalg.solve(gaussian.covariance[only], residual)),
-                chi2_after=float(residual @ np.linalg.solve(with_kernel.covariance[only], residual)),
-                n=len(index),
+                chi2_before=before,
+                chi2_after=after,
+                n=part.n if is_held_out and part is not None else len(index),
+                captures=captures,
                 correction=correction.said,
-                check=f"The {side} camera looks {remarked.remark}: check what is stated of both." if remarked else "",
+                check=" ".join(checks),
             )
         )
     return found
@@ -106,16 +166,62 @@ def _sigma(part: Slice | None) -> float:
     return round(part.significance_sigma, 2) if part is not None else 0.0
 
 
-def _shape(one: Discrepancy, block: Block, near: Sequence[Candidate]) -> str:
-    """How a discrepancy looks, and the effects that come nearest to it."""
-    nearest = [
-        f"{c.effect.name} ({100 * c.probability:.0f} %)"
-        + "".join(f", {n} ({100 * p:.0f} %)" for n, p in c.rivals[:LISTED_RIVALS])
-        for c in near
-    ]
-    family = (
-        f"; nearest of the library, none of them likely enough to be named: {'; '.join(nearest)}" if nearest else ""
+def _seen_chi2(model: MeasurementModel, gaussian: Gaussian, index: np.ndarray) -> float:
+    return chi2((model.value - gaussian.mean)[index], gaussian.covariance[np.ix_(index, index)])
+
+
+def _level_check(recordings: RecordingSet, level: OutlyingLevel) -> str:
+    """What captures whose level isn't that of what is stated would be in line with, as a sentence."""
+    stated = {c.id: c.exposure_s for c in recordings.captures() if c.id in level.captures}
+    exposure_s = float(np.mean(list(stated.values())))
+    many = len(level.captures) > 1
+    return (
+        f"Capture{'s' if many else ''} {', '.join(level.captures)}: stated with {exposure_s:.6g} s, but {'their' if many else 'its'} level is "
+        f"that of {exposure_s * level.factor:.6g} ± {exposure_s * level.factor_std:.2g} s, or of {level.factor:.4f} ± {level.factor_std:.1g} "
+        "times the stated light: check both."
     )
+
+
+def _held_out_shape(outlying: Sequence[OutlyingLevel]) -> str:
+    """How a mismatch looks that only held-out captures show."""
+    if outlying:
+        return "single captures aren't in line with the others"
+    return "held-out captures contradict what the other captures say"
+
+
+def _shape(
+    one: Discrepancy,
+    verdict: Verdict,
+    near: Sequence[Candidate],
+    chi2_without: float,
+    outlying: Sequence[OutlyingLevel],
+    policy: DecisionPolicy,
+) -> str:
+    """How a discrepancy looks, and the law that comes nearest to it."""
+    if outlying:
+        return _held_out_shape(outlying)
+    block = verdict.model.blocks[one.index]
+    law = f"; {_nearest(one, verdict, near, chi2_without, policy)}" if near else ""
     if one.log_odds > 0:
-        return f"smooth over {one.length:.3g} {block.measurement.unit}, {one.grouping}, of relative size {one.amplitude:.2g}{family}"
-    return f"irregular: no smooth discrepancy describes it{family}"
+        return f"smooth over {one.length:.3g} {block.measurement.unit}, {one.grouping}, of relative size {one.amplitude:.2g}{law}"
+    return f"irregular: no smooth discrepancy predicts captures that it hasn't seen{law}"
+
+
+def _nearest(
+    one: Discrepancy, verdict: Verdict, near: Sequence[Candidate], chi2_without: float, policy: DecisionPolicy
+) -> str:
+    """The nearest law of the library, and why it isn't named: what it leaves, or what fits as well."""
+    model, at = verdict.model, verdict.model.slices[one.index]
+    nearest = max(near, key=lambda c: c.log_odds)
+    name = nearest.effect.name
+    index = np.arange(at.start, at.stop)[model.seen[at]]
+    others = tuple(e for e in verdict.effects if e.name != name)
+    left = _seen_chi2(model, model.gaussian((*others, nearest.effect)), index)
+    least = float(stats.chi2.isf(policy.slice_false_alarm_rate, len(index))) * (1.0 + policy.covariance_slack) ** 2
+    if left > least:
+        told = f"chi2 is {left:.0f} with it, {chi2_without:.0f} without, {len(index)} are expected"
+        return f"the nearest law is {name}, and it doesn't hold exactly: {told}"
+    rivals = [f"{n} ({100 * p:.0f} %)" for n, p in nearest.rivals[:LISTED_RIVALS] if n != UNKNOWN and p >= LEAST_TOLD]
+    if rivals:
+        return f"the nearest law is {name} ({100 * nearest.probability:.0f} %), which these recordings can't tell from {', '.join(rivals)}"
+    return f"the nearest law is {name}; what it leaves beside it in the same captures has no name, so that both may be one unknown cause"

@@ -7,6 +7,7 @@ from lab.formats.results.blur import MtfCurve, PsfKernel, PsfSymmetry
 from lab.formats.results.comparison import Change, ComparisonResult, ProjectionChange
 from lab.formats.results.diagnosis import (
     DiagnosisResult,
+    DiagnosisVerdict,
     ExaminedPlace,
     HeldOut,
     MeasurementFit,
@@ -20,6 +21,7 @@ from lab.formats.results.diagnosis import (
     Resolution,
     Rival,
     Unexplained,
+    VetoedName,
     Visibility,
 )
 from lab.formats.results.fit import CameraFit, FitResult
@@ -67,6 +69,7 @@ __all__ = [
     "Defect",
     "DepthUncertainty",
     "DiagnosisResult",
+    "DiagnosisVerdict",
     "DistortionModel",
     "Emva1288",
     "Emva1288Points",
@@ -103,6 +106,7 @@ __all__ = [
     "StereoFit",
     "Unexplained",
     "ValidationResult",
+    "VetoedName",
     "ViewResiduals",
     "Visibility",
 ]

@@ -8,6 +8,9 @@ from lab.formats.results.skipped import Skipped
 from sim.camera import Side
 from sim.parameters import Frozen
 
+#: `nothing_judged`: no measurement could be looked at.
+DiagnosisVerdict = Literal["no_mismatch", "explained", "partly_explained", "unexplained", "nothing_judged"]
+
 
 class Mismatch(Frozen):
     """A part of a measurement whose prediction and recording differ beyond the threshold."""
@@ -60,8 +63,25 @@ class Unexplained(Frozen):
     chi2_before: float
     chi2_after: float
     n: int
+    captures: tuple[str, ...] = ()  # that show it
     correction: str = ""  # the model discrepancy, in words
-    check: str = ""  # a stated value of the camera that the recordings contradict, as a sentence
+    check: str = ""  # stated values, of the camera or of captures, that the recordings contradict, as sentences
+
+
+class VetoedName(Frozen):
+    """An effect that the captures used for the choice suggest, and that held-out captures contradict: it isn't named.
+
+    `before`, `after`: chi2 of n held-out numbers without and with it.
+    """
+
+    side: Side
+    name: str
+    probability: float
+    captures: tuple[str, ...]
+    chi2_before: float
+    chi2_after: float
+    n: int
+    statement: str
 
 
 class HeldOut(Frozen):
@@ -172,7 +192,7 @@ class Resolution(Frozen):
 
     capture: str
     session: str
-    verdict_before: Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+    verdict_before: DiagnosisVerdict
     effects_before: tuple[NamedEffect, ...]
 
 
@@ -192,10 +212,11 @@ class DiagnosisResult(Frozen):
     format: Literal["calibench-diagnosis"] = "calibench-diagnosis"
     version: Literal[1] = 1
     source: str
-    verdict: Literal["no_mismatch", "explained", "partly_explained", "unexplained"]
+    verdict: DiagnosisVerdict
     mismatches: tuple[Mismatch, ...] = ()
     effects: tuple[NamedEffect, ...] = ()
     unexplained: tuple[Unexplained, ...] = ()
+    vetoed: tuple[VetoedName, ...] = ()
     held_out: HeldOut | None = None
     next_capture: str | None = None
     next_captures: tuple[NextCapture, ...] = ()  # best first, for each side

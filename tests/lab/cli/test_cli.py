@@ -27,6 +27,8 @@ from lab.formats.results import (
     Check,
     DiagnosisResult,
     FitResult,
+    MeasurementFit,
+    Mismatch,
     NoiseFit,
     Resolution,
     Skipped,
@@ -261,6 +263,32 @@ def test_every_command_writes_before_it_prints(
     file = tmp_path / "result.json"
     assert cli.main([command, str(flats), "--json", str(file)]) == 1
     assert json.loads(file.read_text())["source"]
+
+
+def test_a_diagnosis_that_judged_nothing_ends_with_2(
+    flats: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nothing = DiagnosisResult(source="x", verdict="nothing_judged", next_capture="Add dark frames.")
+    monkeypatch.setattr(lab.diagnose, "examine", lambda *_, **__: Diagnosis(nothing, {}))
+    assert cli.main(["diagnose", str(flats)]) == 2
+    assert "Add dark frames." in capsys.readouterr().out
+
+
+def test_a_departing_measurement_is_told_with_its_held_out_chi2(
+    flats: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left: Any = {"side": "left", "measurement": "photon_transfer"}
+    off = Mismatch(**left, axis="level", where="2597 DN", significance_sigma=9.0, captures=("c1",))
+    chi2: Any = {"n": 18, "chi2_before": 11.0, "chi2_after": 11.0, "held_out_n": 6}
+    fits = (
+        MeasurementFit(**left, **chi2, held_out_before=1809.0, held_out_after=1809.0),
+        MeasurementFit(side="left", measurement="dark", **chi2, held_out_before=5.0, held_out_after=5.0),
+    )
+    found = DiagnosisResult(source="x", verdict="unexplained", mismatches=(off,), measurements=fits)
+    monkeypatch.setattr(lab.diagnose, "examine", lambda *_, **__: Diagnosis(found, {}))
+    assert cli.main(["diagnose", str(flats)]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if " left " in line]
+    assert rows == [["photon_transfer", "left", "18", "11", "11", "6", "1809", "1809"]]
 
 
 def test_effects_tells_of_the_whole_library(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

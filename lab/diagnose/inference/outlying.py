@@ -1,0 +1,116 @@
+"""Captures whose level isn't that of what is stated of them: a factor on the light of single captures (data snooping, Baarda 1968)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from lab.diagnose.inference.gaussian import Gaussian
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.measurements.block import Block, Effects
+from lab.diagnose.policy import DecisionPolicy
+from sim.spectrum import FloatArray
+from sim.uniform import LEVEL
+
+#: Share of a measurement's captures that may be outlying: of more, none can be told from the others.
+MOST_OUTLYING = 0.3
+#: Standard deviations within which captures of one setting count as off by the same factor.
+ALIKE_SIGMA = 4.0
+
+
+@dataclass(frozen=True)
+class OutlyingLevel:
+    """Captures of one setting whose numbers fit `factor` times the stated exposure, or light."""
+
+    captures: tuple[str, ...]
+    factor: float
+    factor_std: float
+
+
+def outlying_levels(
+    model: MeasurementModel, index: int, effects: Effects, policy: DecisionPolicy
+) -> tuple[OutlyingLevel, ...]:
+    """Captures of one measurement of levels, seen or held out, by whose factors alone it agrees with the model; none where it doesn't.
+
+    With d_c the signal of a capture's numbers, 0 elsewhere, the factor of capture c gains (d_c' C^-1 r)^2 / (d_c' C^-1 d_c) in chi2.
+    The best capture is taken while its gain is above the chi2_1 quantile of `slice_false_alarm_rate` over the number of captures, all
+    factors fitted again each time.
+    """
+    block, at = model.blocks[index], model.slices[index]
+    if not block.reads >= LEVEL or block.measurement.places:
+        return ()
+    captures = list(dict.fromkeys(label.captures for label in block.labels))
+    column = np.zeros((len(model.value), len(captures)))
+    for i, label in enumerate(block.labels):
+        column[at.start + i, captures.index(label.captures)] = block.scale[i]
+    gaussian = model.gaussian(effects)
+    solved = gaussian.solve(np.column_stack([model.value - gaussian.mean, column]))
+    normal, right = column.T @ solved[:, 1:], column.T @ solved[:, 0]
+    slack = (1.0 + policy.covariance_slack) ** 2
+    least = slack * float(stats.chi2.isf(policy.slice_false_alarm_rate / len(captures), 1))
+    chosen: list[int] = []
+    while True:
+        rest = [i for i in range(len(captures)) if i not in chosen]
+        inner = np.linalg.solve(normal[np.ix_(chosen, chosen)], normal[np.ix_(chosen, rest)])
+        left = right[rest] - inner.T @ right[chosen]
+        size = np.diag(normal)[rest] - np.sum(normal[np.ix_(chosen, rest)] * inner, axis=0)
+        gain = np.square(left) / np.maximum(size, 1e-9 * np.diag(normal)[rest])
+        if gain.max() < least:
+            break
+        chosen.append(rest[int(np.argmax(gain))])
+        if len(chosen) > MOST_OUTLYING * len(captures):
+            return ()
+    if not chosen:
+        return ()
+    covariance = np.linalg.inv(normal[np.ix_(chosen, chosen)])
+    shift = covariance @ right[chosen]
+    if not _agrees(model, gaussian, index, column[:, chosen] @ shift, len(chosen), policy):
+        return ()
+    # the measured signal is the factor times what is predicted: shift = 1 - 1 / factor
+    factor = 1.0 / (1.0 - shift)
+    return _by_setting(block, [captures[i] for i in chosen], factor, np.sqrt(np.diag(covariance)) * factor**2)
+
+
+def _agrees(
+    model: MeasurementModel, gaussian: Gaussian, index: int, moved: FloatArray, freed: int, policy: DecisionPolicy
+) -> bool:
+    """Whether the measurement's numbers agree with the model once the outlying ones are `moved`."""
+    mine = model.mask(index)
+    both, others = model.seen | mine, model.seen & ~mine
+    value = model.value - moved
+
+    def chi2_of(where: np.ndarray) -> float:
+        covariance = gaussian.covariance[np.ix_(where, where)]
+        residual = (value - gaussian.mean)[where]
+        return float(residual @ np.linalg.solve(covariance, residual))
+
+    left = chi2_of(both) - (chi2_of(others) if others.any() else 0.0)
+    left /= (1.0 + policy.covariance_slack) ** 2
+    return float(stats.chi2.sf(left, max(int(mine.sum()) - freed, 1))) > policy.slice_false_alarm_rate
+
+
+def _by_setting(
+    block: Block, captures: list[tuple[str, ...]], factor: FloatArray, std: FloatArray
+) -> tuple[OutlyingLevel, ...]:
+    """Captures of one setting that are off by the same factor, together, with its weighted mean."""
+    setting = {label.captures: label.condition for label in block.labels}
+    groups: list[list[int]] = []
+    for i, names in enumerate(captures):
+        for group in groups:
+            j = group[0]
+            alike = abs(factor[i] - factor[j]) < ALIKE_SIGMA * float(np.hypot(std[i], std[j]))
+            if alike and setting[names] == setting[captures[j]]:
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    found = []
+    for group in groups:
+        weight = 1.0 / np.square(std[group])
+        mean = float(np.sum(weight * factor[group]) / weight.sum())
+        names = tuple(sorted({name for i in group for name in captures[i]}))
+        # factors share the other captures' uncertainty: the largest is no less than the mean's
+        found.append(OutlyingLevel(names, mean, float(np.max(std[group]))))
+    return tuple(found)
