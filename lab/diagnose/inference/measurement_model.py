@@ -102,20 +102,20 @@ class MeasurementModel:
         return {}
 
     def acts(self, effect: type[Effect]) -> tuple[bool, ...]:
-        """Whether an effect may change each block."""
+        """Whether an effect may change each block: its mean or its scatter."""
         if effect not in self._acting:
-            self._acting[effect] = tuple(block.touched_by(effect) for block in self.blocks)
+            self._acting[effect] = tuple(block.touched_by(effect) or block.scatters_by(effect) for block in self.blocks)
         return self._acting[effect]
 
     def affected_blocks(self, effect: Effect) -> list[int]:
-        """Indices of the blocks that an effect may change."""
-        return [i for i, acting in enumerate(self.acts(type(effect))) if acting]
+        """Indices of the blocks whose mean an effect may change."""
+        return [i for i, block in enumerate(self.blocks) if block.touched_by(type(effect))]
 
     def affected(self, effect: type[Effect]) -> np.ndarray:
-        """Mask (n,) of the numbers that an effect may change."""
+        """Mask (n,) of the numbers whose mean an effect may change."""
         mask = np.zeros(len(self.value), bool)
-        for acting, at in zip(self.acts(effect), self.slices, strict=True):
-            mask[at] = acting
+        for block, at in zip(self.blocks, self.slices, strict=True):
+            mask[at] = block.touched_by(effect)
         return mask
 
     def change_chi2(self, effect: Effect, others: Effects, index: int) -> float:

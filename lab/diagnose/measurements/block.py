@@ -78,6 +78,7 @@ class Block:
     along: FloatArray | None = (
         None  # where smoothness isn't along x: logarithms of levels (n,), places on the sensor (n, 2)
     )
+    scattered_by: frozenset[str] = frozenset()  # quantities of the stages that only the covariance depends on
 
     @property
     def position(self) -> FloatArray:
@@ -87,3 +88,7 @@ class Block:
     def touched_by(self, effect: type[Effect]) -> bool:
         """Whether the effect acts on anything that this measurement sees."""
         return not self.reads.isdisjoint(may_change(effect))
+
+    def scatters_by(self, effect: type[Effect]) -> bool:
+        """Whether the effect makes the numbers scatter."""
+        return not self.scattered_by.isdisjoint(may_change(effect))

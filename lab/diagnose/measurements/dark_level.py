@@ -84,7 +84,7 @@ def dark_level_block(study: Study) -> Block:
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
         covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | DARK_CURRENT | LINES | {"signal.offset_dn"}, predict=predict, scale=np.ones(len(value)),
+        reads=LAG | DARK_CURRENT | {"signal.offset_dn"}, scattered_by=LINES, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 

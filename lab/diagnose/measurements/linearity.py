@@ -87,7 +87,7 @@ def linearity_block(study: Study) -> Block:
     return Block(
         measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
         labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
-        reads=LEVEL | LAG | DARK_CURRENT | LINES, predict=predict, scale=signal,
+        reads=LEVEL | LAG | DARK_CURRENT, scattered_by=LINES, predict=predict, scale=signal,
     )  # fmt: skip
 
 

@@ -100,7 +100,7 @@ def narrowband_block(study: Study) -> Block:
     return Block(
         measurement=NARROWBAND, reach=25.0, value=value, covariance=covariance,
         labels=tuple(Label(c.wavelength_nm, channel, f"{c.wavelength_nm:g} nm", (c.id,), o) for c, channel, _, o in points),
-        reads=LEVEL | LAG | DARK_CURRENT | LINES | SPECTRAL, predict=predict, scale=np.maximum(signal, 1.0),
+        reads=LEVEL | LAG | DARK_CURRENT | SPECTRAL, scattered_by=LINES, predict=predict, scale=np.maximum(signal, 1.0),
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from scipy import ndimage
 from lab.capture_kinds.base import Capture
 from lab.diagnose.measurements.repeatability import (
     LAMP_FLOOR,
-    Repeats,
+    RepeatedMeans,
     level_repeatability,
     repeated_levels,
     steady,
@@ -186,7 +186,9 @@ def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[F
     for group, mean in zip(groups, means, strict=True):
         if len(group) > 1:
             time = np.array([study.elapsed_s(c) for c in group])
-            repeats.append(Repeats(tuple(group), mean - mean.mean(), time - time.mean(), USUAL_JITTER_DN**2 + own_dn2))
+            repeats.append(
+                RepeatedMeans(tuple(group), mean - mean.mean(), time - time.mean(), USUAL_JITTER_DN**2 + own_dn2)
+            )
     repeats = steady(repeats)
     freedom = sum(len(r.away) - 1 for r in repeats)
     if freedom == 0:

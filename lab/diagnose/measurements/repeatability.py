@@ -31,7 +31,7 @@ COMMON_REPEATS = 4
 
 
 @dataclass(frozen=True)
-class Repeats:
+class RepeatedMeans:
     """Frames of one setting: their levels less the mean; seconds less the mean; variance by pixels' noise."""
 
     captures: tuple[Capture, ...]
@@ -40,7 +40,7 @@ class Repeats:
     noise: float
 
 
-def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[Repeats]:
+def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedMeans]:
     """Of every flat setting with repeats, all unclipped channels together, relative to the mean level, without frames that may hold image
     lag of another level. `black` in DN, `gain` in DN/e."""
     found = []
@@ -55,11 +55,11 @@ def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> 
             continue
         noise = float(((gain * np.maximum(levels.mean(0), 0.0) + read_dn**2) * size).sum()) / total.mean() ** 2
         elapsed = np.array([study.elapsed_s(k) for k in group])
-        found.append(Repeats(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
+        found.append(RepeatedMeans(tuple(group), total / total.mean() - 1.0, elapsed - elapsed.mean(), noise))
     return found
 
 
-def steady(repeats: Sequence[Repeats]) -> list[Repeats]:
+def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
     """Those settings whose scatter is in line with the others'.
 
     With the settings' common trend b with time (weighted median of their slopes) taken out, S_g = sum((a - b t)^2) of n_g repeats is
@@ -96,7 +96,7 @@ def _weighted_median(value: FloatArray, weight: FloatArray) -> float:
     return float(value[order][int(np.searchsorted(below, 0.5 * below[-1]))])
 
 
-def level_repeatability(repeats: Sequence[Repeats]) -> float:
+def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
     """Relative standard deviation of repeated flat frames' levels beyond pixels' noise, without a common trend with time (a lamp's drift),
     over the settings that are in line. Settings count by the inverse of their noise's variance."""
     repeats = steady(repeats)

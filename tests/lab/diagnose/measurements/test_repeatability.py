@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lab.capture_kinds.flat import FlatCapture
-from lab.diagnose.measurements.repeatability import Repeats, level_repeatability, steady
+from lab.diagnose.measurements.repeatability import RepeatedMeans, level_repeatability, steady
 
 SCATTER, NOISE = 3e-4, 1e-4
 
 
-def _drawn(rng: np.random.Generator, groups: int = 10, repeats: int = 3) -> list[Repeats]:
+def _drawn(rng: np.random.Generator, groups: int = 10, repeats: int = 3) -> list[RepeatedMeans]:
     made = []
     for g in range(groups):
         away = np.hypot(SCATTER, NOISE) * rng.standard_normal(repeats)
@@ -19,13 +19,15 @@ def _drawn(rng: np.random.Generator, groups: int = 10, repeats: int = 3) -> list
             FlatCapture(id=f"c{g}-{k}", kind="flat", side="left", frame=f"{g}-{k}.npy", exposure_s=0.01 * (g + 1))
             for k in range(repeats)
         )
-        made.append(Repeats(captures, away - away.mean(), 20.0 * (np.arange(repeats) - (repeats - 1) / 2), NOISE**2))
+        made.append(
+            RepeatedMeans(captures, away - away.mean(), 20.0 * (np.arange(repeats) - (repeats - 1) / 2), NOISE**2)
+        )
     return made
 
 
-def _with_one_off(repeats: list[Repeats], group: int, by: float) -> list[Repeats]:
+def _with_one_off(repeats: list[RepeatedMeans], group: int, by: float) -> list[RepeatedMeans]:
     away = repeats[group].away + by * np.eye(len(repeats[group].away))[-1]
-    bad = Repeats(repeats[group].captures, away - away.mean(), repeats[group].elapsed_s, NOISE**2)
+    bad = RepeatedMeans(repeats[group].captures, away - away.mean(), repeats[group].elapsed_s, NOISE**2)
     return [bad if i == group else r for i, r in enumerate(repeats)]
 
 
