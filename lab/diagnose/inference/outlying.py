@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from lab.diagnose.inference.gaussian import Gaussian
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.block import Block, Effects
 from lab.diagnose.policy import DecisionPolicy
@@ -66,7 +65,7 @@ def outlying_levels(
         return ()
     covariance = np.linalg.inv(normal[np.ix_(chosen, chosen)])
     shift = covariance @ right[chosen]
-    if not _agrees(model, gaussian, index, column[:, chosen] @ shift, len(chosen), policy):
+    if not _agrees(model, effects, index, column[:, chosen] @ shift, len(chosen), policy):
         return ()
     # the measured signal is the factor times what is predicted: shift = 1 - 1 / factor
     factor = 1.0 / (1.0 - shift)
@@ -74,20 +73,16 @@ def outlying_levels(
 
 
 def _agrees(
-    model: MeasurementModel, gaussian: Gaussian, index: int, moved: FloatArray, freed: int, policy: DecisionPolicy
+    model: MeasurementModel, effects: Effects, index: int, moved: FloatArray, freed: int, policy: DecisionPolicy
 ) -> bool:
     """Whether the measurement's numbers agree with the model once the outlying ones are `moved`."""
     mine = model.mask(index)
-    both, others = model.seen | mine, model.seen & ~mine
     value = model.value - moved
-
-    def chi2_of(where: np.ndarray) -> float:
-        covariance = gaussian.covariance[np.ix_(where, where)]
-        residual = (value - gaussian.mean)[where]
-        return float(residual @ np.linalg.solve(covariance, residual))
-
-    left = chi2_of(both) - (chi2_of(others) if others.any() else 0.0)
-    left /= (1.0 + policy.covariance_slack) ** 2
+    both, others = (
+        model.gaussian(effects, where).chi2(value[where]) if where.any() else 0.0
+        for where in (model.seen | mine, model.seen & ~mine)
+    )
+    left = (both - others) / (1.0 + policy.covariance_slack) ** 2
     return float(stats.chi2.sf(left, max(int(mine.sum()) - freed, 1))) > policy.slice_false_alarm_rate
 
 

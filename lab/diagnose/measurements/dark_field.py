@@ -54,8 +54,9 @@ def dark_field_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         mean = np.zeros(len(value))
         if Uniform(study.camera, effects).changes_dark_current:
+            dark_at = dark_current_map(study, effects)
             for i, (f, *_) in enumerate(points):
-                cells = cell_means(dark_current_map(study, effects, f.condition.temperature_c).astype(np.float32))
+                cells = cell_means(dark_at(f.condition.temperature_c).astype(np.float32))
                 here = study.noise.gain * f.condition.exposure_s * (cells - cells.mean())
                 mean[i * count : (i + 1) * count] = here.ravel()
         jacobian = {}

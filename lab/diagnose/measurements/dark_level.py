@@ -24,8 +24,8 @@ from sim.uniform import Uniform
 MOST_POINTS = 1e6
 
 
-def dark_current_map(study: Study, effects: Effects, temperature_c: float | None) -> FloatArray:
-    """Dark current (e/s) by pixel, or by squares of pixels where the frame has more than `MOST_POINTS`."""
+def dark_current_map(study: Study, effects: Effects) -> Callable[[float | None], FloatArray]:
+    """Dark current (e/s) at a temperature (C), by pixel, or by squares of pixels where the frame has more than `MOST_POINTS`."""
     camera = study.camera
     down = math.ceil(math.sqrt(camera.rows * camera.cols / MOST_POINTS))
     coarse = camera.model_copy(
@@ -35,21 +35,20 @@ def dark_current_map(study: Study, effects: Effects, temperature_c: float | None
             "pixel_pitch_um": camera.pixel_pitch_um * down,
         }
     )
-    return Uniform(coarse, effects).dark_e_per_s(temperature_c)
+    return Uniform(coarse, effects).dark_e_per_s
 
 
-def added_dark_e_per_s(study: Study, effects: Effects, temperature_c: float | None) -> float:
-    """Change of the mean dark current by effects, without defective pixels, e/s."""
+def added_dark_e_per_s(study: Study, effects: Effects) -> Callable[[float | None], float]:
+    """Change of the mean dark current at a temperature (C) by effects, without defective pixels, e/s."""
     if not Uniform(study.camera, effects).changes_dark_current:
-        return 0.0
-    return float(dark_current_map(study, effects, temperature_c).mean()) - study.camera.dark_current_e_per_s
+        return lambda temperature_c: 0.0
+    at = dark_current_map(study, effects)
+    return cache(lambda temperature_c: float(at(temperature_c).mean()) - study.camera.dark_current_e_per_s)
 
 
 def added_dark_dn(study: Study, effects: Effects) -> Callable[[Capture], float]:
     """By how many DN effects change the mean dark signal of a capture."""
-    if not Uniform(study.camera, effects).changes_dark_current:
-        return lambda capture: 0.0
-    rate_at = cache(lambda temperature_c: added_dark_e_per_s(study, effects, temperature_c))
+    rate_at = added_dark_e_per_s(study, effects)
     return lambda capture: study.noise.gain * rate_at(capture.temperature_c) * capture.exposure_s
 
 

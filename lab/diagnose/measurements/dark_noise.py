@@ -53,10 +53,11 @@ def dark_noise_block(study: Study) -> Block:
         mean = base.copy()
         shot = dark.copy()
         model, grid = Uniform(study.camera, effects), np.linspace(0.0, 0.5, 65)
+        more_at = added_dark_e_per_s(study, effects)
         lines = sum((float(np.mean(one.spectrum_e2(grid, fixed=False))) for one in model.lines), 0.0)
         for i, (f, *_) in enumerate(points):
             t, temperature = f.condition.exposure_s, f.condition.temperature_c
-            shot[i] += noise.gain**2 * added_dark_e_per_s(study, effects, temperature) * t
+            shot[i] += noise.gain**2 * more_at(temperature) * t
             mean[i] += shot[i] - dark[i]
             mean[i] += _defect_variance(model, noise.gain, t, float(value[i])) + noise.gain**2 * lines
         jacobian = {

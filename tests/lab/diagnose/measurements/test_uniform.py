@@ -207,7 +207,7 @@ def test_a_dark_current_over_the_field_is_that_of_the_pixels() -> None:
     at = study(rendered(3))
     glow = (AmplifierGlow(glow_e_per_s=60.0, reach_mm=0.5, corner="bottom_right"),)
     at.camera = at.camera.model_copy(update={"rows": 384, "cols": 512})
-    found = cell_means(dark_current_map(at, glow, None).astype(np.float32))
+    found = cell_means(dark_current_map(at, glow)(None).astype(np.float32))
     expected = cell_means(Uniform(at.camera, glow).dark_e_per_s(None).astype(np.float32))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
