@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
 from sim.camera import CameraModel
@@ -21,14 +21,19 @@ from sim.optics.diffraction import aperture_otf
 from sim.optics.illumination import sin_theta as sin_theta_at
 from sim.optics.imaging import DiffractionLimited
 from sim.point import HIGHEST_CY_PER_PX, Blur, edge_profile
-from sim.scene.render import Drawing, Grid, LitSurface, cell_means, draw
+from sim.scene.render import EVERYWHERE, Drawing, Grid, LitSurface, cell_means, draw
 from sim.scene.scenes import KnifeEdge, PosedEdges, Scene, ScreenPattern, SpectralImage, UniformField
 from sim.spectrum import FloatArray, Spectrum, lagrange_shares
-from sim.stages import ComplexArray, Image, image_of, light_of
+from sim.stages import ComplexArray, image_of, light_of
 from sim.uniform import electron_rate
 
 #: Wavelengths at which a whole frame's transfer function is averaged: within 1e-3 near the cutoff, where little contrast is left.
 FRAME_WAVELENGTHS = 5
+
+#: Where shifts are worked out on a drawing, and how near wavelengths land to each other that are moved as one.
+NODES_PX = 8.0
+ALIKE_PX = 1e-6
+MIDDLE_NM = 550.0
 
 
 class KeptTransfers:
@@ -117,6 +122,10 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
     rates = [electron_rate(camera, channel, radiance, effects, scene.kind) for radiance in spectra]
     field = _field_of_rates(camera, channel, [(radiance, None) for radiance in spectra], effects, scene.kind)
     image = np.empty(row.shape)
+    moves = image_of(camera, effects).moves
+    if moves:
+        mean_nm = _mean_wavelength(camera, channel, scene.light_radiance, effects, scene.kind)
+        from_px = _unmoved_px(camera, row, col, mean_nm, effects)
     for index, edge in enumerate(scene.regions):
         mine = owner == index
         if not np.any(mine):
@@ -125,15 +134,14 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
         if field is not None:
             square = sin_theta_at(camera, row[mine], col[mine]) ** 2
             dark, light = dark * field[0](square), light * field[1](square)
-        seen_row, seen_col, acting = row[mine], col[mine], tuple(effects)
         row0, col0, row1, col1 = edge.region
         middle = 0.5 * (row0 + row1 - 1), 0.5 * (col0 + col1 - 1)
-        if image_of(camera, effects).moves:
+        if moves:
             # by place as the channel's mean wavelength is moved; what others differ from that, alike over a region, blurs
-            mean_nm = _mean_wavelength(camera, channel, scene.light_radiance, effects, scene.kind)
-            seen_row, seen_col = _unmoved_px(camera, seen_row, seen_col, mean_nm, effects)
-            acting = (*acting, _ShiftAt(acting=acting, row=middle[0], col=middle[1], less_at_nm=mean_nm))
-        distance = edge.distance_px(seen_row, seen_col)
+            distance, angle_deg = _bent_edge(edge.distance_px(*from_px), middle)
+            distance = distance[mine]
+        else:
+            distance, angle_deg = edge.distance_px(row[mine], col[mine]), edge.angle_deg
         pitch = camera.pixel_pitch_um
         place_um = (middle[1] - 0.5 * (camera.cols - 1)) * pitch, (middle[0] - 0.5 * (camera.rows - 1)) * pitch
         dim, bright = (
@@ -141,9 +149,9 @@ def _edge_image(camera: CameraModel, channel: str, scene: KnifeEdge, effects: Se
                 camera,
                 channel,
                 radiance,
-                edge.angle_deg,
+                angle_deg,
                 distance,
-                acting,
+                effects,
                 scene.kind,
                 place_um=place_um,
                 collected=True,
@@ -180,28 +188,38 @@ def _posed_edge_images(camera: CameraModel, scene: PosedEdges, effects: Sequence
             use = mine == index
             if not np.any(use):
                 continue
-            px = distance / np.hypot(down, across)
-            seen = px[inner][use] if place is None else map_coordinates(px, place[:, use], order=3, mode="nearest")
             at = np.array([np.clip(float(v), 0.0, n - 1.0) for v, n in zip(scene.warp().to_camera(*edge.centre_mm), (camera.rows, camera.cols), strict=True)])  # fmt: skip
-            near = tuple(np.rint(at).astype(int) + margin)
-            angle_deg = float(np.rad2deg(np.arctan2(down[near], across[near])))
+            if place is None:
+                near = tuple(np.rint(at).astype(int) + margin)
+                angle_deg = float(np.rad2deg(np.arctan2(down[near], across[near])))
+                seen = (distance / np.hypot(down, across))[inner][use]
+            else:
+                at = at + np.ravel(_shift_px(camera, at[:1], at[1:], mean_nm, effects))
+                there = np.asarray(map_coordinates(distance, place, order=3, mode="nearest"))
+                bent, angle_deg = _bent_edge(there, (float(at[0]), float(at[1])))
+                seen = bent[use]
             from_centre_um = (at - 0.5 * (np.array([camera.rows, camera.cols]) - 1.0)) * camera.pixel_pitch_um
-            acting = tuple(effects)
             profile = partial(
                 edge_profile, camera, channel, angle_deg=angle_deg, distance_px=seen, kind=scene.kind, collected=True,
                 place_um=(float(from_centre_um[1]), float(from_centre_um[0])),
             )  # fmt: skip
-            if moves:
-                acting = (*acting, _ShiftAt(acting=acting, row=float(at[0]), col=float(at[1]), less_at_nm=mean_nm))
-            profiles = [profile(radiance=scene.light_radiance, effects=acting)]
+            profiles = [profile(radiance=scene.light_radiance, effects=effects)]
             if not _alike(*spectra):
-                profiles.append(profile(radiance=scene.dark_radiance, effects=acting))
+                profiles.append(profile(radiance=scene.dark_radiance, effects=effects))
             dark, light = rates[0] * np.ones(1), rates[1] * np.ones(1)
             if field is not None:
                 dark, light = dark * field[0](square[use]), light * field[1](square[use])
             image[use] = light * profiles[0] + dark * (1.0 - profiles[-1])
         images[channel] = np.maximum(image, 0.0)
     return images
+
+
+def _bent_edge(distance: FloatArray, at_px: tuple[float, float]) -> tuple[FloatArray, float]:
+    """Of an edge that the lens bends: every pixel's distance (px), to first order, and the edge's angle (degrees) at a place, given what
+    the straight edge's distance is where each pixel's light comes from, (rows, cols)."""
+    down, across = (np.asarray(part) for part in np.gradient(distance))
+    near = tuple(int(np.clip(np.rint(v), 0, n - 1)) for v, n in zip(at_px, distance.shape, strict=True))
+    return distance / np.hypot(down, across), float(np.rad2deg(np.arctan2(down[near], across[near])))
 
 
 def _alike(one: Spectrum, other: Spectrum) -> bool:
@@ -229,7 +247,7 @@ def _blurred_images(
     ny, nx = grid.shape
     fy, fx, pixel_y, pixel_x = pixel_on_grid(camera, grid)
     images: dict[str, FloatArray] = {}
-    moves = image_of(camera, effects).moves
+    moved = _Moved(camera, grid, effects) if image_of(camera, effects).moves else None
     blur = Blur(camera, effects, collected=True)
     transformed: list[ComplexArray] = []
     for channel in camera.channels:
@@ -247,36 +265,29 @@ def _blurred_images(
                 for index, (layer, picture) in enumerate(zip(drawing.layers, pictures, strict=True), 1)
             ]
         windows = [layer.window for layer in drawing.layers]
+        over = shares[1:] - shares[0]
         # Few pictures are transformed one by one, once for all channels; of many, one sum a wavelength.
         few = len(pictures) <= nodes.size
-        if few and (apart or not transformed):
+        if moved is not None and few and (apart or not transformed) and moved.alike:
+            pictures = [moved.picture(_whole(grid, [w], [p], [1.0])) for w, p in zip(windows, pictures, strict=True)]
+            windows = [EVERYWHERE] * len(pictures)
+        if few and (apart or not transformed) and (moved is None or moved.alike):
             transformed = [_transform(grid, [w], [p], [1.0]) for w, p in zip(windows, pictures, strict=True)]
-        over = shares[1:] - shares[0]
 
-        if few and not moves:
+        spectrum = np.zeros((ny, nx // 2 + 1), complex)
+        if transformed and few:
             key = (channel, nodes.tobytes(), over.tobytes(), grid)
             make = partial(_layer_transfers, blur, nodes, over, grid)
-            spectrum = np.zeros((ny, nx // 2 + 1), complex)
             acting: Sequence[NDArray[np.complexfloating[Any]]] = make() if kept is None else kept.get(key, make)
             for transfer, picture in zip(acting, transformed, strict=True):
                 spectrum += transfer * picture
-            image = _at_pixels(spectrum, grid.oversample, nx)[m : m + grid.rows, m : m + grid.cols]
         else:
-            spectrum = np.zeros((ny, nx // 2 + 1), complex)
-            image = np.zeros((grid.rows, grid.cols))
             for node, factors in zip(nodes, over.T.tolist(), strict=True):
-                part = blur.at(float(node), fx, fy) * (pixel_x * pixel_y)
-                part = part * (
-                    _summed(transformed, factors)
-                    if few and transformed
-                    else _transform(grid, windows, pictures, factors)
-                )
-                if moves:
-                    image = image + _at_moved_pixels(camera, part, grid, float(node), effects)
-                else:
-                    spectrum += part
-            if not moves:
-                image = _at_pixels(spectrum, grid.oversample, nx)[m : m + grid.rows, m : m + grid.cols]
+                total = _whole(grid, windows, pictures, factors)
+                if moved is not None:
+                    total = moved.picture(total, float(node))
+                spectrum += blur.at(float(node), fx, fy) * (pixel_x * pixel_y) * fft.rfft2(total)
+        image = _at_pixels(spectrum, grid.oversample, nx)[m : m + grid.rows, m : m + grid.cols]
         image = np.maximum(image + np.sum(weight[0]), 0.0)
         if field is not None:
             row, col = np.arange(camera.rows)[:, None], np.arange(camera.cols)[None, :]
@@ -294,13 +305,6 @@ def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid
         for index, factor in enumerate(factors):
             total[index] += factor * transfer
     return [part * pixel_x * pixel_y for part in total]
-
-
-def _summed(transformed: Sequence[ComplexArray], factors: Sequence[float]) -> ComplexArray:
-    total = np.zeros_like(transformed[0])
-    for factor, picture in zip(factors, transformed, strict=True):
-        total += factor * picture
-    return total
 
 
 def _shown(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
@@ -332,11 +336,11 @@ def _cube_images(
     ny, nx = shape
     start = 0 if aligned else margin_px
     fy, fx, pixel_y, pixel_x = pixel_on_grid(camera, grid)
+    moved = _Moved(camera, grid, effects) if moves else None
     images: dict[str, FloatArray] = {}
     for channel in camera.channels:
         nodes, pictures = _node_pictures(camera, channel, scene, effects)
         spectrum = np.zeros((ny, nx // 2 + 1), np.complex64)
-        moved = np.zeros((camera.rows, camera.cols))
         for node, picture in zip(nodes, pictures, strict=True):
             if aligned:
                 transfer = _folded_transfer(blur, float(node), (ny, nx))
@@ -345,17 +349,15 @@ def _cube_images(
                 fine[: seen.shape[0], : seen.shape[1]] = seen
             else:
                 transfer = blur.at(float(node), fx, fy)
-                fine = cell_means(picture.astype(float), scene.warp(), grid, 0.0).astype(np.float32)
+                drawn = cell_means(picture.astype(float), scene.warp(), grid, 0.0)
+                fine = (drawn if moved is None else moved.picture(drawn, float(node))).astype(np.float32)
             transformed = fft.rfft2(fine)
             transformed *= transfer.astype(np.complex64 if np.iscomplexobj(transfer) else np.float32)
-            if moves:
-                moved += _at_moved_pixels(camera, transformed * (pixel_y * pixel_x), grid, float(node), effects)
-            else:
-                spectrum += transformed
+            spectrum += transformed
         if not aligned:
             spectrum *= (pixel_y * pixel_x).astype(np.complex64)
         image = _at_pixels(spectrum, grid.oversample, nx)[start : start + grid.rows, start : start + grid.cols]
-        images[channel] = np.maximum(moved if moves else image, 0.0).astype(float)
+        images[channel] = np.maximum(image, 0.0).astype(float)
     return images
 
 
@@ -428,28 +430,6 @@ def _shift_px(
     return np.broadcast_to(np.asarray(down) / pitch, shape), np.broadcast_to(np.asarray(right) / pitch, shape)
 
 
-class _ShiftAt(Effect):
-    """The shifts of other effects at one place (px), less those of one wavelength, as the phase of a transfer function."""
-
-    acting: tuple[Effect, ...]
-    row: float
-    col: float
-    less_at_nm: float
-
-    def on_image(self, image: Image) -> Image:
-        place = np.array(self.row), np.array(self.col)
-        mean_down, mean_right = _shift_px(image.camera, *place, self.less_at_nm, self.acting)
-
-        def phase(fx_cy_per_um: FloatArray, fy_cy_per_um: FloatArray, wavelength_nm: float) -> ComplexArray:
-            down, right = _shift_px(image.camera, *place, wavelength_nm, self.acting)
-            turns = (
-                fx_cy_per_um * (right - mean_right) + fy_cy_per_um * (down - mean_down)
-            ) * image.camera.pixel_pitch_um
-            return np.asarray(np.exp(-2j * np.pi * turns))
-
-        return image.adding(transfer=phase)
-
-
 def _mean_wavelength(
     camera: CameraModel, channel: str, radiance: Spectrum | None, effects: Sequence[Effect], kind: str
 ) -> float:
@@ -491,16 +471,39 @@ def _margin_for(camera: CameraModel, effects: Sequence[Effect], margin_px: int) 
     return margin_px + int(np.ceil(out))
 
 
-def _at_moved_pixels(
-    camera: CameraModel, spectrum: ComplexArray, grid: Grid, wavelength_nm: float, effects: Sequence[Effect]
-) -> FloatArray:
-    """Back from a transform to the frame's pixels, each taken where its light would be without the effects' shifts; between
-    the image's samples by splines of the third order, on the drawing's grid: 1e-3 of the contrast at 1/2 cy/px and 3 samples a pixel."""
-    row, col = np.meshgrid(np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float), indexing="ij")
-    from_row, from_col = _unmoved_px(camera, row, col, wavelength_nm, effects)
-    image = fft.irfft2(spectrum, grid.shape)
-    place = np.stack([from_row + grid.margin_px, from_col + grid.margin_px]) * grid.oversample
-    return np.asarray(map_coordinates(image, place, mode="grid-wrap"))
+class _Moved:
+    """What is drawn on a grid as the lens's geometry lets it land, before anything blurs it.
+
+    A sample is taken where its light would be without the effects' shifts; between the drawing's samples by splines of the third
+    order: 1e-3 of the contrast at 1/2 cy/px and 3 samples a pixel. Places are worked out every `NODES_PX` and, between, by splines.
+    """
+
+    def __init__(self, camera: CameraModel, grid: Grid, effects: Sequence[Effect]) -> None:
+        self._camera, self._grid, self._effects = camera, grid, effects
+        self._rows, self._cols = (
+            np.linspace(
+                -grid.margin_px, n - 1.0 + grid.margin_px, int(np.ceil((n + 2 * grid.margin_px) / NODES_PX)) + 4
+            )
+            for n in (camera.rows, camera.cols)
+        )
+        ends = [np.stack(self._from_px(nm)) for nm in (400.0, 550.0, 700.0)]
+        #: Whether all wavelengths are moved alike.
+        self.alike = bool(np.ptp(ends, axis=0).max() < ALIKE_PX)
+
+    def picture(self, drawn: FloatArray, wavelength_nm: float = MIDDLE_NM) -> FloatArray:
+        """A picture on the grid, moved as light of a wavelength is."""
+        grid = self._grid
+        place = [
+            (RectBivariateSpline(self._rows, self._cols, part)(*grid.axes_px()) + grid.margin_px + 0.5)
+            * grid.oversample
+            - 0.5
+            for part in self._from_px(wavelength_nm)
+        ]
+        return np.asarray(map_coordinates(drawn, np.stack(place), mode="nearest"))
+
+    def _from_px(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
+        row, col = np.meshgrid(self._rows, self._cols, indexing="ij")
+        return _unmoved_px(self._camera, row, col, wavelength_nm, self._effects)
 
 
 def _relative_to_ground(
@@ -512,11 +515,18 @@ def _relative_to_ground(
     return np.asarray(field(square) / np.maximum(ground(square), 1e-12))
 
 
-def _transform(
+def _whole(
     grid: Grid, windows: Sequence[tuple[slice, slice]], pictures: Sequence[FloatArray], factors: Sequence[float]
-) -> ComplexArray:
-    """Fourier transform of the sum of factor x picture, each on its window of the grid."""
+) -> FloatArray:
+    """The sum of factor x picture, each on its window of the grid."""
     total = np.zeros(grid.shape)
     for window, picture, factor in zip(windows, pictures, factors, strict=True):
         total[window] += factor * picture
-    return np.asarray(fft.rfft2(total), complex)
+    return total
+
+
+def _transform(
+    grid: Grid, windows: Sequence[tuple[slice, slice]], pictures: Sequence[FloatArray], factors: Sequence[float]
+) -> ComplexArray:
+    """Fourier transform of the sum of factor x picture."""
+    return np.asarray(fft.rfft2(_whole(grid, windows, pictures, factors)), complex)

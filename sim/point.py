@@ -34,9 +34,15 @@ TRANSFER = frozenset(
     }
 )
 
+#: Those that a transfer function at a place depends on, where wavelengths land apart.
+TRANSFER_AT = TRANSFER | {"image.shift"}
+
 #: Wavelengths at which an optical transfer function is averaged over light and sensitivity (Gauss's rule for that weight): within
 #: 1e-4 of a 1 nm sum.
 OTF_WAVELENGTHS = 10
+
+#: Wavelengths that land as near to each other as this are one image.
+TOGETHER_PX = 1e-9
 
 #: Frequencies beyond which an edge's profile isn't followed: 64 cy/px, where a pixel's aperture passes < 0.5 %.
 HIGHEST_CY_PER_PX = 64.0
@@ -104,8 +110,9 @@ def times(transfer: FloatArray | ComplexArray, factor: FloatArray | ComplexArray
 
 
 def varies_over_field(camera: CameraModel, effects: Sequence[Acts]) -> bool:
-    """Whether any effect's path error changes with the place."""
-    return bool(image_of(camera, effects).pupil_at)
+    """Whether any effect's path error, or how far it lets wavelengths land apart, changes with the place."""
+    image = image_of(camera, effects)
+    return bool(image.pupil_at) or image.moves
 
 
 def displaced_um(
@@ -117,6 +124,40 @@ def displaced_um(
         return None
     right, down = image.shifted_um(x_um, y_um, wavelength_nm)
     return np.asarray(right), np.asarray(down)
+
+
+def dispersal(
+    camera: CameraModel,
+    wavelength_nm: FloatArray,
+    shares: FloatArray,
+    fx_cy_per_px: FloatArray,
+    fy_cy_per_px: FloatArray,
+    effects: Sequence[Acts],
+    places_um: Sequence[tuple[float, float]],
+) -> ComplexArray | None:
+    """Factors on the transfer functions of single wavelengths, (sights, wavelengths, *frequencies), by which a sight's wavelengths land
+    apart: the mean over places of exp(-2 pi i f (s(wavelength) - s(mean wavelength))), s the shift of light that lands off.
+
+    `shares`: how much each wavelength (nm) counts for each sight, (sights, wavelengths), sum 1. None where all land together.
+    """
+    image = image_of(camera, effects)
+    if not image.moves:
+        return None
+    x, y = (np.array(part, float) for part in zip(*places_um, strict=True))
+
+    def shift_px(at_nm: float) -> FloatArray:
+        pair = (np.broadcast_to(np.asarray(part, float), x.shape) for part in image.shifted_um(x, y, at_nm))
+        return np.array(list(pair)) / camera.pixel_pitch_um
+
+    single = np.array([shift_px(float(w)) for w in wavelength_nm])
+    apart = single - np.array([shift_px(float(mean)) for mean in shares @ wavelength_nm])[:, None]
+    if np.max(np.abs(apart)) < TOGETHER_PX:
+        return None
+    factor = np.zeros((*apart.shape[:2], *np.broadcast_shapes(fx_cy_per_px.shape, fy_cy_per_px.shape)), complex)
+    for across, down in np.moveaxis(apart, (3, 2), (0, 1)):  # of (sights, wavelengths, 2, places)
+        turns = np.multiply.outer(across, fx_cy_per_px) + np.multiply.outer(down, fy_cy_per_px)
+        factor += np.exp(-2j * np.pi * turns)
+    return np.asarray(factor / x.size, complex)
 
 
 def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:
@@ -158,7 +199,7 @@ def optical_transfer(
 
     The average of the lens's transfer (`Lens.imaging`) x the effects', weighted by the detected electrons (light x responsivity) over
     wavelength, times the pixel's aperture. `radiance` None: light of equal energy at every wavelength. `place_um`: where, for path
-    errors that change over the field. `collected`: as the pixels collect it, before charge moves between them and filters on the
+    errors that change over the field and wavelengths that land apart (about where the mean wavelength lands). `collected`: as the pixels collect it, before charge moves between them and filters on the
     chip act: what a frame is drawn with, in which these act on the pixels themselves.
     """
     fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_px, float), np.asarray(fy_cy_per_px, float))
@@ -166,8 +207,10 @@ def optical_transfer(
     nodes, share = otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
     total: FloatArray | ComplexArray = np.zeros(fx.shape)
     blur = Blur(camera, effects, collected=collected)
-    for node, part in zip(nodes, share, strict=True):
-        total = total + part * blur.at(float(node), fx, fy, place_um)
+    apart = dispersal(camera, nodes, share[None], fx, fy, effects, [place_um])
+    for k, (node, part) in enumerate(zip(nodes, share, strict=True)):
+        single = blur.at(float(node), fx, fy, place_um)
+        total = total + part * (single if apart is None else single * apart[0, k])
     return np.asarray(total * aperture_otf(fx, fy, camera.fill_factor), complex)
 
 

@@ -83,6 +83,9 @@ class Pattern:
     light: Spectrum | None
     ghost: Callable[[Effects], float]  # the coefficient of the ghost under effects on the image as a whole
     reach: float  # largest distance from the frame's middle in half diagonals
+    places_um: tuple[
+        tuple[float, float], ...
+    ]  # (x, y) from the frame's middle, of the mean and the variances of the pixels that it was fitted to
 
 
 #: Coefficients behind the bands', in their order: cell borders, ghost, constant, shift x, shift y, radial, radial^3, across.
@@ -223,10 +226,20 @@ def _measured(
                 Pattern(
                     captures=tuple(c.id for c in part), held_out=part[0].id in out, channel=channel, bands=design.bands,
                     value=value, shown=shown, common=common, mix=design.mix, beyond=design.beyond, shown_by=shown_by, levels_e=levels, light=light,
-                    ghost=ghost_by, reach=design.reach,
+                    ghost=ghost_by, reach=design.reach, places_um=_places_um(camera, points),
                 )
             )  # fmt: skip
     return found
+
+
+def _places_um(camera: CameraModel, points: FloatArray) -> tuple[tuple[float, float], ...]:
+    """Four places (x, y) from the frame's middle, of the mean and the variances of pixels' places, (pixels, 2)."""
+    middle, spread = (
+        np.mean(points, axis=0) - 0.5 * np.array([camera.cols - 1, camera.rows - 1]),
+        np.std(points, axis=0),
+    )
+    corners = camera.pixel_pitch_um * (middle + spread * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]))
+    return tuple((float(x), float(y)) for x, y in corners)
 
 
 def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> FloatArray:

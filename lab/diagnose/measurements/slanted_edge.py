@@ -37,8 +37,9 @@ from sim.effects.base import Effect
 from sim.frame import charge_response
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.point import (
-    TRANSFER,
+    TRANSFER_AT,
     common_wavelengths,
+    dispersal,
     halos,
     transfer_at,
     varies_over_field,
@@ -101,7 +102,7 @@ def edge_block(study: Study) -> Block:
             Label(float(f), e.channel, e.orientation + (ASIDE if k >= len(REAL_AT) else ""), tuple(c.id for c in e.part), e.held_out)
             for e in edges.edges for k, f in enumerate(x)
         ),
-        reads=TRANSFER | CHANGING | {"image.transmittance"}, predict=predict,
+        reads=TRANSFER_AT | CHANGING | {"image.transmittance"}, predict=predict,
         scale=np.ones(edges.value.size),
         # discrepancies of the real part and of the imaginary part are independent
         along=np.tile(np.where(np.arange(len(x)) < len(REAL_AT), x, x + APART_CY_PER_PX), len(edges.edges)),
@@ -267,10 +268,13 @@ class _Edges:
         nodes, shares, kink = self._wavelengths(spectral)
         fx, fy = self._frequencies
         moving = acting(effects, KERNELS) if self._camera.cfa != "MONO" else ()
-        optical = acting(tuple(e for e in effects if e not in moving), TRANSFER)
+        optical = acting(tuple(e for e in effects if e not in moving), TRANSFER_AT)
 
         def blurred() -> ComplexArray:
             whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical, place_um=place_um) for w in nodes])
+            apart = dispersal(self._camera, nodes, shares, fx, fy, optical, [place_um])
+            if apart is not None:
+                return np.asarray(np.einsum("sw,sw...,w...->s...", shares, apart, whole) + kink, complex)
             return np.asarray(np.tensordot(shares, whole, 1) + kink, complex)
 
         otf = _kept(self._blurred, (spectral, optical, place_um), blurred)

@@ -475,9 +475,8 @@ def test_a_pinholes_scene_is_distorted_as_the_geometry_says() -> None:
     camera = camera.model_copy(update={"lens": lens})
     seen = expected_electrons(camera, Exposure(replace(board, geometry=geometry), 1.0))
     moved = expected_electrons(camera, Exposure(board, 1.0), (effect("distortion")(geometry=geometry),))
-    # blur comes before the warp in the one and after it in the other: 10 % of scale change the edges' width by as much
     away = np.abs(moved - seen) / np.ptp(seen)
-    assert np.sqrt(np.mean(away**2)) < 0.01
+    assert np.sqrt(np.mean(away**2)) < 0.006
     assert np.mean(np.abs(expected_electrons(camera, Exposure(board, 1.0)) - seen)) / np.ptp(seen) > 0.05
 
 
