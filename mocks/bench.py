@@ -264,12 +264,15 @@ class Bench:
         return model.rows, model.cols, model.pixel_pitch_um
 
     def compile_loops(self) -> None:
-        """Those that patterns, charts and shot noise are drawn with: on a new installation that takes as long as a camera's driver waits
+        """Those that patterns, charts, moved light and shot noise are drawn with: on a new installation that takes as long as a camera's driver waits
         for its first frame. No frame changes by it."""
+        from sim.scene.displace import displaced
+
         square = np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 1.0, 1.0, 0.0])
         cells(np.ones((2, 2)), SCREEN_POSE.warp(self._truth.cameras["left"]), Grid(4, 4, 1, 0), 0.0)
         quadrilateral(np.arange(2.0), np.arange(2.0), 1.0, *square)
         draw_poisson(np.ones((2, 2), np.float32), np.random.default_rng(0))
+        displaced(np.ones((2, 2)), np.zeros((4, 4)), np.zeros((4, 4)), 1)
 
     def expose(self, side: Side, exposure_s: float, gain_db: float = 0.0, start_s: float | None = None) -> UInt16Array:
         """One raw frame, (rows, cols) DN, of what stands in front now.

@@ -105,7 +105,7 @@ def scene_light(
     x_um: FloatArray = (col - 0.5 * (camera.cols - 1)) * camera.pixel_pitch_um
     y_um: FloatArray = (row - 0.5 * (camera.rows - 1)) * camera.pixel_pitch_um
     shade = Uniform(camera, effects).illuminated(shade, x_um, y_um)
-    images = {channel: _reflected(image, image_state) * shade for channel, image in images.items()}
+    images = {channel: _scattered(image, image_state, shade) for channel, image in images.items()}
     if not before_lens.ambient_e_per_s:
         return SceneLight(mosaic.assemble(images, camera.cfa))
     room = {channel: np.full(shape, before_lens.ambient(channel)) for channel in camera.channels}
@@ -362,12 +362,18 @@ def read_out(camera: CameraModel, exposure: Exposure, effects: Sequence[Effect])
     )
 
 
-def _reflected(image: FloatArray, state: Image) -> FloatArray:
-    """A channel's image with its reflections. A traced lens's image is a mosaic already: colour by colour."""
-    if not state.copies:
-        return image
+def _scattered(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray:
+    """A channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's image is a mosaic already:
+    colour by colour."""
     traced = isinstance(state.camera.lens.imaging, TracedLens)
-    changed = image.copy()
-    for plane in mosaic.planes(changed, state.camera.cfa).values() if traced else [changed]:
-        plane[:] = state.with_copies(plane)
-    return changed
+    shaded = image * shade
+    if not state.copies and not state.veils:
+        return shaded
+    if state.copies:
+        shaded = image.copy()
+        for plane in mosaic.planes(shaded, state.camera.cfa).values() if traced else [shaded]:
+            plane[:] = state.with_copies(plane)
+        shaded = shaded * shade
+    for plane in mosaic.planes(shaded, state.camera.cfa).values() if traced else [shaded]:
+        plane[:] = state.veiled(plane)
+    return shaded

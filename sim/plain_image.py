@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.interpolate import CubicSpline, RectBivariateSpline
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
 from sim.camera import CameraModel
@@ -30,8 +30,7 @@ from sim.uniform import electron_rate
 #: Wavelengths at which a whole frame's transfer function is averaged: within 1e-3 near the cutoff, where little contrast is left.
 FRAME_WAVELENGTHS = 5
 
-#: Where shifts are worked out on a drawing, and how near wavelengths land to each other that are moved as one.
-NODES_PX = 8.0
+#: How near wavelengths land to each other that are moved as one.
 ALIKE_PX = 1e-6
 MIDDLE_NM = 550.0
 
@@ -475,16 +474,14 @@ class _Moved:
     """What is drawn on a grid as the lens's geometry lets it land, before anything blurs it.
 
     A sample is taken where its light would be without the effects' shifts; between the drawing's samples by splines of the third
-    order: 1e-3 of the contrast at 1/2 cy/px and 3 samples a pixel. Places are worked out every `NODES_PX` and, between, by splines.
+    order: 3e-3 of the contrast up to 1/2 cy/px and 3 samples a pixel.
     """
 
     def __init__(self, camera: CameraModel, grid: Grid, effects: Sequence[Effect]) -> None:
         self._camera, self._grid, self._effects = camera, grid, effects
+        #: Pixels of the drawing, and one more all round.
         self._rows, self._cols = (
-            np.linspace(
-                -grid.margin_px, n - 1.0 + grid.margin_px, int(np.ceil((n + 2 * grid.margin_px) / NODES_PX)) + 4
-            )
-            for n in (camera.rows, camera.cols)
+            np.arange(-grid.margin_px - 1.0, n + grid.margin_px + 1.0) for n in (camera.rows, camera.cols)
         )
         ends = [np.stack(self._from_px(nm)) for nm in (400.0, 550.0, 700.0)]
         #: Whether all wavelengths are moved alike.
@@ -492,14 +489,10 @@ class _Moved:
 
     def picture(self, drawn: FloatArray, wavelength_nm: float = MIDDLE_NM) -> FloatArray:
         """A picture on the grid, moved as light of a wavelength is."""
-        grid = self._grid
-        place = [
-            (RectBivariateSpline(self._rows, self._cols, part)(*grid.axes_px()) + grid.margin_px + 0.5)
-            * grid.oversample
-            - 0.5
-            for part in self._from_px(wavelength_nm)
-        ]
-        return np.asarray(map_coordinates(drawn, np.stack(place), mode="nearest"))
+        from sim.scene.displace import displaced  # here: the compiler's library takes a while to load
+
+        row, col = (part + self._grid.margin_px for part in self._from_px(wavelength_nm))
+        return displaced(drawn, row, col, self._grid.oversample)
 
     def _from_px(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
         row, col = np.meshgrid(self._rows, self._cols, indexing="ij")

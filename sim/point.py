@@ -52,9 +52,11 @@ class Blur:
     """Transfer of lens and effects at one wavelength, without the pixel's aperture; the stages' states taken once."""
 
     def __init__(self, camera: CameraModel, effects: Sequence[Acts] = (), *, collected: bool = False) -> None:
-        """`collected`: without what moves charge between pixels and without filters on the chip."""
+        """`collected`: what frames are drawn with: without light that is scattered evenly over the frame, without what moves charge between
+        pixels, and without filters on the chip."""
         self.camera = camera
-        self.image: Image = image_of(camera, effects)
+        image = image_of(camera, effects)
+        self.image: Image = image.unveiled() if collected else image
         self.charge: Charge = charge_of(camera, effects)
         self.signal = Signal(camera) if collected else signal_of(camera, effects)
         self.kernels = () if collected else self.charge.kernels
@@ -199,8 +201,8 @@ def optical_transfer(
 
     The average of the lens's transfer (`Lens.imaging`) x the effects', weighted by the detected electrons (light x responsivity) over
     wavelength, times the pixel's aperture. `radiance` None: light of equal energy at every wavelength. `place_um`: where, for path
-    errors that change over the field and wavelengths that land apart (about where the mean wavelength lands). `collected`: as the pixels collect it, before charge moves between them and filters on the
-    chip act: what a frame is drawn with, in which these act on the pixels themselves.
+    errors that change over the field and wavelengths that land apart (about where the mean wavelength lands). `collected`: as the pixels collect it, before light that is scattered over the whole frame is added, charge moves
+    between pixels and filters on the chip act: what a frame is drawn with, in which these act on the pixels themselves.
     """
     fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_px, float), np.asarray(fy_cy_per_px, float))
     wavelength_nm, weight = detected(camera, channel, [(radiance, reflectance)], effects, kind)

@@ -188,6 +188,15 @@ class Image(State):
             right, down = right + dx, down + dy
         return right, down
 
+    def unveiled(self) -> Image:
+        """This without the light that is scattered evenly over a frame."""
+        return replace(self, veils=tuple(replace(veil, even_share=0.0) for veil in self.veils))
+
+    def veiled(self, image: FloatArray) -> FloatArray:
+        """A channel's irradiance (rows, cols) with what is scattered evenly over the frame: (1 - s) I + s <I>. Scattered light has met
+        the lens's fall-off already and has none of its own."""
+        return reduce(lambda v, veil: v + veil.even_share * (np.mean(v) - v), self.veils, image)
+
     def with_copies(self, image: FloatArray) -> FloatArray:
         """A channel's whole image (rows, cols) with its reflections."""
         return reduce(lambda value, law: law(value), self.copies, image)

@@ -25,6 +25,7 @@ from lab.fit.geometry.board_detection import BoardView
 from sim.camera import Side
 from sim.frame import right_over_left
 from sim.optics.illumination import relative_illumination
+from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
@@ -33,6 +34,7 @@ SCENE_STD = 0.01  # a scene seen from two places: gloss, angles, edges of the re
 CHANNEL_STD = 0.004  # light of another colour than the uniform light's, each channel by itself
 OWN_STD = 0.004  # of one channel in one scene
 LIGHT_STD = 0.005  # common to all scenes: the uniform light before one side and the other
+GLARE_STD = 0.02  # of the left camera's light, scattered evenly over its frame: of what its own diagnosis finds, the right side knows nothing
 SAME_LAMP = 0.02
 SAME_COLOUR = 0.04  # of a ratio of channels
 FEWEST_PIXELS = 200
@@ -64,7 +66,11 @@ class _Darks:
 
 
 def scene_gain_block(study: Study) -> Block:
-    """ln(right / left) of the signals in every scene that both cameras see, less that in uniform light, by channel."""
+    """ln(right / left) of the signals in every scene that both cameras see, less that in uniform light, by channel.
+
+    A share g of a camera's light that is scattered evenly changes a region's signal by the factor 1 + g (mean of the frame / mean of the
+    region - 1). The right camera's share is predicted; the left one's is a nuisance parameter.
+    """
     needs_both_sides(study, "stereo_gain")
     darks = {side: _Darks(study, side) for side in SIDES}
     uniform = [_uniform(study, side, darks[side]) for side in SIDES]
@@ -76,7 +82,7 @@ def scene_gain_block(study: Study) -> Block:
     lamps = [(left, right) for left in uniform[0] for right in uniform[1] if left.like(right)]
     if not lamps:
         raise NotDetermined("stereo_gain", "the two sides' flats are of different lamps")
-    values, labels = [], []
+    values, labels, lifts = [], [], []
     for scene_name, regions in _scenes(study).items():
         rates = [
             _rates(study, side, darks[side], captures, mask)
@@ -88,7 +94,9 @@ def scene_gain_block(study: Study) -> Block:
         captures = tuple(c.id for part, _ in regions for c in part)
         for channel in study.channels if alike else ():
             of_light = np.mean([np.log(right.level[channel] / left.level[channel]) for left, right in alike])
-            values.append(float(np.log(rates[1][channel] / rates[0][channel]) - of_light))
+            values.append(float(np.log(rates[1][channel].rate / rates[0][channel].rate) - of_light))
+            of_lamp = np.mean([[side.lift[channel] for side in pair] for pair in alike], axis=0)
+            lifts.append(np.array([side[channel].lift for side in rates]) - of_lamp)
             labels.append(Label(float(len(values) - 1), channel, scene_name, captures, False))
     if not values:
         raise NotDetermined(
@@ -102,23 +110,35 @@ def scene_gain_block(study: Study) -> Block:
     )
     covariance = covariance + np.diag(np.full(len(values), OWN_STD**2))
 
+    left_lift, right_lift = np.array(lifts).T
+
     def predict(effects: Effects) -> Prediction:
-        gain = right_over_left(study.camera, effects)
-        return Prediction(np.full(len(values), np.log(max(gain, 1e-6))), {})
+        gain = np.log(max(right_over_left(study.camera, effects), 1e-6))
+        scattered = even_share(study.camera, effects) * right_lift
+        return Prediction(gain + scattered, {"stereo_gain:glare of the left camera": -GLARE_STD * left_lift})
 
     return Block(
         measurement=STEREO_GAIN, reach=1e9, value=np.array(values), covariance=covariance,
-        labels=tuple(labels), reads=frozenset({"light.pair_gain"}), predict=predict, scale=np.ones(len(values)),
+        labels=tuple(labels), reads=frozenset({"light.pair_gain", "image.veils"}), predict=predict, scale=np.ones(len(values)),
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
+class _Seen:
+    """A channel in the region of a frame: DN a second, corrected for the lens's fall-off, and mean of the frame / mean of the region - 1."""
+
+    rate: float
+    lift: float
+
+
+@dataclass(frozen=True)
 class _Lamp:
-    """A lamp before one side: the shape of its spectrum, and DN a second by channel over its radiance."""
+    """A lamp before one side: the shape of its spectrum, DN a second by channel over its radiance, and `_Seen.lift`."""
 
     wavelength_nm: FloatArray
     shape: FloatArray  # sum 1
     level: dict[str, float]
+    lift: dict[str, float]
 
     def like(self, other: _Lamp) -> bool:
         """Whether it's the same lamp, read anew: 2 % of its light at other wavelengths at most."""
@@ -129,59 +149,61 @@ class _Lamp:
 def _uniform(study: Study, side: Side, dark: _Darks) -> list[_Lamp]:
     recordings = study.recordings
     white = recordings.camera(side).saturation_dn
-    gathered: dict[str, dict[str, list[float]]] = {}
+    gathered: dict[str, dict[str, list[_Seen]]] = {}
     for capture in recordings.captures(FlatCapture, side):
         if capture.gain_db or capture.radiance is None:
             continue
         total = float(recordings.spectrum(capture.radiance).arrays[1].sum())
-        for channel, level in _means(study, recordings.frame(capture), side, None, white).items():
-            signal = level - dark.at(capture.exposure_s)
-            if signal > 0.02 * white:
+        for channel, seen in _signals(study, capture, side, dark, None).items():
+            if seen.rate * capture.exposure_s > 0.02 * white:
                 levels = gathered.setdefault(capture.radiance, {}).setdefault(channel, [])
-                levels.append(signal / capture.exposure_s / total)
+                levels.append(_Seen(seen.rate / total, seen.lift))
     found = []
     for path, by_channel in gathered.items():
         if set(by_channel) >= set(study.channels):
             wavelength, radiance = recordings.spectrum(path).arrays
-            middle = {c: float(np.median(v)) for c, v in by_channel.items()}
-            found.append(_Lamp(wavelength, radiance / max(float(radiance.sum()), 1e-300), middle))
+            middle = {c: float(np.median([seen.rate for seen in v])) for c, v in by_channel.items()}
+            lift = {c: float(np.mean([seen.lift for seen in v])) for c, v in by_channel.items()}
+            found.append(_Lamp(wavelength, radiance / max(float(radiance.sum()), 1e-300), middle, lift))
     return found
 
 
-def _means(study: Study, frame: Any, side: Side, mask: np.ndarray | None, white: float) -> dict[str, float]:
-    """Mean DN by channel of the frame's middle or of a mask's pixels, corrected for the lens's fall-off; without clipped channels."""
+def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndarray | None) -> dict[str, _Seen]:
+    """By channel what a frame's middle or a mask's pixels see; without clipped channels."""
+    camera, frame = study.recordings.camera(side), study.recordings.frame(capture)
     rows, cols = frame.shape
     row, col = np.arange(rows)[:, None], np.arange(cols)[None, :]
     if mask is None:
         mask = (np.abs(row - rows / 2) < rows / 4) & (np.abs(col - cols / 2) < cols / 4)
-    cfa = study.recordings.camera(side).cfa
-    step = mosaic.step(cfa)
+    step, black = mosaic.step(camera.cfa), dark.at(capture.exposure_s)
     found = {}
-    for channel, places in mosaic.phases(cfa).items():
+    for channel, places in mosaic.phases(camera.cfa).items():
         own = np.zeros_like(mask)
         for i, j in places:
             own[i::step, j::step] = True
         use = mask & own
-        if use.sum() < FEWEST_PIXELS or np.mean(frame[use] >= white) > 1e-3:
+        if use.sum() < FEWEST_PIXELS or np.mean(frame[use] >= camera.saturation_dn) > 1e-3:
             continue
-        at = np.nonzero(use)
-        found[channel] = float(
-            frame[use].mean() / relative_illumination(study.camera, *(a.astype(float) for a in at)).mean()
+        signal, whole = float(frame[use].mean()) - black, float(frame[own].mean()) - black
+        fall_off = relative_illumination(study.camera, *(a.astype(float) for a in np.nonzero(use))).mean()
+        found[channel] = _Seen(
+            rate=signal / float(fall_off) / capture.exposure_s, lift=whole / signal - 1.0 if signal > 0.0 else 0.0
         )
     return found
 
 
 def _rates(
     study: Study, side: Side, dark: _Darks, captures: Sequence[Capture], mask: np.ndarray | None
-) -> dict[str, float]:
+) -> dict[str, _Seen]:
     white = study.recordings.camera(side).saturation_dn
-    levels: dict[str, list[float]] = {}
+    found: dict[str, list[_Seen]] = {}
     for capture in captures:
-        for channel, level in _means(study, study.recordings.frame(capture), side, mask, white).items():
-            signal = level - dark.at(capture.exposure_s)
-            if signal > 0.01 * white:
-                levels.setdefault(channel, []).append(signal / capture.exposure_s)
-    return {channel: float(np.mean(v)) for channel, v in levels.items()}
+        for channel, seen in _signals(study, capture, side, dark, mask).items():
+            if seen.rate * capture.exposure_s > 0.01 * white:
+                found.setdefault(channel, []).append(seen)
+    return {
+        c: _Seen(float(np.mean([s.rate for s in v])), float(np.mean([s.lift for s in v]))) for c, v in found.items()
+    }
 
 
 def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]]:
@@ -209,12 +231,12 @@ def _screen_captures(study: Study, side: Side) -> dict[str, list[Any]]:
     return found
 
 
-def _same_colour(rates: dict[str, float], lamp: _Lamp) -> bool:
+def _same_colour(rates: dict[str, _Seen], lamp: _Lamp) -> bool:
     """Whether a grey scene is lit by the lamp of the flats: the ratios of its channels agree. Under another light a difference of the
     cameras' filters would look like a gain. A camera of one channel can't tell: False."""
     if len(lamp.level) < 2 or set(rates) != set(lamp.level):
         return False
-    gap = np.array([np.log(rates[c] / lamp.level[c]) for c in rates])
+    gap = np.array([np.log(seen.rate / lamp.level[c]) for c, seen in rates.items()])
     return bool(np.ptp(gap) < SAME_COLOUR)
 
 

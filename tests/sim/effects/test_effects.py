@@ -241,6 +241,16 @@ def test_glare_leaves_an_edge_its_levels_mean() -> None:
     np.testing.assert_allclose(veiled - 0.5, 0.96 * (plain - 0.5), atol=2e-3)
 
 
+def test_scattered_light_has_no_fall_off_of_its_own() -> None:
+    """A uniform field under glare g: (1 - g) of the shaded field and g of its mean, by channel; the mean stays."""
+    fall_off, glare = effect("vignetting")(corner_loss_percent=30.0), effect("veiling_glare")(share_percent=4.0)
+    camera = CAMERA.model_copy(update={"cfa": "MONO", "quantum_efficiency": {"Y": LINE_650}})
+    field = Exposure(UniformField(LIGHT), 1.0)
+    plain, veiled = (expected_electrons(camera, field, acting) for acting in ((fall_off,), (fall_off, glare)))
+    assert np.ptp(plain) > 0.01 * plain.mean()
+    np.testing.assert_allclose(veiled, 0.96 * plain + 0.04 * plain.mean(), rtol=1e-6)
+
+
 def test_what_glare_leaves_about_its_source_is_between_the_two() -> None:
     """Far within the halo an edge's plateaus come as near as by an even veil, far beyond it they stay."""
     reach_um = 12.0 * CAMERA.pixel_pitch_um
