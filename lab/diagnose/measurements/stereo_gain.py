@@ -19,10 +19,13 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import views_of
+from lab.diagnose.measurements.dark_squares import screen_block
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView
+from lab.predict.camera_model import camera_model
 from sim.camera import Side
+from sim.effects.veiling_glare import VeilingGlare
 from sim.frame import right_over_left
 from sim.optics.illumination import relative_illumination
 from sim.point import even_share
@@ -34,7 +37,9 @@ SCENE_STD = 0.01  # a scene seen from two places: gloss, angles, edges of the re
 CHANNEL_STD = 0.004  # light of another colour than the uniform light's, each channel by itself
 OWN_STD = 0.004  # of one channel in one scene
 LIGHT_STD = 0.005  # common to all scenes: the uniform light before one side and the other
-GLARE_STD = 0.02  # of the left camera's light, scattered evenly over its frame: of what its own diagnosis finds, the right side knows nothing
+GLARE_STD = (
+    0.02  # of a camera's light, scattered evenly over its frame, where its screens' dark squares don't say how much
+)
 SAME_LAMP = 0.02
 SAME_COLOUR = 0.04  # of a ratio of channels
 FEWEST_PIXELS = 200
@@ -69,7 +74,8 @@ def scene_gain_block(study: Study) -> Block:
     """ln(right / left) of the signals in every scene that both cameras see, less that in uniform light, by channel.
 
     A share g of a camera's light that is scattered evenly changes a region's signal by the factor 1 + g (mean of the frame / mean of the
-    region - 1). The right camera's share is predicted; the left one's is a nuisance parameter.
+    region - 1). The right camera's share is predicted; the left one's, as far as its screens' dark squares tell, is taken out, and what
+    they leave open is a nuisance parameter.
     """
     needs_both_sides(study, "stereo_gain")
     darks = {side: _Darks(study, side) for side in SIDES}
@@ -111,11 +117,13 @@ def scene_gain_block(study: Study) -> Block:
     covariance = covariance + np.diag(np.full(len(values), OWN_STD**2))
 
     left_lift, right_lift = np.array(lifts).T
+    glare, glare_std = _glare(study, "left")
 
     def predict(effects: Effects) -> Prediction:
         gain = np.log(max(right_over_left(study.camera, effects), 1e-6))
         scattered = even_share(study.camera, effects) * right_lift
-        return Prediction(gain + scattered, {"stereo_gain:glare of the left camera": -GLARE_STD * left_lift})
+        of_left = {"stereo_gain:glare of the left camera": -glare_std * left_lift}
+        return Prediction(gain + scattered - glare * left_lift, of_left)
 
     return Block(
         measurement=STEREO_GAIN, reach=1e9, value=np.array(values), covariance=covariance,
@@ -229,6 +237,22 @@ def _screen_captures(study: Study, side: Side) -> dict[str, list[Any]]:
         if not capture.gain_db:
             found.setdefault(capture.screen.pose, []).append(capture)
     return found
+
+
+def _glare(study: Study, side: Side) -> tuple[float, float]:
+    """Share of a camera's light that is scattered evenly, and its standard deviation: weighted least squares of the light in the dark
+    squares of its screens beside `GLARE_STD`; never below 0."""
+    camera = camera_model(study.recordings, side, None, maker_curves=True)
+    try:
+        squares = screen_block(Study(study.recordings, side, camera))
+    except NotDetermined:
+        return 0.0, GLARE_STD
+    seen = np.array([not label.held_out for label in squares.labels])
+    without = squares.predict(()).mean
+    per_share = (squares.predict((VeilingGlare(share_percent=1.0),)).mean - without)[seen] / 0.01
+    weighted = np.linalg.solve(squares.covariance[np.ix_(seen, seen)], per_share)
+    precision = float(per_share @ weighted) + GLARE_STD**-2
+    return max(float((squares.value - without)[seen] @ weighted) / precision, 0.0), precision**-0.5
 
 
 def _same_colour(rates: dict[str, _Seen], lamp: _Lamp) -> bool:

@@ -66,11 +66,13 @@ def test_the_same_lens_is_no_finding_and_one_that_slipped_is_decentred() -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gain", [0.0, 8.0])
-def test_a_gain_that_only_scenes_show_is_named(gain: float) -> None:
-    plan = Plan(kinds=("dark", "flat", "charuco"))
+@pytest.mark.parametrize(("gain", "glare"), [(0.0, 0.0), (0.0, 3.0), (8.0, 0.0), (8.0, 3.0)])
+def test_a_gain_that_only_scenes_show_is_named(gain: float, glare: float) -> None:
+    """`glare` (%) of the left camera brightens its boards by as much; its screens' dark squares say so."""
+    plan = Plan(kinds=("dark", "flat", "charuco", "screen"))
     laws = [concealed.StereoGainLaw(gain, 0, 7)] if gain else []
-    left = ConcealedCamera(51, cfa="RGGB", rows=192, cols=256, pair_middle_mm=5.0)
+    veil = [concealed.VeilingGlareLaw(glare, 0, 7)] if glare else []
+    left = ConcealedCamera(51, veil, cfa="RGGB", rows=192, cols=256, pair_middle_mm=5.0)
     right = ConcealedCamera(52, laws, cfa="RGGB", rows=192, cols=256, side="right", offset_mm=10.0, pair_middle_mm=5.0)
     study = study_of(recordings_of_pair(left, right, plan), "right")
     verdict = decide(
