@@ -118,7 +118,7 @@ def collected_electrons(
     """`expected_electrons` of a scene whose light is known. `source`: factor on the scene's light at this time, beside the effects'.
     Light of the room is collected as long as the source's: for the time that the shutter is really open."""
     before_lens, charge = light_of(camera, effects), charge_of(camera, effects)
-    source *= before_lens.source(exposure.elapsed_s)
+    source *= before_lens.frame_source(exposure.elapsed_s)
     if exposure.magnification != 0.0:
         source *= irradiance_factor(camera.lens.f_number, exposure.magnification) / irradiance_factor(
             camera.lens.f_number
@@ -142,7 +142,7 @@ def read_electrons(
 def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
     """Whether the light is the same in all frames of one setting, whenever they are taken."""
     light = light_of(camera, effects)
-    return not light.level and not light.rows
+    return not light.level and not light.rows and not light.unsteadiness
 
 
 def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:

@@ -49,6 +49,19 @@ class State:
 
 
 @dataclass(frozen=True)
+class Unsteadiness:
+    """A factor on the source that differs at random from frame to frame: normal about 1, the same for a frame whenever it is asked for."""
+
+    relative_std: float
+    seed: int
+
+    def factor(self, elapsed_s: float) -> float:
+        """Of the frame that is taken `elapsed_s` after the first capture."""
+        rng = np.random.default_rng([self.seed, 3, round(1e3 * max(elapsed_s, 0.0))])
+        return 1.0 + self.relative_std * float(rng.standard_normal())
+
+
+@dataclass(frozen=True)
 class Light(State):
     """What reaches the lens, given what the radiometer and the screen were told.
 
@@ -56,6 +69,7 @@ class Light(State):
     rows, exposure_s, elapsed_s) -> factor (rows,) on the source's light in one frame. `shading`: (x_um, y_um) -> factor by place on the sensor. `ambient_e_per_s`: channel -> electrons a second of
     light beside the source. `screen`: (share asked for, x_um, y_um) -> share of the lit state that is shown. `pair_gain`: factors
     on the right camera's signal over the left one's in one scene. `pair_delay_s`: by how much the right camera captures later.
+    `unsteadiness`: random factors on the source, one a frame.
     """
 
     spectrum: tuple[Callable[[FloatArray, FloatArray, str], FloatArray], ...] = ()
@@ -66,14 +80,21 @@ class Light(State):
     screen: tuple[Callable[[FloatArray, FloatArray, FloatArray], FloatArray], ...] = ()
     pair_gain: tuple[float, ...] = ()
     pair_delay_s: tuple[float, ...] = ()
+    unsteadiness: tuple[Unsteadiness, ...] = ()
 
     def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
         """The radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
         return reduce(lambda value, law: law(wavelength_nm, value, kind), self.spectrum, radiance)
 
     def source(self, elapsed_s: float) -> float:
-        """Factor on the source's radiance at a time after the first capture."""
+        """Factor on the source's radiance at a time after the first capture, on average over frames at that time."""
         return reduce(lambda value, law: value * max(law(elapsed_s), 0.0), self.level, 1.0)
+
+    def frame_source(self, elapsed_s: float) -> float:
+        """The same of the one frame that is taken at that time."""
+        return reduce(
+            lambda value, law: value * max(law.factor(elapsed_s), 0.0), self.unsteadiness, self.source(elapsed_s)
+        )
 
     def row_factors(self, rows: int, exposure_s: float, elapsed_s: float) -> FloatArray | None:
         """Factor (rows,) on the source's light in each row of one frame; None where no law says one."""

@@ -141,6 +141,16 @@ class Uniform:
         """Factor on the source's radiance at a time after the first capture."""
         return self._light.source(elapsed_s)
 
+    @property
+    def unsteadiness(self) -> float:
+        """Relative standard deviation of the source's light from frame to frame."""
+        return float(np.sqrt(sum(law.relative_std**2 for law in self._light.unsteadiness)))
+
+    @property
+    def varies_by_row(self) -> bool:
+        """Whether the source's light varies while a frame is taken."""
+        return bool(self._light.rows)
+
     def collected_s(self, exposure_s: float) -> float:
         """The time in which light is collected, given the time that was asked for."""
         return self._charge.collected_s(exposure_s)

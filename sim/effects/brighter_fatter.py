@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge
 
@@ -21,6 +22,7 @@ class BrighterFatter(Effect):
     """
 
     name: ClassVar[str] = "brighter_fatter"
+    family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "P. Astier et al., A&A 629, A36 (2019)"
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset(
