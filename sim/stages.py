@@ -87,14 +87,12 @@ class Light(State):
         return reduce(lambda value, law: law(wavelength_nm, value, kind), self.spectrum, radiance)
 
     def source(self, elapsed_s: float) -> float:
-        """Factor on the source's radiance at a time after the first capture, on average over frames at that time."""
+        """Factor on the source's radiance at a time after the first capture; of an unsteady source the mean."""
         return reduce(lambda value, law: value * max(law(elapsed_s), 0.0), self.level, 1.0)
 
-    def frame_source(self, elapsed_s: float) -> float:
-        """The same of the one frame that is taken at that time."""
-        return reduce(
-            lambda value, law: value * max(law.factor(elapsed_s), 0.0), self.unsteadiness, self.source(elapsed_s)
-        )
+    def unsteady(self, elapsed_s: float) -> float:
+        """Random factor besides, of mean 1, in the one frame that is taken at that time."""
+        return reduce(lambda value, law: value * max(law.factor(elapsed_s), 0.0), self.unsteadiness, 1.0)
 
     def row_factors(self, rows: int, exposure_s: float, elapsed_s: float) -> FloatArray | None:
         """Factor (rows,) on the source's light in each row of one frame; None where no law says one."""

@@ -39,8 +39,8 @@ class DoubleImage(Effect):
         float, Quantity("%", "the copy's light over all", lower=0.0, upper=50.0, prior=(0.0, 3.0), absent=0.0)
     ] = 0.0
     displacement_x_px: Annotated[
-        float, Quantity("px", "of the copy along columns, to the right", lower=-40.0, upper=40.0, absent=0.0)
-    ] = 0.0
+        float, Quantity("px", "of the copy along columns, to the right", lower=-40.0, upper=40.0, absent=5.0)
+    ] = 5.0
     displacement_y_px: Annotated[
         float, Quantity("px", "of the copy along rows, downwards", lower=-40.0, upper=40.0, absent=0.0)
     ] = 0.0
