@@ -220,7 +220,8 @@ class Charge(State):
     pixel. `dark_current`: (e/s, sensor temperature) -> e/s, of all
     pixels or of each (rows, cols). `defects`: pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) ->
     factor on the transfer function, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1: they
-    act on whole frames, and as transfer functions where there is one channel. `overflow`: mean electrons (rows, cols) -> the same
+    act on whole frames, and as transfer functions where there is one channel. `exchange`: mean electrons (rows, cols) -> the same after
+    neighbours have exchanged charge by how much they hold. `overflow`: mean electrons (rows, cols) -> the same
     after full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame. `variance_e2`: (mean electrons,
     shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.
     """
@@ -231,6 +232,7 @@ class Charge(State):
     defects: tuple[Defects, ...] = ()
     transfer: tuple[Callable[[FloatArray, FloatArray, float], FloatArray], ...] = ()
     kernels: tuple[FloatArray, ...] = ()
+    exchange: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     overflow: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     lag: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
@@ -264,7 +266,15 @@ class Charge(State):
     def moved(self, electrons: FloatArray) -> FloatArray:
         """Electrons of a whole frame (rows, cols) where they end up. The frame goes on as its mirror image about the outermost pixels'
         centres, which keeps the mosaic's phases."""
-        return reduce(lambda value, kernel: np.asarray(convolve(value, kernel, mode="mirror")), self.kernels, electrons)
+        mixed = reduce(
+            lambda value, kernel: np.asarray(convolve(value, kernel, mode="mirror")), self.kernels, electrons
+        )
+        return reduce(lambda value, law: law(value), self.exchange, mixed)
+
+    @property
+    def mixes(self) -> bool:
+        """Whether charge moves between neighbouring pixels."""
+        return bool(self.kernels or self.exchange)
 
     def overflown(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of a whole frame after what is above the full well has run over."""

@@ -42,6 +42,8 @@ def family_claim(search: Search, named: Sequence[Candidate], candidate: Candidat
     if share < policy.family_least_share:
         return None
     at = fit.names.index(kind.name)
+    # a law whose name was given up for what it leaves isn't exact; one that others of its family fit as well may be
+    is_tie = members[0][1] < policy.family_probability
     return replace(
         candidate,
         effect=fit.effects[at],
@@ -50,7 +52,7 @@ def family_claim(search: Search, named: Sequence[Candidate], candidate: Candidat
         rivals=tuple((name, p) for name, p in candidate.among_listed if library()[name].family is not kind.family),
         log_odds=log_odds,
         explained_share=share,
-        is_closed=is_closed,
+        is_closed=is_closed and is_tie,
         members=members,
     )
 
