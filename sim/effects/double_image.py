@@ -14,7 +14,7 @@ from sim.spectrum import FloatArray
 from sim.stages import ComplexArray, Image
 
 #: Displacements (px) that are tried first, along columns and rows.
-PLACES_PX = (-14.0, -10.0, -7.0, -4.0, -2.0, 0.0, 2.0, 4.0, 7.0, 10.0, 14.0)
+PLACES_PX = (-12.0, -6.0, -2.5, 0.0, 2.5, 6.0, 12.0)
 
 
 class DoubleImage(Effect):
