@@ -48,7 +48,8 @@ def policy_page() -> str:
 
 def effects_page() -> str:
     """docs/reference/effects.md."""
-    every = effect_list().effects
+    listed = effect_list()
+    every = listed.effects
     lines = [
         "# Effects",
         "",
@@ -60,11 +61,19 @@ def effects_page() -> str:
         "declared: the forward model draws a reference session with every kind of capture, and a measurement shows an effect where a typical",
         "instance changes it by more than rounding (`lab/diagnose/visibility.py`). **Rivals** change some part of that session alike.",
         "",
-        "| effect | stage | shown by captures |",
-        "| --- | --- | --- |",
+        "Every effect belongs to a **family**. A diagnosis names the family where no law of it holds exactly, or where the recordings can't",
+        "tell its members apart.",
+        "",
+        "| family | what recordings show | effects | what tells them apart |",
+        "| --- | --- | --- | --- |",
     ]
     lines += [
-        f"| [`{one.name}`](#{one.name}) | {', '.join(one.stages)} | {', '.join(one.capture_kinds) or 'none'} |"
+        f"| `{one.name}` | {one.sentence} | {', '.join(f'[`{m}`](#{m})' for m in one.members)} | {one.told_apart_by} |"
+        for one in listed.families
+    ]
+    lines += ["", "| effect | family | stage | shown by captures |", "| --- | --- | --- | --- |"]
+    lines += [
+        f"| [`{one.name}`](#{one.name}) | `{one.family}` | {', '.join(one.stages)} | {', '.join(one.capture_kinds) or 'none'} |"
         for one in every
     ]
     for one in every:

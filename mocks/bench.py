@@ -55,6 +55,7 @@ from sim.frame import (
     read_out,
     right_over_left,
     scene_light,
+    unsteady_source,
 )
 from sim.scene import Scene, ScreenPattern, UniformField
 from sim.scene.render import Grid, cells, quadrilateral
@@ -296,6 +297,7 @@ class Bench:
             elapsed_s=self._elapsed_s(begin_s),
         )
         with self._camera_locks[side]:
+            source *= unsteady_source(camera.model, camera.acting, exposure.elapsed_s)
             held = collected_electrons(light, camera.model, exposure, camera.acting, source=source)
             read, self._left_behind[side] = read_electrons(held + self._left_behind[side], camera.model, camera.acting)
             frame = sample_from(

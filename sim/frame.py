@@ -55,20 +55,32 @@ class Exposure:
 
 
 def expected_electrons(
-    camera: CameraModel, exposure: Exposure, effects: Sequence[Effect] = (), *, oversample: int = 3, margin_px: int = 32
+    camera: CameraModel,
+    exposure: Exposure,
+    effects: Sequence[Effect] = (),
+    *,
+    oversample: int = 3,
+    margin_px: int = 32,
+    source: float = 1.0,
 ) -> FloatArray:
     """Mean electrons (rows, cols) of every pixel, light and dark current, after the effects on charge; not yet clipped.
 
     Scenes that aren't uniform or straight edges are drawn by area on `oversample` x `oversample` samples a pixel, with
     `margin_px` around the frame, and blurred channel by channel with the channel's transfer function. The light beyond the
     margin is taken as the scene's other end. On random cells of 2 px at f/4 and 3 um pixels, 2, 3, 4, 6 samples a pixel leave
-    0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4.
+    0.6, 0.2, 0.1, 0.05 % of white rms; a frame of 480 x 640 takes 0.5, 1.1, 2.4 s of one core at 2, 3, 4. `source`: factor on the
+    scene's light, such as `unsteady_source` of the frame that is drawn.
     """
     check_overlap(camera, exposure.scene)
     light = scene_light(
         camera, exposure.scene, effects, oversample=oversample, margin_px=margin_px, placed=exposure.placed
     )
-    return collected_electrons(light, camera, exposure, effects)
+    return collected_electrons(light, camera, exposure, effects, source=source)
+
+
+def unsteady_source(camera: CameraModel, effects: Sequence[Effect], elapsed_s: float) -> float:
+    """Factor on the scene's light in the one frame that is taken at a time, of mean 1; 1 where the source is steady."""
+    return light_of(camera, effects).unsteady(elapsed_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +159,7 @@ def is_steady(camera: CameraModel, effects: Sequence[Effect]) -> bool:
 
 def grows_with_exposure(camera: CameraModel, effects: Sequence[Effect]) -> bool:
     """Whether mean electrons are in proportion to the exposure that is asked for."""
-    return not laws_of(camera, effects) & {"charge.exposure_s", "light.rows", "charge.overflow"}
+    return not laws_of(camera, effects) & {"charge.exposure_s", "light.rows", "charge.overflow", "light.unsteadiness"}
 
 
 def screen_light(
@@ -276,7 +288,14 @@ def sample(
     For many frames of one scene take `expected_electrons` once and draw with `sim.sensor.electrons.sample_from`.
     """
     return sensor.sample_from(
-        expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px),
+        expected_electrons(
+            camera,
+            exposure,
+            effects,
+            oversample=oversample,
+            margin_px=margin_px,
+            source=unsteady_source(camera, effects, exposure.elapsed_s),
+        ),
         camera,
         rng,
         fixed_pattern,
@@ -293,20 +312,25 @@ def expected_sequence(
     *,
     oversample: int = 3,
     margin_px: int = 32,
+    drawn: bool = False,
 ) -> Iterator[FloatArray]:
     """Mean electrons (rows, cols) that are read in each exposure of a sequence, one after the other: charge that
     isn't read with a frame (image lag) is read with the next. The first follows empty pixels; an exposure that is the same object
     as the one before is drawn once.
 
     Drawing every frame's electrons from these means on their own is exact: of Poisson electrons that are told apart one by
-    one, those read and those that stay are independent Poisson variables.
+    one, those read and those that stay are independent Poisson variables. `drawn`: of frames with an unsteady source's light as it was
+    in each, not of its mean.
     """
     before: Exposure | None = None
     new: FloatArray = np.zeros(())
     left: FloatArray | float = 0.0
     for exposure in exposures:
         if exposure is not before:
-            new = expected_electrons(camera, exposure, effects, oversample=oversample, margin_px=margin_px)
+            source = unsteady_source(camera, effects, exposure.elapsed_s) if drawn else 1.0
+            new = expected_electrons(
+                camera, exposure, effects, oversample=oversample, margin_px=margin_px, source=source
+            )
             before = exposure
         read, left = read_electrons(new + left, camera, effects)
         yield read
@@ -324,7 +348,7 @@ def sample_sequence(
 ) -> Iterator[NDArray[np.uint16]]:
     """Raw frames (rows, cols) of exposures taken one after the other, drawn as `sample` does from `expected_sequence`."""
     every = list(exposures)
-    means = expected_sequence(camera, every, effects, oversample=oversample, margin_px=margin_px)
+    means = expected_sequence(camera, every, effects, oversample=oversample, margin_px=margin_px, drawn=True)
     for exposure, electrons in zip(every, means, strict=True):
         yield sensor.sample_from(
             electrons,

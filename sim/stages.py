@@ -49,6 +49,19 @@ class State:
 
 
 @dataclass(frozen=True)
+class Unsteadiness:
+    """A factor on the source that differs at random from frame to frame: normal about 1, the same for a frame whenever it is asked for."""
+
+    relative_std: float
+    seed: int
+
+    def factor(self, elapsed_s: float) -> float:
+        """Of the frame that is taken `elapsed_s` after the first capture."""
+        rng = np.random.default_rng([self.seed, 3, round(1e3 * max(elapsed_s, 0.0))])
+        return 1.0 + self.relative_std * float(rng.standard_normal())
+
+
+@dataclass(frozen=True)
 class Light(State):
     """What reaches the lens, given what the radiometer and the screen were told.
 
@@ -56,6 +69,7 @@ class Light(State):
     rows, exposure_s, elapsed_s) -> factor (rows,) on the source's light in one frame. `shading`: (x_um, y_um) -> factor by place on the sensor. `ambient_e_per_s`: channel -> electrons a second of
     light beside the source. `screen`: (share asked for, x_um, y_um) -> share of the lit state that is shown. `pair_gain`: factors
     on the right camera's signal over the left one's in one scene. `pair_delay_s`: by how much the right camera captures later.
+    `unsteadiness`: random factors on the source, one a frame.
     """
 
     spectrum: tuple[Callable[[FloatArray, FloatArray, str], FloatArray], ...] = ()
@@ -66,14 +80,19 @@ class Light(State):
     screen: tuple[Callable[[FloatArray, FloatArray, FloatArray], FloatArray], ...] = ()
     pair_gain: tuple[float, ...] = ()
     pair_delay_s: tuple[float, ...] = ()
+    unsteadiness: tuple[Unsteadiness, ...] = ()
 
     def radiance(self, wavelength_nm: FloatArray, radiance: FloatArray, kind: str) -> FloatArray:
         """The radiance in front of the lens, given what the radiometer said; `kind` is the capture's."""
         return reduce(lambda value, law: law(wavelength_nm, value, kind), self.spectrum, radiance)
 
     def source(self, elapsed_s: float) -> float:
-        """Factor on the source's radiance at a time after the first capture."""
+        """Factor on the source's radiance at a time after the first capture; of an unsteady source the mean."""
         return reduce(lambda value, law: value * max(law(elapsed_s), 0.0), self.level, 1.0)
+
+    def unsteady(self, elapsed_s: float) -> float:
+        """Random factor besides, of mean 1, in the one frame that is taken at that time."""
+        return reduce(lambda value, law: value * max(law.factor(elapsed_s), 0.0), self.unsteadiness, 1.0)
 
     def row_factors(self, rows: int, exposure_s: float, elapsed_s: float) -> FloatArray | None:
         """Factor (rows,) on the source's light in each row of one frame; None where no law says one."""
@@ -210,7 +229,8 @@ class Charge(State):
     pixel. `dark_current`: (e/s, sensor temperature) -> e/s, of all
     pixels or of each (rows, cols). `defects`: pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) ->
     factor on the transfer function, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1: they
-    act on whole frames, and as transfer functions where there is one channel. `overflow`: mean electrons (rows, cols) -> the same
+    act on whole frames, and as transfer functions where there is one channel. `exchange`: mean electrons (rows, cols) -> the same after
+    neighbours have exchanged charge by how much they hold. `overflow`: mean electrons (rows, cols) -> the same
     after full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame. `variance_e2`: (mean electrons,
     shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.
     """
@@ -221,6 +241,7 @@ class Charge(State):
     defects: tuple[Defects, ...] = ()
     transfer: tuple[Callable[[FloatArray, FloatArray, float], FloatArray], ...] = ()
     kernels: tuple[FloatArray, ...] = ()
+    exchange: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     overflow: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     lag: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     variance_e2: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
@@ -254,7 +275,15 @@ class Charge(State):
     def moved(self, electrons: FloatArray) -> FloatArray:
         """Electrons of a whole frame (rows, cols) where they end up. The frame goes on as its mirror image about the outermost pixels'
         centres, which keeps the mosaic's phases."""
-        return reduce(lambda value, kernel: np.asarray(convolve(value, kernel, mode="mirror")), self.kernels, electrons)
+        mixed = reduce(
+            lambda value, kernel: np.asarray(convolve(value, kernel, mode="mirror")), self.kernels, electrons
+        )
+        return reduce(lambda value, law: law(value), self.exchange, mixed)
+
+    @property
+    def mixes(self) -> bool:
+        """Whether charge moves between neighbouring pixels."""
+        return bool(self.kernels or self.exchange)
 
     def overflown(self, electrons: FloatArray) -> FloatArray:
         """Mean electrons of a whole frame after what is above the full well has run over."""

@@ -28,6 +28,7 @@ LEVEL = SHADING | {
     "charge.exposure_s",
     "light.ambient_e_per_s",
     "charge.kernels",
+    "charge.exchange",
     "signal.response",
     "signal.offset_dn",
     "codes.codes",
@@ -141,6 +142,16 @@ class Uniform:
         """Factor on the source's radiance at a time after the first capture."""
         return self._light.source(elapsed_s)
 
+    @property
+    def unsteadiness(self) -> float:
+        """Relative standard deviation of the source's light from frame to frame."""
+        return float(np.sqrt(sum(law.relative_std**2 for law in self._light.unsteadiness)))
+
+    @property
+    def varies_by_row(self) -> bool:
+        """Whether the source's light varies while a frame is taken."""
+        return bool(self._light.rows)
+
     def collected_s(self, exposure_s: float) -> float:
         """The time in which light is collected, given the time that was asked for."""
         return self._charge.collected_s(exposure_s)
@@ -163,26 +174,27 @@ class Uniform:
         transmittance in them), dark current included. `field` is that of `Uniform.field`."""
         source_s = self._light.source(elapsed_s) * self._charge.collected_s(exposure_s)
         dark = self.camera.dark_current_e_per_s * exposure_s
-        mixed = self.mixing({c: rates.get(c, 1.0) for c in self.camera.channels})
+        typical_s = source_s * float(np.mean(field.light))
+        mixed = self.mixing({c: rates.get(c, 1.0) * typical_s for c in self.camera.channels})
         return {
             c: (rate * source_s * field.light + self.ambient_e(c, exposure_s)) * mixed.get(c, 1.0) + dark
             for c, rate in rates.items()
         }
 
-    def mixing(self, rates: Mapping[str, float]) -> dict[str, float]:
-        """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic of these rates;
+    def mixing(self, electrons: Mapping[str, float]) -> dict[str, float]:
+        """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic of these electrons;
         empty where none moves."""
-        if not self._charge.kernels:
+        if not self._charge.mixes:
             return {}
         cfa, size, inner = self.camera.cfa, 12, slice(4, 8)
-        tile = mosaic.assemble({c: np.full((size, size), rate) for c, rate in rates.items()}, cfa)
+        tile = mosaic.assemble({c: np.full((size, size), level) for c, level in electrons.items()}, cfa)
         after = self._charge.moved(tile)
         factors = {}
-        for channel, rate in rates.items():
+        for channel, level in electrons.items():
             where = np.zeros((size, size), bool)
             for row, col in mosaic.phases(cfa)[channel]:
                 where[row :: mosaic.step(cfa), col :: mosaic.step(cfa)] = True
-            factors[channel] = float(after[inner, inner][where[inner, inner]].mean()) / rate if rate > 0 else 1.0
+            factors[channel] = float(after[inner, inner][where[inner, inner]].mean()) / level if level > 0 else 1.0
         return factors
 
     @property

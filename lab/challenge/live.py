@@ -257,7 +257,7 @@ def _command(*arguments: str, data: Path | None = None) -> None:
 def judged(case: LiveCase, found: DiagnosisResult) -> LiveRun:
     """A diagnosis against what was concealed."""
     named = {effect.name: effect.sides for effect in found.effects}
-    rivals = {effect.name: tuple(rival.name for rival in effect.rivals) for effect in found.effects}
+    rivals = {effect.name: effect.alternatives for effect in found.effects}
     parameters = []
     wanted: dict[str, frozenset[Side]] = {}
     for spec in case.concealed:

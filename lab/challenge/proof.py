@@ -44,6 +44,7 @@ def table(found: ChallengeScore) -> str:
     ]
     lines += ["", "| also | |", "| --- | --- |"]
     for what, rate in (
+        ("concealed effects above 25, every one named as such", found.families.right_effects),
         ("compounds, one member named at least", found.compounds_one_named),
         ("compounds with both members above 50, both named", found.compounds_strong_both_named),
         ("healthy, a mismatch where there is none", found.false_alarms),

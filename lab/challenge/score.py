@@ -12,8 +12,10 @@ from typing import Literal
 from scipy.special import betaincinv
 
 from lab.challenge.run import CaseRun
-from lab.challenge.truth import CaseTruth, Purpose, Seals, Truths, digest, seal
+from lab.challenge.truth import CaseTruth, Concealed, Purpose, Seals, Truths, digest, seal
 from lab.formats.results import DiagnosisResult
+from mocks.former import OUTSIDE
+from sim.effects.library import effects as library
 from sim.parameters import Frozen
 
 CONFIDENCE = 0.95
@@ -71,6 +73,13 @@ class CaseScore(Frozen):
     rivals: tuple[str, ...]
     unexplained: tuple[str, ...]
     right: bool
+    effects: tuple[str, ...]  # that are concealed, as the results' list calls them
+    true_families: tuple[
+        tuple[str, ...], ...
+    ]  # by concealed law, any of which describes it; none for what no family has
+    families: tuple[str, ...]  # of all that was named
+    right_family: bool  # of everything that was concealed, the family or the effect is named
+    wrong_family: bool  # something of another family is named
     excess_removed: float | None
     cpu_s: float
     memory_mib: float
@@ -84,6 +93,18 @@ class SinglesScore(Frozen):
     top_1: Rate
     alone: Rate
     unnamed: Rate
+
+
+class FamiliesScore(Frozen):
+    """What was said of concealed laws above a non-centrality of 25, listed or not, that belong to a family; each share is of cases.
+
+    `right_effects`: of cases of listed effects, every one is named as such. `right_families`: every one by its effect or its family.
+    `wrong_families`: of all cases, healthy ones among them, something of another family is named.
+    """
+
+    right_effects: Rate
+    right_families: Rate
+    wrong_families: Rate
 
 
 class EffectScore(Frozen):
@@ -106,6 +127,7 @@ class ChallengeScore(Frozen):
     broken_seals: tuple[str, ...]
     failed: dict[str, str]
     singles: tuple[SinglesScore, ...]
+    families: FamiliesScore
     effects: tuple[EffectScore, ...]
     compounds_both_named: Rate
     compounds_one_named: Rate
@@ -196,6 +218,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     covered = Rate.over(hit for case, truth in of_truth.items() for hit in _covered(truth, diagnoses[case]))
     mean_removed = fmean(removed) if removed else None
     cpu, memory = max((r.cpu_s for r in ran), default=None), max((r.memory_mib for r in ran), default=None)
+    families = _families(scored)
     goals = (
         Goal(
             name="seals that hold",
@@ -212,6 +235,8 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
             sure=True,
         ),
         _at_least("top-1 of single effects above 50", classes[0].top_1, 0.95),
+        _at_least("right families above 25", families.right_families, 0.97),
+        _at_most("names of a wrong family", families.wrong_families, 0.01),
         _at_least("both members of a compound named", both, 0.80),
         _at_least("rival sets cover the truth", cover, 0.95),
         _limit("rivals in a set, mean", size, 1.5, ""),
@@ -229,7 +254,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     )
     return ChallengeScore(
         purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals), broken_seals=tuple(broken),
-        failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, effects=_by_effect(singles),
+        failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, families=families, effects=_by_effect(singles),
         compounds_both_named=both, compounds_one_named=one, compounds_strong_both_named=both_strong, rival_sets_cover=cover,
         rival_set_mean_size=size, false_alarms=alarms, false_names=names, outside_not_named=abstained, outside_located=located,
         parameters_covered=covered, excess_removed=mean_removed, excess_removed_median=median(removed) if removed else None,
@@ -246,7 +271,10 @@ def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
     found = run.diagnosis
     effects = sorted(found.effects, key=lambda e: -e.probability) if found is not None else []
     named = tuple(e.name for e in effects)
-    rivals = tuple(r.name for r in effects[0].rivals if r.name != "unknown") if effects else ()
+    rivals = tuple(name for name in effects[0].alternatives if name != "unknown") if effects else ()
+    told = [e.family for e in effects]
+    true = [families_of(c) for c in truth.concealed]
+    accepted = frozenset(library()[name].family.value for name in truth.accepts)
     right = {
         "healthy": found is not None and found.verdict == "no_mismatch",
         "single": named[:1] == truth.names,
@@ -258,8 +286,17 @@ def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
         noncentrality=tuple(c.noncentrality for c in truth.concealed), fault=truth.fault,
         verdict=found.verdict if found is not None else "failed", named=named, rivals=rivals,
         unexplained=tuple(u.measurement for u in found.unexplained) if found is not None else (), right=right,
+        effects=truth.names, true_families=tuple(tuple(sorted(one)) for one in true), families=tuple(told),
+        right_family=bool(true) and all(set(told) & one for one in true), wrong_family=not set(told) <= accepted.union(*true),
         excess_removed=_removed(truth, found), cpu_s=run.cpu_s, memory_mib=run.memory_mib,
     )  # fmt: skip
+
+
+def families_of(concealed: Concealed) -> frozenset[str]:
+    """Families that describe a concealed law rightly: its effect's, or those that the second former declares; none for what no family has."""
+    if concealed.effect is not None:
+        return frozenset({library()[concealed.effect].family.value})
+    return next((law.families for law in OUTSIDE if law.name == concealed.name), frozenset())
 
 
 def _removed(truth: CaseTruth, found: DiagnosisResult | None) -> float | None:
@@ -294,6 +331,15 @@ def _singles(what: str, cases: Sequence[CaseScore]) -> SinglesScore:
         top_1=Rate.over(s.right for s in cases),
         alone=Rate.over(s.named == s.truth for s in cases),
         unnamed=Rate.over(not s.named for s in cases),
+    )
+
+
+def _families(scored: Sequence[CaseScore]) -> FamiliesScore:
+    held = [s for s in scored if s.truth and all(s.true_families) and min(s.noncentrality) > SEEN]
+    return FamiliesScore(
+        right_effects=Rate.over(set(s.effects) <= set(s.named) for s in held if s.kind != "outside"),
+        right_families=Rate.over(s.right_family for s in held),
+        wrong_families=Rate.over(s.wrong_family for s in scored),
     )
 
 

@@ -22,13 +22,17 @@ def effects(
     name: Annotated[str, typer.Argument(metavar="[NAME]", help="only this effect")] = "",
     json: Json = None,
 ) -> None:
-    """The library of effects: where each acts, its parameters, which measurements can show it, and its rivals."""
+    """The library of effects: its families, where each effect acts, its parameters, which measurements can show it, and its rivals."""
     from lab.diagnose.effect_list import EffectList, effect_description, effect_list
 
     check_writable(json)
     told = EffectList(effects=(effect_description(name),)) if name else effect_list()
     write_json(told, json)
     if str(json) != "-":
+        for family in told.families:
+            out.print(f"[bold]{escape(family.name)}[/]: {escape(family.sentence)} {escape(', '.join(family.members))}")
+        if told.families:
+            out.print()
         for number, effect in enumerate(told.effects):
             if number:
                 out.print()
@@ -50,6 +54,7 @@ def _print_effect(effect: EffectDescription) -> None:
             table.add_row(f"  {one.name}", one.unit, *numbers, usual, absent, escape(one.meaning))
         out.print(table)
     for heading, items in (
+        ("family", (effect.family,)),
         ("measurements that can show it", effect.measurements),
         ("captures that these rest on", effect.capture_kinds),
         ("rivals", effect.rivals),

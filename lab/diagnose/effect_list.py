@@ -8,6 +8,7 @@ from lab.diagnose.visibility import visibility
 from lab.errors import InputError
 from sim.effects import library
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Frozen, Quantity
 
 UNSEEN = "No measurement of a diagnosis can see it, so a diagnosis never names it."
@@ -50,6 +51,7 @@ class ParameterDescription(Frozen):
 class EffectDescription(Frozen):
     """An effect of the library.
 
+    family : the physics that it is one law of: named where no law of it holds exactly, or several fit alike
     stages : the stages of the forward model in which it acts, in the order of the light
     sentence : what physics a model without it leaves out
     reference : where its law comes from
@@ -60,6 +62,7 @@ class EffectDescription(Frozen):
     """
 
     name: str
+    family: str
     stages: tuple[str, ...]
     sentence: str
     reference: str
@@ -71,17 +74,47 @@ class EffectDescription(Frozen):
     remark: str | None
 
 
+class FamilyDescription(Frozen):
+    """A family of effects.
+
+    words : the physics, as a noun
+    sentence : what recordings show where it is named
+    members : effects of it that a diagnosis looks for
+    told_apart_by : the capture that tells these apart; empty where there is one
+    """
+
+    name: str
+    words: str
+    sentence: str
+    members: tuple[str, ...]
+    told_apart_by: str
+
+
 class EffectList(Frozen):
     """What `calibench effects --json FILE` writes."""
 
     format: Literal["calibench-effects"] = "calibench-effects"
     version: Literal[1] = 1
     effects: tuple[EffectDescription, ...]
+    families: tuple[FamilyDescription, ...] = ()
 
 
 def effect_list() -> EffectList:
-    """All effects of the library."""
-    return EffectList(effects=tuple(_described(kind) for kind in library.effects().values()))
+    """All effects of the library, and their families."""
+    return EffectList(
+        effects=tuple(_described(kind) for kind in library.effects().values()),
+        families=tuple(_family(family) for family in Family if library.members(family)),
+    )
+
+
+def _family(family: Family) -> FamilyDescription:
+    return FamilyDescription(
+        name=family.value,
+        words=family.words,
+        sentence=family.sentence,
+        members=library.members(family),
+        told_apart_by=family.told_apart_by,
+    )
 
 
 def effect_description(name: str) -> EffectDescription:
@@ -96,6 +129,7 @@ def _described(kind: type[Effect]) -> EffectDescription:
     shown = visibility().get(kind.name)
     return EffectDescription(
         name=kind.name,
+        family=kind.family.value,
         stages=kind.stages(),
         sentence=kind.sentence,
         reference=kind.reference,

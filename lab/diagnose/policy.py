@@ -184,6 +184,24 @@ class DecisionPolicy(Frozen):
             "name", "1", "least probability of a name that explains less than `exact_share`", "odds of 4 to 1, chosen"
         ),
     ] = 0.8
+    family_probability: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "least probability that a family's members hold together, if the cause is a listed effect; and below which its likeliest member isn't named beside others of the family that fit",
+            "as `least_probability_inexact`: odds of 4 to 1",
+        ),
+    ] = 0.8
+    family_least_share: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "least share of the excess chi2, in the measurements that its nearest law acts on, that a family of which no law holds explains",
+            "more than half: what is left can't then hold a stronger cause than the one that is named",
+        ),
+    ] = 0.5
     exact_share: Annotated[
         float, Rule("name", "1", "share of the excess chi2 from which on a name explains it nearly all", TUNED)
     ] = 0.95

@@ -17,7 +17,7 @@ from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
-from lab.diagnose.outcome.mismatches import located, shown_in, unexplained, vetoed_names
+from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
 from lab.diagnose.outcome.next_capture import Proposal, proposals
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.policy import DecisionPolicy
@@ -46,10 +46,12 @@ SEED = 1288
 
 @dataclass(frozen=True)
 class NamedCandidate:
-    """A named effect, and the measurements in which its change stands out of the noise."""
+    """A named effect or family, the measurements in which its change stands out of the noise, and what stands in the improved model
+    beside a family's nearest law."""
 
     candidate: Candidate
     shown_in: tuple[str, ...]
+    corrections: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,10 @@ def diagnose_side(
         is_judged=True,
         threshold=verdict.threshold if np.isfinite(verdict.threshold) else None,
         mismatches=tuple(located(side, verdict)),
-        named=tuple(NamedCandidate(c, shown_in(verdict, c, policy)) for c in verdict.named),
+        named=tuple(
+            NamedCandidate(c, shown_in(verdict, c, policy), family_corrections(verdict, c, corrections, policy))
+            for c in verdict.named
+        ),
         abstained=verdict.abstained,
         unexplained=tuple(unexplained(recordings, side, verdict, corrections, policy)),
         vetoed=tuple(vetoed_names(side, verdict)),

@@ -167,7 +167,14 @@ def simulate(options: SimulateOptions, content: CameraFile, progress: Progress |
         exposure = exposed(seconds)
         proportional = sim_frame.grows_with_exposure(camera, content.effects)
         electrons = (
-            each_second * seconds if proportional else sim_frame.expected_electrons(camera, exposure, content.effects)
+            each_second * seconds
+            if proportional
+            else sim_frame.expected_electrons(
+                camera,
+                exposure,
+                content.effects,
+                source=sim_frame.unsteady_source(camera, content.effects, exposure.elapsed_s),
+            )
         )
         sim_frame.check_not_saturated(camera, exposure, electrons)
         tell("sensor", 0.8)

@@ -152,6 +152,7 @@ def page_environment() -> jinja2.Environment:
         "words": lambda text: str(text).replace("_", " "),
         "measurement": measurement_title,
         "chart_json": _chart_json,
+        "effect_name": words.effect_name,
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,

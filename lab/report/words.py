@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from lab.diagnose.measurements.library import measurement_title
 from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ParameterValue, ValidationResult
 from lab.report.figures import measured
+from sim.effects.families import Family
 
 #: Verdict -> (what stands on the badge, its mood, the headline).
 VERDICTS = {
@@ -16,12 +17,12 @@ VERDICTS = {
     "partly_explained": (
         "partly explained",
         "open",
-        "The baseline model leaves physics out; the named effects account for a part of it.",
+        "The baseline model leaves physics out; what is named accounts for a part of it.",
     ),
     "unexplained": (
         "unexplained",
         "bad",
-        "The baseline model leaves something out that no effect in the library accounts for.",
+        "The baseline model leaves something out that no family of effects accounts for.",
     ),
 }
 
@@ -34,8 +35,8 @@ def headline(diagnosis: DiagnosisResult | None) -> tuple[str, str, str]:
 
 
 def effect_name(name: str) -> str:
-    """An effect's name as words."""
-    return name.replace("_", " ")
+    """An effect's or a family's name as words."""
+    return Family(name).words if name in set(Family) else name.replace("_", " ")
 
 
 def parameter_name(name: str, value: ParameterValue) -> str:
@@ -53,7 +54,14 @@ def effect_sentence(effect: NamedEffect) -> str:
     """An effect's name, side, probability and parameters."""
     where = " and ".join(effect.sides)
     sizes = "; ".join(parameter_text(name, value) for name, value in effect.parameters.items())
-    return f"{effect_name(effect.name).capitalize()} ({where}, probability {effect.probability:.3g}): {sizes}."
+    near = ""
+    if effect.members:
+        near = (
+            f"by {effect_name(effect.nearest_law)}, "
+            if effect.law == "exact"
+            else f"nearest law {effect_name(effect.nearest_law)}, "
+        )
+    return f"{effect_name(effect.name).capitalize()} ({where}, probability {effect.probability:.3g}): {near}{sizes}."
 
 
 def summary(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult | None) -> Iterator[str]:

@@ -34,6 +34,8 @@ class Law:
     effect: ClassVar[str | None] = None
     #: Other effects of the list that describe it rightly.
     accepts: ClassVar[frozenset[str]] = frozenset()
+    #: Families of effects that describe it rightly, where the list has no effect of it.
+    families: ClassVar[frozenset[str]] = frozenset()
     variants: ClassVar[int] = 1
     unit: ClassVar[str] = "1"
     nominal: ClassVar[float]

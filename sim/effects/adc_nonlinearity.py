@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Codes
@@ -17,6 +18,7 @@ class AdcNonlinearity(Effect):
     gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-3)."""
 
     name: ClassVar[str] = "adc_nonlinearity"
+    family: ClassVar[Family] = Family.CONVERTER
     reference: ClassVar[str] = (
         "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"
     )

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Light
 
@@ -14,6 +15,7 @@ class AmbientLight(Effect):
     """Electrons a second added while the shutter is open: e in green (and in a camera without colour), e sqrt(c) in red, e / sqrt(c) in blue."""
 
     name: ClassVar[str] = "ambient_light"
+    family: ClassVar[Family] = Family.FIELD_OF_LIGHT
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, measuring set-up"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge
 
@@ -18,6 +19,7 @@ class AmplifierGlow(Effect):
     """g exp(-r / r0) electrons a second on top, r from the outermost pixel of one corner; it glows while charge is collected."""
 
     name: ClassVar[str] = "amplifier_glow"
+    family: ClassVar[Family] = Family.DARK_SIGNAL
     reference: ClassVar[str] = "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, luminescence"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "level", "orientation", "time"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.pupil import Wavefront
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -14,6 +15,7 @@ class Astigmatism(Effect):
     """Path errors quadratic along x and y apart: W = (x_defocus x^2 + y_defocus y^2) / (8 N^2)."""
 
     name: ClassVar[str] = "astigmatism"
+    family: ClassVar[Family] = Family.DIRECTIONAL_CONTRAST
     reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.pupil import Wavefront, seidel
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -22,6 +23,7 @@ class AxialChromaticAberration(Effect):
     """
 
     name: ClassVar[str] = "axial_chromatic_aberration"
+    family: ClassVar[Family] = Family.COLOUR_BLUR
     reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on chromatic aberration"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})

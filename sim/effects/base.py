@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from sim.camera import CameraModel
+from sim.effects.families import Family
 from sim.parameters import Frozen, Quantity, declared
 from sim.stages import Charge, Codes, Image, Light, Signal
 
@@ -34,6 +35,8 @@ class Effect(Frozen):
     """
 
     name: ClassVar[str]
+    #: The physics that it is one law of: the name where no member's law holds exactly, or several do.
+    family: ClassVar[Family]
     reference: ClassVar[str]
     #: Fraction of its own effect by which the textbook law may be wrong (one standard deviation).
     form_tolerance: ClassVar[float] = 0.05

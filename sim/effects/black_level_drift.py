@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Signal
 
@@ -13,6 +14,7 @@ class BlackLevelDrift(Effect):
     """DN added: a t + b (T - 25 C), t from the first capture."""
 
     name: ClassVar[str] = "black_level_drift"
+    family: ClassVar[Family] = Family.DARK_SIGNAL
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, dark signal"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset(

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Charge
@@ -17,6 +18,7 @@ class Blooming(Effect):
     pixels to their full wells one after the other; the rest is drained. What runs off the frame is lost."""
 
     name: ClassVar[str] = "blooming"
+    family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, blooming"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "time"})

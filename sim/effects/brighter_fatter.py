@@ -5,11 +5,16 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
+from scipy.ndimage import convolve
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge
+
+#: Sum over the four next pixels less four times the own.
+NEXT_LESS_OWN = np.array([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]])
 
 
 class BrighterFatter(Effect):
@@ -18,9 +23,14 @@ class BrighterFatter(Effect):
 
     Where all that a pixel loses goes to these four b is a (charge is conserved: the covariances of all pixels sum up to e). Part of
     it lands farther away, or in the depth of other pixels, so that both are free.
+
+    Means move between unequal neighbours, such as the colours of a mosaic in even light: the border between pixels of e and f electrons
+    moves in proportion to e - f and takes the light that falls there, (e + f) / 2, along, so that the fuller one loses
+    c / (4 W) (e^2 - f^2), W the full well. If borders are all there is, a and b are 4 c. Walls of charge between colours make c smaller.
     """
 
     name: ClassVar[str] = "brighter_fatter"
+    family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "P. Astier et al., A&A 629, A36 (2019)"
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset(
@@ -54,9 +64,28 @@ class BrighterFatter(Effect):
         ),
     ] = 0.0
 
+    exchanged_percent: Annotated[
+        float,
+        Quantity(
+            "%",
+            "mean charge that a full pixel loses to its four next ones where these are empty",
+            lower=0.0,
+            upper=40.0,
+            prior=(0.0, 2.5),
+            absent=0.0,
+            dispensable=True,
+        ),
+    ] = 0.0
+
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
-        return ((cls(loss_percent=1.5), cls(loss_percent=1.5, shared_percent=1.5)),)
+        return (
+            (
+                cls(loss_percent=1.5),
+                cls(loss_percent=1.5, shared_percent=1.5),
+                cls(loss_percent=1.5, shared_percent=1.5, exchanged_percent=0.375),
+            ),
+        )
 
     def on_charge(self, charge: Charge) -> Charge:
         full_well_e = charge.camera.full_well_e
@@ -70,6 +99,13 @@ class BrighterFatter(Effect):
             charge = charge.adding(
                 correlation=lambda electrons: (
                     0.25 * (self.shared_percent / 100.0) * np.clip(electrons / full_well_e, 0.0, 1.0)
+                )
+            )
+        if self.exchanged_percent != 0.0:
+            pair = 0.01 * self.exchanged_percent / (4.0 * full_well_e)
+            charge = charge.adding(
+                exchange=lambda electrons: (
+                    electrons + pair * convolve(np.square(electrons), NEXT_LESS_OWN, mode="mirror")
                 )
             )
         return charge

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Charge
@@ -22,6 +23,7 @@ class ChargeDiffusion(Effect):
     """
 
     name: ClassVar[str] = "charge_diffusion"
+    family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = "D. Seib, IEEE Trans. Electron Devices 21, 210 (1974)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "level", "orientation", "time"})

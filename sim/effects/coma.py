@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.pupil import seidel
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -18,6 +19,7 @@ class Coma(Effect):
     """
 
     name: ClassVar[str] = "coma"
+    family: ClassVar[Family] = Family.DIRECTIONAL_CONTRAST
     reference: ClassVar[str] = "V. Mahajan, Optical Imaging and Aberrations, part II, section 4.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.filters import plate_wavefront
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -20,6 +21,7 @@ class CoverGlass(Effect):
     """
 
     name: ClassVar[str] = "cover_glass"
+    family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "V. Mahajan, Optical Imaging and Aberrations, part I, section 5.8"
     form_tolerance: ClassVar[float] = 0.06

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Charge
@@ -19,6 +20,7 @@ class Crosstalk(Effect):
     stays white."""
 
     name: ClassVar[str] = "crosstalk"
+    family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "K. Hirakawa, Cross-talk explained, ICIP 2008"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time", "field"})

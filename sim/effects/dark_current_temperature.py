@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Charge
@@ -14,6 +15,7 @@ class DarkCurrentTemperature(Effect):
     """Dark current x 2^(k (T - T_reference)), the camera's reference temperature; on top of what its own doubling says."""
 
     name: ClassVar[str] = "dark_current_temperature"
+    family: ClassVar[Family] = Family.DARK_SIGNAL
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, dark current and doubling temperature"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "orientation"})

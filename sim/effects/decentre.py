@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
@@ -19,6 +20,7 @@ class Decentre(Effect):
     """
 
     name: ClassVar[str] = "decentre"
+    family: ClassVar[Family] = Family.GEOMETRY
     reference: ClassVar[str] = "D. C. Brown, Photogramm. Eng. 32, 444 (1966)"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.pupil import seidel
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -14,6 +15,7 @@ class Defocus(Effect):
     """Path error W020 = dz / (8 N^2) at the pupil's rim: the OTF of a circular pupil with a quadratic path error (Hopkins)."""
 
     name: ClassVar[str] = "defocus"
+    family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = "H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955)"
     form_tolerance: ClassVar[float] = 0.04
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})

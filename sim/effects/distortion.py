@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import Geometry
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.scene.warp import distort
@@ -24,6 +25,7 @@ class Distortion(Effect):
     """
 
     name: ClassVar[str] = "distortion"
+    family: ClassVar[Family] = Family.GEOMETRY
     reference: ClassVar[str] = "D. C. Brown, Photogramm. Eng. 37, 855 (1971)"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge
 
@@ -13,6 +14,7 @@ class ExposureOffset(Effect):
     """Exposure t + t0."""
 
     name: ClassVar[str] = "exposure_offset"
+    family: ClassVar[Family] = Family.RESPONSE
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, linearity"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset(

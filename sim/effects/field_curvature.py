@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.pupil import Wavefront, seidel
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -19,6 +20,7 @@ class FieldCurvature(Effect):
     """
 
     name: ClassVar[str] = "field_curvature"
+    family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = "W. J. Smith, Modern Optical Engineering, chapter on aberrations"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Image
@@ -19,6 +20,7 @@ class Ghost(Effect):
     """I'(r) = I(r) + q I(-r), r from the frame's middle, the copy blurred by 2 px: two reflections turn the image by half a turn."""
 
     name: ClassVar[str] = "ghost"
+    family: ClassVar[Family] = Family.COPIES_AND_VEILS
     reference: ClassVar[str] = "E. Oleszko et al., Computer Graphics Forum 36, 165 (2017)"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})

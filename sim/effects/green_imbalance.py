@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.sensor.mosaic import phases, step
 from sim.spectrum import FloatArray
@@ -15,6 +16,7 @@ class GreenImbalance(Effect):
     """Light of G on red rows x (1 + a / 2), on blue rows x (1 - a / 2): a checker in even light, the greens' mean as before."""
 
     name: ClassVar[str] = "green_imbalance"
+    family: ClassVar[Family] = Family.RESPONSE
     reference: ClassVar[str] = (
         "J. Nakamura (ed.), Image Sensors and Signal Processing for Digital Still Cameras, CRC Press 2006, green imbalance"
     )

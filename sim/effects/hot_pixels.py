@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.sensor.defects import Defects
 from sim.stages import Charge
@@ -16,6 +17,7 @@ class HotPixels(Effect):
     spread of 1 is an exponential distribution, 0 are pixels that are all alike."""
 
     name: ClassVar[str] = "hot_pixels"
+    family: ClassVar[Family] = Family.DEFECTIVE_PIXELS
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, logarithmic histograms of defect pixels"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset(

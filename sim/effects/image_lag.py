@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Charge
 
@@ -14,6 +15,7 @@ class ImageLag(Effect):
     in the k-th dark frame, and the first frame of a series lacks q."""
 
     name: ClassVar[str] = "image_lag"
+    family: ClassVar[Family] = Family.FRAME_MEMORY
     reference: ClassVar[str] = (
         "E. R. Fossum, Charge transfer noise and lag in CMOS active pixel sensors, IEEE Workshop on CCDs and AIS 2003"
     )

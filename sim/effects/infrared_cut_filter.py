@@ -8,6 +8,7 @@ from pydantic import Field
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.filters import edge_transmittance
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -22,6 +23,7 @@ class InfraredCutFilter(Effect):
     """
 
     name: ClassVar[str] = "infrared_cut_filter"
+    family: ClassVar[Family] = Family.SPECTRAL_FILTER
     reference: ClassVar[str] = "H. A. Macleod, Thin-Film Optical Filters, chapter on edge filters"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time"})

@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from sim.effects.crosstalk import Crosstalk
+from sim.effects.families import Family
 from sim.stages import Charge
 
 
@@ -15,6 +16,7 @@ class InterPixelCapacitance(Crosstalk):
     astray, and neighbours' shot noise is correlated, 2 c / (1 - 4 c) at all levels of light; read noise comes after."""
 
     name: ClassVar[str] = "inter_pixel_capacitance"
+    family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "A. C. Moore, Z. Ninkov, W. J. Forrest, Optical Engineering 45, 076402 (2006)"
     sentence: ClassVar[str] = (
         "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is common to neighbours at all levels of light, but not in the dark."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
@@ -22,6 +23,7 @@ class LateralChromaticAberration(Effect):
     """
 
     name: ClassVar[str] = "lateral_chromatic_aberration"
+    family: ClassVar[Family] = Family.COLOUR_BLUR
     reference: ClassVar[str] = "ISO 19084:2015"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "time"})

@@ -9,6 +9,7 @@ from functools import cache, lru_cache
 import sim.effects
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.spectrum import Spectrum
 from sim.stages import laws_of
 
@@ -36,6 +37,12 @@ def effect(name: str) -> type[Effect]:
     if name not in known:
         raise KeyError(f"no effect named {name!r}; there are: {', '.join(known)}")
     return known[name]
+
+
+@cache
+def members(family: Family) -> tuple[str, ...]:
+    """Names of the effects of a family that a diagnosis looks for."""
+    return tuple(kind.name for kind in candidates() if kind.family is family)
 
 
 def candidates() -> tuple[type[Effect], ...]:

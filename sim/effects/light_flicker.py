@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -21,6 +22,7 @@ class LightFlicker(Effect):
     row. Bands that vanish where T is a multiple of 1 / f; with a line time of 0 (global shutter) frames flicker as a whole."""
 
     name: ClassVar[str] = "light_flicker"
+    family: ClassVar[Family] = Family.SOURCE_IN_TIME
     reference: ClassVar[str] = "IEEE Std 1789-2015, modulation of current in high-brightness LEDs"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})

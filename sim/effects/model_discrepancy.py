@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.illumination import from_axis_um
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
@@ -26,6 +27,7 @@ class ModelDiscrepancy(Effect):
     """
 
     name: ClassVar[str] = "model_discrepancy"
+    family: ClassVar[Family] = Family.DISCREPANCY
     is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "M. C. Kennedy and A. O'Hagan, J. R. Statist. Soc. B 63, 425 (2001)"
     form_tolerance: ClassVar[float] = 0.2

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -17,6 +18,7 @@ class NonUniformIllumination(Effect):
     it as a lamp beside the axis leaves it."""
 
     name: ClassVar[str] = "non_uniform_illumination"
+    family: ClassVar[Family] = Family.FIELD_OF_LIGHT
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, homogeneity of the source"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "level", "time"})

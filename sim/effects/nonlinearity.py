@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Signal
@@ -19,6 +20,7 @@ class Nonlinearity(Effect):
     """electrons (1 + a x + b x^2 + c exp(-x / 0.1)) with x = electrons / full well; a, b in percent at full well, c at none."""
 
     name: ClassVar[str] = "nonlinearity"
+    family: ClassVar[Family] = Family.RESPONSE
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, linearity"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "orientation", "time"})

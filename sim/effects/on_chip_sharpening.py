@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
+from sim.effects.families import Family
 from sim.effects.on_chip_filter import CornerShare, OnChipFilter
 from sim.parameters import Quantity
 
@@ -14,6 +15,7 @@ class OnChipSharpening(OnChipFilter):
     what neighbours have in common is negative."""
 
     name: ClassVar[str] = "on_chip_sharpening"
+    family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 12233:2023, annex on sharpening"
     sentence: ClassVar[str] = (
         "The camera sharpens on the chip: contrast rises above what optics and pixel allow, and the noise of neighbouring pixels is opposed, bright or dark."

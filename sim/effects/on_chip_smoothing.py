@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
+from sim.effects.families import Family
 from sim.effects.on_chip_filter import CornerShare, OnChipFilter
 from sim.parameters import Quantity
 
@@ -14,6 +15,7 @@ class OnChipSmoothing(OnChipFilter):
     neighbours have noise in common, in the same proportion at all levels."""
 
     name: ClassVar[str] = "on_chip_smoothing"
+    family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 15739:2023, annex on noise filtering"
     sentence: ClassVar[str] = (
         "The camera smooths on the chip: contrast falls alike at all apertures, and neighbouring pixels have noise in common, bright or dark."

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.filters import birefringent_displacement_um, birefringent_otf
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
@@ -25,6 +26,7 @@ class OpticalLowPassFilter(Effect):
     """
 
     name: ClassVar[str] = "optical_low_pass_filter"
+    family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = "Walker-Pavlopoulos plate displacement; J. Greivenkamp, Appl. Opt. 29, 676 (1990)"
     form_tolerance: ClassVar[float] = 0.01
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})

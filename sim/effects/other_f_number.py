@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.diffraction import diffraction_otf
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
@@ -23,6 +24,7 @@ class OtherFNumber(Effect):
     """
 
     name: ClassVar[str] = "other_f_number"
+    family: ClassVar[Family] = Family.METADATA
     is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "J. W. Goodman, Introduction to Fourier Optics, chapter 6"
     form_tolerance: ClassVar[float] = 0.03

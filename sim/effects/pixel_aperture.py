@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Charge
@@ -18,6 +19,7 @@ class PixelAperture(Effect):
     """Side of the square aperture changed by a few um: OTF factor sinc(w' fx) sinc(w' fy) / (sinc(w fx) sinc(w fy))."""
 
     name: ClassVar[str] = "pixel_aperture"
+    family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = (
         "G. Boreman, Modulation Transfer Function in Optical and Electro-Optical Systems, chapter 3"
     )

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -21,6 +22,7 @@ class RadiometerNonlinearity(Effect):
     for q = 1 an error in proportion to the level, as of a detector that begins to saturate."""
 
     name: ClassVar[str] = "radiometer_nonlinearity"
+    family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
     reference: ClassVar[str] = "CIE 214:2014; S. Yang, I. Vayshenker, X. Li, T. R. Scott, NIST J. Res. 99, 1 (1994)"
     form_tolerance: ClassVar[float] = 0.04
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "orientation", "time"})

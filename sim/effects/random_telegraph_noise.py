@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.sensor.defects import Defects
 from sim.stages import Signal
@@ -17,6 +18,7 @@ class RandomTelegraphNoise(Effect):
     (relative spread 0), or gamma distributed about its mean."""
 
     name: ClassVar[str] = "random_telegraph_noise"
+    family: ClassVar[Family] = Family.DEFECTIVE_PIXELS
     reference: ClassVar[str] = "X. Wang et al., Random telegraph signal in CMOS image sensor pixels, IEDM 2006"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset(

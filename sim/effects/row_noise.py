@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.sensor.lines import LineNoise
 from sim.stages import Signal
@@ -16,6 +17,7 @@ class RowNoise(Effect):
     row; rows that are n apart have c^n of it in common."""
 
     name: ClassVar[str] = "row_noise"
+    family: ClassVar[Family] = Family.LINE_NOISE
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, spatial and temporal variances of rows and columns"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})

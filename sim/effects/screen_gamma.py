@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -24,6 +25,7 @@ class ScreenGamma(Effect):
     How wide rims are isn't stated, and drawings take a sample: the exponent is good to tens of per cent."""
 
     name: ClassVar[str] = "screen_gamma"
+    family: ClassVar[Family] = Family.SCREEN
     reference: ClassVar[str] = "R. S. Berns, Displays 16, 173 (1996)"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset(

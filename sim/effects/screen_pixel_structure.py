@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -18,6 +19,7 @@ class ScreenPixelStructure(Effect):
     sensor (px), which a drawing has to choose and a fit doesn't ask for: the grid's first harmonic, which is what a lens passes. Where it is finer than half the pixels it beats."""
 
     name: ClassVar[str] = "screen_pixel_structure"
+    family: ClassVar[Family] = Family.SCREEN
     reference: ClassVar[str] = "I. Amidror, The Theory of the Moire Phenomenon, Springer 2009"
     form_tolerance: ClassVar[float] = 0.3
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time"})

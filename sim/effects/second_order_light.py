@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -16,6 +17,7 @@ class SecondOrderLight(Effect):
     """Narrowband radiance L(w) + 2 r L(2 w): a line read at w0 brings r of its power along at w0 / 2, in half the width."""
 
     name: ClassVar[str] = "second_order_light"
+    family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
     reference: ClassVar[str] = "C. Palmer, Diffraction Grating Handbook, free spectral range and order sorting"
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})

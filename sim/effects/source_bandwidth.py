@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -19,6 +20,7 @@ class SourceBandwidth(Effect):
     """Narrowband radiance convolved with a Gaussian of the stated standard deviation."""
 
     name: ClassVar[str] = "source_bandwidth"
+    family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
     reference: ClassVar[str] = "E. and R. Stearns, Color Res. Appl. 13, 257 (1988)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Light
 
@@ -19,6 +20,7 @@ class SourceDrift(Effect):
     """Radiance factor 1 + a T (1 - exp(-t / T)): in proportion to the time at first, settled after a few T. 1 + a t for long T."""
 
     name: ClassVar[str] = "source_drift"
+    family: ClassVar[Family] = Family.SOURCE_IN_TIME
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, irradiation"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "orientation"})

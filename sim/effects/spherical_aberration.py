@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.optics.pupil import seidel
 from sim.parameters import Quantity
 from sim.stages import Image
@@ -14,6 +15,7 @@ class SphericalAberration(Effect):
     """Path error W040 rho^4 over the pupil, in the paraxial focus."""
 
     name: ClassVar[str] = "spherical_aberration"
+    family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = "J. Goodman, Introduction to Fourier Optics, section 6.4"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "orientation", "time", "field"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Light
 
@@ -17,6 +18,7 @@ class StereoGainMismatch(Effect):
     """
 
     name: ClassVar[str] = "stereo_gain_mismatch"
+    family: ClassVar[Family] = Family.RESPONSE
     reference: ClassVar[str] = "H. Hirschmueller and D. Scharstein, IEEE Trans. PAMI 31, 1582 (2009)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Light
 
@@ -13,6 +14,7 @@ class StereoTimeOffset(Effect):
     """The right camera captures later by dt: what moves by v in its picture lies off by v dt; what stands still shows nothing."""
 
     name: ClassVar[str] = "stereo_time_offset"
+    family: ClassVar[Family] = Family.GEOMETRY
     reference: ClassVar[str] = "P. Furgale, J. Rehder and R. Siegwart, IROS 2013"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level", "time"})

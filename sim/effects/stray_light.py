@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
@@ -16,6 +17,7 @@ class StrayLight(Effect):
     """Narrowband radiance plus a share of its integral, spread evenly over the wavelengths stated."""
 
     name: ClassVar[str] = "stray_light"
+    family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
     reference: ClassVar[str] = "Y. Zong et al., Appl. Opt. 45, 1111 (2006)"
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})

@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Self
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Image, Veil
 
@@ -15,6 +16,7 @@ class VeilingGlare(Effect):
     lowest, where a share h of the veil lies about its source, by a normal distribution N."""
 
     name: ClassVar[str] = "veiling_glare"
+    family: ClassVar[Family] = Family.COPIES_AND_VEILS
     reference: ClassVar[str] = "ISO 9358:1994; ISO 18844:2017"
     form_tolerance: ClassVar[float] = 0.1
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "orientation", "time"})

@@ -9,6 +9,7 @@ from scipy.special import j0
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Image
@@ -18,6 +19,7 @@ class VibrationBlur(Effect):
     """OTF factor J0(2 pi (ax fx + ay fy)) of a sinusoidal movement with amplitude (ax, ay), long against its period."""
 
     name: ClassVar[str] = "vibration_blur"
+    family: ClassVar[Family] = Family.DIRECTIONAL_CONTRAST
     reference: ClassVar[str] = "J. Hadar, I. Dror, N. Kopeika, Opt. Eng. 33, 566 (1994)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})

@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Image
@@ -21,6 +22,7 @@ class Vignetting(Effect):
     that part), 4 and more where a mount's rim only reaches the corners."""
 
     name: ClassVar[str] = "vignetting"
+    family: ClassVar[Family] = Family.FIELD_OF_LIGHT
     reference: ClassVar[str] = "ISO 17957:2015"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})

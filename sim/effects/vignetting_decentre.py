@@ -8,6 +8,7 @@ import numpy as np
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Image
@@ -18,6 +19,7 @@ class VignettingDecentre(Effect):
     diagonals: 1 at the centre, as without it. All of a small offset is a slope, which uneven illumination has as well."""
 
     name: ClassVar[str] = "vignetting_decentre"
+    family: ClassVar[Family] = Family.FIELD_OF_LIGHT
     reference: ClassVar[str] = "ISO 17957:2015; D. B. Goldman, IEEE Trans. Pattern Anal. Mach. Intell. 32, 2276 (2010)"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "wavelength", "level", "time"})

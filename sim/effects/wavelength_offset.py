@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.parameters import Quantity
 from sim.stages import Light
 
@@ -15,6 +16,7 @@ class WavelengthOffset(Effect):
     """What was read as radiance at w lies at w + offset."""
 
     name: ClassVar[str] = "wavelength_offset"
+    family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
     reference: ClassVar[str] = "CIE 214:2014"
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation"})

@@ -155,12 +155,18 @@ def read_by(bench: Bench, kind: str) -> UniformField:
 def predicted(
     camera: HiddenCamera, exposures: Sequence[Exposure], effects: tuple[Effect, ...], gains: Sequence[float]
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Mean and variance (DN) of every frame of a sequence, by the forward model; `gains` of the light."""
+    """Mean and variance (DN) of every frame of a sequence, by the forward model, an unsteady source's light as it was; `gains` of the
+    light."""
     found = []
     model = camera.model
     fine = any(isinstance(exposure.scene, ScreenPattern) for exposure in exposures)
     means = expected_sequence(
-        model, exposures, effects, oversample=SCREEN_OVERSAMPLE if fine else OVERSAMPLE, margin_px=MARGIN_PX
+        model,
+        exposures,
+        effects,
+        oversample=SCREEN_OVERSAMPLE if fine else OVERSAMPLE,
+        margin_px=MARGIN_PX,
+        drawn=True,
     )
     for exposure, electrons, gain in zip(exposures, means, gains, strict=True):
         dark = dark_electrons(model, exposure, effects)

@@ -46,6 +46,8 @@ def result(verdict: str, *effects: tuple[str, tuple[Side, ...], dict[str, float]
     named = [
         NamedEffect(
             name=name,
+            family="",
+            law="exact",
             probability=0.9,
             sides=sides,
             parameters={key: ParameterValue(value=value, std=0.1, unit="um") for key, value in values.items()},

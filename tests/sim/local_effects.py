@@ -9,6 +9,7 @@ import numpy as np
 
 from sim.camera import Geometry
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.scene import (
     Darkness,
     EdgeRegion,
@@ -27,6 +28,7 @@ from sim.stages import Charge, Image, Light, Signal
 class Local(Effect):
     """Base of the effects that only these tests know."""
 
+    family: ClassVar[Family] = Family.DISCREPANCY
     reference: ClassVar[str] = "tests"
     sentence: ClassVar[str] = "tests"
 

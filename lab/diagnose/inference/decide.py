@@ -13,6 +13,7 @@ from lab.diagnose.inference.discrepancy import (
     no_discrepancy,
     predictive_discrepancy,
 )
+from lab.diagnose.inference.families import family_claim, tied_family
 from lab.diagnose.inference.held_out import VetoedCandidate, held_out_mismatches, predicts_held_out, vetoed
 from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -96,9 +97,19 @@ def decide(
             left = [model.strongest_block(abstained[0].effect, effects)]
         gaussian = model.seen_gaussian(effects)
         likeliest = [likeliest_discrepancy(model, gaussian, i, policy) for i in left]
-        parts = [c for c in named if after and _is_part_of_unknown(model, c, effects, likeliest, policy)]
+        parts = [
+            c
+            for c in named
+            if after and not c.holds_a_remainder and _is_part_of_unknown(model, c, effects, likeliest, policy)
+        ]
+        claims = [] if parts else [(c, f) for c in abstained if (f := family_claim(search, named, c)) is not None]
+        if claims:
+            strongest, claimed = max(claims, key=lambda claim: claim[1].log_odds)
+            abstained.remove(strongest)
+            named = _refitted(search, [*named, claimed])
+            continue
         if not parts:
-            told = tuple(_with_either_sign(model, c, effects, policy) for c in named)
+            told = tuple(_with_either_sign(model, tied_family(c, policy), effects, policy) for c in named)
             return _verdict(
                 Verdict(model, threshold, top, before, told, tuple(abstained), after, ()), left, refused, policy
             )
@@ -134,8 +145,8 @@ def _verdict(told: Verdict, left: Sequence[int], refused: Sequence[VetoedCandida
     )
 
 
-def _refitted(search: Search, named: Sequence[Candidate], gone: Candidate) -> list[Candidate]:
-    """The named candidates without one of them, fitted again."""
+def _refitted(search: Search, named: Sequence[Candidate], gone: Candidate | None = None) -> list[Candidate]:
+    """The named candidates, without one of them, fitted again."""
     rest = search.fitted(tuple(c.effect for c in named if c is not gone), converged=True)
     kept = {c.effect.name: c for c in named}
     return [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]

@@ -37,7 +37,7 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
                 if better is not None and frozenset(better.names) not in weighed:
                     current = search.fitted(better.effects, converged=True)
                     continue
-                given_up.append(candidate)
+                given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
             current = search.without(current, index)
             continue
         members, likelier = [], None

@@ -3,7 +3,7 @@ metadata."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,8 @@ class Candidate:
     `explained_share`: of the excess chi2 in the measurements that it acts on.
     `is_closed`: what is left there is within noise and the form tolerances of the named laws.
     `remark`: metadata that would explain the recordings as well, in words.
+    `among_listed`: probabilities of the effect and its rivals if the cause is one of them, likeliest first; empty where none was weighed.
+    `members`: where the family is named and not the effect, the family's effects with their probabilities, likeliest first.
     """
 
     effect: Effect
@@ -47,6 +49,24 @@ class Candidate:
     explained_share: float = 1.0
     is_closed: bool = True
     remark: str = ""
+    among_listed: tuple[tuple[str, float], ...] = ()
+    members: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def told_name(self) -> str:
+        """The name that is given: the effect's, or its family's."""
+        return type(self.effect).family.value if self.members else self.effect.name
+
+    @property
+    def alternatives(self) -> tuple[tuple[str, float], ...]:
+        """What may be meant besides the effect, likeliest first: the other members of a family that is named, and rivals."""
+        others = [(n, p) for n, p in self.members if n != self.effect.name]
+        return tuple(sorted([*others, *self.rivals], key=lambda item: -item[1]))
+
+    @property
+    def holds_a_remainder(self) -> bool:
+        """Whether what its law leaves is a part of what is named: of a family no law of which is exact."""
+        return bool(self.members) and not self.is_closed
 
     @property
     def unknown_probability(self) -> float:
@@ -61,6 +81,7 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
 
     - the member, and every effect whose score is near its own in its place. Where both act, a model discrepancy is allowed beside either,
       so that neither is preferred for what both leave;
+    - where no law holds, for the family's sake: the same with a discrepancy in each measurement that the member acts on, beside every effect;
     - unknown: discrepancies in place of the member, with the other members as they are or refitted, or misstated metadata.
     """
     model, policy, effect = search.model, search.policy, fit.effects[index]
@@ -102,8 +123,25 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
         share,
         is_closed,
         remark if misstated >= top else "",
+        _among_listed(
+            {n: weights[n] for n in fits}
+            if is_closed
+            else {
+                n: f.log_posterior + with_discrepancies(model.seen_gaussian(f.effects), affected)
+                for n, f in fits.items()
+            }
+        ),
     )
     return candidate, better
+
+
+def _among_listed(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
+    """Probabilities by log posterior, likeliest first."""
+    top = max(weights.values())
+    odds = {name: float(np.exp(w - top)) for name, w in weights.items()}
+    total = sum(odds.values())
+    kept = [(n, o / total) for n, o in odds.items() if o / total > LEAST_KEPT_PROBABILITY]
+    return tuple(sorted(kept, key=lambda item: -item[1]))
 
 
 def _rival_fits(search: Search, fit: Fit, index: int, without: Fit) -> dict[str, Fit]:

@@ -144,7 +144,8 @@ def patch_levels(study: Study) -> list[Patch]:
 
 
 def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> FloatArray:
-    """Noise, the patches' tolerance (one for all repeats and channels, and one a channel), and the point spread's."""
+    """Noise, the patches' tolerance (one for all repeats and channels, and one a channel), the point spread's, and the lamp's
+    repeatability (common to all patches of the frames whose mean is taken)."""
     noise = study.noise
     pixels = np.array([p.pixels for p in points])
     repeats = np.array([len(p.captures) for p in points])
@@ -162,6 +163,9 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
         + np.outer(signal, signal) * PATCH_STD**2
         + np.outer(perfect, perfect) * PATCH_LEVEL_STD**2
     )
+    taken = np.array([p.captures[0].id for p in points])
+    lamp = signal * noise.jitter_lamp / np.sqrt(repeats)
+    covariance += (taken[:, None] == taken) * np.outer(lamp, lamp)
     return np.asarray(covariance)
 
 

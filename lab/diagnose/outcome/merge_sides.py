@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
@@ -14,6 +15,7 @@ from lab.formats.results import (
     DiagnosisResult,
     DiagnosisVerdict,
     HeldOut,
+    Member,
     Mismatch,
     NamedEffect,
     ParameterValue,
@@ -22,8 +24,11 @@ from lab.formats.results import (
     VetoedName,
 )
 from sim.camera import Side
+from sim.effects.families import Family
 from sim.effects.library import effects as library
 
+#: Members of a named family that its sentence lists.
+TOLD_MEMBERS = 4
 #: What to add to recordings in which no measurement can be looked at.
 LEAST_CAPTURES = "Add dark frames at two exposures, and flat frames at three levels or more with the light's radiance: the measurements begin with these."
 
@@ -40,7 +45,8 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
     elif not effects and not unexplained and not mismatches:
         verdict = "no_mismatch"
     elif effects:
-        verdict = "partly_explained" if unexplained else "explained"
+        is_whole = not unexplained and not any(e.members and e.law == "inexact" for e in effects)
+        verdict = "explained" if is_whole else "partly_explained"
     held_out = _held_out(found)
     offered = tuple(proposal.capture for f in found for proposal in f.proposals)
     return DiagnosisResult(
@@ -74,14 +80,18 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
     by_name: dict[str, list[tuple[Side, NamedCandidate]]] = {}
     for findings in found:
         for one in findings.named:
-            by_name.setdefault(one.candidate.effect.name, []).append((findings.side, one))
+            by_name.setdefault(one.candidate.told_name, []).append((findings.side, one))
     named = []
     for name, members in by_name.items():
-        kind = library()[name]
-        candidates = [one.candidate for _, one in members]
+        held = _members([one.candidate for _, one in members])
+        # of sides whose nearest laws differ, the parameters are those of the likelier one
+        kind = library()[held[0].name if held else name]
+        alike = [one.candidate for _, one in members if one.candidate.effect.name == kind.name]
+        candidates = alike or [max((one.candidate for _, one in members), key=lambda c: c.log_odds)]
+        kind = type(candidates[0].effect)
         rivals: dict[str, float] = {}
-        for c in candidates:
-            for rival, probability in c.rivals:
+        for _, one in members:
+            for rival, probability in one.candidate.rivals:
                 if probability >= policy.least_rival_probability:
                     rivals[rival] = max(rivals.get(rival, 0.0), probability)
         parameters = {}
@@ -95,19 +105,57 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             f"{f.removesuffix('_' + p.unit).replace('_', ' ')} {_number(p)}" for f, p in parameters.items()
         )
         sides = tuple(side for side, _ in members)
-        statement = f"{kind.sentence} Seen in {' and '.join(shown)} of the {' and '.join(sides)} camera: {values}."
+        is_exact = all(one.candidate.is_closed for _, one in members)
+        corrections = tuple(dict.fromkeys(c for _, one in members for c in one.corrections))
+        seen = f"Seen in {' and '.join(shown)} of the {' and '.join(sides)} camera"
+        if held:
+            statement = _family_statement(kind.family, held, is_exact, seen, values, corrections)
+        else:
+            statement = f"{kind.sentence} {seen}: {values}."
         named.append(
             NamedEffect(
                 name=name,
-                probability=min(c.probability for c in candidates),
+                family=kind.family.value,
+                law="exact" if is_exact else "inexact",
+                members=held,
+                probability=min(one.candidate.probability for _, one in members),
                 sides=sides,
                 parameters=parameters,
                 rivals=tuple(Rival(name=n, probability=p) for n, p in sorted(rivals.items(), key=lambda r: -r[1])),
                 statement=statement,
                 reference=kind.reference,
+                corrections=corrections,
             )
         )
     return named
+
+
+def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
+    """The effects of a named family over all sides, by their mean probability, likeliest first."""
+    total: dict[str, float] = {}
+    for candidate in candidates:
+        for name, probability in candidate.members:
+            total[name] = total.get(name, 0.0) + probability / len(candidates)
+    return tuple(Member(name=n, probability=p) for n, p in sorted(total.items(), key=lambda item: -item[1]))
+
+
+def _family_statement(
+    family: Family, members: Sequence[Member], is_exact: bool, seen: str, values: str, corrections: Sequence[str]
+) -> str:
+    """What a named family is, in sentences: how far its laws hold, which they are, and the capture that tells them apart."""
+    names = [f"{m.name} ({100 * m.probability:.0f} %)" for m in members[:TOLD_MEMBERS]]
+    told = [family.sentence, f"{seen}."]
+    if is_exact:
+        told.append(f"The recordings can't tell {' from '.join(names)}; by the first: {values}.")
+    else:
+        told.append(f"No listed law of {family.words} fits exactly; the nearest is {members[0].name}: {values}.")
+        if len(names) > 1:
+            told.append(f"Of the listed laws: {', '.join(names)}.")
+        if corrections:
+            told.append(f"What it leaves is in the improved model: {'; '.join(corrections)}.")
+    if len(names) > 1 and family.told_apart_by:
+        told.append(f"What tells them apart: {family.told_apart_by}.")
+    return " ".join(told)
 
 
 def _number(parameter: ParameterValue) -> str:

@@ -76,17 +76,32 @@ def vetoed_names(side: Side, verdict: Verdict) -> list[VetoedName]:
     return [
         VetoedName(
             side=side,
-            name=one.candidate.effect.name,
+            name=one.candidate.told_name,
             probability=one.candidate.probability,
             captures=one.captures,
             chi2_before=one.chi2_without,
             chi2_after=one.chi2_with,
             n=one.n,
-            statement=f"{one.candidate.effect.name} is not named for the {side} camera: the captures that the choice used suggest it, but on "
+            statement=f"{one.candidate.told_name} is not named for the {side} camera: the captures that the choice used suggest it, but on "
             f"held-out captures chi2 rises by it from {one.chi2_without:.0f} to {one.chi2_with:.0f} for {one.n} numbers, more than chance allows.",
         )
         for one in verdict.vetoed
     ]
+
+
+def held_by_families(verdict: Verdict, policy: DecisionPolicy) -> frozenset[str]:
+    """Measurements whose remaining mismatch belongs to a named family: its nearest law shows there, and isn't exact."""
+    return frozenset(m for c in verdict.named if c.holds_a_remainder for m in shown_in(verdict, c, policy))
+
+
+def family_corrections(
+    verdict: Verdict, candidate: Candidate, corrections: Sequence[Correction], policy: DecisionPolicy
+) -> tuple[str, ...]:
+    """What stands in the improved model beside a family's nearest law, in words."""
+    if not candidate.holds_a_remainder:
+        return ()
+    shown = shown_in(verdict, candidate, policy)
+    return tuple(one.said for one in corrections if one.measurement in shown)
 
 
 def shown_in(verdict: Verdict, candidate: Candidate, policy: DecisionPolicy) -> tuple[str, ...]:
@@ -115,11 +130,14 @@ def unexplained(
 ) -> list[Unexplained]:
     """Every mismatch that is left: where, how its discrepancy looks, which law comes nearest, and chi2 with and
     without the discrepancy's covariance, of what only held-out captures show that of theirs; the captures, and what is to be checked of
-    them. `corrections` of the improved model, one for each."""
+    them. `corrections` of the improved model, one for each. What the nearest law of a named family leaves isn't listed."""
     model = verdict.model
     gaussian = model.gaussian(verdict.effects)
+    held = held_by_families(verdict, policy)
     found = []
     for one, correction in zip(verdict.discrepancies, corrections, strict=True):
+        if correction.measurement in held:
+            continue
         block, at = model.blocks[one.index], model.slices[one.index]
         part = next((s for s in (*verdict.after, *verdict.held_out) if s.block is block), None)
         is_held_out = part is not None and part in verdict.held_out

@@ -89,7 +89,7 @@ def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[Hypothesis]:
     model, least = verdict.model, policy.least_rival_probability
 
     def rival_probability(candidate: Candidate) -> float:
-        return sum(p for name, p in candidate.rivals if name in library() and p >= least)
+        return sum(p for name, p in candidate.alternatives if name in library() and p >= least)
 
     candidates = [c for c in (*verdict.named, *verdict.abstained) if rival_probability(c) > 0]
     if not candidates:
@@ -97,7 +97,11 @@ def _rivals(verdict: Verdict, policy: DecisionPolicy) -> list[Hypothesis]:
     chosen = max(candidates, key=rival_probability)
     beside = tuple(e for e in verdict.effects if e.name != chosen.effect.name)
     found = [_hypothesis(model, chosen.effect.name, (*beside, chosen.effect))]
-    held = [(chosen.probability, chosen.effect.name), *((p, name) for name, p in chosen.rivals if name in library())]
+    own = dict(chosen.members).get(chosen.effect.name, chosen.probability)
+    held = [
+        (own, chosen.effect.name),
+        *((p, name) for name, p in chosen.alternatives if name in library()),
+    ]
     before = np.cumsum([0.0, *(p for p, _ in held)]) / sum(p for p, _ in held)
     for (p, name), reached in list(zip(held, before, strict=False))[1 : policy.next_capture_rivals]:
         if p < least or (reached > policy.next_capture_share and len(found) > 1):

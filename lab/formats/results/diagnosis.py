@@ -38,10 +38,24 @@ class Rival(Frozen):
     probability: float
 
 
-class NamedEffect(Frozen):
-    """An effect that the diagnosis names, with its posterior probability."""
+class Member(Frozen):
+    """An effect of a family that is named, with its probability if the cause is one of the listed effects."""
 
     name: str
+    probability: float
+
+
+class NamedEffect(Frozen):
+    """An effect that the diagnosis names, or the family of one, with its posterior probability.
+
+    `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`: where the family is
+    named, its effects, likeliest first; `name` is then the family's identifier, and `parameters` are those of the first member.
+    """
+
+    name: str
+    family: str
+    law: Literal["exact", "inexact"]
+    members: tuple[Member, ...] = ()
     probability: float
     sides: tuple[Side, ...]
     parameters: dict[str, ParameterValue]
@@ -49,6 +63,18 @@ class NamedEffect(Frozen):
     statement: str
     #: Publication that the effect's law is taken from.
     reference: str | None = None
+    #: What stands in the improved model beside the nearest law, in words, where a family is named.
+    corrections: tuple[str, ...] = ()
+
+    @property
+    def alternatives(self) -> tuple[str, ...]:
+        """What else may be meant: of a family its members, and the rivals."""
+        return (*(member.name for member in self.members), *(rival.name for rival in self.rivals))
+
+    @property
+    def nearest_law(self) -> str:
+        """The effect whose parameters these are."""
+        return self.members[0].name if self.members else self.name
 
 
 class Unexplained(Frozen):

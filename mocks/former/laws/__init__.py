@@ -34,6 +34,7 @@ from mocks.former.laws.illumination import (
     ScreenPixelStructureLaw,
     SourceBandwidthLaw,
     SourceDriftLaw,
+    SourceInstabilityLaw,
     StereoGainLaw,
     StrayLightLaw,
     WavelengthOffsetLaw,
@@ -130,6 +131,8 @@ LISTED: tuple[type[Law], ...] = (
     ScreenGammaLaw,
     LateralColourLaw,
     AmbientLightLaw,
+    DoubleImageLaw,
+    SourceInstabilityLaw,
 )
 
 #: Listed laws that only an earlier calibration or a second camera can show: a challenge of single cameras has neither.
@@ -157,7 +160,6 @@ OUTSIDE: tuple[type[Law], ...] = (
     DigitalGainLaw,
     LossyCodesLaw,
     LeakyShutterLaw,
-    DoubleImageLaw,
     MotionLaw,
     TrefoilLaw,
     HaloLaw,

@@ -51,6 +51,7 @@ class InterPixelCapacitanceLaw(Law):
     """Neighbours are coupled after the charge was collected, so that noise is shared, too (related to crosstalk)."""
 
     name, unit, nominal, limits = "inter_pixel_capacitance", "%", 0.8, (0.02, 6.0)
+    families = frozenset({"charge_between_neighbours"})
     accepts = frozenset({"crosstalk", "inter_pixel_capacitance"})
 
     def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
@@ -59,14 +60,19 @@ class InterPixelCapacitanceLaw(Law):
 
 
 class BrighterFatterLaw(Law):
-    """Charge repels charge. Variants: the variance falls with the signal; neighbours receive what is repelled (Antilogus 2014)."""
+    """Charge repels charge. Variants: the variance falls with the signal; neighbours receive what is repelled (Antilogus 2014); every
+    border between two pixels moves in proportion to the difference of their charges, so that means of unequal neighbours move, too."""
 
     name = effect = "brighter_fatter"
-    variants, unit, nominal, limits = 2, "%", 4.0, (0.1, 20.0)
+    variants, unit, nominal, limits = 3, "%", 4.0, (0.1, 20.0)
 
     def drawn_e(self, electrons: Array, mean_e: Array) -> Array:
         x = np.clip(mean_e / self.camera.full_well_e, 0, 1)
         away = electrons - mean_e
+        if self.variant == 2:  # a pair exchanges a / 2 (e^2 - f^2): alone it would cost 8 a of the variance
+            square = np.square(electrons)
+            four = convolve(square, np.array([[0, 1, 0], [1, -4, 1], [0, 1, 0]]), mode="mirror")
+            return electrons + self.strength / 100.0 / (16.0 * self.camera.full_well_e) * four
         if self.variant == 0:
             return mean_e + away * np.sqrt(1 - self.strength / 100.0 * x)
         around = convolve(away, np.array([[0, 0.25, 0], [0.25, 0, 0.25], [0, 0.25, 0]]), mode="mirror")
@@ -94,6 +100,7 @@ class TapGainLaw(Law):
     """The right half of the sensor is read by another amplifier, with another gain."""
 
     name, unit, nominal, limits = "tap_gain", "%", 1.0, (0.02, 8.0)
+    families = frozenset({"response_to_light", "field_of_light"})
 
     def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
         out = electrons.copy()
@@ -105,6 +112,7 @@ class TreeRingsLaw(Law):
     """Rings of doping in the wafer: the response oscillates with the distance from a centre outside the frame."""
 
     name, unit, nominal, limits = "tree_rings", "%", 1.0, (0.02, 10.0)
+    families = frozenset({"field_of_light"})
 
     def relative_response(self, x: Array, y: Array) -> Array:
         return 1 + self.strength / 100 * np.cos(
@@ -116,6 +124,7 @@ class ResponseTailLaw(Law):
     """2 % of the pixels have a lower response, lognormal: dust on the sensor."""
 
     name, unit, nominal, limits = "response_tail", "%", 2.0, (0.05, 20.0)
+    families = frozenset({"defective_pixels"})
 
     def relative_response(self, x: Array, y: Array) -> Array:
         return 1 - np.where(
@@ -140,6 +149,7 @@ class LeakyShutterLaw(Law):
     """Light is still collected while rows wait for read-out, longer the later the row (related to the exposure offset)."""
 
     name, unit, nominal, limits = "leaky_shutter", "us", 60.0, (0.5, 5000.0)
+    families = frozenset({"field_of_light", "response_to_light"})
 
     def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
         return electrons + rate_e_per_s * self.strength * 1e-6 * (np.arange(len(electrons)) / len(electrons))[:, None]
@@ -149,6 +159,7 @@ class SmearLaw(Law):
     """Charge is shifted through the light: each column receives a share of its own mean."""
 
     name, unit, nominal, limits = "smear", "%", 0.5, (0.01, 5.0)
+    families = frozenset({"charge_between_neighbours", "copies_and_veils"})
     shown_by = frozenset({"chart", "checkerboard"})
 
     def collected_e(self, electrons: Array, rate_e_per_s: Array) -> Array:
@@ -204,16 +215,18 @@ class AmplifierGlowLaw(Law):
 
 
 class HotPixelsLaw(Law):
-    """A few pixels of high dark current. Variants: all equal; lognormal."""
+    """A few pixels of high dark current. Variants: all equal; lognormal; exponential."""
 
     name = effect = "hot_pixels"
-    variants, unit, nominal, limits, shown_by = 2, "e/s", 150.0, (5.0, 3000.0), DARK
+    variants, unit, nominal, limits, shown_by = 3, "e/s", 150.0, (5.0, 3000.0), DARK
 
     def dark_rate(self, rate_e_per_s: Array, temperature_c: float) -> Array:
         rng = self.rng(1)
         hot = rng.random((self.camera.rows, self.camera.cols)) < 5e-4
         hot[self.camera.rows // 3, self.camera.cols // 3] = True  # one at least
-        size = 1.0 if self.variant == 0 else rng.lognormal(-0.3, 0.8, hot.shape)
+        size: Array = 1.0
+        if self.variant:
+            size = rng.lognormal(-0.3, 0.8, hot.shape) if self.variant == 1 else rng.exponential(1.0, hot.shape)
         return rate_e_per_s + np.where(hot, self.strength * size, 0.0)
 
 
@@ -221,6 +234,7 @@ class LightLeakLaw(Law):
     """Light passes the lens cap, most of it about one position inside the frame (related to amplifier glow)."""
 
     name, unit, nominal, limits, shown_by = "light_leak", "e/s", 5.0, (0.05, 400.0), DARK
+    families = frozenset({"dark_signal"})
 
     def dark_rate(self, rate_e_per_s: Array, temperature_c: float) -> Array:
         x, y = self.camera.field_position

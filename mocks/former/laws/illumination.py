@@ -22,10 +22,26 @@ class SourceDriftLaw(Law):
         return {"drift_percent_per_min": self.signed_strength} if self.variant == 0 else {}
 
 
+class SourceInstabilityLaw(Law):
+    """The source is unsteady at random. Variants: anew in each frame; correlated from frame to frame."""
+
+    name = effect = "source_instability"
+    variants, unit, nominal, limits, power = 2, "%", 0.6, (0.01, 8.0), 2.0
+
+    def source_factor(self, elapsed_s: float) -> float:
+        turns = [self.rng(13, round(elapsed_s) + 20 * lag).standard_normal() for lag in range(6 if self.variant else 1)]
+        weight = 0.6 ** np.arange(len(turns))
+        return float(1 + self.strength / 100 * (weight @ turns) / np.sqrt(weight @ weight))
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"instability_percent": self.strength} if self.variant == 0 else {}
+
+
 class LampJumpLaw(Law):
     """The lamp's arc jumps once (related to source drift)."""
 
     name, unit, nominal, limits, signed = "lamp_jump", "%", 1.0, (0.01, 10.0), True
+    families = frozenset({"source_in_time"})
 
     def source_factor(self, elapsed_s: float) -> float:
         return 1 + self.signed_strength / 100 * float(elapsed_s > 60.0 * (5.0 + 12.0 * self.uniform[0]))
@@ -49,6 +65,7 @@ class PulsedLightLaw(Law):
     """A source dimmed by 2 kHz pulses under a rolling shutter (related to flicker)."""
 
     name, unit, nominal, limits = "pulsed_light", "%", 60.0, (5.0, 95.0)
+    families = frozenset({"source_in_time"})
 
     def row_factors(self, count: int, exposure_s: float, k: int) -> Array:
         on, period = 1 - self.strength / 100, 5e-4
@@ -176,6 +193,7 @@ class PolarisedLightLaw(Law):
     """Beyond a grating anomaly the light is polarised and the camera's response changes: a step over wavelength."""
 
     name, unit, nominal, limits, shown_by = "polarised_light", "%", 3.0, (0.05, 20.0), SPECTRAL
+    families = frozenset({"source_in_wavelength", "spectral_filter"})
 
     def radiance(self, radiance: Array, kind: str) -> Array:
         at = 500.0 + 100.0 * self.uniform[0]

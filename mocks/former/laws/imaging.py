@@ -90,6 +90,7 @@ class TrefoilLaw(Law):
     """Wavefront W (x^3 - 3 x y^2)."""
 
     name, unit, nominal, limits, power, shown_by = "trefoil", "um", 0.2, (0.02, 1.5), 2.0, OPTICAL
+    families = frozenset({"directional_contrast_loss"})
 
     def path_error_um(self, x: Array, y: Array, wavelength_nm: float) -> Array:
         return self.strength * (x**3 - 3 * x * y * y)
@@ -194,6 +195,7 @@ class MotionLaw(Law):
     """Uniform motion along a random direction during the exposure (related to vibration)."""
 
     name, unit, nominal, limits, power, shown_by = "motion", "um", 2.0, (0.1, 8.0), 2.0, OPTICAL
+    families = frozenset({"directional_contrast_loss"})
     accepts = frozenset({"vibration_blur"})
 
     def transfer(self, fx: Array, fy: Array) -> Array:
@@ -202,19 +204,26 @@ class MotionLaw(Law):
 
 
 class DoubleImageLaw(Law):
-    """A second image 2.5 px aside, by reflection between the faces of a plate."""
+    """A second image, by reflection between the faces of a plate. Variants: 2.5 px aside; aside and up by 4 to 20 px, as by a thick or
+    tilted plate."""
 
-    name, unit, nominal, limits, shown_by = "double_image", "%", 3.0, (0.1, 25.0), OPTICAL
+    name = effect = "double_image"
+    variants, unit, nominal, limits, shown_by = 2, "%", 3.0, (0.1, 25.0), OPTICAL
 
     def transfer(self, fx: Array, fy: Array) -> Array:
         r = self.strength / 100
-        return (1 - r) + r * np.exp(2j * np.pi * fx * 2.5 * self.camera.pitch_um)
+        dx, dy = (2.5, 0.0) if self.variant == 0 else (4.0 + 16.0 * self.uniform[0], -4.0 - 16.0 * self.uniform[1])
+        return (1 - r) + r * np.exp(2j * np.pi * (fx * dx + fy * dy) * self.camera.pitch_um)
+
+    def library_parameters(self) -> dict[str, float]:
+        return {"share_percent": self.strength}
 
 
 class HaloLaw(Law):
     """Light scattered in the cover glass: an exponential halo of some pixels (related to charge diffusion and to veiling glare)."""
 
     name, unit, nominal, limits, shown_by = "halo", "%", 3.0, (0.05, 30.0), OPTICAL
+    families = frozenset({"copies_and_veils", "isotropic_contrast_loss"})
 
     def spectral_transfer(self, frequency_cy_um: Array, wavelength_um: float) -> Array:
         r = (2.0 + 4.0 * self.uniform[0]) * self.camera.pitch_um

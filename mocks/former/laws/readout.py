@@ -33,6 +33,7 @@ class CompandingKneeLaw(Law):
     """The response has a knee, a smaller slope above it (related to nonlinearity)."""
 
     name, unit, nominal, limits = "companding_knee", "%", 3.0, (0.05, 20.0)
+    families = frozenset({"response_to_light"})
 
     def response(self, electrons: Array) -> Array:
         knee = (0.3 + 0.3 * self.uniform[0]) * self.camera.full_well_e
@@ -40,12 +41,17 @@ class CompandingKneeLaw(Law):
 
 
 class AdcNonlinearityLaw(Law):
-    """Bit weights of the converter are wrong. Variants: the highest bit; the two highest."""
+    """The converter's steps are unequal. Variants: the weight of the highest bit; of the two highest; a sine over 512 codes (integral
+    nonlinearity of a folding converter); a saw tooth of 1024 codes (the second stage of a pipeline has another gain)."""
 
     name = effect = "adc_nonlinearity"
-    variants, unit, nominal, limits, signed = 2, "DN", 3.0, (0.05, 20.0), True
+    variants, unit, nominal, limits, signed = 4, "DN", 3.0, (0.05, 20.0), True
 
     def adc_output(self, dn: Array) -> Array:
+        if self.variant == 2:
+            return dn + self.signed_strength * np.sin(2 * np.pi * (dn / 512.0 + self.uniform[0]))
+        if self.variant == 3:
+            return dn + self.signed_strength * (dn % 1024.0 / 1024.0 - 0.5)
         out = dn + self.signed_strength * (dn >= 2048)
         return out + (0.5 * self.signed_strength * ((dn % 2048) >= 1024) if self.variant == 1 else 0.0)
 
@@ -54,6 +60,7 @@ class DigitalGainLaw(Law):
     """Codes are multiplied after the converter: some occur twice as often or never (related to ADC nonlinearity)."""
 
     name, unit, nominal, limits = "digital_gain", "%", 10.0, (1.0, 60.0)
+    families = frozenset({"converter"})
 
     def processed_dn(self, dn: Array) -> Array:
         black = self.camera.black_level_dn
@@ -64,6 +71,7 @@ class LossyCodesLaw(Law):
     """Codes are quantised in equal steps of their square root, as by lossy compression."""
 
     name, unit, nominal, limits = "lossy_codes", "1", 0.05, (0.003, 0.5)
+    families = frozenset({"converter"})
 
     def processed_dn(self, dn: Array) -> Array:
         return np.square(np.round(np.sqrt(np.clip(dn, 0, None)) / self.strength) * self.strength)
@@ -100,6 +108,7 @@ class TapOffsetLaw(Law):
     """The right half of the sensor is read by another amplifier, with another black level."""
 
     name, unit, nominal, limits, shown_by = "tap_offset", "e", 1.0, (0.02, 30.0), DARK
+    families = frozenset({"dark_signal", "line_noise"})
 
     def noise_e(self, shape: tuple[int, int], k: int) -> Array:
         return np.where(np.arange(shape[1]) < shape[1] // 2, 0.0, self.strength)[None, :] * np.ones((shape[0], 1))
@@ -126,6 +135,7 @@ class PeriodicBandingLaw(Law):
     """A sinusoidal offset over the rows, of fixed period and random phase in each frame (related to row noise)."""
 
     name, unit, nominal, limits, power, shown_by = "periodic_banding", "e", 3.0, (0.1, 40.0), 2.0, DARK
+    families = frozenset({"line_noise"})
 
     def noise_e(self, shape: tuple[int, int], k: int) -> Array:
         phase = self.rng(7, k).random()
@@ -138,6 +148,7 @@ class PinkNoiseLaw(Law):
     """1/f noise along the read-out (related to row noise)."""
 
     name, unit, nominal, limits, power, shown_by = "pink_noise", "e", 3.0, (0.2, 40.0), 2.0, DARK
+    families = frozenset({"line_noise"})
     accepts = frozenset({"row_noise"})
 
     def noise_e(self, shape: tuple[int, int], k: int) -> Array:
@@ -162,15 +173,18 @@ class ColumnNoiseLaw(Law):
 
 
 class RandomTelegraphNoiseLaw(Law):
-    """Some pixels switch between two levels. Variants: equal amplitudes; exponentially distributed ones."""
+    """Some pixels switch between two levels. Variants: equal amplitudes; exponentially distributed ones; equal ones, high in a quarter of
+    the frames."""
 
     name = effect = "random_telegraph_noise"
-    variants, unit, nominal, limits, power, shown_by = 2, "e", 15.0, (1.0, 200.0), 2.0, DARK
+    variants, unit, nominal, limits, power, shown_by = 3, "e", 15.0, (1.0, 200.0), 2.0, DARK
 
     def noise_e(self, shape: tuple[int, int], k: int) -> Array:
         still = self.rng(4)
         odd = still.random(shape) < 0.004
-        size = self.strength * (np.ones(shape) if self.variant == 0 else still.exponential(0.7, shape))
+        size = self.strength * (still.exponential(0.7, shape) if self.variant == 1 else np.ones(shape))
+        if self.variant == 2:
+            return np.where(odd, size * ((self.rng(5, k).random(shape) < 0.25) - 0.25), 0.0)
         return np.where(odd, size * (self.rng(5, k).integers(0, 2, shape) - 0.5), 0.0)
 
 
@@ -205,6 +219,7 @@ class DefectInterpolationLaw(Law):
     """Some pixels are replaced by the mean of two neighbours of their row: less noise there, broken edges."""
 
     name, unit, nominal, limits = "defect_interpolation", "%", 5.0, (0.1, 60.0)
+    families = frozenset({"on_chip_processing"})
 
     def processed_dn(self, dn: Array) -> Array:
         odd = self.rng(11).random(dn.shape) < self.strength / 100
@@ -217,6 +232,7 @@ class JitteredRowsLaw(Law):
     """Every other row is displaced by a part of a pixel, by a fault of the sensor's timing."""
 
     name, unit, nominal, limits, power, needs, shown_by = "jittered_rows", "px", 0.3, (0.05, 1.0), 2.0, "mono", OPTICAL
+    families = frozenset({"directional_contrast_loss"})
 
     def image(self, image: Array) -> Array:
         out = image.copy()

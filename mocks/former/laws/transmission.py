@@ -34,6 +34,7 @@ class CoverGlassFringeLaw(Law):
     """Interference in a plate: T = 1 + m cos(2 pi (2 n t) / wavelength), slow enough for steps of 1 nm."""
 
     name, unit, nominal, limits, shown_by = "cover_glass_fringe", "%", 2.0, (0.05, 20.0), SPECTRAL
+    families = frozenset({"spectral_filter"})
 
     def transmittance(self, channel: str) -> Array:
         return 1 + self.strength / 100 * np.cos(2 * np.pi * (14000.0 + 8000.0 * self.uniform[0]) / WAVELENGTH_NM)
@@ -43,6 +44,7 @@ class AbsorptionBandLaw(Law):
     """A dye or a rare earth in the glass absorbs a Gaussian band (related to the infrared cut filter)."""
 
     name, unit, nominal, limits, shown_by = "absorption_band", "%", 10.0, (0.2, 70.0), SPECTRAL
+    families = frozenset({"spectral_filter"})
 
     def transmittance(self, channel: str) -> Array:
         return 1 - self.strength / 100 * np.exp(
@@ -54,6 +56,7 @@ class RedLeakLaw(Law):
     """One colour filter transmits long wavelengths again."""
 
     name, unit, nominal, limits, shown_by = "red_leak", "%", 8.0, (0.1, 60.0), SPECTRAL
+    families = frozenset({"spectral_filter"})
 
     def transmittance(self, channel: str) -> Array:
         if channel not in {"B", "Y"}:
@@ -95,6 +98,7 @@ class DustShadowLaw(Law):
     """A dust particle far in front of the sensor: a soft round shadow off the centre (related to vignetting)."""
 
     name, unit, nominal, limits = "dust_shadow", "%", 2.0, (0.05, 25.0)
+    families = frozenset({"field_of_light"})
 
     def relative_response(self, x: Array, y: Array) -> Array:
         r = np.hypot(x - 0.8 * (self.uniform[0] - 0.5), y - 0.6 * (self.uniform[1] - 0.5))

@@ -10,7 +10,10 @@ from lab.challenge.proof import confusion, table, write_page
 from lab.challenge.run import CaseRun
 from lab.challenge.score import ChallengeScore, Rate, score
 from lab.challenge.truth import CaseTruth, Concealed, Kind, Seals, Truths, salted, seal
-from lab.formats.results import DiagnosisResult, HeldOut, NamedEffect, ParameterValue, Rival
+from lab.formats.results import DiagnosisResult, HeldOut, Member, NamedEffect, ParameterValue, Rival
+from mocks.former import OUTSIDE
+from sim.effects.families import Family
+from sim.effects.library import effects as library
 
 
 def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, accepts: tuple[str, ...] = ()) -> CaseTruth:
@@ -31,7 +34,7 @@ def named(
     """Names with probabilities that fall from the first on; the first has the rivals."""
     effects = tuple(
         NamedEffect(
-            name=name, probability=0.99 - 0.1 * i, sides=("left",), statement="",
+            name=name, family=library()[name].family.value, law="exact", probability=0.99 - 0.1 * i, sides=("left",), statement="",
             parameters={"size_um": ParameterValue(value=value, std=0.1, unit="um")},
             rivals=tuple(Rival(name=r, probability=0.1) for r in rivals) if i == 0 else (),
         )
@@ -82,6 +85,38 @@ def counts(rate: Rate) -> tuple[int, int]:
     return rate.count, rate.of
 
 
+def test_a_family_is_no_effect_and_may_be_right() -> None:
+    """Two members told, neither singled out: the family is right, the effect isn't named, and the rival set holds both."""
+    told = (
+        named("defocus")
+        .effects[0]
+        .model_copy(
+            update={
+                "name": "isotropic_contrast_loss",
+                "members": (Member(name="defocus", probability=0.6), Member(name="charge_diffusion", probability=0.4)),
+            }
+        )
+    )
+    kept = {"case-0001": salted(truth("single", ("charge_diffusion", 80.0)))}
+    run = CaseRun(
+        case="case-0001",
+        wall_s=1.0,
+        cpu_s=1.0,
+        memory_mib=1.0,
+        diagnosis=named().model_copy(update={"effects": (told,)}),
+    )
+    seals = Seals(seals={n: seal(s) for n, s in kept.items()})
+    found = score(Truths(purpose="tuning", seed=3, size="small", cases=1, truths=kept), seals, {"case-0001": run})
+    one = found.case_scores[0]
+    assert (one.right, one.right_family, one.wrong_family) == (False, True, False)
+    assert counts(found.rival_sets_cover) == (1, 1)
+
+
+def test_outside_laws_are_of_families_that_there_are() -> None:
+    known = {family.value for family in Family}
+    assert all(law.families <= known for law in OUTSIDE)
+
+
 def test_every_figure_is_what_a_hand_counts() -> None:
     found = scored()
     assert [counts(s.top_1) for s in found.singles] == [(1, 3), (1, 1), (1, 1)]
@@ -97,6 +132,10 @@ def test_every_figure_is_what_a_hand_counts() -> None:
     assert counts(found.false_names) == (1, 4)
     assert counts(found.outside_not_named) == (3, 4)
     assert counts(found.outside_located) == (3, 3)
+    # above 25 and of a family: three singles right of four, one compound of two, motion and halo of the three outside
+    assert counts(found.families.right_families) == (5, 9)
+    assert counts(found.families.right_effects) == (3, 6)
+    assert counts(found.families.wrong_families) == (3, 16)  # healthy, crosstalk, and vignetting beside defocus
     # 2.0, 2.19 and 2.21 of the singles, 2.0 twice of the first compound, 2.0 of the second's one; the interval is 2 +- 0.196
     assert counts(found.parameters_covered) == (5, 6)
     assert found.excess_removed == pytest.approx((0.9 + 0.5) / 2)

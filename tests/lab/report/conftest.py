@@ -285,13 +285,13 @@ def _made_up(seed: int = 3, verdict: str = "explained", sides: tuple[Side, ...] 
         ),
         effects=(
             NamedEffect(
-                name="optical_low_pass_filter", probability=0.994, sides=("left",), rivals=(Rival(name="defocus", probability=0.006),),
+                name="optical_low_pass_filter", family="isotropic_contrast_loss", law="exact", probability=0.994, sides=("left",), rivals=(Rival(name="defocus", probability=0.006),),
                 parameters={"displacement_x_um": ParameterValue(value=2.104, std=0.051, unit="um"), "displacement_y_um": ParameterValue(value=2.08, std=0.05, unit="um")},
                 statement="A birefringent plate before the sensor splits each ray in two; contrast falls as the cosine of the displacement.",
                 reference="Greivenkamp, Appl. Opt. 29, 676 (1990)",
             ),
             NamedEffect(
-                name="infrared_cut_filter", probability=0.999, sides=("left",),
+                name="infrared_cut_filter", family="spectral_filter", law="exact", probability=0.999, sides=("left",),
                 parameters={"cut_nm": ParameterValue(value=655.2, std=0.8, unit="nm")}, statement="A filter cuts off the long waves.",
             ),
         ),

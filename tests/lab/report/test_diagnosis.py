@@ -34,7 +34,15 @@ def test_the_map_has_every_measurement_and_its_worst_place() -> None:
 
 
 def test_a_second_map_shows_what_named_effects_leave() -> None:
-    named = NamedEffect(name="defocus", probability=1.0, sides=("left",), parameters={}, statement="")
+    named = NamedEffect(
+        name="defocus",
+        family="isotropic_contrast_loss",
+        law="exact",
+        probability=1.0,
+        sides=("left",),
+        parameters={},
+        statement="",
+    )
     maps = place_maps(RESULT.model_copy(update={"effects": (named,)}), ("left",))
     assert [title for title, _ in maps] == ["left, baseline", "left, improved model"]
     assert maps[1][1]["layout"]["annotations"] == []

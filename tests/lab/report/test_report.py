@@ -165,7 +165,7 @@ def test_mismatch_without_a_name(small_set: Callable[..., RecordingSet], made_up
         update={"verdict": "unexplained", "effects": (), "unexplained": (nameless, nameless), "policy": (rule,)}
     )
     page = Page(render_report(recordings, fit, validation, changed, provenance_of(recordings)))
-    assert "no effect in the library accounts for" in page.text
+    assert "no family of effects accounts for" in page.text
     assert "a slow fall" in page.text
     assert page.text.count(nameless.check) == 1  # whatever the number of measurements that say so
     assert page.text.index(nameless.check) < page.text.index("a slow fall")

@@ -86,6 +86,7 @@ def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
     moved = displaced_um(CAMERA, place, 0.5 * place, 620.0, acting)
     rest = [one.source(600.0), one.collected_s(0.02), one.ambient_e("G", 1.0) / 1e3, one.offset_dn(600.0, 30.0),
             float(one.shot_e2(np.array(9e3))), even_share(CAMERA, acting), sum(h[0] for h in halos(CAMERA, acting)),
+            1e3 * one.unsteadiness**2,
             *one.illuminated(np.ones(5), place, place), *np.ravel(np.zeros(10) if moved is None else moved)]  # fmt: skip
     # what acts on dark pixels, on the frame after, and on the read-out, in electrons or DN
     dark = Exposure(Darkness(), 0.5, temperature_c=32.0)
@@ -181,6 +182,14 @@ def test_charge_that_moves_is_conserved() -> None:
     after = collected_mosaic(CAMERA, frame, (one,), exposure_s=1.0, elapsed_s=0.0)
     assert after.sum() == pytest.approx(100.0, rel=1e-12)
     assert after[8, 9] == pytest.approx(3.0)
+
+
+def test_a_double_image_lies_where_its_phase_turns() -> None:
+    """H = 1 - q + q exp(-2 pi i f . d): half a turn at f = 1 / (2 d) leaves 1 - 2 q, a whole one all."""
+    one = effect("double_image")(share_percent=10.0, displacement_x_px=5.0, displacement_y_px=-4.0)
+    fx = np.array([0.0, 0.1, 0.2, 0.0]) / CAMERA.pixel_pitch_um
+    fy = np.array([0.0, 0.0, 0.0, 0.0625]) / CAMERA.pixel_pitch_um
+    np.testing.assert_allclose(_transfer(one, fx, fy, 550.0), [1.0, 0.8, 1.0, 0.9 + 0.1j], atol=1e-12)
 
 
 def test_low_pass_filter_has_its_null_at_half_the_inverse_displacement() -> None:

@@ -14,11 +14,13 @@ from sim.effects.radiometer_nonlinearity import RIGHT_AT, RadiometerNonlinearity
 from sim.effects.screen_gamma import ScreenGamma
 from sim.effects.second_order_light import SecondOrderLight
 from sim.effects.source_drift import SourceDrift
+from sim.effects.source_instability import SourceInstability
 from sim.effects.vignetting import Vignetting
 from sim.effects.vignetting_decentre import VignettingDecentre
 from sim.frame import screen_light
 from sim.point import optical_transfer
 from sim.spectrum import Spectrum
+from sim.stages import light_of
 from sim.uniform import Uniform
 
 WAVELENGTH = np.arange(380.0, 961.0)
@@ -67,6 +69,17 @@ def test_a_warm_up_starts_as_a_drift_and_settles() -> None:
     )
     assert Uniform(CAMERA, (steady,)).source(600.0) == pytest.approx(1.03, rel=1e-4)
     assert Uniform(CAMERA, (settling,)).source(36000.0) == pytest.approx(1 + 0.003 * 8.0)
+
+
+def test_an_unsteady_source_scatters_and_keeps_its_mean() -> None:
+    """Of 4000 frames the mean is known to s / sqrt(4000), the standard deviation to s / sqrt(8000); the same frame is the same again."""
+    one = light_of(CAMERA, (SourceInstability(instability_percent=2.0),))
+    drawn = np.array([one.unsteady(20.0 * k) for k in range(4000)])
+    assert drawn.mean() == pytest.approx(1.0, abs=3.5 * 0.02 / np.sqrt(4000))
+    assert drawn.std() == pytest.approx(0.02, abs=3.5 * 0.02 / np.sqrt(8000))
+    assert one.unsteady(40.0) == drawn[2]
+    assert one.source(40.0) == 1.0
+    assert Uniform(CAMERA, (SourceInstability(instability_percent=2.0),)).unsteadiness == pytest.approx(0.02)
 
 
 def test_second_order_brings_half_the_wavelength_with_its_share_of_the_power() -> None:

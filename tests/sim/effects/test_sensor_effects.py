@@ -7,9 +7,11 @@ import pytest
 
 from sim.camera import CameraModel, Lens
 from sim.effects.adc_nonlinearity import AdcNonlinearity
+from sim.effects.adc_ripple import AdcRipple
 from sim.effects.amplifier_glow import AmplifierGlow
 from sim.effects.base import Effect
 from sim.effects.blooming import Blooming
+from sim.effects.brighter_fatter import BrighterFatter
 from sim.effects.column_noise import ColumnNoise
 from sim.effects.dark_current_temperature import DarkCurrentTemperature
 from sim.effects.green_imbalance import GreenImbalance
@@ -32,7 +34,7 @@ from sim.frame import (
 from sim.scene.scenes import Darkness, UniformField
 from sim.sensor.mosaic import planes
 from sim.spectrum import FloatArray, Spectrum
-from sim.stages import charge_of, signal_of
+from sim.stages import charge_of, codes_of, signal_of
 from sim.uniform import Uniform
 
 LIGHT = Spectrum.of([500.0, 600.0], [2e-3, 2e-3])
@@ -188,6 +190,24 @@ def test_telegraph_pixels_have_two_levels() -> None:
     assert np.all(variance[blinking] == 400.0)
     # each half of the time: the mean of 400 x 154 signs
     assert drawn[:, blinking].mean() == pytest.approx(0.0, abs=4.5 * 20.0 / np.sqrt(400 * blinking.sum()))
+
+
+def test_full_pixels_lose_to_empty_ones_and_none_is_lost() -> None:
+    """c of a full pixel whose four next ones are empty, a quarter of it to each; equal pixels exchange nothing."""
+    frame = np.zeros((9, 9))
+    frame[4, 4] = CAMERA.full_well_e
+    state = charge_of(CAMERA, (BrighterFatter(exchanged_percent=2.0),))
+    after = state.moved(frame)
+    assert after[4, 4] == pytest.approx(0.98 * CAMERA.full_well_e)
+    assert after[4, 5] == pytest.approx(0.005 * CAMERA.full_well_e)
+    assert after.sum() == pytest.approx(CAMERA.full_well_e)
+    np.testing.assert_array_equal(state.moved(np.full((5, 5), 4e3)), np.full((5, 5), 4e3))
+
+
+def test_a_ripple_lifts_and_lowers_codes_in_turn() -> None:
+    law = codes_of(CAMERA, (AdcRipple(sine_dn=3.0, cosine_dn=4.0, period_dn=512.0),))
+    dn = np.array([0.0, 128.0, 256.0, 512.0])
+    np.testing.assert_allclose(law.converted(dn) - dn, [4.0, 3.0, -4.0, 4.0], atol=1e-12)
 
 
 def test_the_converters_bits_jump_where_they_stand() -> None:

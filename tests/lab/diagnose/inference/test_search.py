@@ -20,6 +20,7 @@ from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
 from sim.camera import CameraModel, Lens
 from sim.effects.base import Effect
+from sim.effects.families import Family
 from sim.effects.library import candidates, effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray, Spectrum
@@ -36,6 +37,7 @@ THRESHOLD = 12.0
 class _Curve(Effect):
     """Adds `size` times a shape to the line that is measured; it borrows the law for offsets."""
 
+    family: ClassVar[Family] = Family.DARK_SIGNAL
     reference: ClassVar[str] = "made up"
     sentence: ClassVar[str] = "Made up."
     form_tolerance: ClassVar[float] = 0.01

@@ -19,6 +19,7 @@ from lab.diagnose.policy import DecisionPolicy
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
 from mocks.former.laws import AdcNonlinearityLaw, DigitalGainLaw, LossyCodesLaw
+from sim.effects.adc_ripple import AdcRipple
 from sim.effects.library import effect
 from sim.uniform import Uniform
 
@@ -68,12 +69,32 @@ def test_wrong_bits_are_named(variant: int) -> None:
 
 
 @pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)
-def test_other_combs_are_located_and_not_named(law: Law) -> None:
+def test_other_combs_are_located_and_at_most_their_family_is_named(law: Law) -> None:
     study = _study(772021, (law,))
     model = MeasurementModel((code_block(study),), study.camera)
     verdict = decide(model, np.random.default_rng(0), DecisionPolicy())
     assert verdict.before[0].block.measurement.name == "code_density"
-    assert not verdict.named
+    assert {c.told_name for c in verdict.named} <= {"converter"}
+
+
+@pytest.mark.parametrize("variant", [2, 3])
+def test_a_ripple_is_named_and_a_saw_tooth_is_the_converter(variant: int) -> None:
+    """2.5 DN sin(2 pi code / 512 + phase): amplitude and period within three standard deviations. A saw tooth over 1024 codes is off by
+    its converter's gain where a boundary stands: its bits' weights are the nearest law, or hold."""
+    law = AdcNonlinearityLaw(2.5 if variant == 2 else 5.0, variant, 3)
+    study = _study(772302, (law,))
+    blocks = (linearity_block(study), variance_block(study), code_block(study))
+    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    assert [type(c.effect).family.value for c in verdict.named] == ["converter"]
+    if variant == 3:
+        assert verdict.named[0].effect.name == "adc_nonlinearity"
+        return
+    found, std = verdict.named[0].effect, verdict.named[0].std
+    assert isinstance(found, AdcRipple)
+    assert verdict.named[0].told_name == "adc_ripple"
+    amplitude = np.hypot(found.sine_dn, found.cosine_dn)
+    assert abs(amplitude - 2.5) < 3.0 * np.hypot(std["sine_dn"] or 0.0, std["cosine_dn"] or 0.0)
+    assert abs(found.period_dn - 512.0) < 3.0 * (std["period_dn"] or 0.0)
 
 
 def test_codes_are_averaged_over_noise_in_a_mean() -> None:

@@ -162,6 +162,16 @@ def test_what_another_former_conceals_is_named(law: Law, name: str) -> None:
     assert [c.effect.name for c in _verdict(_concealed(770021, (law,), cfa="MONO")).named] == [name]
 
 
+def test_borders_that_move_between_colours_are_measured_by_their_means() -> None:
+    """A loss of 6 % by borders alone is a mean exchange of 6 / 4 %: all three sizes within 3.5 standard uncertainties."""
+    study = _concealed(770041, (BrighterFatterLaw(6.0, 2),), cfa="RGGB")
+    verdict = _verdict(study)
+    assert [c.told_name for c in verdict.named] == ["brighter_fatter"]
+    found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std
+    for name, truth in (("loss_percent", 6.0), ("shared_percent", 6.0), ("exchanged_percent", 1.5)):
+        assert abs(found[name] - truth) < 3.5 * (std[name] or 0.0)
+
+
 def test_few_repeats_hold_whole_levels_out_and_many_their_last_third() -> None:
     few, many = _concealed(770031), _concealed(770031, repeats=6)
     levels = [{c.id for c in g} for g in few.flat_levels()]

@@ -1,0 +1,119 @@
+"""The scatter of repeated levels, beyond pixels' noise and what a steady lamp has: whether the light differs from frame to frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import digamma, polygamma
+
+from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
+from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.repeatability import RepeatedMeans, repeated_levels, steady
+from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
+from sim.spectrum import FloatArray
+from sim.uniform import Uniform
+
+#: Relative standard deviation of a steady lamp's light from frame to frame: data sheets of regulated halogen sources and integrating
+#: spheres state 0.05 %, twice that at most. No finding by itself.
+STEADY_LAMP = 5.0e-4
+#: Degrees of freedom of a number, at least, and how many numbers there are at most: by exposure.
+LEAST_FREEDOM, MOST_NUMBERS = 4, 4
+#: Times at which a light that varies within a frame is looked at, for the variance of whole frames.
+PHASES = 32
+
+
+def level_repeats_block(study: Study) -> Block:
+    """log((S + s0^2) / (noise + s0^2)) of flat settings with repeats, several of neighbouring exposures together.
+
+    S is the mean square of a setting's relative levels about their mean, with n - 1 degrees of freedom; noise what pixels' noise makes of
+    it; s0 a steady lamp's scatter. Settings that are out of line with the others don't count: they are other measurements' finding.
+    """
+    groups = _by_exposure(_seen(study))
+    if not groups:
+        raise NotDetermined(
+            "level_repeats",
+            f"fewer than {LEAST_FREEDOM + 1} repeats of flat settings: how steady the light is can't be told; repeat one setting ten times",
+        )
+    freedom = np.array([sum(len(r.away) - 1 for r in group) for group in groups], float)
+    noise = np.array([_weighted(group, [r.noise for r in group]) for group in groups])
+    square = np.array([sum(float(np.sum(np.square(r.away))) for r in group) for group in groups]) / freedom
+    value = np.log((square + STEADY_LAMP**2) / (noise + STEADY_LAMP**2))
+    # of log chi2_f: mean and variance, as far as chi2 and not the lamp's floor sets it
+    share = noise / (noise + STEADY_LAMP**2)
+    bias = share * (digamma(0.5 * freedom) - np.log(0.5 * freedom))
+    # how unsteady a lamp usually is differs by as much as its usual size, and is common to all settings
+    usual = np.log1p(STEADY_LAMP**2 / (noise + STEADY_LAMP**2))
+    covariance = np.diag(polygamma(1, 0.5 * freedom)) + np.outer(usual, usual)
+    exposure_s = np.array([_weighted(group, [r.captures[0].exposure_s for r in group]) for group in groups])
+
+    def predict(effects: Effects) -> Prediction:
+        model = Uniform(study.camera, effects)
+        more = np.array([model.unsteadiness**2 + _of_rows(model, study, t) for t in exposure_s])
+        return Prediction(np.log((noise + more + STEADY_LAMP**2) / (noise + STEADY_LAMP**2)) + bias, {})
+
+    labels = tuple(
+        Label(float(np.log(t)), "all", f"{t:.4g} s", tuple(c.id for r in group for c in r.captures), held_out=False)
+        for t, group in zip(exposure_s, groups, strict=True)
+    )
+    return Block(
+        measurement=LEVEL_REPEATS, reach=1.0, value=value, covariance=covariance, labels=labels,
+        reads=frozenset({"light.unsteadiness", "light.rows"}), predict=predict, scale=np.ones(len(value)),
+    )  # fmt: skip
+
+
+def _seen(study: Study) -> list[RepeatedMeans]:
+    """Repeats that aren't held out, of settings in line with each other."""
+    noise, out = study.noise, study.once(held_out_flats)
+    found = []
+    for one in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
+        kept = [i for i, c in enumerate(one.captures) if c.id not in out]
+        if len(kept) > 1:
+            captures, elapsed = tuple(one.captures[i] for i in kept), one.elapsed_s[kept]
+            found.append(RepeatedMeans(captures, one.away[kept] - one.away[kept].mean(), elapsed, one.noise))
+    return steady(found)
+
+
+def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:
+    """Settings in the order of their exposure, in groups of `LEAST_FREEDOM` or more degrees of freedom."""
+    ordered = sorted(repeats, key=lambda r: (r.captures[0].exposure_s, r.captures[0].id))
+    whole = sum(len(r.away) - 1 for r in ordered)
+    wanted = max(LEAST_FREEDOM, -(-whole // MOST_NUMBERS))
+    groups: list[list[RepeatedMeans]] = []
+    free = wanted
+    for one in ordered:
+        if free >= wanted:
+            groups.append([])
+            free = 0
+        groups[-1].append(one)
+        free += len(one.away) - 1
+    if groups and free < LEAST_FREEDOM:
+        last = groups.pop()
+        if groups:
+            groups[-1].extend(last)
+    return groups
+
+
+def _weighted(group: list[RepeatedMeans], value: list[float]) -> float:
+    """Mean over settings by their degrees of freedom."""
+    return float(np.average(value, weights=[len(r.away) - 1 for r in group]))
+
+
+def _of_rows(model: Uniform, study: Study, exposure_s: float) -> float:
+    """Variance of whole frames' light that varies within a frame, over frames that begin at any time."""
+    if not model.varies_by_row:
+        return 0.0
+    # steps of the golden ratio of a second meet every phase of any frequency
+    begin_s = np.arange(PHASES) * 0.6180339887498949
+    mean = [float(np.mean(model.row_factors(study.camera.rows, exposure_s, float(t)))) for t in begin_s]
+    level: FloatArray = np.array(mean)
+    return float(np.var(level))
+
+
+LEVEL_REPEATS = Measurement(
+    "level_repeats",
+    title="scatter of repeated levels",
+    order=205,
+    axis="exposure",
+    unit="log s",
+    make=level_repeats_block,
+)

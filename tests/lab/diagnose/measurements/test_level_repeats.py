@@ -1,0 +1,56 @@
+"""How steady the light is from frame to frame: on the second former's cameras, and on scatter that is drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lab.diagnose.inference.decide import decide
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.measurements.level_repeats import level_repeats_block
+from lab.diagnose.policy import DecisionPolicy
+from mocks.former.laws import LightFlickerLaw, SourceInstabilityLaw
+from sim.effects.light_flicker import LightFlicker
+from sim.effects.source_instability import SourceInstability
+from tests.lab.diagnose.on_blocks import former, study
+
+
+@pytest.mark.parametrize("seed", [772511, 772512, 772513, 772514])
+def test_a_steady_source_shows_nothing(seed: int) -> None:
+    block = level_repeats_block(study(former(seed)))
+    left = block.value - block.predict(()).mean
+    assert np.all(np.abs(left) < 3.0 * np.sqrt(np.diag(block.covariance)))
+
+
+def test_an_unsteady_source_is_named_with_its_size() -> None:
+    """1.2 % in each frame; of f degrees of freedom a standard deviation is known to sqrt(1 / (2 f)), 25 % of 8."""
+    here = study(former(772521, SourceInstabilityLaw(1.2, 0, 9)))
+    verdict = decide(
+        MeasurementModel((level_repeats_block(here),), here.camera), np.random.default_rng(0), DecisionPolicy()
+    )
+    assert [c.effect.name for c in verdict.named] == ["source_instability"]
+    found, std = (
+        verdict.named[0].effect.model_dump()["instability_percent"],
+        verdict.named[0].std["instability_percent"],
+    )
+    assert std is not None
+    assert abs(found - 1.2) < 3.0 * std
+    assert found > 0.4
+
+
+def test_flicker_within_frames_moves_whole_frames_too() -> None:
+    """100 Hz over 96 rows of 60 us, 0.58 of a period: whole frames scatter by what the rows' mean leaves of the modulation, and no
+    other light is asked for."""
+    law = LightFlickerLaw(20.0, 0, 4)
+    block = level_repeats_block(study(former(772531, law)))
+    flicker = LightFlicker(modulation_percent=20.0, frequency_hz=100.0, line_time_us=60.0)
+    std = np.sqrt(np.diag(block.covariance))
+    assert np.any(block.value - block.predict(()).mean > 3.0 * std)
+    assert np.all(np.abs(block.value - block.predict((flicker,)).mean) < 3.0 * std)
+
+
+def test_the_law_adds_its_variance() -> None:
+    """log((n + s^2 + s0^2) / (n + s0^2)) grows with s, and is 2 log(s) apart for large s."""
+    block = level_repeats_block(study(former(772541)))
+    one, two = (block.predict((SourceInstability(instability_percent=s),)).mean for s in (5.0, 10.0))
+    np.testing.assert_allclose(two - one, 2.0 * np.log(2.0), rtol=1e-3)

@@ -1,0 +1,77 @@
+"""What is told of a named family: its identifier, its members, the nearest law's parameters, and what tells the members apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lab.diagnose.inference.weigh import Candidate
+from lab.diagnose.outcome.merge_sides import merged
+from lab.diagnose.policy import DecisionPolicy
+from lab.diagnose.side import NamedCandidate, SideFindings
+from lab.formats.results import DiagnosisResult
+from sim.camera import Side
+from sim.effects.hot_pixels import HotPixels
+from sim.effects.random_telegraph_noise import RandomTelegraphNoise
+
+HOT = Candidate(
+    HotPixels(excess_e_per_s=300.0),
+    {"excess_e_per_s": 20.0, "share_ppm": 5.0, "relative_spread": 0.1},
+    0.97,
+    (("unknown", 0.5),),
+    100.0,
+    0.9,
+    is_closed=False,
+    members=(("hot_pixels", 0.9), ("random_telegraph_noise", 0.07)),
+)
+BLINKING = replace(
+    HOT,
+    effect=RandomTelegraphNoise(amplitude_e=20.0),
+    std={"amplitude_e": 1.0, "share_percent": 0.1, "relative_spread": 0.1},
+    members=(("random_telegraph_noise", 0.6), ("hot_pixels", 0.4)),
+    log_odds=50.0,
+)
+
+
+def _told(*sides: tuple[Side, Candidate]) -> DiagnosisResult:
+    found = [
+        SideFindings(
+            side, (), is_judged=True, named=(NamedCandidate(c, ("defective_pixels",), ("a factor on the noise",)),)
+        )
+        for side, c in sides
+    ]
+    return merged("made up", found, DecisionPolicy())
+
+
+def test_an_inexact_family_says_its_nearest_law_and_what_is_left() -> None:
+    result = _told(("left", HOT))
+    one = result.effects[0]
+    assert (one.name, one.family, one.law) == ("defective_pixels", "defective_pixels", "inexact")
+    assert [(m.name, m.probability) for m in one.members] == [("hot_pixels", 0.9), ("random_telegraph_noise", 0.07)]
+    assert one.nearest_law == "hot_pixels"
+    assert one.parameters["excess_e_per_s"].value == 300.0
+    assert one.alternatives == ("hot_pixels", "random_telegraph_noise", "unknown")
+    assert "No listed law of defective pixels fits exactly; the nearest is hot_pixels" in one.statement
+    assert "a factor on the noise" in one.statement
+    assert one.corrections == ("a factor on the noise",)
+    # what the law leaves is the family's, and the camera isn't fully explained
+    assert result.verdict == "partly_explained"
+
+
+def test_a_tie_says_which_capture_tells_its_members_apart() -> None:
+    result = _told(("left", replace(HOT, is_closed=True)))
+    assert result.effects[0].law == "exact"
+    assert "can't tell hot_pixels (90 %) from random_telegraph_noise (7 %)" in result.effects[0].statement
+    assert "dark frames at two exposures" in result.effects[0].statement
+    assert result.verdict == "explained"
+
+
+def test_sides_of_one_family_are_one_entry_with_the_likelier_law() -> None:
+    """Mean probabilities over the sides: hot pixels (0.9 + 0.4) / 2, blinking ones (0.07 + 0.6) / 2."""
+    one = _told(("left", HOT), ("right", BLINKING)).effects
+    assert len(one) == 1
+    assert one[0].sides == ("left", "right")
+    assert [(m.name, round(m.probability, 3)) for m in one[0].members] == [
+        ("hot_pixels", 0.65),
+        ("random_telegraph_noise", 0.335),
+    ]
+    assert "excess_e_per_s" in one[0].parameters
