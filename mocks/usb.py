@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
 from mocks.bench import Bench
@@ -27,6 +27,7 @@ from mocks.cornerstone260b import Cornerstone260B
 from mocks.u3v import TriggerLine, U3vDevice
 from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb_device import Abandoned, UsbDevice, UsbFault
+from mocks.wire import MeasuredLight
 
 SERIAL_NUMBERS = {"left": "CB-U3V-0001", "right": "CB-U3V-0002"}
 
@@ -40,7 +41,7 @@ def stereo_pair(bench: Bench) -> tuple[U3vDevice, U3vDevice]:
     )
 
 
-_INSTRUMENTS: dict[str, Callable[[Bench], Sequence[UsbDevice]]] = {
+_INSTRUMENTS: dict[str, Callable[[Any], Sequence[UsbDevice]]] = {
     "cornerstone260b": lambda bench: (Cornerstone260B(bench),),
     "u3v": lambda bench: stereo_pair(bench)[:1],
     "u3v-stereo": stereo_pair,
@@ -48,8 +49,11 @@ _INSTRUMENTS: dict[str, Callable[[Bench], Sequence[UsbDevice]]] = {
 }
 
 
-def devices(name: str, bench: Bench | None = None) -> tuple[UsbDevice, ...]:
-    """The device models of one instrument, on a bench of its own if none is given. Raises ValueError for an unknown name."""
+def devices(name: str, bench: Bench | MeasuredLight | None = None) -> tuple[UsbDevice, ...]:
+    """The device models of one instrument, on a bench of its own if none is given; cameras need a bench.
+
+    Raises ValueError for an unknown name.
+    """
     if name not in _INSTRUMENTS:
         raise ValueError(f"no USB instrument {name!r}: there are {', '.join(_INSTRUMENTS)}")
     return tuple(_INSTRUMENTS[name](bench if bench is not None else Bench()))

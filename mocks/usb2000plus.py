@@ -115,7 +115,10 @@ class MockUsb2000Plus(UsbDevice):
             return whole[:length]
 
     def _say(self, endpoint: int, data: bytes) -> None:
+        data = self.broken(data)
         with self.changed:
+            if not data:
+                return
             self._queues[endpoint].append(data)
             self.changed.notify_all()
 

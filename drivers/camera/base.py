@@ -19,7 +19,7 @@ Trigger = Literal["software", "line"]
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """What the camera reports of its sensor; None where it doesn't."""
+    """What the camera reports of its sensor; None where it doesn't. `black_level` is in the camera's own unit, mostly codes."""
 
     rows: int
     cols: int
@@ -27,6 +27,7 @@ class SensorInfo:
     cfa: str | None  # "RGGB" ..., "MONO"
     bit_depth: int | None
     pixel_pitch_um: float | None = None
+    black_level: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,13 @@ from drivers.camera.gencp import (
     GenCp,
     read_xml,
 )
+from drivers.camera.genicam_settings import (
+    black_level,
+    give_pulses,
+    set_if_there,
+    switch_processing_off,
+    trigger_line,
+)
 from drivers.camera.pixel_format import PIXEL_FORMATS, PREFERENCE
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer
 from drivers.instrument import Identity, Recorder
@@ -95,7 +102,9 @@ class U3vCamera(Camera):
     """One USB3 Vision camera at `usbip://HOST:PORT/SERIAL` or `usb://SERIAL` (or an already found pyusb `device`).
 
     `pixel_format`: a format's name, or None for the deepest raw format of up to 14 bits that the camera offers (16
-    only if it has no other). `timeout_s`: longest time beyond the exposure until a frame has arrived.
+    only if it has no other). `timeout_s`: longest time beyond the exposure until a frame has arrived. `trigger_line`: the
+    input that is wired to the camera that leads; None: Line0. `output_line`: the output of the camera that leads, on which
+    `output_source` gives the pulses; None: it gives none.
     """
 
     def __init__(
@@ -104,6 +113,9 @@ class U3vCamera(Camera):
         *,
         pixel_format: str | None = None,
         timeout_s: float = 3.0,
+        trigger_line: str | None = None,
+        output_line: str | None = None,
+        output_source: str = "ExposureActive",
         device: usb.core.Device | None = None,
         recorder: Recorder | None = None,
     ) -> None:
@@ -111,6 +123,7 @@ class U3vCamera(Camera):
         self._given = device
         self._wanted_format = pixel_format
         self._timeout_s = timeout_s
+        self._wanted_line, self._output_line, self._output_source = trigger_line, output_line, output_source
         self._recorder = recorder
         self._who = f"camera {address}"
         self._lock = threading.RLock()
@@ -165,17 +178,16 @@ class U3vCamera(Camera):
         self.nodes = NodeMap(read_xml(control, self._who), control)
         self._stop_acquisition()
         self._choose_format()
-        self._set_if_there("AcquisitionMode", "Continuous")
-        self._set_if_there("ExposureMode", "Timed")
-        for automatic in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto"):
-            self._set_if_there(automatic, "Off")
-        self._set_if_there("TriggerSelector", "FrameStart")
+        set_if_there(self.nodes, "AcquisitionMode", "Continuous")
+        set_if_there(self.nodes, "ExposureMode", "Timed")
+        switch_processing_off(self.nodes, self._who)
+        set_if_there(self.nodes, "TriggerSelector", "FrameStart")
         self.nodes.set("TriggerMode", "On")
+        if self._wanted_line is not None:
+            trigger_line(self.nodes, self._who, self._wanted_line)
+        if self._output_line is not None:
+            give_pulses(self.nodes, self._who, self._output_line, self._output_source)
         self._prepare_stream()
-
-    def _set_if_there(self, feature: str, value: str) -> None:
-        if self.nodes.has(feature) and value in self.nodes.entries(feature):
-            self.nodes.set(feature, value)
 
     def _choose_format(self) -> None:
         offered = self.nodes.entries("PixelFormat")
@@ -240,6 +252,7 @@ class U3vCamera(Camera):
                 cfa=self._format.cfa,
                 bit_depth=self._format.bits,
                 pixel_pitch_um=None if pitch is None else float(pitch),
+                black_level=black_level(self.nodes),
             )
 
     # --- frames -------------------------------------------------------------------------------------------------------
@@ -264,7 +277,11 @@ class U3vCamera(Camera):
                 raise InstrumentError(f"{self._who}: no exposure time was set; call configure first")
             if self._armed != trigger:
                 self._stop_acquisition()
-                self.nodes.set("TriggerSource", "Software" if trigger == "software" else "Line0")
+                line = "Software"
+                if trigger == "line":
+                    line = trigger_line(self.nodes, self._who, self._wanted_line)
+                self.nodes.set("TriggerSource", line)
+                set_if_there(self.nodes, "TLParamsLocked", 1)
                 self._control.write(self._sirm + SIRM_CONTROL, struct.pack("<I", 1))
                 self.nodes.execute("AcquisitionStart")
                 self._armed = trigger
@@ -294,6 +311,9 @@ class U3vCamera(Camera):
                 failure = translate(error, self._who, f"reading a frame of {self._exposure_s:g} s")
             except InstrumentError as error:
                 failure = error
+            if self._armed == "line" and isinstance(failure, NoAnswer):
+                line = self._wanted_line or "Line0"
+                failure = NoAnswer(f"{failure}; it waited for {line}: the camera that leads needs output_line")
             self._recover()
             raise failure
 
@@ -361,6 +381,7 @@ class U3vCamera(Camera):
         self._armed = None
         self.nodes.execute("AcquisitionStop")
         self._control.write(self._sirm + SIRM_CONTROL, struct.pack("<I", 0))
+        set_if_there(self.nodes, "TLParamsLocked", 0)
 
     @contextlib.contextmanager
     def _lost(self) -> Iterator[None]:
