@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import typer
 
 from mocks.cornerstone260 import MockCornerstone260
+from mocks.cornerstone260b_serial import MockCornerstone260BSerial
 from mocks.cr300 import ColorimetryResearch
 from mocks.display import MockScreen, Page, browse
 from mocks.lamp import Lamp, LampClock
-from mocks.pr655 import PhotoResearch
+from mocks.pr655 import DIALECTS, PhotoResearch
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage, Targets
 from mocks.wire import (
@@ -60,7 +61,10 @@ class Place(MeasuredLight, Targets, MockScreen, Protocol):
 
 INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "cornerstone260": MockCornerstone260,
+    "cornerstone260b-serial": MockCornerstone260BSerial,
     "specbos1211": MockSpecbos1211,
+    "specbos1201": lambda place: MockSpecbos1211(place, "1201427", "specbos 1201", (380.0, 780.0)),
+    "spectraval1501": lambda place: MockSpecbos1211(place, "1501427", "spectraval 1501", (380.0, 780.0)),
     "pr655": lambda place: PhotoResearch(place, "PR-655"),
     "pr670": lambda place: PhotoResearch(place, "PR-670", "67001234"),
     "cr250": lambda place: ColorimetryResearch(place, "CR-250"),
@@ -89,6 +93,10 @@ def mock(
         typer.Option(help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug."),
     ] = "",
     real_time: Annotated[float, typer.Option(help="Real seconds for each of the instrument's (0: no waiting).")] = 0.0,
+    dialect: Annotated[
+        str,
+        typer.Option(help="Which of an instrument's public dialects it speaks (pr655, pr670: two-lines, one-line)."),
+    ] = "",
     calibration: Annotated[
         Path | None, typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus).")
     ] = None,
@@ -99,6 +107,8 @@ def mock(
             raise _Unusable(f"mock {name}: no such instrument; choose from {', '.join(EVERY_INSTRUMENT)}")
         if link is not None and name in (*USB_INSTRUMENTS, "display"):
             raise _Unusable(f"mock {name}: it has no line that a path could name; leave --link out")
+        if dialect and (name not in ("pr655", "pr670") or dialect not in DIALECTS):
+            raise _Unusable(f"mock {name}: no dialect {dialect!r}; pr655 and pr670 have {', '.join(DIALECTS)}")
         if calibration is not None and name != "usb2000plus":
             raise _Unusable(f"mock {name}: no calibration file comes with it; leave --calibration out")
         if link is not None and tcp:
@@ -117,7 +127,10 @@ def mock(
                 )
             else:
                 endpoint = Tcp(*_host_and_port(tcp)) if tcp else Pty(link)
-                serve(INSTRUMENTS[name](lamp), endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
+                grammar = INSTRUMENTS[name](lamp)
+                if isinstance(grammar, PhotoResearch) and dialect:
+                    grammar.dialect = dialect
+                serve(grammar, endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
 
 
 def _serve_usb(

@@ -86,7 +86,7 @@ def test_a_move_changes_the_light(host: Host, bench: Bench) -> None:
     assert bench.light.wavelength_nm == 400.0
     assert bench.clock.now() - before == pytest.approx(400 / 175)
     host.say("shutter 1")
-    host.say("FILTER 2; grating 2; outport 2")
+    host.say("FILTER 2; grating 2; outport 2; *wai")
     assert [host.ask(f"{what}?") for what in ("shutter", "filter", "grating", "outport")] == ["1", "2", "2", "2"]
     assert bench.light.shutter_open
     assert bench.light.filter_place == 2
@@ -94,7 +94,7 @@ def test_a_move_changes_the_light(host: Host, bench: Bench) -> None:
 
 def test_units(host: Host, bench: Bench) -> None:
     host.say("units um")
-    host.say("gowave 0.55")
+    host.say("gowave 0.55; *wai")
     assert host.ask("wave?") == "0.550"
     assert bench.light.wavelength_nm == pytest.approx(550.0)
     host.say("units wn")
