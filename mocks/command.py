@@ -28,6 +28,7 @@ from mocks.cr300 import ColorimetryResearch
 from mocks.display import MockScreen, Page, browse
 from mocks.lamp import Lamp, LampClock
 from mocks.pr655 import DIALECTS, PhotoResearch
+from mocks.scpi_meter import MockScpiMeter
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage, Targets
 from mocks.wire import (
@@ -69,6 +70,7 @@ INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "pr670": lambda place: PhotoResearch(place, "PR-670", "67001234"),
     "cr250": lambda place: ColorimetryResearch(place, "CR-250"),
     "cr300": lambda place: ColorimetryResearch(place, "CR-300"),
+    "scpi-meter": MockScpiMeter,
     "stage": MockStage,
 }
 
