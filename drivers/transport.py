@@ -85,8 +85,11 @@ class Transport:
         port, self._port = self._port, None
         self._received.clear()
         if port is not None:
+            connection = getattr(port, "_socket", None)
             with suppress(OSError):
                 port.close()
+            if connection is not None:  # pyserial leaves it open where the other side was quicker
+                connection.close()
 
     def interrupt(self) -> None:
         """End the wait of another thread: it raises `Interrupted`."""

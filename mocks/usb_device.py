@@ -111,6 +111,7 @@ class UsbDevice:
         self._strings = ["", identity.maker, identity.product, identity.serial_number]
         self._line_faults: tuple[Fault, ...] = ()
         self.answers = 0
+        self._silent = False
 
     # --- descriptors --------------------------------------------------------------------------------------------------
 
@@ -160,6 +161,9 @@ class UsbDevice:
         """One transfer: `data` of an OUT, None for an IN of at most `length` bytes. Raises `UsbFault`."""
         if not self.plugged:
             raise Unplugged(self.identity.serial_number)
+        if self._silent:
+            with self.changed:
+                self.wait_for(lambda: not self._silent, cancelled)
         if endpoint & 0x0F == 0:
             return self._setup(setup, data, cancelled)[: length if data is None else None]
         if endpoint in self._state.halted:
@@ -225,6 +229,12 @@ class UsbDevice:
         """Break answers, which count from 1, as serial instruments' answers break; a camera's answers are its frames."""
         self._line_faults = tuple(faults)
         self.answers = 0
+
+    def mute(self, silent: bool) -> None:
+        """Let every transfer wait, as if the device hung; or go on."""
+        with self.changed:
+            self._silent = silent
+            self.changed.notify_all()
 
     def _faults_of_answer(self) -> list[Fault]:
         """The faults of the answer that is about to go out."""

@@ -161,6 +161,11 @@ class RawFolderCamera(Camera):
             self._frames += 1
             return Frame(found.raw, exposure_s, self._gain_db, None, self._fired, "raw file", self._frames - 1)
 
+    def capture(self) -> Frame:
+        """One frame on a software trigger; of two threads the second waits."""
+        with self._lock:
+            return super().capture()
+
     def stop(self) -> None:
         """End the wait for a file."""
         self._stopped.set()

@@ -47,7 +47,7 @@ from drivers.camera.genicam_settings import (
     trigger_line,
 )
 from drivers.camera.pixel_format import PIXEL_FORMATS, PREFERENCE
-from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
 from drivers.instrument import Identity, Recorder
 from drivers.usbip import open_device, translate
 
@@ -61,6 +61,7 @@ SIRM_MAX_LEADER, SIRM_TRANSFER_SIZE, SIRM_TRANSFER_COUNT = 0x18, 0x1C, 0x20
 SIRM_FINAL_1, SIRM_FINAL_2, SIRM_MAX_TRAILER = 0x24, 0x28, 0x2C
 
 _TRANSFER_BYTES = 1 << 20
+_LOOK_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ class U3vCamera(Camera):
         self._recorder = recorder
         self._who = f"camera {address}"
         self._lock = threading.RLock()
+        self._stopped = threading.Event()
         self._device: usb.core.Device | None = None
         self._armed: Trigger | None = None
         self._exposure_s: float | None = None
@@ -319,7 +321,7 @@ class U3vCamera(Camera):
 
     def _collect(self, exposure_s: float, fired: datetime) -> Frame:
         deadline = time.monotonic() + exposure_s + self._timeout_s
-        leader = self._stream(self._leader_bytes, deadline)
+        leader = self._await_leader(deadline)
         if len(leader) < LEADER.size or LEADER.unpack_from(leader)[0] != LEADER_MAGIC:
             raise Garbled(f"{self._who}: a frame began with {leader[:8].hex()}, not with a leader; it is taken again")
         (_, _, _, frame_id, _, _, _, code, cols, rows, _, _, padding, _) = LEADER.unpack_from(leader)
@@ -358,6 +360,17 @@ class U3vCamera(Camera):
             pixel_format=pixel_format.name,
             frame_id=frame_id,
         )
+
+    def _await_leader(self, deadline: float) -> bytes:
+        """The leader, one short packet; until it comes, it is looked every now and then whether `stop` was called."""
+        while True:
+            if self._stopped.is_set():
+                raise Interrupted(f"{self._who}: stopped while waiting for a frame; start again")
+            try:
+                return self._stream(self._leader_bytes, min(deadline, time.monotonic() + _LOOK_S))
+            except usb.core.USBTimeoutError:
+                if time.monotonic() >= deadline:
+                    raise
 
     def _stream(self, size: int, deadline: float) -> bytes:
         left_ms = max(1, int((deadline - time.monotonic()) * 1000))
@@ -402,7 +415,10 @@ class U3vCamera(Camera):
                 usb.util.dispose_resources(device)
 
     def stop(self) -> None:
+        """End the exposure under way, in whatever thread it is waited for."""
+        self._stopped.set()
         with contextlib.suppress(InstrumentError, usb.core.USBError), self._lock:
+            self._stopped.clear()
             if self._device is not None:
                 self._stop_acquisition()
 

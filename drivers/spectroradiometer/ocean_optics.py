@@ -7,11 +7,13 @@ radiance of 1 W sr^-1 m^-2 nm^-1 at the place where it is used (fibre, lens and 
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from typing import Any
 
 import numpy as np
 import usb.core
+import usb.util
 from numpy.typing import NDArray
 
 from drivers.calibration_file import read_calibration
@@ -75,6 +77,7 @@ class OceanOptics(Spectroradiometer):
         self._lock = threading.RLock()
         self._stopped = threading.Event()
         self._open: Any = None
+        self._device: usb.core.Device | None = None
 
     def connect(self) -> None:
         with self._lock:
@@ -84,6 +87,7 @@ class OceanOptics(Spectroradiometer):
             from seabreeze.pyseabreeze.transport import USBTransport, USBTransportHandle
 
             device = self._given if self._given is not None else open_device(self.address)
+            self._device = device
             self._model = USBTransport.vendor_product_ids.get((device.idVendor, device.idProduct), "")
             if not self._model:
                 raise InstrumentError(
@@ -170,11 +174,13 @@ class OceanOptics(Spectroradiometer):
 
     def _drop(self) -> None:
         opened, self._open = self._open, None
+        device, self._device = self._device, None
         if opened is not None:
-            try:
+            with contextlib.suppress(Exception):  # the library raises what it likes, and the device may be gone
                 opened.close()
-            except Exception:  # the library raises what it likes, and the device may be gone
-                return
+        if device is not None:  # the library keeps it where closing failed
+            with contextlib.suppress(usb.core.USBError):
+                usb.util.dispose_resources(device)
 
     def _error(self, error: Exception, doing: str) -> InstrumentError:
         who = f"spectrometer {self.address}"
