@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
+import shutil
+import signal
 import socket
+import subprocess
 import tempfile
 import threading
 import time
@@ -10,7 +16,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from drivers.camera.basler import pylon_library
 from drivers.contract.peer import Peer
+from drivers.errors import InstrumentError
 from mocks.bench import Bench
 from mocks.cornerstone260 import MockCornerstone260
 from mocks.cornerstone260b import Cornerstone260B
@@ -259,6 +267,75 @@ class PromptPeer(Peer):
         """Nothing is held."""
 
 
+class EmulatedBasler(Peer):
+    """The first of the two cameras that pypylon emulates itself: it can't be silenced or unplugged."""
+
+    can_fail = False
+
+    def __init__(self) -> None:
+        os.environ.setdefault("PYLON_CAMEMU", "2")
+        pylon_library()  # raises where it isn't installed
+        self.address, self.settings = "0815-0000", {}
+
+    def mute(self, silent: bool) -> None:
+        """Can't be done."""
+
+    def unplug(self) -> None:
+        """Can't be done."""
+
+    def plug(self) -> None:
+        """It is."""
+
+    def slow(self, slowly: bool) -> bool:
+        return False
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class AravisFakeCamera(Peer):
+    """The fake GigE camera of the package aravis-tools, a process of its own, on loopback; one at a time on this computer."""
+
+    program = "arv-fake-gv-camera-0.8"
+
+    def __init__(self) -> None:
+        if shutil.which(self.program) is None:
+            raise InstrumentError(f"{self.program} isn't installed (scripts/install-aravis)")
+        self._lock = (Path(tempfile.gettempdir()) / "calibench-aravis.lock").open("w")
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self.address, self.settings = "127.0.0.1", {"timeout_s": 2.0}
+        self.plug()
+
+    def plug(self) -> None:
+        self._process = subprocess.Popen(
+            [self.program, "-i", "127.0.0.1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        discovery = bytes.fromhex("42 01 00 02 00 00 00 01")  # GVCP: who is there
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+            asking.settimeout(0.1)
+            for _ in range(300):
+                asking.sendto(discovery, ("127.0.0.1", 3956))
+                with contextlib.suppress(OSError):
+                    if asking.recv(1024):
+                        return
+                    time.sleep(0.05)
+        raise RuntimeError(f"{self.program} doesn't answer")
+
+    def unplug(self) -> None:
+        self._process.kill()
+        self._process.wait(30)
+
+    def mute(self, silent: bool) -> None:
+        self._process.send_signal(signal.SIGSTOP if silent else signal.SIGCONT)
+
+    def slow(self, slowly: bool) -> bool:
+        return False
+
+    def close(self) -> None:
+        self.unplug()
+        self._lock.close()
+
+
 def lit_bench() -> Bench:
     """A bench with white light in front of the cameras, its loops compiled and its first frame drawn."""
     bench = Bench(seed=4)
@@ -299,6 +376,14 @@ def ocean_optics() -> Peer:
 def u3v() -> Peer:
     bench = lit_bench()
     return UsbPeer(stereo_pair(bench)[:1], bench.clock, timeout_s=2.0)
+
+
+def basler() -> Peer:
+    return EmulatedBasler()
+
+
+def aravis() -> Peer:
+    return AravisFakeCamera()
 
 
 def raw_folder() -> Peer:

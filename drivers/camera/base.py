@@ -77,6 +77,9 @@ class Camera(Instrument):
         Raises `drivers.errors.NoAnswer` if no frame, or not all of it, came.
         """
 
+    def follow(self) -> None:
+        """Called right after the camera that leads was triggered: a camera that isn't wired to it is triggered by software here."""
+
     def capture(self) -> Frame:
         """One frame on a software trigger."""
         self.arm("software")
@@ -87,6 +90,8 @@ class Camera(Instrument):
 def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:
     """One frame of each camera, exposed at the same time: the first is triggered by software and pulses the others' line.
 
+    Cameras that aren't wired follow milliseconds later (`follow`).
+
     All are read out even if one fails, so that none is left with an old frame; then the first failure is raised.
     """
     first, *others = cameras
@@ -94,6 +99,8 @@ def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:
         camera.arm("line")
     first.arm("software")
     first.fire()
+    for camera in others:
+        camera.follow()
     frames: list[Frame] = []
     failure: InstrumentError | None = None
     for camera in cameras:

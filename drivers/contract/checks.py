@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from drivers.contract.families import CONTRACTS, NotMet, require
-from drivers.contract.peer import Peer, RealInstrument
+from drivers.contract.peer import Peer
 from drivers.errors import InstrumentError
 from drivers.instrument import Instrument
 from drivers.registry import driver as driver_of
@@ -52,8 +52,8 @@ class _Subject:
         return made
 
     def needs_mock(self) -> None:
-        if isinstance(self.peer, RealInstrument):
-            raise _LeftOut("a real instrument isn't silenced or unplugged by a program")
+        if not self.peer.can_fail:
+            raise _LeftOut("no program can silence or unplug this instrument")
 
 
 def check_driver(family: str, name: str, peer: Peer) -> Iterator[Outcome]:

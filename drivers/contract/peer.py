@@ -23,6 +23,8 @@ class Peer(ABC):
 
     address: str
     settings: dict[str, Any]
+    #: Whether it can be silenced and unplugged.
+    can_fail = True
 
     @abstractmethod
     def mute(self, silent: bool) -> None:
@@ -55,6 +57,8 @@ class Peer(ABC):
 
 class RealInstrument(Peer):
     """An instrument at its address: nobody silences or unplugs it, and what needs that is left out."""
+
+    can_fail = False
 
     def __init__(self, address: str, settings: dict[str, Any]) -> None:
         self.address, self.settings = address, settings

@@ -9,8 +9,15 @@ from drivers.contract.peer import peers
 from drivers.errors import InstrumentError
 from drivers.registry import drivers
 
+#: Each call on a silent GigE camera takes the library seconds.
+SLOW = {("camera", "aravis")}
 
-@pytest.mark.parametrize(("family", "name"), drivers(), ids=lambda part: part)
+
+@pytest.mark.parametrize(
+    ("family", "name"),
+    [pytest.param(*one, marks=[pytest.mark.slow] if one in SLOW else []) for one in drivers()],
+    ids=lambda part: part,
+)
 def test_it_keeps_the_contract(family: str, name: str) -> None:
     if (family, name) == ("spectroradiometer", "usb2000plus"):
         pytest.skip("another name of ocean_optics")
@@ -23,4 +30,4 @@ def test_it_keeps_the_contract(family: str, name: str) -> None:
     with peer:
         found = list(check_driver(family, name, peer))
     assert [(outcome.asks, outcome.why) for outcome in found if outcome.ended == "not met"] == []
-    assert sum(outcome.ended == "met" for outcome in found) >= 5
+    assert sum(outcome.ended == "met" for outcome in found) >= (5 if peer.can_fail else 4)
