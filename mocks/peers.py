@@ -356,15 +356,15 @@ def cornerstone260b() -> Peer:
 
 
 def specbos1211() -> Peer:
-    return LinePeer(MockSpecbos1211, slowness=5.0, timeout_s=0.5, fetch_timeout_s=0.5, measure_timeout_s=10.0)
+    return LinePeer(MockSpecbos1211, slowness=5.0, timeout_s=0.5, fetch_timeout_s=0.5, measure_timeout_s=2.0)
 
 
 def pr655() -> Peer:
-    return LinePeer(PhotoResearch, slowness=3.0, timeout_s=0.5, measure_timeout_s=10.0)
+    return LinePeer(PhotoResearch, slowness=3.0, timeout_s=0.5, measure_timeout_s=2.0)
 
 
 def cr300() -> Peer:
-    return LinePeer(ColorimetryResearch, slowness=5.0, timeout_s=0.5, measure_timeout_s=10.0)
+    return LinePeer(ColorimetryResearch, slowness=5.0, timeout_s=0.5, measure_timeout_s=2.0)
 
 
 def ocean_optics() -> Peer:
