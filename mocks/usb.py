@@ -130,6 +130,7 @@ class _Urb:
     data: bytes | None
     length: int
     unlinked: threading.Event = field(default_factory=threading.Event)
+    unlink_number: int | None = None  # of the request that cancels this one
 
 
 class _Session:
@@ -189,31 +190,38 @@ class _Session:
 
     def _work(self, waiting: queue.Queue[_Urb | None]) -> None:
         while (urb := waiting.get()) is not None:
-            status, came = 0, b""
+            status, came, abandoned = 0, b"", urb.unlinked.is_set()
             try:
-                if urb.unlinked.is_set():
-                    raise Abandoned
-                came = self._device.transfer(urb.endpoint, urb.setup, urb.data, urb.length, urb.unlinked.is_set)
+                if not abandoned:
+                    came = self._device.transfer(urb.endpoint, urb.setup, urb.data, urb.length, urb.unlinked.is_set)
+            except Abandoned:
+                abandoned = True
             except UsbFault as fault:
                 status = fault.status
             with self._lock:
-                if self._pending.pop(urb.number, None) is None:
-                    continue  # unlinked: the answer to that has gone out
-                count = len(came) if urb.data is None else len(urb.data) * (status == 0)
-                self._send(
-                    struct.pack(">IIIII", 3, urb.number, 0, 0, 0)
-                    + struct.pack(">iiiii8x", status, count, 0, 0, 0)
-                    + came
-                )
+                self._pending.pop(urb.number, None)
+                # A request that ended before it could be cancelled is answered: what it took from the device would be lost.
+                if not abandoned:
+                    count = len(came) if urb.data is None else len(urb.data) * (status == 0)
+                    self._send(
+                        struct.pack(">IIIII", 3, urb.number, 0, 0, 0)
+                        + struct.pack(">iiiii8x", status, count, 0, 0, 0)
+                        + came
+                    )
+                if urb.unlink_number is not None:
+                    self._answer_unlink(urb.unlink_number, Abandoned.status if abandoned else 0)
 
     def _unlink(self, number: int, target: int) -> None:
         with self._lock:
-            urb = self._pending.pop(target, None)
-            if urb is not None:
+            urb = self._pending.get(target)
+            if urb is None:
+                self._answer_unlink(number, 0)
+            else:
+                urb.unlink_number = number
                 urb.unlinked.set()
-            self._send(
-                struct.pack(">IIIII", 4, number, 0, 0, 0) + struct.pack(">i24x", 0 if urb is None else Abandoned.status)
-            )
+
+    def _answer_unlink(self, number: int, status: int) -> None:
+        self._send(struct.pack(">IIIII", 4, number, 0, 0, 0) + struct.pack(">i24x", status))
 
     def _send(self, data: bytes) -> None:
         with self._send_lock, contextlib.suppress(OSError):
