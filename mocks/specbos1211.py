@@ -255,8 +255,18 @@ class MockSpecbos1211(Grammar):
             raise _Refusal(NOTHING_MEASURED)
         return self._measured
 
+    def _calculate_spectrum(self) -> bytes:
+        """A spectraval's: wavelength and value a line, if it was told to speak text."""
+        spectrum = self._spectrum()
+        if self._model != "spectraval 1501" or self._settings["form"] != 2:
+            raise _Refusal(COMMAND)
+        lines = [f"{w:.1f} {v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
+        return "\r".join([*lines, ""]).encode("ascii")
+
     def _fetch_spectrum(self, form: str | None) -> bytes:
         spectrum = self._spectrum()
+        if self._model == "spectraval 1501":
+            raise _Refusal(COMMAND)
         number = int(form) if form else int(self._settings["form"])
         if number in (7, 10):  # for a terminal: wavelength and value, blocks ended by an empty line
             lines = [f"{w:.0f}\t{v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
@@ -305,6 +315,7 @@ class MockSpecbos1211(Grammar):
         (r"\*contr(?:ol)?:cyctim(?: \d+){0,2}", _cycle_time),
         (r"\*init(?:iate)?|\*meas(?:ure)?:refer", _init),
         (r"\*fetch:sprad(?: (\d{1,2}))?", _fetch_spectrum),
+        (r"\*calc:sprad", _calculate_spectrum),
         (r"\*fetch(?: (\d{1,2}))?", _fetch),
         (r"\*fetch:xyz(?: \d{1,2})?", _fetch_xyz),
         (r"\*fetch:photo(?:metric)?(?: (\d{1,2}))?", _fetch_luminance),

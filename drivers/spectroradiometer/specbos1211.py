@@ -2,8 +2,8 @@
 
 A setting is answered by ACK or NAK; after a NAK, `*stat:err?` tells why. A measurement (`*init`, a spectraval's `*meas:refer`) is
 answered by ACK, and by BEL once it is done; ENQ in between is passed over. Without flow control a spectrum can lose characters on its
-way: it is asked for again. A spectraval takes `*para:` where a specbos takes `*conf:` (unverified without the instrument: after a
-public client's behaviour).
+way: it is asked for again. A spectraval takes `*para:` where a specbos takes `*conf:`, and tells its spectrum on `*calc:sprad`
+(unverified without the instrument: after the behaviour of a public client, ArgyllCMS).
 """
 
 from __future__ import annotations
@@ -72,13 +72,18 @@ class Specbos1211(WireInstrument, Spectroradiometer):
 
     def measure(self) -> RadianceMeasurement:
         with self._conversation():
-            begin = "*meas:refer" if self._spectraval else "*init"
+            begin = "*init"
+            if self._spectraval:
+                self._set("*para:form 0")  # the spectrum is asked for once it is measured
+                begin = "*meas:refer"
             self._set(begin)
             done = self._byte(begin, self.measure_timeout_s)
             if done == NAK:
                 raise self._refusal(begin)
             if done != BEL:
                 raise self._strange(begin, done)
+            if self._spectraval:
+                self._set("*para:form 2")  # as text
             spectrum = self._fetch_spectrum()
             return RadianceMeasurement(spectrum, self._integration_time_s(), self._identity.serial_number)
 
@@ -100,7 +105,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         self._identity = Identity("JETI", model, serial_number, firmware)
         self._spectraval = model.startswith("spectraval")
         if self._spectraval:
-            settings = ["*para:form 0", "*para:aver 1", f"*para:maxtint {round(self.max_integration_s * 1000)}"]
+            settings = ["*para:aver 1", f"*para:maxtint {round(self.max_integration_s * 1000)}"]
         else:
             settings = ["*conf:default", "*para:calibn 0", "*para:expo 1"]
             settings += [f"*conf:maxtin {round(self.max_integration_s * 1000)}"]
@@ -216,35 +221,34 @@ class Specbos1211(WireInstrument, Spectroradiometer):
 
     def _fetch_once(self) -> Spectrum:
         line = self._transport
-        query = "*fetch:sprad"
+        # A specbos says two lines, then a value a line; a spectraval a wavelength and its value a line.
+        query, header = ("*calc:sprad", 0) if self._spectraval else ("*fetch:sprad", _HEADER_LINES)
         wavelengths = range(self.from_nm, self.to_nm + 1)
         line.write(query.encode("ascii") + b"\r")
         first = self._byte(query, self.fetch_timeout_s)
         if first == NAK:
             raise self._refusal(query)
-        header = (
-            [first.strip()] if first == b"\r" else [first + line.read_until(b"\r", self.fetch_timeout_s, query).strip()]
-        )
-        while len(header) < _HEADER_LINES:
-            header.append(line.read_until(b"\r", self.fetch_timeout_s, query).strip())
-        values: list[float] = []
+        began = first if first == b"\r" else first + line.read_until(b"\r", self.fetch_timeout_s, query)
         # Within a reply characters follow each other: a pause of a second is where it broke off.
-        for _ in wavelengths:
-            told = line.read_until(b"\r", min(1.0, self.fetch_timeout_s), query)
-            text = told.replace(ENQ, b"").decode("latin-1").strip()
-            try:
-                value = float(text)
-            except ValueError:
-                raise self._strange(query, text.encode("latin-1")) from None
-            if not math.isfinite(value):
-                raise self._strange(query, text.encode("latin-1"))
-            values.append(value)
+        pause_s = min(1.0, self.fetch_timeout_s)
+        rest_of_it = (line.read_until(b"\r", pause_s, query) for _ in range(header + len(wavelengths) - 1))
+        told = [piece.replace(ENQ, b"").strip() for piece in (began, *rest_of_it)]
+        values = [self._value(query, nm, text) for nm, text in zip(wavelengths, told[header:], strict=True)]
         rest = line.drain(quiet_s=0.05)
         if rest.strip():
             raise Garbled(
                 f"{line.name}: sent {shown(rest.strip())} after {len(values)} values; check that nothing else talks to it"
             )
         return Spectrum.of(wavelengths, values)
+
+    def _value(self, query: str, wavelength_nm: int, text: bytes) -> float:
+        try:
+            *beside, value = (float(word) for word in text.split())
+        except ValueError:
+            raise self._strange(query, text) from None
+        if not math.isfinite(value) or beside != ([float(wavelength_nm)] if self._spectraval else []):
+            raise self._strange(query, text)
+        return value
 
     def _integration_time_s(self) -> float | None:
         """Integration time of the last measurement; None where the firmware doesn't report it."""

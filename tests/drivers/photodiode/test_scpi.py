@@ -50,6 +50,19 @@ def diode_at(address: str, calibration: str, **settings: Any) -> ScpiPhotodiode:
     return ScpiPhotodiode(visa(address), calibration=calibration, **known)
 
 
+def test_golden_transcript(scripted: Callable[[str], Any], tmp_path: Path) -> None:
+    file = tmp_path / "diode.csv"
+    file.write_text("wavelength_nm,responsivity_a_per_w\n500,0.2\n600,0.2\n")
+    peer = scripted("scpi-meter-driver.txt")
+    with diode_at(peer.address, str(file), readings=2, area_mm2=100.0, calibration_sd_percent=1.0) as diode:
+        measured = diode.measure(550.0)
+        assert diode.identity().serial_number == "1234567"
+    # 2 uA / (0.2 A/W x 1e-4 m2) = 0.1 W/m2; readings scatter by sqrt(2) uA, their mean by 1 uA = 0.05 W/m2; 1 % of 0.1.
+    assert measured.irradiance_w_m2 == pytest.approx(0.1)
+    assert measured.sd_irradiance_w_m2 == pytest.approx(np.hypot(0.05, 0.001))
+    assert peer.strange == []
+
+
 def test_irradiance_is_radiance_times_solid_angle(served: Callable[..., str], calibration: str) -> None:
     light = Line(550.0, 2.0)
     with diode_at(served(MockScpiMeter(light), Tcp("127.0.0.1", 0)), calibration) as diode:

@@ -31,6 +31,17 @@ def test_golden_transcript(scripted: Callable[[str], Any]) -> None:
     assert peer.requests.count(b"*fetch:sprad\r") == 2
 
 
+def test_golden_transcript_of_a_spectraval(scripted: Callable[[str], Any]) -> None:
+    peer = scripted("spectraval1501-driver.txt")
+    with Specbos1211(peer.address, from_nm=500, to_nm=502) as radiometer:
+        measured = radiometer.measure()
+        assert radiometer.identity().model == "spectraval 1501"
+    assert measured.radiance_w_sr_m2_nm.wavelength_nm == (500.0, 501.0, 502.0)
+    assert measured.radiance_w_sr_m2_nm.value == (1e-3, 2e-3, 3e-3)
+    assert measured.integration_time_s is None
+    assert peer.strange == []
+
+
 @pytest.mark.parametrize("endpoint", [Pty, lambda: Tcp("127.0.0.1", 0)])
 def test_round_trip_with_the_mock(served: Callable[..., str], endpoint: Callable[[], Any]) -> None:
     lamp = Lamp(20.0)
