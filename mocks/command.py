@@ -52,6 +52,8 @@ commands = typer.Typer()
 
 #: Says what a bench conceals that is told nothing on its command line.
 CONCEAL_VARIABLE = "CALIBENCH_CONCEAL"
+#: What a calibration file of `calibench mock` is off by, as real ones are.
+CALIBRATION_DEPARTURE_PERCENT = 2.0
 #: The dark current doubles every few degrees: beyond this, darks saturate.
 WARMEST_C = 40.0
 
@@ -157,7 +159,7 @@ def _serve_usb(
     for device in exported:
         device.fail(faults)
     if calibration is not None:
-        _write(calibration, calibration_csv())
+        _write(calibration, calibration_csv(CALIBRATION_DEPARTURE_PERCENT))
     try:
         server = serve_usbip(exported, *at)
     except OSError as error:
