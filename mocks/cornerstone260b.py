@@ -46,7 +46,7 @@ class _Refusal(Exception):
 _UNKNOWN, _BAD_DATA, _OUT_OF_RANGE = '-113, "Undefined header"', '-104, "Data type error"', '-222, "Data out of range"'
 
 
-class Cornerstone260B(UsbDevice):
+class MockCornerstone260B(UsbDevice):
     """The instrument; `light` feels its grating, slits, filter wheel and shutter."""
 
     def __init__(self, light: MeasuredLight, serial_number: str = "CB-260B-01") -> None:

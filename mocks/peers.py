@@ -21,7 +21,7 @@ from drivers.contract.peer import Peer
 from drivers.errors import InstrumentError
 from mocks.bench import Bench
 from mocks.cornerstone260 import MockCornerstone260
-from mocks.cornerstone260b import Cornerstone260B
+from mocks.cornerstone260b import MockCornerstone260B
 from mocks.cr300 import ColorimetryResearch
 from mocks.display import Page, browse
 from mocks.lamp import Lamp, LampClock
@@ -352,7 +352,7 @@ def cornerstone260() -> Peer:
 
 def cornerstone260b() -> Peer:
     bench = Bench()
-    return UsbPeer((Cornerstone260B(bench),), bench.clock, timeout_s=0.5, move_timeout_s=20.0)
+    return UsbPeer((MockCornerstone260B(bench),), bench.clock, timeout_s=0.5, move_timeout_s=20.0)
 
 
 def specbos1211() -> Peer:

@@ -23,7 +23,7 @@ from typing import Any, Self
 
 from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
 from mocks.bench import Bench
-from mocks.cornerstone260b import Cornerstone260B
+from mocks.cornerstone260b import MockCornerstone260B
 from mocks.u3v import TriggerLine, U3vDevice
 from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb_device import Abandoned, UsbDevice, UsbFault
@@ -42,7 +42,7 @@ def stereo_pair(bench: Bench) -> tuple[U3vDevice, U3vDevice]:
 
 
 _INSTRUMENTS: dict[str, Callable[[Any], Sequence[UsbDevice]]] = {
-    "cornerstone260b": lambda bench: (Cornerstone260B(bench),),
+    "cornerstone260b": lambda bench: (MockCornerstone260B(bench),),
     "u3v": lambda bench: stereo_pair(bench)[:1],
     "u3v-stereo": stereo_pair,
     "usb2000plus": lambda bench: (MockUsb2000Plus(bench),),

@@ -13,7 +13,7 @@ from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, 
 from drivers.monochromator.cornerstone260b import Cornerstone260B
 from drivers.usbtmc import UsbTmc
 from mocks.bench import Bench
-from mocks.cornerstone260b import Cornerstone260B as Mock
+from mocks.cornerstone260b import MockCornerstone260B as Mock
 from mocks.usb import InProcessBackend
 from mocks.wire import parse_faults
 

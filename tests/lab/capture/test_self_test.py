@@ -14,7 +14,7 @@ from lab.capture.self_test import check_station, record_transcript, station_text
 from lab.capture.station import Station, read_station
 from lab.errors import DeviceError, InputError
 from mocks.bench import Bench
-from mocks.cornerstone260b import Cornerstone260B
+from mocks.cornerstone260b import MockCornerstone260B
 from mocks.peers import cornerstone260, pr655
 from mocks.usb import UsbIpServer, serve_usbip, stereo_pair
 from mocks.usb2000plus import MockUsb2000Plus
@@ -23,7 +23,7 @@ from mocks.usb2000plus import MockUsb2000Plus
 @pytest.fixture(scope="module")
 def server() -> Iterator[UsbIpServer]:
     bench = Bench()
-    with serve_usbip((*stereo_pair(bench), Cornerstone260B(bench), MockUsb2000Plus(bench))) as server:
+    with serve_usbip((*stereo_pair(bench), MockCornerstone260B(bench), MockUsb2000Plus(bench))) as server:
         yield server
 
 
