@@ -7,7 +7,7 @@ STAMP := $(VENV)/.ready
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: setup run test serve bench proof proof-live slow lint clean
+.PHONY: aravis soak setup run test serve bench proof proof-live slow lint clean
 
 setup: $(STAMP)
 
@@ -15,6 +15,15 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
+
+# A day in virtual time on a bench whose instruments fail at 1 % of their answers; takes hours. ARGS as pytest's.
+SOAK_CAPTURES ?= 20000
+soak: $(STAMP)
+	SOAK_CAPTURES=$(SOAK_CAPTURES) $(BIN)/python -m pytest tests/soak -m slow -s $(ARGS)
+
+# The library for GigE cameras of any maker, from the distribution; tests that need it skip without it.
+aravis:
+	scripts/install-aravis
 
 run: $(STAMP)
 	$(BIN)/calibench run --out calibench-data $(ARGS)

@@ -15,6 +15,10 @@ class Disconnected(InstrumentError):
     """The connection is gone: unplugged, refused, or closed by the other side."""
 
 
+class InUse(Disconnected):
+    """Another program, or another driver of this one, holds the port."""
+
+
 class Garbled(InstrumentError):
     """Something was received that isn't an answer to the request."""
 

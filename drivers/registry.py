@@ -21,6 +21,11 @@ def names(family: str) -> tuple[str, ...]:
     return tuple(sorted(name.partition(".")[2] for name in _all() if name.partition(".")[0] == family))
 
 
+def drivers() -> tuple[tuple[str, str], ...]:
+    """(family, name) of every driver that is installed, sorted."""
+    return tuple(sorted((name.partition(".")[0], name.partition(".")[2]) for name in _all()))
+
+
 def driver(family: str, name: str) -> Callable[..., Any]:
     """What makes the instrument: call it with an address. Raises `InstrumentError` if there is no such driver."""
     point = _all().get(f"{family}.{name}")

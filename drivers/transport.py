@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import re
 import threading
 import time
 from abc import abstractmethod
@@ -10,11 +12,15 @@ from contextlib import contextmanager, suppress
 
 import serial
 
-from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, InUse, NoAnswer, Refused
 from drivers.instrument import Instrument, Recorder
 
 #: Longest time between two looks at whether `interrupt` was called.
 _SLICE_S = 0.05
+#: Within an answer characters follow each other: a pause of this length is where it broke off.
+BETWEEN_S = 1.0
+#: What the system says of a port that another program, or another driver of this one, holds.
+_IN_USE = {errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY}
 #: More than any instrument here says at once: what babbles on is not ours.
 _LONGEST_ANSWER = 1 << 20
 
@@ -65,6 +71,11 @@ class Transport:
             )
         except (OSError, ValueError) as error:  # pyserial's SerialException is an OSError
             reason = getattr(error, "strerror", None) or str(error).replace("\n", " ")
+            if _number_of(error) in _IN_USE:
+                raise InUse(
+                    f"{self.name}: this port is in use, by another program or another instrument of the station; "
+                    "one port serves one instrument: close the other, or correct the address in the station file"
+                ) from error
             raise Disconnected(
                 f"{self.name}: can't be opened ({reason}); check the cable, the power and the address in the station file"
             ) from error
@@ -74,8 +85,11 @@ class Transport:
         port, self._port = self._port, None
         self._received.clear()
         if port is not None:
+            connection = getattr(port, "_socket", None)
             with suppress(OSError):
                 port.close()
+            if connection is not None:  # pyserial leaves it open where the other side was quicker
+                connection.close()
 
     def interrupt(self) -> None:
         """End the wait of another thread: it raises `Interrupted`."""
@@ -84,6 +98,11 @@ class Transport:
     def resume(self) -> None:
         """Revoke `interrupt`."""
         self._interrupted.clear()
+
+    def pause(self, seconds: float, asked: str = "") -> None:
+        """Let time pass before the next question. Raises `Interrupted`."""
+        if self._interrupted.wait(seconds):
+            raise self._stopped(asked)
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises `Disconnected`."""
@@ -133,21 +152,23 @@ class Transport:
         return data
 
     def _fill(self, deadline: tuple[float, float], asked: str) -> None:
-        """Wait for at least one more byte until the deadline."""
+        """Wait for at least one more byte until the deadline; for `BETWEEN_S` where an answer has begun."""
         end, wait_s = deadline
+        begun = bool(self._received) and end - time.monotonic() > BETWEEN_S
+        if begun:
+            end = time.monotonic() + BETWEEN_S
         while True:
             if self._interrupted.is_set():
-                raise Interrupted(
-                    f"{self.name}: stopped while waiting{f' for {asked!r}' if asked else ''}; start again"
-                )
+                raise self._stopped(asked)
             left = end - time.monotonic()
             if self._receive(max(0.0, min(_SLICE_S, left))):
                 return
             if left <= 0:
                 question = f" to {asked!r}" if asked else ""
                 got = f"only {shown(bytes(self._received))}" if self._received else "no answer"
+                since = f"then nothing for {BETWEEN_S:g} s" if begun else f"within {wait_s:g} s"
                 raise NoAnswer(
-                    f"{self.name}: {got} within {wait_s:g} s{question}; check the power, the cable and that nothing else talks to it"
+                    f"{self.name}: {got}{', ' if begun else ' '}{since}{question}; check the power, the cable and that nothing else talks to it"
                 )
 
     def _receive(self, timeout_s: float) -> bool:
@@ -163,6 +184,9 @@ class Transport:
             self._received += data
         return bool(data)
 
+    def _stopped(self, asked: str) -> Interrupted:
+        return Interrupted(f"{self.name}: stopped while waiting{f' for {asked!r}' if asked else ''}; start again")
+
     def _open_port(self) -> serial.SerialBase:
         if self._port is None:
             raise Disconnected(f"{self.name}: not connected; connect first")
@@ -172,6 +196,14 @@ class Transport:
         self.close()
         reason = str(error).replace("\n", " ")
         return Disconnected(f"{self.name}: the line broke ({reason}); plug it in again, the next call reconnects")
+
+
+def _number_of(error: BaseException) -> int | None:
+    """The system's number of an error; pyserial keeps that of a refused lock in its text alone."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno
+    found = re.search(r"\[Errno (\d+)\]", str(error))
+    return int(found[1]) if found else None
 
 
 class WireInstrument(Instrument):
@@ -191,6 +223,9 @@ class WireInstrument(Instrument):
     def _make_safe(self) -> None:
         """Bring the instrument into its safe state, within a conversation."""
 
+    def _let_go(self) -> None:
+        """Leave it as it was found, within a conversation: other programs may talk to it next."""
+
     def connect(self) -> None:
         with self._conversation():
             pass
@@ -209,6 +244,9 @@ class WireInstrument(Instrument):
             with suppress(InstrumentError):
                 self.stop()
         with self._lock:
+            if self._live:
+                with suppress(InstrumentError):
+                    self._let_go()
             self._live = self._met = False
             self._transport.close()
 

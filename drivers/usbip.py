@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 import usb.core
 from usb.backend import IBackend
 
-from drivers.errors import Disconnected, InstrumentError, NoAnswer
+from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
 
 VERSION = 0x0111
 OP_REQ_DEVLIST, OP_REP_DEVLIST = 0x8005, 0x0005
@@ -568,6 +568,10 @@ def translate(error: usb.core.USBError, who: str, doing: str) -> InstrumentError
         return NoAnswer(f"{who}: no answer while {doing}; check the cable and the power")
     if error.errno in (errno.ENODEV, errno.EIO, errno.ESHUTDOWN):
         return Disconnected(f"{who}: the connection was lost while {doing} ({error}); plug it in again")
+    if error.errno == errno.EPIPE:
+        return NoAnswer(f"{who}: halted its endpoint while {doing}; the halt is cleared, try again")
+    if error.errno == errno.EBUSY:
+        return InUse(f"{who}: in use by another program or another instrument of the station; close that one")
     if error.errno == errno.EACCES:
         return InstrumentError(f"{who}: no permission for this USB device; add a udev rule for it")
     return InstrumentError(f"{who}: USB error while {doing}: {error}")

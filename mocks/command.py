@@ -23,10 +23,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import typer
 
 from mocks.cornerstone260 import MockCornerstone260
+from mocks.cornerstone260b_serial import MockCornerstone260BSerial
 from mocks.cr300 import ColorimetryResearch
 from mocks.display import MockScreen, Page, browse
 from mocks.lamp import Lamp, LampClock
-from mocks.pr655 import PhotoResearch
+from mocks.pr655 import DIALECTS, PhotoResearch
+from mocks.scpi_meter import MockScpiMeter
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.stage import MockStage, Targets
 from mocks.wire import (
@@ -50,6 +52,8 @@ commands = typer.Typer()
 
 #: Says what a bench conceals that is told nothing on its command line.
 CONCEAL_VARIABLE = "CALIBENCH_CONCEAL"
+#: What a calibration file of `calibench mock` is off by, as real ones are.
+CALIBRATION_DEPARTURE_PERCENT = 2.0
 #: The dark current doubles every few degrees: beyond this, darks saturate.
 WARMEST_C = 40.0
 
@@ -60,13 +64,21 @@ class Place(MeasuredLight, Targets, MockScreen, Protocol):
 
 INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
     "cornerstone260": MockCornerstone260,
+    "cornerstone260b-serial": MockCornerstone260BSerial,
     "specbos1211": MockSpecbos1211,
+    "specbos1201": lambda place: MockSpecbos1211(place, "1201427", "specbos 1201", (380.0, 780.0)),
+    "spectraval1501": lambda place: MockSpecbos1211(place, "1501427", "spectraval 1501", (380.0, 780.0)),
     "pr655": lambda place: PhotoResearch(place, "PR-655"),
     "pr670": lambda place: PhotoResearch(place, "PR-670", "67001234"),
     "cr250": lambda place: ColorimetryResearch(place, "CR-250"),
     "cr300": lambda place: ColorimetryResearch(place, "CR-300"),
+    "scpi-meter": MockScpiMeter,
     "stage": MockStage,
 }
+
+#: Exported over USB/IP (`mocks.usb`).
+USB_INSTRUMENTS = ("cornerstone260b", "usb2000plus", "u3v", "u3v-stereo")
+EVERY_INSTRUMENT = (*INSTRUMENTS, *USB_INSTRUMENTS, "display")
 
 
 class _Unusable(Exception):
@@ -75,19 +87,34 @@ class _Unusable(Exception):
 
 @commands.command()
 def mock(
-    name: Annotated[str, typer.Argument(help=f"Instrument: {', '.join([*INSTRUMENTS, 'display'])}.")],
+    name: Annotated[str, typer.Argument(help=f"Instrument: {', '.join(EVERY_INSTRUMENT)}.")],
     link: Annotated[Path | None, typer.Option(help="Make this path a link to the pseudo-terminal.")] = None,
-    tcp: Annotated[str, typer.Option(help="HOST:PORT to listen at instead (display: to connect to).")] = "",
+    tcp: Annotated[
+        str, typer.Option(help="HOST:PORT to listen at instead (display: to connect to; USB instruments: for USB/IP).")
+    ] = "",
     fault: Annotated[
         str,
         typer.Option(help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug."),
     ] = "",
     real_time: Annotated[float, typer.Option(help="Real seconds for each of the instrument's (0: no waiting).")] = 0.0,
+    dialect: Annotated[
+        str,
+        typer.Option(help="Which of an instrument's public dialects it speaks (pr655, pr670: two-lines, one-line)."),
+    ] = "",
+    calibration: Annotated[
+        Path | None, typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus).")
+    ] = None,
 ) -> None:
-    """Serve one mock instrument on a pseudo-terminal or a TCP port; prints `ready ADDRESS` when it listens."""
+    """Serve one mock instrument on a pseudo-terminal, a TCP port or USB/IP; prints `ready ADDRESS` when it listens."""
     with _one_line_errors():
-        if name not in INSTRUMENTS and name != "display":
-            raise _Unusable(f"mock {name}: no such instrument; choose from {', '.join([*INSTRUMENTS, 'display'])}")
+        if name not in EVERY_INSTRUMENT:
+            raise _Unusable(f"mock {name}: no such instrument; choose from {', '.join(EVERY_INSTRUMENT)}")
+        if link is not None and name in (*USB_INSTRUMENTS, "display"):
+            raise _Unusable(f"mock {name}: it has no line that a path could name; leave --link out")
+        if dialect and (name not in ("pr655", "pr670") or dialect not in DIALECTS):
+            raise _Unusable(f"mock {name}: no dialect {dialect!r}; pr655 and pr670 have {', '.join(DIALECTS)}")
+        if calibration is not None and name != "usb2000plus":
+            raise _Unusable(f"mock {name}: no calibration file comes with it; leave --calibration out")
         if link is not None and tcp:
             raise _Unusable("mock: --link and --tcp exclude one another; give one of them")
         faults = parse_faults(fault)
@@ -98,9 +125,51 @@ def mock(
                 host, port = _host_and_port(tcp or "127.0.0.1:8765")
                 _say(f"ready {host}:{port}")
                 browse(Page(lamp), f"{host}:{port}", stop, faults)
+            elif name in USB_INSTRUMENTS:
+                _serve_usb(
+                    name, lamp, _host_and_port(tcp or "127.0.0.1:0"), stop, faults, calibration, max(0.0, real_time)
+                )
             else:
                 endpoint = Tcp(*_host_and_port(tcp)) if tcp else Pty(link)
-                serve(INSTRUMENTS[name](lamp), endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
+                grammar = INSTRUMENTS[name](lamp)
+                if isinstance(grammar, PhotoResearch) and dialect:
+                    grammar.dialect = dialect
+                serve(grammar, endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
+
+
+def _serve_usb(
+    name: str,
+    lamp: Lamp,
+    at: tuple[str, int],
+    stop: threading.Event,
+    faults: tuple[Fault, ...],
+    calibration: Path | None,
+    real_time: float,
+) -> None:
+    from mocks.bench import Bench
+    from mocks.usb import devices, serve_usbip
+    from mocks.usb2000plus import calibration_csv
+
+    light: Bench | Lamp = lamp
+    if name.startswith("u3v"):
+        light = Bench(real_time_factor=real_time)
+        light.place("sphere")
+        light.set_shutter(True)
+    exported = devices(name, light)
+    for device in exported:
+        device.fail(faults)
+    if calibration is not None:
+        _write(calibration, calibration_csv(CALIBRATION_DEPARTURE_PERCENT))
+    try:
+        server = serve_usbip(exported, *at)
+    except OSError as error:
+        raise AddressError(
+            f"--tcp {at[0]}:{at[1]}: can't listen there ({error.strerror}); choose a free port"
+        ) from error
+    with server:
+        for device in exported:
+            _say(f"ready {server.url(device.identity.serial_number)}")
+        stop.wait()
 
 
 @commands.command()
@@ -229,11 +298,15 @@ def _start_bench(
         addresses[instrument]["address"] = line.advertised(address)
     page = Page(place, SCREEN_ROWS, SCREEN_COLS)
     _thread(running, "display", lambda: browse(page, display_at, stop, faults.get("display", ())))
-    usb = running.enter_context(serve_usbip(stereo_pair(place), line.host))
+    cameras = stereo_pair(place)
+    for device in cameras:
+        device.fail(faults.get(f"cameras.{device.side}", ()))
+    usb = running.enter_context(serve_usbip(cameras, line.host))
     for side, serial_number in SERIAL_NUMBERS.items():
         # The first frame of a new scene is rendered while the camera exposes: real seconds for virtual milliseconds.
         address = line.advertised(usb.url(serial_number))
         addresses[f"cameras.{side}"] = {"driver": "u3v", "address": address, "timeout_s": 60.0}
+    addresses["cameras.left"]["output_line"] = "Line1"  # wired to the right camera's Line0
     known: dict[str, Any] = {"cameras": place.station_cameras(), "targets": place.station_targets()}
     return addresses, known
 
@@ -317,7 +390,7 @@ def _write(path: Path, text: str) -> None:
         temporary.replace(path)
     except OSError as error:
         raise _Unusable(
-            f"--station {path}: can't be written ({error.strerror}); give a path in a folder that is there"
+            f"{path}: can't be written ({error.strerror}); give a path in a folder that is there"
         ) from error
 
 
@@ -354,7 +427,7 @@ def _wait_for_parent(stop: threading.Event) -> None:
 
 
 def _bench_faults(specs: list[str]) -> dict[str, tuple[Fault, ...]]:
-    instruments = ("monochromator", "spectroradiometer", "display", "stage")
+    instruments = ("monochromator", "spectroradiometer", "display", "stage", "cameras.left", "cameras.right")
     faults: dict[str, tuple[Fault, ...]] = {}
     for spec in specs:
         instrument, separator, what = spec.partition(":")

@@ -55,6 +55,7 @@ class MockCornerstone260(Grammar):
     """The instrument; `light` feels its grating, slits, filter wheel and shutter."""
 
     fault_code = SYSTEM
+    model = "Cornerstone 260 74125"
 
     def __init__(self, light: MeasuredLight, serial_number: str = "0427") -> None:
         super().__init__(light.clock)
@@ -368,7 +369,7 @@ class MockCornerstone260(Grammar):
         (r"SLIT(\d)MICRONS\?", _slit),
         (rf"SLIT(\d)MICRONS {_NUMBER}", _set_slit),
         (r"HANDSHAKE ([01])", _set_handshake),
-        (r"INFO\?", lambda self: _Done(f"Cornerstone 260 74125 SN {self._serial_number}")),
+        (r"INFO\?", lambda self: _Done(f"{self.model} SN {self._serial_number}")),
         (r"STB\?", _read_status),
         (r"ERROR\?", _read_error),
     )

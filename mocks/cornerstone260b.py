@@ -1,16 +1,20 @@
 """A Cornerstone 260B monochromator on USB: a USBTMC (USB488) device that takes SCPI-like commands.
 
-A motion is done by a thread, so that `idle?` and `*opc?` behave as on the instrument; commands wait for the motion
-before them, except `idle?`, `abort` and the error queue. Wordings beyond those in the manual's examples follow SCPI-99.
+Each motion is done by a thread of its own: motions overlap, and commands don't wait for them; `*wai` and `*opc?` do. A host that asks
+where the grating stands without waiting is told where it stood. Wordings beyond those in the manual's examples follow SCPI-99.
 
-Source: USB-IF, USBTMC 1.0 and USB488; Newport, CS130B/CS260B command examples.
+Source: USB-IF, USBTMC 1.0 and USB488; Newport, MCS260B manual, p. 43-46, 62.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 import threading
+import time
 from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from mocks.usb_device import Cancelled, Stalled, UsbDevice, UsbEndpoint, UsbIdentity, UsbInterface
 from mocks.wire import MeasuredLight
@@ -21,8 +25,18 @@ _HEADER = struct.Struct("<BBBxIB3x")  # message, tag, its complement, size, attr
 _END_OF_MESSAGE = 1
 _UPPER_NM, _NM_PER_S = 1400.0, 175.0
 _LONGEST_MESSAGE = 4096
+#: The least that a motion takes in real time: no host reads its end by being quick.
+_LEAST_REAL_S = 0.03
 #: nm in one unit; wavenumbers are the exception.
 _UNITS = {"NM": 1.0, "UM": 1000.0}
+
+
+@dataclass(eq=False)
+class _Command:
+    """A command that waits for its turn, and how many times ABORT had been said when it came."""
+
+    text: str
+    aborts: int
 
 
 class _Refusal(Exception):
@@ -32,7 +46,7 @@ class _Refusal(Exception):
 _UNKNOWN, _BAD_DATA, _OUT_OF_RANGE = '-113, "Undefined header"', '-104, "Data type error"', '-222, "Data out of range"'
 
 
-class Cornerstone260B(UsbDevice):
+class MockCornerstone260B(UsbDevice):
     """The instrument; `light` feels its grating, slits, filter wheel and shutter."""
 
     def __init__(self, light: MeasuredLight, serial_number: str = "CB-260B-01") -> None:
@@ -44,14 +58,16 @@ class Cornerstone260B(UsbDevice):
         self._message = bytearray()
         self._requests: deque[tuple[int, int]] = deque()  # tag and largest size of answers that the host waits for
         self._answers = bytearray()
-        self._waiting: deque[tuple[int, str]] = deque()  # with the number of aborts when it came
+        self._waiting: deque[_Command] = deque()
         self._worker: threading.Thread | None = None
-        self._moving = False
+        self._motions = 0
         self._aborts = self._current = 0
+        self._events = 0x80  # power on
         self._errors: deque[str] = deque()
         self._settings: dict[str, float] = {"GRATING": 1, "FILTER": 1, "OUTPORT": 1, "SHUTTER": 0}
         self._nm = 0.0
         self._units = "NM"
+        self._slits_um = {1: 3000.0, 2: 3000.0, 3: 3000.0}
 
     # --- USBTMC -------------------------------------------------------------------------------------------------------
 
@@ -104,8 +120,8 @@ class Cornerstone260B(UsbDevice):
         with self.changed:
             self.wait_for(lambda: bool(self._requests and self._answers), cancelled)
             tag, most = self._requests.popleft()
-            end = self._answers.index(b"\n") + 1
-            count = min(end, most, max(0, length - _HEADER.size))
+            end = self._answers.find(b"\n") + 1 or len(self._answers) + 1  # one that broke off never ends
+            count = min(end, len(self._answers), most, max(0, length - _HEADER.size))
             piece = bytes(self._answers[:count])
             del self._answers[:count]
         head = _HEADER.pack(REQUEST_DEV_DEP_MSG_IN, tag, tag ^ 0xFF, count, int(count == end))
@@ -134,7 +150,7 @@ class Cornerstone260B(UsbDevice):
 
     def _enqueue(self, command: str) -> None:
         with self.changed:
-            self._waiting.append((self._aborts, command))
+            self._waiting.append(_Command(command, self._aborts))
             if self._worker is None:
                 self._worker = threading.Thread(target=self._work, name="cs260b", daemon=True)
                 self._worker.start()
@@ -145,11 +161,31 @@ class Cornerstone260B(UsbDevice):
                 if not self._waiting:
                     self._worker = None
                     return
-                self._current, command = self._waiting.popleft()
-                self._moving = command.startswith(("GOWAVE", "GRATING ", "FILTER ", "OUTPORT "))
+                entry = self._waiting[0]
+                command, self._current = entry.text, entry.aborts
+                if command in ("*WAI", "*OPC?"):
+                    while self._motions and self.plugged and self._waiting:
+                        self.changed.wait(0.05)
             self._obey(command)
             with self.changed:
-                self._moving = False
+                if self._waiting and self._waiting[0] is entry:
+                    self._waiting.popleft()
+
+    def _begin_motion(self, seconds: float, arrive: Callable[[], None]) -> None:
+        with self.changed:
+            self._motions += 1
+            begun = self._current
+
+        def move() -> None:
+            self._light.clock.sleep(seconds)
+            time.sleep(_LEAST_REAL_S)
+            with self.changed:
+                if begun == self._aborts:
+                    arrive()
+                self._motions -= 1
+                self.changed.notify_all()
+
+        threading.Thread(target=move, name="cs260b-motion", daemon=True).start()
 
     def _obey(self, command: str) -> None:
         try:
@@ -157,10 +193,12 @@ class Cornerstone260B(UsbDevice):
         except _Refusal as refusal:
             with self.changed:
                 self._errors.append(str(refusal))
+                self._events |= 0x20 if str(refusal).startswith("-11") else 0x10
             return
         if answer is not None:
+            data = self.broken(answer.encode() + b"\r\n")
             with self.changed:
-                self._answers += answer.encode() + b"\r\n"
+                self._answers += data
                 self.changed.notify_all()
 
     def _execute(self, command: str) -> str | None:
@@ -168,21 +206,24 @@ class Cornerstone260B(UsbDevice):
         if word.endswith("?"):
             return self._answer(word[:-1])
         if word == "ABORT":
-            self._aborts += 1
+            with self.changed:
+                self._aborts += 1
         elif word == "GOWAVE":
             self._move_to(self._nanometres(_number(argument)))
         elif word == "UNITS":
             if argument not in (*_UNITS, "WN"):
                 raise _Refusal(_OUT_OF_RANGE)
             self._units = argument
-        elif word in self._settings:
-            self._set(word, _number(argument))
-        elif word.startswith("SLIT") and word.endswith("MICRONS"):
+        elif word == "SHUTTER" and argument in ("O", "C"):
+            self._set(word, float(argument == "O"))
+        elif word in self._settings or word == "GRAT":
+            self._set("GRATING" if word == "GRAT" else word, _number(argument))
+        elif found := re.fullmatch(r"SLIT([123])MICRONS", word):
             width_um = _number(argument)
             if not 4.0 <= width_um <= 3000.0:
                 raise _Refusal(_OUT_OF_RANGE)
-            self._light.set_slit_um(width_um)
-        elif word not in ("*CLS", "*RST", "*OPC"):
+            self._begin_motion(0.5, lambda: self._set_slit(int(found[1]), width_um))
+        elif word not in ("*CLS", "*RST", "*OPC", "*WAI"):
             raise _Refusal(_UNKNOWN)
         if word == "*CLS":
             self._errors.clear()
@@ -199,13 +240,39 @@ class Cornerstone260B(UsbDevice):
             return "1"  # it waited for its turn: everything before is done
         if what == "IDLE":
             with self.changed:
-                return "0" if self._moving or self._waiting else "1"
+                return "0" if self._motions or self._waiting else "1"
         if what in ("SYSTEM:ERROR", "SYST:ERR"):
             with self.changed:
                 return self._errors.popleft() if self._errors else "0, No Error"
+        if what in ("ERROR", "STB", "*STB", "*ESR"):
+            return self._status(what)
+        if what == "INFO":
+            return f"CS260B SN {self.identity.serial_number}"
+        if what == "GRAT":
+            return f"{self._settings['GRATING']:.0f},{1200 if self._settings['GRATING'] == 1 else 600},VIS"
+        if found := re.fullmatch(r"SLIT([123])MICRONS", what):
+            return f"{self._slits_um[int(found[1])]:.0f}"
+        if found := re.fullmatch(r"FILTER([1-6])LABEL", what):
+            return f"FILTER{found[1]}"
         if what in self._settings:
             return f"{self._settings[what]:.0f}"
         raise _Refusal(_UNKNOWN)
+
+    def _status(self, what: str) -> str:
+        """`error?` and `stb?` as the RS-232 port has them, the event register of IEEE 488.2; reading clears."""
+        with self.changed:
+            if what == "*ESR":
+                told, self._events = self._events, 0
+                return str(told)
+            if what in ("STB", "*STB"):
+                return "20" if self._errors else "00"
+            last, self._errors = (list(self._errors) or [""])[-1], deque()
+            return "0" if not last else "1" if last.startswith("-113") else "2"
+
+    def _set_slit(self, slit: int, width_um: float) -> None:
+        self._slits_um[slit] = width_um
+        if slit == 1:
+            self._light.set_slit_um(width_um)
 
     def _nanometres(self, value: float) -> float:
         if self._units == "WN":
@@ -220,10 +287,12 @@ class Cornerstone260B(UsbDevice):
     def _move_to(self, nm: float) -> None:
         if not 0 <= nm <= _UPPER_NM:
             raise _Refusal(_OUT_OF_RANGE)
-        self._light.clock.sleep(abs(nm - self._nm) / _NM_PER_S)
-        if self._current == self._aborts:
+
+        def arrive() -> None:
             self._nm = nm
             self._light.set_wavelength(nm)
+
+        self._begin_motion(abs(nm - self._nm) / _NM_PER_S, arrive)
 
     def _set(self, what: str, value: float) -> None:
         most = {"GRATING": 2, "FILTER": 6, "OUTPORT": 2, "SHUTTER": 1}[what]
@@ -231,11 +300,15 @@ class Cornerstone260B(UsbDevice):
             raise _Refusal(_OUT_OF_RANGE)
         if what == "SHUTTER":
             self._light.set_shutter(bool(value))
+            self._settings[what] = value
         elif value != self._settings[what]:
-            self._light.clock.sleep(10.0 if what == "GRATING" else 1.5)
-            if what == "FILTER":
-                self._light.set_filter(int(value))
-        self._settings[what] = value
+
+            def arrive() -> None:
+                self._settings[what] = value
+                if what == "FILTER":
+                    self._light.set_filter(int(value))
+
+            self._begin_motion(29.0 if what == "GRATING" else 1.5, arrive)
 
 
 def _number(text: str) -> float:

@@ -27,16 +27,22 @@ _SPEEDS = ("slow", "normal", "fast", "2x fast")
 
 
 class ColorimetryResearch(Grammar):
-    """The instrument; `model` is "CR-300" (2 nm) or "CR-250" (4 nm)."""
+    """The instrument; `model` is "CR-300" or "CR-250", `step_nm` 2 or 4 if it isn't told."""
 
     fault_code = TOO_LOW
 
-    def __init__(self, light: MeasuredLight, model: str = "CR-300", serial_number: str = "A00427") -> None:
+    def __init__(
+        self,
+        light: MeasuredLight,
+        model: str = "CR-300",
+        serial_number: str = "A00427",
+        step_nm: float | None = None,
+    ) -> None:
         super().__init__(light.clock)
         self._light = light
         self._model = model
         self._serial_number = serial_number
-        self._step_nm = 2.0 if model == "CR-300" else 4.0
+        self._step_nm = step_nm or (2.0 if model == "CR-300" else 4.0)
         self._wavelength_nm: FloatArray = np.arange(380.0, 780.1, self._step_nm)
         self._echo = False
         self._line = bytearray()
@@ -46,7 +52,7 @@ class ColorimetryResearch(Grammar):
         self._spectrum: FloatArray | None = None
         self._xyz = (0.0, 0.0, 0.0)
         self._exposure_ms = 100.0
-        self._settings = {"Speed": 1, "ExposureMode": 0, "ExposureX": 1, "Exposure": 100, "SyncMode": 0}
+        self._settings = {"Speed": 1, "ExposureMode": 0, "ExposureX": 1, "Exposure": 100, "SyncMode": 0, "SyncFreq": 60}
 
     def receive(self, data: bytes) -> list[bytes]:
         out: list[bytes] = []
@@ -124,10 +130,22 @@ class ColorimetryResearch(Grammar):
             "RS Speed": _SPEEDS[self._settings["Speed"]],
             "RS Aperture": "2 deg",
             **{f"RS {name}": str(value) for name, value in self._settings.items() if name != "Speed"},
+            "RS Exposure": f"{self._settings['Exposure']} msec",
+            "RS SyncFreq": f"{self._settings['SyncFreq']:.2f} Hz",
+            "RM Warnings": "0",
         }
         if command in told:
             return _ok(command, told[command])
-        if command not in {"RM Spectrum", "RM XYZ", "RM Y", "RM xy", "RM Exposure", "RM Radiometric"}:
+        if command not in {
+            "RM Spectrum",
+            "RM XYZ",
+            "RM Y",
+            "RM xy",
+            "RM Exposure",
+            "RM Radiometric",
+            "RM X",
+            "RM XYZ10",
+        }:
             return _error(INVALID_COMMAND, command)
         if self._spectrum is None:
             return _error(NOTHING_MEASURED, command)
@@ -139,6 +157,8 @@ class ColorimetryResearch(Grammar):
             return _ok(command, f"{first_nm:.1f},{last_nm:.1f},{self._step_nm:.1f},{len(self._spectrum)}{values}")
         measured = {
             "RM XYZ": f"{x:.4e},{y:.4e},{z:.4e}",
+            "RM XYZ10": f"{x:.4e},{y:.4e},{z:.4e}",  # close enough for a mock: it knows the 2 degree functions alone
+            "RM X": f"{x:.4e}",
             "RM Y": f"{y:.4e}",
             "RM xy": f"{x / total:.4f},{y / total:.4f}",
             "RM Exposure": f"{self._exposure_ms:.3f} msec",

@@ -2,7 +2,8 @@
 
 Nothing is answered until the characters PHOTO have come, in whatever pieces and with whatever line end, or none; Q
 leaves remote mode at once. Commands end CR or LF, a pair of them counts once. Answers end CR LF and begin with a
-quality code, 00000 if all is well. Data codes as in the maker's table; the two lines before a spectrum are (unverified).
+quality code, 00000 if all is well. Data codes as in the maker's table. Before a spectrum stand two lines, or by the manual (p. 127)
+one of five fields, with three-digit exponents: `dialect` chooses.
 """
 
 from __future__ import annotations
@@ -17,17 +18,27 @@ from sim.spectrum import PHOTON_ENERGY_J_NM, FloatArray
 
 NOT_CONSTANT, OVERLOAD, CANNOT_SYNC, WEAK_LIGHT, SYNC, AUTO_SYNC, TIMED_OUT = -1, -2, -3, -8, -9, -10, -12
 _BAD_COMMAND = -20
+DIALECTS = ("two-lines", "one-line")
 _OVERLOAD_CD_M2 = 1.0e5
 _WEAKEST_CD_M2 = 1e-3
 
 
 class PhotoResearch(Grammar):
-    """The instrument; `model` is "PR-655" (4 nm) or "PR-670" (2 nm)."""
+    """The instrument; `model` is "PR-655" (4 nm) or "PR-670" (2 nm), `dialect` one of `DIALECTS`."""
 
     fault_code = WEAK_LIGHT
 
-    def __init__(self, light: MeasuredLight, model: str = "PR-655", serial_number: str = "65501234") -> None:
+    def __init__(
+        self,
+        light: MeasuredLight,
+        model: str = "PR-655",
+        serial_number: str = "65501234",
+        dialect: str = "two-lines",
+    ) -> None:
         super().__init__(light.clock)
+        if dialect not in DIALECTS:
+            raise ValueError(f"no dialect {dialect!r}: there are {', '.join(DIALECTS)}")
+        self.dialect = dialect
         self._light = light
         self._model = model
         self._serial_number = serial_number
@@ -140,6 +151,7 @@ class PhotoResearch(Grammar):
 
     def _data(self, code: int) -> bytes:
         fixed = {110: self._serial_number, 111: self._model, 114: "1.19C", 601: self._settings()}
+        fixed |= {112: "1", 115: "0", 116: "0", 117: "0", 120: "380,4,101", 200: "0", 401: "0", 602: self._settings()}
         if code in fixed:
             return f"00000,{fixed[code]}\r\n".encode("ascii")
         if code == 0:
@@ -174,9 +186,19 @@ class PhotoResearch(Grammar):
         peak_nm = float(self._wavelength_nm[int(np.argmax(spectrum))])
         power = float(np.trapezoid(spectrum, self._wavelength_nm))
         photons = float(np.trapezoid(spectrum * self._wavelength_nm / PHOTON_ENERGY_J_NM, self._wavelength_nm))
+        if self.dialect == "one-line":
+            lines = [f"00000,0,{_three_digits(0.0)},{power:.3e},{photons:.3e}"]
+            lines += [f"{w:.0f},{_three_digits(v)}" for w, v in zip(self._wavelength_nm, spectrum, strict=True)]
+            return ("\r\n".join(lines) + "\r\n").encode("ascii")
         lines = ["00000,0", f"{peak_nm:.0f},{power:.3e},{photons:.3e}"]
         lines += [f"{w:.0f},{v:.3e}" for w, v in zip(self._wavelength_nm, spectrum, strict=True)]
         return ("\r\n".join(lines) + "\r\n").encode("ascii")
+
+
+def _three_digits(value: float) -> str:
+    """A number of ten characters, its exponent of three digits: 1.234e-003."""
+    mantissa, _, exponent = f"{value:.3e}".partition("e")
+    return f"{mantissa}e{exponent[0]}{int(exponent[1:]):03d}"
 
 
 def _quality(code: int) -> bytes:

@@ -24,7 +24,6 @@ OVER_EXPOSED, UNDER_EXPOSED, NOTHING_MEASURED, OUT_OF_RANGE, BROKEN_OFF = 120, 1
 #: Radiance x integration time (W s sr^-1 m^-2 nm^-1) at which the detector is full.
 _FULL = 6e-4
 _SHORTEST_MS = 1.0
-_CALIBRATED_NM = (350.0, 1000.0)
 #: Settings and what they may be: lower end, upper end, value after `*conf:default`.
 _SETTINGS: dict[str, tuple[float, float, float]] = {
     "calibn": (0, 3, 0),
@@ -52,8 +51,16 @@ class MockSpecbos1211(Grammar):
     line_end = b"\r"
     fault_code = OVER_EXPOSED
 
-    def __init__(self, light: MeasuredLight, serial_number: str = "1211427") -> None:
+    def __init__(
+        self,
+        light: MeasuredLight,
+        serial_number: str = "1211427",
+        model: str = "specbos 1211",
+        calibrated_nm: tuple[float, float] = (350.0, 1000.0),
+    ) -> None:
         super().__init__(light.clock)
+        self._model = model
+        self._calibrated_nm = calibrated_nm
         self._light = light
         self._serial_number = serial_number
         self._line = bytearray()
@@ -61,7 +68,7 @@ class MockSpecbos1211(Grammar):
         self._error = 0
         self._laser = 0
         self._settings: dict[str, float] = {}
-        self._range_nm = (380.0, 780.0, 1.0)
+        self._range_nm = self._whole_range()
         self._default()
         self._done_at: float | None = None
         self._planned_failure: int | None = None
@@ -127,7 +134,7 @@ class MockSpecbos1211(Grammar):
         return [Reply(NAK)]
 
     def _answer(self, words: str, action: Callable[..., bytes], arguments: tuple[str | None, ...]) -> bytes:
-        if words != "*stat:err?" and not words.startswith("*init"):
+        if words != "*stat:err?" and not words.startswith(("*init", "*meas")):
             code = self._failure()
             if code is not None:
                 raise _Refusal(code)
@@ -136,10 +143,14 @@ class MockSpecbos1211(Grammar):
     # --- commands ---------------------------------------------------------------------------------------------------
 
     def _identify(self) -> bytes:
-        return b"JETI_SB1211\r"
+        return {
+            "specbos 1211": b"JETI_SB1211\r",
+            "specbos 1201": b"SB05\r",
+            "spectraval 1501": b"JETI_SDCM3 1501427\r",
+        }[self._model]
 
     def _version(self) -> bytes:
-        return b"V2.1.4\r"
+        return b"1.8.3\r" if self._model == "specbos 1201" else b"V2.1.4\r"
 
     def _last_error(self) -> bytes:
         code, self._error = self._error, 0
@@ -147,8 +158,12 @@ class MockSpecbos1211(Grammar):
 
     def _default(self) -> bytes:
         self._settings = {name: default for name, (_, _, default) in _SETTINGS.items()}
-        self._range_nm = (380.0, 780.0, 1.0)
+        self._range_nm = self._whole_range()
         return ACK
+
+    def _whole_range(self) -> tuple[float, float, float]:
+        """A specbos begins with the visible, a spectraval with all that it measures."""
+        return (*self._calibrated_nm, 1.0) if self._model == "spectraval 1501" else (380.0, 780.0, 1.0)
 
     def _save(self) -> bytes:
         return ACK
@@ -161,7 +176,12 @@ class MockSpecbos1211(Grammar):
                 raise _Refusal(wrong)
             self._range_nm = (numbers[0], numbers[1], numbers[2])
             return ACK
-        if name not in _SETTINGS:
+        if name == "maxtint" and self._model == "spectraval 1501":
+            name = "maxtin"
+        # Firmware of the 1201 up to 1.8.3 doesn't know maxtin; a spectraval has its settings under para alone.
+        if name not in _SETTINGS or (name == "maxtin" and self._model == "specbos 1201"):
+            raise _Refusal(COMMAND)
+        if self._model == "spectraval 1501" and tree.startswith("conf"):
             raise _Refusal(COMMAND)
         lower, upper, _ = _SETTINGS[name]
         value = _number(text, wrong)
@@ -173,13 +193,14 @@ class MockSpecbos1211(Grammar):
     def _get(self, tree: str, name: str) -> bytes:
         first_nm, last_nm, step_nm = self._range_nm
         if name == "wavbeg":
-            return b"Predefined start wave: %.1f\r" % _CALIBRATED_NM[0]
+            return b"Predefined start wave: %.1f\r" % self._calibrated_nm[0]
         if name == "wavend":
-            return b"Predefined end wave: %.1f\r" % _CALIBRATED_NM[1]
+            return b"Predefined end wave: %.1f\r" % self._calibrated_nm[1]
         if name == "spnum":
             return f"spectrometer number: {self._serial_number}\r".encode("ascii")
         if name == "wran":
-            return b"wran: %.0f %.0f %.0f\r" % (first_nm, last_nm, step_nm)
+            bare = self._model == "spectraval 1501"
+            return b"%s%.0f %.0f %.0f\r" % (b"" if bare else b"wran: ", first_nm, last_nm, step_nm)
         if name in _SETTINGS:
             return f"{name}: {self._settings[name]:g}\r".encode("ascii")
         raise _Refusal(COMMAND)
@@ -215,7 +236,7 @@ class MockSpecbos1211(Grammar):
         if self._planned_failure is not None:
             raise _Refusal(self._planned_failure)
         first_nm, last_nm, step_nm = self._range_nm
-        if first_nm < _CALIBRATED_NM[0] or last_nm > _CALIBRATED_NM[1]:
+        if first_nm < self._calibrated_nm[0] or last_nm > self._calibrated_nm[1]:
             raise _Refusal(OUT_OF_RANGE)
         tint_ms = self._integration_ms()
         radiance = self._light.radiance()
@@ -234,8 +255,18 @@ class MockSpecbos1211(Grammar):
             raise _Refusal(NOTHING_MEASURED)
         return self._measured
 
+    def _calculate_spectrum(self) -> bytes:
+        """A spectraval's: wavelength and value a line, if it was told to speak text."""
+        spectrum = self._spectrum()
+        if self._model != "spectraval 1501" or self._settings["form"] != 2:
+            raise _Refusal(COMMAND)
+        lines = [f"{w:.1f} {v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
+        return "\r".join([*lines, ""]).encode("ascii")
+
     def _fetch_spectrum(self, form: str | None) -> bytes:
         spectrum = self._spectrum()
+        if self._model == "spectraval 1501":
+            raise _Refusal(COMMAND)
         number = int(form) if form else int(self._settings["form"])
         if number in (7, 10):  # for a terminal: wavelength and value, blocks ended by an empty line
             lines = [f"{w:.0f}\t{v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
@@ -282,8 +313,9 @@ class MockSpecbos1211(Grammar):
         (r"\*contr(?:ol)?:laser\?", _laser_state),
         (r"\*contr(?:ol)?:laser ([01])", _set_laser),
         (r"\*contr(?:ol)?:cyctim(?: \d+){0,2}", _cycle_time),
-        (r"\*init(?:iate)?", _init),
+        (r"\*init(?:iate)?|\*meas(?:ure)?:refer", _init),
         (r"\*fetch:sprad(?: (\d{1,2}))?", _fetch_spectrum),
+        (r"\*calc:sprad", _calculate_spectrum),
         (r"\*fetch(?: (\d{1,2}))?", _fetch),
         (r"\*fetch:xyz(?: \d{1,2})?", _fetch_xyz),
         (r"\*fetch:photo(?:metric)?(?: (\d{1,2}))?", _fetch_luminance),

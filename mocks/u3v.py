@@ -51,8 +51,16 @@ SBRM, SIRM, MANIFEST, XML, FEATURES = 0x1_0000, 0x2_0000, 0x3_0000, 0x4_0000, 0x
     TEMPERATURE,
     PIXEL_PITCH,
     BINNING,
-) = (FEATURES + 4 * n for n in range(18))
-FEATURE_BYTES = 4 * 18
+    LINE_SELECTOR,
+    LINE_MODE,  # one word a line
+    LINE_MODE_1,
+    LINE_SOURCE,
+    LINE_SOURCE_1,
+    GAMMA_ENABLE,
+    BLACK_LEVEL,
+    PARAMS_LOCKED,
+) = (FEATURES + 4 * n for n in range(26))
+FEATURE_BYTES = 4 * 26
 
 TICKS_PER_US = 10
 MOST_EXPOSURE_US = 60e6
@@ -61,6 +69,17 @@ BAYER_RG8, BAYER_RG12, BAYER_RG12P = 0x01080009, 0x01100011, 0x010C0059
 TRIGGER_ON = 1 << 0
 SOURCE_SHIFT, SOURCE_SOFTWARE, SOURCE_LINE = 4, 0, 1
 _MOST_QUEUED = 4
+
+#: What the faults of serial instruments are to a camera's frames (`UsbDevice.fail`).
+_AS_FRAMES = {
+    "late": "late",
+    "never": "never",
+    "half": "short",
+    "wrong": "damaged",
+    "error": "halt",
+    "drop": "lost-trailer",
+    "unplug": "unplug",
+}
 
 #: What a camera can be told to do wrong, once or several times (`U3vDevice.inject`).
 FAULTS = {
@@ -132,7 +151,7 @@ def _zipped(xml: bytes) -> bytes:
 
 
 class TriggerLine:
-    """The wire that runs from each camera's output to the others' Line0."""
+    """The wire that runs from each camera's Line1 to the others' Line0; a pulse goes out where Line1 is told to follow the exposure."""
 
     def __init__(self) -> None:
         self._devices: list[U3vDevice] = []
@@ -143,6 +162,8 @@ class TriggerLine:
 
     def pulse(self, source: U3vDevice, start_s: float) -> None:
         """An exposure of `source` begins at virtual time `start_s`."""
+        if not source.gives_pulses:
+            return
         for device in self._devices:
             if device is not source:
                 device.line_pulse(start_s)
@@ -266,6 +287,9 @@ class U3vDevice(UsbDevice):
             (PIXEL_FORMAT, BAYER_RG8),
             (EXPOSURE_TICKS, 10_000 * TICKS_PER_US),
             (PIXEL_PITCH, round(pitch_um * 1000)),
+            (LINE_MODE_1, 0),
+            (GAMMA_ENABLE, 1),  # as cameras leave the factory
+            (BLACK_LEVEL, 64),
         ):
             self._put(register, value)
         self._update_payload()
@@ -346,7 +370,7 @@ class U3vDevice(UsbDevice):
 
     def _write_feature(self, register: int, data: bytes) -> None:
         value = int.from_bytes(data, "little")
-        if register in (SENSOR_WIDTH, SENSOR_HEIGHT, PAYLOAD_SIZE, TEMPERATURE, PIXEL_PITCH, BINNING):
+        if register in (SENSOR_WIDTH, SENSOR_HEIGHT, PAYLOAD_SIZE, TEMPERATURE, PIXEL_PITCH, BINNING, LINE_MODE):
             raise _Refusal(0x8004)
         if register in (WIDTH, HEIGHT, OFFSET_X, OFFSET_Y, PIXEL_FORMAT):
             if self._acquiring:
@@ -383,8 +407,23 @@ class U3vDevice(UsbDevice):
             (gain_db,) = struct.unpack("<f", struct.pack("<I", value))
             if not (math.isfinite(gain_db) and 0 <= gain_db <= MOST_GAIN_DB):
                 raise _Refusal(0x8002)
+        highest = {
+            LINE_SELECTOR: 1,
+            LINE_MODE_1: 1,
+            LINE_SOURCE_1: 1,
+            GAMMA_ENABLE: 1,
+            BLACK_LEVEL: 255,
+            PARAMS_LOCKED: 1,
+        }
+        if register in highest and value > highest[register]:
+            raise _Refusal(0x8002)
         if register == TRIGGER_CONTROL and (value >> SOURCE_SHIFT) & 0xF not in (SOURCE_SOFTWARE, SOURCE_LINE):
             raise _Refusal(0x8002)
+
+    @property
+    def gives_pulses(self) -> bool:
+        """Whether Line1 is an output that follows the exposure."""
+        return self._get(LINE_MODE_1) == 1 and self._get(LINE_SOURCE_1) == 1
 
     def _trigger_source(self) -> int:
         return (self._get(TRIGGER_CONTROL) >> SOURCE_SHIFT) & 0xF
@@ -516,8 +555,11 @@ class U3vDevice(UsbDevice):
         frame_id, self._frame_id = self._frame_id, self._frame_id + 1
         payload = encode(raw[top : top + rows, left : left + cols], pixel_format)
         fault = self._failing("late", "never", "short", "lost-trailer", "damaged", "unplug", "halt")
+        seconds: float | None = None
+        for told in self._faults_of_answer():
+            fault, seconds = _AS_FRAMES[told.kind], told.value
         if fault == "late":
-            time.sleep(1.0)
+            time.sleep(1.0 if seconds is None else seconds)
         if fault == "halt":
             self._state.halted.add(STREAM_IN)
         if fault == "short":
@@ -550,8 +592,10 @@ class U3vDevice(UsbDevice):
             if enabled and self._acquiring and queued < _MOST_QUEUED and fault != "never":
                 self._stream.extend(pieces)
                 self.changed.notify_all()
-        if fault == "unplug":
+        if fault == "unplug" and seconds is None:
             self.unplug()
+        elif fault == "unplug" and seconds is not None:
+            self._unplug_for(seconds)
 
     def _split(self, payload: bytes) -> list[bytes]:
         """The payload in the transfers that the host asked for; the last one is filled up to whole 4 bytes."""

@@ -19,14 +19,15 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
 from mocks.bench import Bench
-from mocks.cornerstone260b import Cornerstone260B
+from mocks.cornerstone260b import MockCornerstone260B
 from mocks.u3v import TriggerLine, U3vDevice
 from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb_device import Abandoned, UsbDevice, UsbFault
+from mocks.wire import MeasuredLight
 
 SERIAL_NUMBERS = {"left": "CB-U3V-0001", "right": "CB-U3V-0002"}
 
@@ -40,16 +41,19 @@ def stereo_pair(bench: Bench) -> tuple[U3vDevice, U3vDevice]:
     )
 
 
-_INSTRUMENTS: dict[str, Callable[[Bench], Sequence[UsbDevice]]] = {
-    "cornerstone260b": lambda bench: (Cornerstone260B(bench),),
+_INSTRUMENTS: dict[str, Callable[[Any], Sequence[UsbDevice]]] = {
+    "cornerstone260b": lambda bench: (MockCornerstone260B(bench),),
     "u3v": lambda bench: stereo_pair(bench)[:1],
     "u3v-stereo": stereo_pair,
     "usb2000plus": lambda bench: (MockUsb2000Plus(bench),),
 }
 
 
-def devices(name: str, bench: Bench | None = None) -> tuple[UsbDevice, ...]:
-    """The device models of one instrument, on a bench of its own if none is given. Raises ValueError for an unknown name."""
+def devices(name: str, bench: Bench | MeasuredLight | None = None) -> tuple[UsbDevice, ...]:
+    """The device models of one instrument, on a bench of its own if none is given; cameras need a bench.
+
+    Raises ValueError for an unknown name.
+    """
     if name not in _INSTRUMENTS:
         raise ValueError(f"no USB instrument {name!r}: there are {', '.join(_INSTRUMENTS)}")
     return tuple(_INSTRUMENTS[name](bench if bench is not None else Bench()))
@@ -126,6 +130,7 @@ class _Urb:
     data: bytes | None
     length: int
     unlinked: threading.Event = field(default_factory=threading.Event)
+    unlink_number: int | None = None  # of the request that cancels this one
 
 
 class _Session:
@@ -185,31 +190,38 @@ class _Session:
 
     def _work(self, waiting: queue.Queue[_Urb | None]) -> None:
         while (urb := waiting.get()) is not None:
-            status, came = 0, b""
+            status, came, abandoned = 0, b"", urb.unlinked.is_set()
             try:
-                if urb.unlinked.is_set():
-                    raise Abandoned
-                came = self._device.transfer(urb.endpoint, urb.setup, urb.data, urb.length, urb.unlinked.is_set)
+                if not abandoned:
+                    came = self._device.transfer(urb.endpoint, urb.setup, urb.data, urb.length, urb.unlinked.is_set)
+            except Abandoned:
+                abandoned = True
             except UsbFault as fault:
                 status = fault.status
             with self._lock:
-                if self._pending.pop(urb.number, None) is None:
-                    continue  # unlinked: the answer to that has gone out
-                count = len(came) if urb.data is None else len(urb.data) * (status == 0)
-                self._send(
-                    struct.pack(">IIIII", 3, urb.number, 0, 0, 0)
-                    + struct.pack(">iiiii8x", status, count, 0, 0, 0)
-                    + came
-                )
+                self._pending.pop(urb.number, None)
+                # A request that ended before it could be cancelled is answered: what it took from the device would be lost.
+                if not abandoned:
+                    count = len(came) if urb.data is None else len(urb.data) * (status == 0)
+                    self._send(
+                        struct.pack(">IIIII", 3, urb.number, 0, 0, 0)
+                        + struct.pack(">iiiii8x", status, count, 0, 0, 0)
+                        + came
+                    )
+                if urb.unlink_number is not None:
+                    self._answer_unlink(urb.unlink_number, Abandoned.status if abandoned else 0)
 
     def _unlink(self, number: int, target: int) -> None:
         with self._lock:
-            urb = self._pending.pop(target, None)
-            if urb is not None:
+            urb = self._pending.get(target)
+            if urb is None:
+                self._answer_unlink(number, 0)
+            else:
+                urb.unlink_number = number
                 urb.unlinked.set()
-            self._send(
-                struct.pack(">IIIII", 4, number, 0, 0, 0) + struct.pack(">i24x", 0 if urb is None else Abandoned.status)
-            )
+
+    def _answer_unlink(self, number: int, status: int) -> None:
+        self._send(struct.pack(">IIIII", 4, number, 0, 0, 0) + struct.pack(">i24x", status))
 
     def _send(self, data: bytes) -> None:
         with self._send_lock, contextlib.suppress(OSError):

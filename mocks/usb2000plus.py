@@ -44,10 +44,15 @@ def response(wavelength: NDArray[np.float64]) -> NDArray[np.float64]:
     return 4.0e7 * (blaze + 0.03) * (1.0 + 0.02 * np.sin(wavelength / 23.0))
 
 
-def calibration_csv() -> str:
-    """The calibration that a laboratory would have sent with the instrument, as its driver reads it."""
+def calibration_csv(departure_percent: float = 0.0) -> str:
+    """The calibration that a laboratory would have sent with the instrument, as its driver reads it.
+
+    `departure_percent`: by how much it is off, smoothly over the spectrum; real ones are good to about 2 % (half of the expanded
+    uncertainty that calibration laboratories state for spectral radiance).
+    """
     at = np.arange(350.0, 1001.0, 2.0)
-    rows = [f"{w:.1f},{r:.6e}" for w, r in zip(at, response(at), strict=True)]
+    told = response(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 90.0))
+    rows = [f"{w:.1f},{r:.6e}" for w, r in zip(at, told, strict=True)]
     return "\n".join(["wavelength_nm,counts_per_s_per_w_sr_m2_nm", *rows]) + "\n"
 
 
@@ -115,7 +120,10 @@ class MockUsb2000Plus(UsbDevice):
             return whole[:length]
 
     def _say(self, endpoint: int, data: bytes) -> None:
+        data = self.broken(data)
         with self.changed:
+            if not data:
+                return
             self._queues[endpoint].append(data)
             self.changed.notify_all()
 

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+
+from mocks.wire import Fault
 
 #: Asked from time to time by a device that waits: has whoever asked lost patience?
 Cancelled = Callable[[], bool]
@@ -106,6 +109,9 @@ class UsbDevice:
         self._association = association
         self._state = _State()
         self._strings = ["", identity.maker, identity.product, identity.serial_number]
+        self._line_faults: tuple[Fault, ...] = ()
+        self.answers = 0
+        self._silent = False
 
     # --- descriptors --------------------------------------------------------------------------------------------------
 
@@ -155,6 +161,9 @@ class UsbDevice:
         """One transfer: `data` of an OUT, None for an IN of at most `length` bytes. Raises `UsbFault`."""
         if not self.plugged:
             raise Unplugged(self.identity.serial_number)
+        if self._silent:
+            with self.changed:
+                self.wait_for(lambda: not self._silent, cancelled)
         if endpoint & 0x0F == 0:
             return self._setup(setup, data, cancelled)[: length if data is None else None]
         if endpoint in self._state.halted:
@@ -213,6 +222,48 @@ class UsbDevice:
             self.plugged = True
             self._state = _State()
         self.on_reset()
+
+    # --- faults -------------------------------------------------------------------------------------------------------
+
+    def fail(self, faults: Iterable[Fault]) -> None:
+        """Break answers, which count from 1, as serial instruments' answers break; a camera's answers are its frames."""
+        self._line_faults = tuple(faults)
+        self.answers = 0
+
+    def mute(self, silent: bool) -> None:
+        """Let every transfer wait, as if the device hung; or go on."""
+        with self.changed:
+            self._silent = silent
+            self.changed.notify_all()
+
+    def _faults_of_answer(self) -> list[Fault]:
+        """The faults of the answer that is about to go out."""
+        self.answers += 1
+        return [fault for fault in self._line_faults if fault.hits(self.answers)]
+
+    def _unplug_for(self, seconds: float) -> None:
+        self.unplug()
+        back = threading.Timer(seconds, self.plug)
+        back.daemon = True
+        back.start()
+
+    def broken(self, answer: bytes) -> bytes:
+        """An answer as its faults leave it; empty: nothing goes out."""
+        for fault in self._faults_of_answer():
+            if fault.kind == "late":
+                time.sleep(3.0 if fault.value is None else fault.value)
+            elif fault.kind in ("never", "drop"):
+                answer = b""
+            elif fault.kind == "half":
+                answer = answer[: len(answer) // 2]
+            elif fault.kind == "wrong":
+                answer = b"?" * max(1, len(answer) - 2) + answer[-2:]
+            elif fault.kind == "error":
+                raise Stalled(f"answer {self.answers} fails as it was told to")
+            elif fault.kind == "unplug":
+                self._unplug_for(1.0 if fault.value is None else fault.value)
+                answer = b""
+        return answer
 
     # --- for subclasses -----------------------------------------------------------------------------------------------
 

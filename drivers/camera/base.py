@@ -19,7 +19,7 @@ Trigger = Literal["software", "line"]
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """What the camera reports of its sensor; None where it doesn't."""
+    """What the camera reports of its sensor; None where it doesn't. `black_level` is in the camera's own unit, mostly codes."""
 
     rows: int
     cols: int
@@ -27,6 +27,7 @@ class SensorInfo:
     cfa: str | None  # "RGGB" ..., "MONO"
     bit_depth: int | None
     pixel_pitch_um: float | None = None
+    black_level: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,9 @@ class Camera(Instrument):
         Raises `drivers.errors.NoAnswer` if no frame, or not all of it, came.
         """
 
+    def follow(self) -> None:
+        """Called right after the camera that leads was triggered: a camera that isn't wired to it is triggered by software here."""
+
     def capture(self) -> Frame:
         """One frame on a software trigger."""
         self.arm("software")
@@ -86,6 +90,8 @@ class Camera(Instrument):
 def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:
     """One frame of each camera, exposed at the same time: the first is triggered by software and pulses the others' line.
 
+    Cameras that aren't wired follow milliseconds later (`follow`).
+
     All are read out even if one fails, so that none is left with an old frame; then the first failure is raised.
     """
     first, *others = cameras
@@ -93,6 +99,8 @@ def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:
         camera.arm("line")
     first.arm("software")
     first.fire()
+    for camera in others:
+        camera.follow()
     frames: list[Frame] = []
     failure: InstrumentError | None = None
     for camera in cameras:

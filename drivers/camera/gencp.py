@@ -5,6 +5,8 @@ Source: EMVA, GenICam GenCP 1.2; bytes checked against `tests/drivers/camera/tes
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import io
 import struct
 import threading
@@ -147,7 +149,14 @@ class GenCp:
                     raise Garbled(f"{self._who}: answered command {command:#06x} while {doing}")
                 return body
         except usb.core.USBError as error:
+            if error.errno == errno.EPIPE:
+                self._clear_halts()
             raise translate(error, self._who, doing) from error
+
+    def _clear_halts(self) -> None:
+        with contextlib.suppress(usb.core.USBError):
+            for endpoint in (self._out, self._in):
+                self._device.clear_halt(endpoint)
 
     def _record(self, direction: str, data: bytes) -> None:
         if self._recorder is not None:

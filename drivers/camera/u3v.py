@@ -39,8 +39,15 @@ from drivers.camera.gencp import (
     GenCp,
     read_xml,
 )
+from drivers.camera.genicam_settings import (
+    black_level,
+    give_pulses,
+    set_if_there,
+    switch_processing_off,
+    trigger_line,
+)
 from drivers.camera.pixel_format import PIXEL_FORMATS, PREFERENCE
-from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
 from drivers.instrument import Identity, Recorder
 from drivers.usbip import open_device, translate
 
@@ -54,6 +61,7 @@ SIRM_MAX_LEADER, SIRM_TRANSFER_SIZE, SIRM_TRANSFER_COUNT = 0x18, 0x1C, 0x20
 SIRM_FINAL_1, SIRM_FINAL_2, SIRM_MAX_TRAILER = 0x24, 0x28, 0x2C
 
 _TRANSFER_BYTES = 1 << 20
+_LOOK_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -95,7 +103,9 @@ class U3vCamera(Camera):
     """One USB3 Vision camera at `usbip://HOST:PORT/SERIAL` or `usb://SERIAL` (or an already found pyusb `device`).
 
     `pixel_format`: a format's name, or None for the deepest raw format of up to 14 bits that the camera offers (16
-    only if it has no other). `timeout_s`: longest time beyond the exposure until a frame has arrived.
+    only if it has no other). `timeout_s`: longest time beyond the exposure until a frame has arrived. `trigger_line`: the
+    input that is wired to the camera that leads; None: Line0. `output_line`: the output of the camera that leads, on which
+    `output_source` gives the pulses; None: it gives none.
     """
 
     def __init__(
@@ -104,6 +114,9 @@ class U3vCamera(Camera):
         *,
         pixel_format: str | None = None,
         timeout_s: float = 3.0,
+        trigger_line: str | None = None,
+        output_line: str | None = None,
+        output_source: str = "ExposureActive",
         device: usb.core.Device | None = None,
         recorder: Recorder | None = None,
     ) -> None:
@@ -111,9 +124,11 @@ class U3vCamera(Camera):
         self._given = device
         self._wanted_format = pixel_format
         self._timeout_s = timeout_s
+        self._wanted_line, self._output_line, self._output_source = trigger_line, output_line, output_source
         self._recorder = recorder
         self._who = f"camera {address}"
         self._lock = threading.RLock()
+        self._stopped = threading.Event()
         self._device: usb.core.Device | None = None
         self._armed: Trigger | None = None
         self._exposure_s: float | None = None
@@ -165,17 +180,16 @@ class U3vCamera(Camera):
         self.nodes = NodeMap(read_xml(control, self._who), control)
         self._stop_acquisition()
         self._choose_format()
-        self._set_if_there("AcquisitionMode", "Continuous")
-        self._set_if_there("ExposureMode", "Timed")
-        for automatic in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto"):
-            self._set_if_there(automatic, "Off")
-        self._set_if_there("TriggerSelector", "FrameStart")
+        set_if_there(self.nodes, "AcquisitionMode", "Continuous")
+        set_if_there(self.nodes, "ExposureMode", "Timed")
+        switch_processing_off(self.nodes, self._who)
+        set_if_there(self.nodes, "TriggerSelector", "FrameStart")
         self.nodes.set("TriggerMode", "On")
+        if self._wanted_line is not None:
+            trigger_line(self.nodes, self._who, self._wanted_line)
+        if self._output_line is not None:
+            give_pulses(self.nodes, self._who, self._output_line, self._output_source)
         self._prepare_stream()
-
-    def _set_if_there(self, feature: str, value: str) -> None:
-        if self.nodes.has(feature) and value in self.nodes.entries(feature):
-            self.nodes.set(feature, value)
 
     def _choose_format(self) -> None:
         offered = self.nodes.entries("PixelFormat")
@@ -240,6 +254,7 @@ class U3vCamera(Camera):
                 cfa=self._format.cfa,
                 bit_depth=self._format.bits,
                 pixel_pitch_um=None if pitch is None else float(pitch),
+                black_level=black_level(self.nodes),
             )
 
     # --- frames -------------------------------------------------------------------------------------------------------
@@ -264,7 +279,11 @@ class U3vCamera(Camera):
                 raise InstrumentError(f"{self._who}: no exposure time was set; call configure first")
             if self._armed != trigger:
                 self._stop_acquisition()
-                self.nodes.set("TriggerSource", "Software" if trigger == "software" else "Line0")
+                line = "Software"
+                if trigger == "line":
+                    line = trigger_line(self.nodes, self._who, self._wanted_line)
+                self.nodes.set("TriggerSource", line)
+                set_if_there(self.nodes, "TLParamsLocked", 1)
                 self._control.write(self._sirm + SIRM_CONTROL, struct.pack("<I", 1))
                 self.nodes.execute("AcquisitionStart")
                 self._armed = trigger
@@ -294,12 +313,15 @@ class U3vCamera(Camera):
                 failure = translate(error, self._who, f"reading a frame of {self._exposure_s:g} s")
             except InstrumentError as error:
                 failure = error
+            if self._armed == "line" and isinstance(failure, NoAnswer):
+                line = self._wanted_line or "Line0"
+                failure = NoAnswer(f"{failure}; it waited for {line}: the camera that leads needs output_line")
             self._recover()
             raise failure
 
     def _collect(self, exposure_s: float, fired: datetime) -> Frame:
         deadline = time.monotonic() + exposure_s + self._timeout_s
-        leader = self._stream(self._leader_bytes, deadline)
+        leader = self._await_leader(deadline)
         if len(leader) < LEADER.size or LEADER.unpack_from(leader)[0] != LEADER_MAGIC:
             raise Garbled(f"{self._who}: a frame began with {leader[:8].hex()}, not with a leader; it is taken again")
         (_, _, _, frame_id, _, _, _, code, cols, rows, _, _, padding, _) = LEADER.unpack_from(leader)
@@ -339,6 +361,17 @@ class U3vCamera(Camera):
             frame_id=frame_id,
         )
 
+    def _await_leader(self, deadline: float) -> bytes:
+        """The leader, one short packet; until it comes, it is looked every now and then whether `stop` was called."""
+        while True:
+            if self._stopped.is_set():
+                raise Interrupted(f"{self._who}: stopped while waiting for a frame; start again")
+            try:
+                return self._stream(self._leader_bytes, min(deadline, time.monotonic() + _LOOK_S))
+            except usb.core.USBTimeoutError:
+                if time.monotonic() >= deadline:
+                    raise
+
     def _stream(self, size: int, deadline: float) -> bytes:
         left_ms = max(1, int((deadline - time.monotonic()) * 1000))
         assert self._device is not None
@@ -361,6 +394,7 @@ class U3vCamera(Camera):
         self._armed = None
         self.nodes.execute("AcquisitionStop")
         self._control.write(self._sirm + SIRM_CONTROL, struct.pack("<I", 0))
+        set_if_there(self.nodes, "TLParamsLocked", 0)
 
     @contextlib.contextmanager
     def _lost(self) -> Iterator[None]:
@@ -381,7 +415,10 @@ class U3vCamera(Camera):
                 usb.util.dispose_resources(device)
 
     def stop(self) -> None:
+        """End the exposure under way, in whatever thread it is waited for."""
+        self._stopped.set()
         with contextlib.suppress(InstrumentError, usb.core.USBError), self._lock:
+            self._stopped.clear()
             if self._device is not None:
                 self._stop_acquisition()
 

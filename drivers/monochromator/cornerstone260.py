@@ -1,11 +1,14 @@
-"""Oriel/Newport Cornerstone 260 on RS-232: 9600 8N1, every character echoed, replies end CR LF.
+"""Oriel/Newport Cornerstone 260 on RS-232, and a CS260B / CS130B on its RS-232 port: 9600 8N1, replies end CR LF.
 
-The driver works in handshake mode, in which every statement is answered by the status byte once it is done: `00`, or
-`20` (hex) for an error whose number `ERROR?` tells. Source: the manual's appendix on low level commands.
+The driver works in handshake mode, in which every statement is answered by the status byte: `00`, or `20` (hex) for an error whose
+number `ERROR?` tells. A Cornerstone 260 sends it when the motion is done, and echoes every character. A CS260B sends it on receipt:
+the driver asks `IDLE?` until nothing moves; its echo may be off. On closing, handshake and units are as they were found: the next
+program that talks to it expects its own. Sources: the manual's appendix on low level commands (p. 50-51); the MCS260B manual.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
@@ -27,10 +30,14 @@ ERRORS = {
     7: "accessory already in position",
     8: "wavelength drive can't find home",
     9: "label too long",
+    10: "system error",
 }
 _ALREADY_THERE = 7
 _DONE = {"00", "0"}
 _FAILED = {"20", "32"}
+_NOT_UNDERSTOOD = 1
+#: Seconds between two looks at whether a motion has ended, where the instrument doesn't say so by itself.
+_LOOK_S = 0.1
 #: Reciprocal linear dispersion with 1200 l/mm: 1e6 nm / (1200 per mm x 260 mm) x cos(9.6 deg).
 _DISPERSION_NM_PER_MM = 3.16
 
@@ -66,6 +73,10 @@ class Cornerstone260(WireInstrument, Monochromator):
         self.tolerance_nm = tolerance_nm
         self.move_timeout_s = move_timeout_s
         self._identity = Identity("Newport", "Cornerstone 260")
+        self._echoes = True
+        self._tells_idle = False
+        self._found_handshake: bool | None = None
+        self._found_units = ""
 
     # --- the abstraction --------------------------------------------------------------------------------------------
 
@@ -130,30 +141,65 @@ class Cornerstone260(WireInstrument, Monochromator):
 
     def _establish(self) -> None:
         line = self._transport
-        # An empty statement ends whatever half a statement an earlier host left behind.
-        line.write(b"\n")
+        # An empty statement ends whatever half a statement an earlier host left behind; ABORT, a motion under way.
+        line.write(b"\r\n")
+        line.write(b"ABORT\r\n")
         line.drain(quiet_s=0.1)
-        line.write(b"HANDSHAKE 1\n")
-        self._echo("HANDSHAKE 1")
-        line.drain(quiet_s=0.1)  # its own status byte, and an error that stood from before
-        self._ask("ERROR?")
-        model, _, serial_number = self._ask("INFO?").partition(" SN ")
+        model, _, serial_number = self._first_answer().partition(" SN ")
         self._identity = Identity("Newport", model.strip() or "Cornerstone 260", serial_number.strip())
+        line.write(b"HANDSHAKE 1\r\n")
+        line.drain(quiet_s=0.1)  # its echo, its own status byte, and an error that stood from before
+        self._ask("ERROR?")
+        self._tells_idle = self._knows("IDLE?")
+        self._found_units = self._found_units or self._ask("UNITS?").strip().upper()
         self._do("UNITS NM")
         if self.grating is not None and self._ask("GRAT?").partition(",")[0].strip() != str(self.grating):
             self._do(f"GRAT {self.grating}")
+
+    def _first_answer(self) -> str:
+        """The reply to INFO?, and by what comes with it: whether the instrument echoes, and whether a host before left handshake mode on."""
+        line = self._transport
+        line.write(b"INFO?\r\n")
+        first = self._line("INFO?")
+        self._echoes = first.strip().upper() == "INFO?"
+        reply = self._line("INFO?") if self._echoes else first
+        more = line.drain(quiet_s=0.1).decode("latin-1").split()
+        if reply in _FAILED or len(more) > 1 or any(len(word) > 2 for word in more):
+            raise self._strange("INFO?", " ".join([first, reply, *more]))
+        if self._found_handshake is None:
+            self._found_handshake = bool(more)
+        return reply
+
+    def _knows(self, query: str) -> bool:
+        try:
+            self._ask(query)
+        except Refused as refusal:
+            if refusal.code != _NOT_UNDERSTOOD:
+                raise
+            return False
+        return True
+
+    def _let_go(self) -> None:
+        if self._found_units in {"UM", "WN"}:
+            self._do(f"UNITS {self._found_units}")
+        if not self._found_handshake:
+            self._transport.write(b"HANDSHAKE 0\r\n")
+            self._transport.drain(quiet_s=0.1)
+        self._found_handshake, self._found_units = None, ""
 
     def _make_safe(self) -> None:
         self._do("SHUTTER C")
 
     def _do(self, statement: str) -> None:
-        """A command: its echo, and its status byte once it is done."""
+        """A command: its echo, its status byte, and the end of its motion."""
         try:
             self._say(statement)
             status = self._line(statement, self.move_timeout_s)
+            if self._tells_idle and status in _DONE:
+                self._await_idle(statement)
         except Interrupted:
             self._transport.resume()
-            self._transport.write(b"ABORT\n")
+            self._transport.write(b"ABORT\r\n")
             self._transport.drain(quiet_s=0.2)
             raise
         if status in _FAILED:
@@ -162,6 +208,16 @@ class Cornerstone260(WireInstrument, Monochromator):
                 raise self._refused(statement, code)
         elif status not in _DONE:
             raise self._strange(statement, status)
+
+    def _await_idle(self, statement: str) -> None:
+        until = time.monotonic() + self.move_timeout_s
+        while self._ask("IDLE?").strip() != "1":
+            if time.monotonic() > until:
+                raise NoAnswer(
+                    f"{self._transport.name}: still moving {self.move_timeout_s:g} s after {statement!r}; "
+                    "listen whether its motors run, and allow it a longer move_timeout_s"
+                )
+            self._transport.pause(_LOOK_S, statement)
 
     def _ask(self, query: str) -> str:
         """A query: its echo, its reply, its status byte. A refused query has the status byte alone."""
@@ -195,8 +251,9 @@ class Cornerstone260(WireInstrument, Monochromator):
         return int(reply) if reply.isdigit() else 0
 
     def _say(self, statement: str) -> None:
-        self._transport.write(statement.encode("ascii") + b"\n")
-        self._echo(statement)
+        self._transport.write(statement.encode("ascii") + b"\r\n")
+        if self._echoes:
+            self._echo(statement)
 
     def _echo(self, statement: str) -> None:
         echo = self._transport.read_until(b"\n", asked=statement)

@@ -1,7 +1,9 @@
-"""JETI specbos 1211 (and 1201) on its serial line: 8N1, no flow control, commands end CR.
+"""JETI specbos 1211 and 1201, spectraval 1501 and 1511 on their serial line: 8N1, no flow control, commands end CR.
 
-A setting is answered by ACK or NAK; after a NAK, `*stat:err?` tells why. `*init` is answered by ACK, and by BEL once
-the measurement is done. Without flow control a spectrum can lose characters on its way: it is asked for again.
+A setting is answered by ACK or NAK; after a NAK, `*stat:err?` tells why. A measurement (`*init`, a spectraval's `*meas:refer`) is
+answered by ACK, and by BEL once it is done; ENQ in between is passed over. Without flow control a spectrum can lose characters on its
+way: it is asked for again. A spectraval takes `*para:` where a specbos takes `*conf:`, and tells its spectrum on `*calc:sprad`
+(unverified without the instrument: after the behaviour of a public client, ArgyllCMS).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiomete
 from drivers.transport import Transport, WireInstrument, shown
 from sim.spectrum import Spectrum
 
-ACK, BEL, NAK = b"\x06", b"\x07", b"\x15"
+ENQ, ACK, BEL, NAK = b"\x05", b"\x06", b"\x07", b"\x15"
 ERRORS = {
     4: ("command not understood", "check that a specbos is at this address"),
     120: ("over-exposed", "dim the light or measure at a greater distance"),
@@ -31,18 +33,18 @@ _HEADER_LINES = 2
 
 
 class Specbos1211(WireInstrument, Spectroradiometer):
-    """A specbos 1211. Rates in `baudrates` are tried in turn; a TCP connection has none.
+    """A specbos or spectraval. Rates in `baudrates` are tried in turn; a TCP connection has none.
 
-    `from_nm`, `to_nm`: range asked for, in steps of 1 nm. `max_integration_s`: longest integration time that the
-    instrument may choose; one measurement ends within 5 times that and 10 s.
+    `from_nm`, `to_nm`: range asked for, in steps of 1 nm; None: as far as the unit is calibrated. `max_integration_s`: longest
+    integration time that the instrument may choose; one measurement ends within 5 times that and 10 s.
     """
 
     def __init__(
         self,
         address: str,
         *,
-        from_nm: int = 350,
-        to_nm: int = 1000,
+        from_nm: int | None = None,
+        to_nm: int | None = None,
         max_integration_s: float = 3.0,
         timeout_s: float = 2.0,
         fetch_timeout_s: float = 6.0,
@@ -53,9 +55,11 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         super().__init__(
             Transport(address, "specbos 1211", baudrate=baudrates[0], timeout_s=timeout_s, recorder=recorder)
         )
-        self.from_nm, self.to_nm = int(from_nm), int(to_nm)
-        if not self.from_nm < self.to_nm:
+        self._wanted_nm = (from_nm, to_nm)
+        if from_nm is not None and to_nm is not None and not from_nm < to_nm:
             raise InstrumentError(f"specbos 1211: {from_nm}..{to_nm} nm is no range; give from_nm below to_nm")
+        self.from_nm, self.to_nm = 0, 0  # what the unit measures, known once it is connected
+        self._spectraval = False
         self.max_integration_s = max_integration_s
         self.fetch_timeout_s = fetch_timeout_s
         self.measure_timeout_s = 5 * max_integration_s + 10 if measure_timeout_s is None else measure_timeout_s
@@ -67,13 +71,19 @@ class Specbos1211(WireInstrument, Spectroradiometer):
             return self._identity
 
     def measure(self) -> RadianceMeasurement:
-        with self._conversation() as line:
-            self._set("*init")
-            done = line.read(1, self.measure_timeout_s, "*init")
+        with self._conversation():
+            begin = "*init"
+            if self._spectraval:
+                self._set("*para:form 0")  # the spectrum is asked for once it is measured
+                begin = "*meas:refer"
+            self._set(begin)
+            done = self._byte(begin, self.measure_timeout_s)
             if done == NAK:
-                raise self._refusal("*init")
+                raise self._refusal(begin)
             if done != BEL:
-                raise self._strange("*init", done)
+                raise self._strange(begin, done)
+            if self._spectraval:
+                self._set("*para:form 2")  # as text
             spectrum = self._fetch_spectrum()
             return RadianceMeasurement(spectrum, self._integration_time_s(), self._identity.serial_number)
 
@@ -93,18 +103,43 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         with suppress(Refused):
             firmware = self._ask("*vers?")
         self._identity = Identity("JETI", model, serial_number, firmware)
-        for setting in (
-            "*conf:default",
-            "*para:calibn 0",
-            "*para:expo 1",
-            f"*conf:maxtin {round(self.max_integration_s * 1000)}",
-            "*conf:func 6",
-            "*conf:form 4",
-            f"*conf:wran {self.from_nm} {self.to_nm} 1",
-            "*conf:aver 1",
-        ):
-            self._set(setting)
+        self._spectraval = model.startswith("spectraval")
+        if self._spectraval:
+            settings = ["*para:aver 1", f"*para:maxtint {round(self.max_integration_s * 1000)}"]
+        else:
+            settings = ["*conf:default", "*para:calibn 0", "*para:expo 1"]
+            settings += [f"*conf:maxtin {round(self.max_integration_s * 1000)}"]
+            settings += ["*conf:func 6", "*conf:form 4", "*conf:aver 1"]
+        for setting in settings:
+            try:
+                self._set(setting)
+            except Refused:
+                # Firmware of the 1201 up to 1.8.3 doesn't know it, and chooses among its own times.
+                if not (model == "specbos 1201" and "maxtin" in setting):
+                    raise
+        self._choose_range()
         line.drain(quiet_s=0.02)
+
+    def _choose_range(self) -> None:
+        """The range asked for if the unit is calibrated there, or all that it is. Raises `InstrumentError`."""
+        if self._spectraval:
+            told = re.findall(r"\d+(?:\.\d+)?", self._ask("*para:wran?"))[:2]
+        else:
+            told = [re.sub(r"^.*:\s*", "", self._ask(f"*para:{end}?")) for end in ("wavbeg", "wavend")]
+        try:
+            first, last = (float(text.split()[0]) for text in told)
+        except (ValueError, IndexError):
+            raise self._strange("*para:wavbeg?", " ".join(told).encode("latin-1")) from None
+        low, high = math.ceil(first), math.floor(last)
+        wanted = [low if self._wanted_nm[0] is None else self._wanted_nm[0]]
+        wanted += [high if self._wanted_nm[1] is None else self._wanted_nm[1]]
+        if not low <= wanted[0] < wanted[1] <= high:
+            raise InstrumentError(
+                f"{self._transport.name}: {wanted[0]}..{wanted[1]} nm isn't within the {low}..{high} nm for which it is calibrated; "
+                "correct from_nm and to_nm in the station file, or leave them out"
+            )
+        self.from_nm, self.to_nm = int(wanted[0]), int(wanted[1])
+        self._set(f"*{'para' if self._spectraval else 'conf'}:wran {self.from_nm} {self.to_nm} 1")
 
     def _find(self) -> str:
         """Model that answers `*idn?`, at the first rate at which one does."""
@@ -127,6 +162,8 @@ class Specbos1211(WireInstrument, Spectroradiometer):
                 return f"specbos {found[1]}"
             if answer.startswith("SB05"):
                 return "specbos 1201"
+            if found := re.match(r"JETI_SDCM3|DCM3_JETI|S?PECFIRM_JETI_(15\d1)", answer):
+                return f"spectraval {found[1] or 1501}"
             failure = self._strange("*idn?", answer.encode("latin-1"))
         line.baudrate = self.baudrates[0]
         assert failure is not None
@@ -138,7 +175,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
     def _set(self, command: str) -> None:
         """A setting: ACK, or NAK and the reason."""
         self._transport.write(command.encode("ascii") + b"\r")
-        answer = self._transport.read(1, asked=command)
+        answer = self._byte(command)
         if answer == NAK:
             raise self._refusal(command)
         if answer != ACK:
@@ -148,11 +185,17 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         """A query: one line, or NAK and the reason."""
         line = self._transport
         line.write(query.encode("ascii") + b"\r")
-        first = line.read(1, asked=query)
+        first = self._byte(query)
         if first == NAK:
             raise self._refusal(query)
         rest = b"" if first == b"\r" else line.read_until(b"\r", asked=query)
-        return (first + rest).decode("latin-1").strip()
+        return (first + rest).replace(ENQ, b"").decode("latin-1").strip()
+
+    def _byte(self, asked: str, timeout_s: float | None = None) -> bytes:
+        """The next byte that isn't ENQ."""
+        while (one := self._transport.read(1, timeout_s, asked)) == ENQ:
+            pass
+        return one
 
     def _refusal(self, command: str) -> InstrumentError:
         self._transport.write(b"*stat:err?\r")
@@ -178,34 +221,34 @@ class Specbos1211(WireInstrument, Spectroradiometer):
 
     def _fetch_once(self) -> Spectrum:
         line = self._transport
-        query = "*fetch:sprad"
+        # A specbos says two lines, then a value a line; a spectraval a wavelength and its value a line.
+        query, header = ("*calc:sprad", 0) if self._spectraval else ("*fetch:sprad", _HEADER_LINES)
         wavelengths = range(self.from_nm, self.to_nm + 1)
         line.write(query.encode("ascii") + b"\r")
-        first = line.read(1, self.fetch_timeout_s, query)
+        first = self._byte(query, self.fetch_timeout_s)
         if first == NAK:
             raise self._refusal(query)
-        header = (
-            [first.strip()] if first == b"\r" else [first + line.read_until(b"\r", self.fetch_timeout_s, query).strip()]
-        )
-        while len(header) < _HEADER_LINES:
-            header.append(line.read_until(b"\r", self.fetch_timeout_s, query).strip())
-        values: list[float] = []
+        began = first if first == b"\r" else first + line.read_until(b"\r", self.fetch_timeout_s, query)
         # Within a reply characters follow each other: a pause of a second is where it broke off.
-        for _ in wavelengths:
-            text = line.read_until(b"\r", min(1.0, self.fetch_timeout_s), query).decode("latin-1").strip()
-            try:
-                value = float(text)
-            except ValueError:
-                raise self._strange(query, text.encode("latin-1")) from None
-            if not math.isfinite(value):
-                raise self._strange(query, text.encode("latin-1"))
-            values.append(value)
+        pause_s = min(1.0, self.fetch_timeout_s)
+        rest_of_it = (line.read_until(b"\r", pause_s, query) for _ in range(header + len(wavelengths) - 1))
+        told = [piece.replace(ENQ, b"").strip() for piece in (began, *rest_of_it)]
+        values = [self._value(query, nm, text) for nm, text in zip(wavelengths, told[header:], strict=True)]
         rest = line.drain(quiet_s=0.05)
         if rest.strip():
             raise Garbled(
                 f"{line.name}: sent {shown(rest.strip())} after {len(values)} values; check that nothing else talks to it"
             )
         return Spectrum.of(wavelengths, values)
+
+    def _value(self, query: str, wavelength_nm: int, text: bytes) -> float:
+        try:
+            *beside, value = (float(word) for word in text.split())
+        except ValueError:
+            raise self._strange(query, text) from None
+        if not math.isfinite(value) or beside != ([float(wavelength_nm)] if self._spectraval else []):
+            raise self._strange(query, text)
+        return value
 
     def _integration_time_s(self) -> float | None:
         """Integration time of the last measurement; None where the firmware doesn't report it."""

@@ -32,6 +32,8 @@ from sim.spectrum import Spectrum
 
 T = TypeVar("T")
 
+_FAMILIES = ("monochromator", "spectroradiometer", "display", "stage")
+
 
 class Address(BaseModel):
     """Which driver reaches an instrument, and where. Further keys are the driver's own settings."""
@@ -84,6 +86,21 @@ class Station(Frozen):
     cameras: dict[Side, StationCamera] = Field(min_length=1)
     targets: dict[str, AnyTarget] = {}
     limits: CaptureLimits = CaptureLimits()
+
+    @model_validator(mode="after")
+    def _one_instrument_a_port(self) -> Station:
+        taken: dict[str, str] = {}
+        tables = {family: getattr(self, family) for family in _FAMILIES}
+        tables |= {f"cameras.{side}": camera for side, camera in self.cameras.items()}
+        for table, entry in tables.items():
+            if entry is None or not entry.address:
+                continue
+            other = taken.setdefault(entry.address, table)
+            if other != table:
+                raise ValueError(
+                    f"[{other}] and [{table}] both have the address {entry.address}; one port serves one instrument: correct one of them"
+                )
+        return self
 
     @property
     def sides(self) -> tuple[Side, ...]:

@@ -51,10 +51,10 @@ def station(**changes: Any) -> Station:
     seen = {"camera_px_per_screen_px": 0.5, "visible": [100, 100, 980, 1820]}
     table = {
         "name": "fake",
-        "monochromator": {"driver": "fake", "address": "here"},
-        "spectroradiometer": {"driver": "fake", "address": "here"},
-        "display": {"driver": "fake", "address": "here"},
-        "stage": {"driver": "fake", "address": "here"},
+        "monochromator": {"driver": "fake", "address": "monochromator"},
+        "spectroradiometer": {"driver": "fake", "address": "spectroradiometer"},
+        "display": {"driver": "fake", "address": "display"},
+        "stage": {"driver": "fake", "address": "stage"},
         "cameras": {side: {"driver": "fake", "address": side, "datasheet": sheet} for side in ("left", "right")},
         "targets": {
             "cap": {"kind": "cap"},

@@ -16,6 +16,7 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.registry import driver
 from lab.capture.station import drivers_of, read_station
 from mocks.command import station_toml
 
@@ -81,6 +82,17 @@ def test_a_mock_alone_answers_on_a_tcp_port(start: Start) -> None:
     assert process.wait(30) == 0
 
 
+def test_a_usb_mock_alone_is_exported_over_usbip(start: Start, tmp_path: Path) -> None:
+    calibration = tmp_path / "calibration.csv"
+    process = start("mock", "usb2000plus", "--calibration", str(calibration))
+    (ready,) = lines_until_ready(process)
+    make = driver("spectroradiometer", "usb2000plus")
+    with make(ready.removeprefix("ready "), calibration=str(calibration), averages=1) as meter:
+        assert meter.measure().radiance_w_sr_m2_nm.integral() > 0
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -89,6 +101,8 @@ def test_a_mock_alone_answers_on_a_tcp_port(start: Start) -> None:
         (("mock", "pr655", "--tcp", "nowhere"), "write HOST:PORT"),
         (("mock", "pr655", "--tcp", "127.0.0.1:1", "--link", "/tmp/x"), "exclude one another"),
         (("mock", "pr655", "--link", "/no/such/folder/x"), "can't become a link"),
+        (("mock", "u3v", "--link", "/tmp/x"), "no line that a path could name"),
+        (("mock", "cr300", "--calibration", "x.csv"), "no calibration file comes with it"),
         (("bench", "--fault", "half@3"), "write INSTRUMENT:SPEC"),
     ],
 )

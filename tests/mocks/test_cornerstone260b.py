@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mocks import usb as mock_usb
 from mocks.bench import Bench
-from mocks.cornerstone260b import Cornerstone260B
+from mocks.cornerstone260b import MockCornerstone260B
 from mocks.usb_device import Abandoned, Stalled
 
 
@@ -25,7 +25,7 @@ def bench() -> Bench:
 class Host:
     """A USBTMC host written from the standard."""
 
-    def __init__(self, device: Cornerstone260B) -> None:
+    def __init__(self, device: MockCornerstone260B) -> None:
         self.device = device
         self.tag = 0
 
@@ -63,7 +63,7 @@ class Host:
 
 @pytest.fixture
 def host(bench: Bench) -> Iterator[Host]:
-    yield Host(Cornerstone260B(bench))
+    yield Host(MockCornerstone260B(bench))
 
 
 def test_golden_bytes(host: Host) -> None:
@@ -86,7 +86,7 @@ def test_a_move_changes_the_light(host: Host, bench: Bench) -> None:
     assert bench.light.wavelength_nm == 400.0
     assert bench.clock.now() - before == pytest.approx(400 / 175)
     host.say("shutter 1")
-    host.say("FILTER 2; grating 2; outport 2")
+    host.say("FILTER 2; grating 2; outport 2; *wai")
     assert [host.ask(f"{what}?") for what in ("shutter", "filter", "grating", "outport")] == ["1", "2", "2", "2"]
     assert bench.light.shutter_open
     assert bench.light.filter_place == 2
@@ -94,7 +94,7 @@ def test_a_move_changes_the_light(host: Host, bench: Bench) -> None:
 
 def test_units(host: Host, bench: Bench) -> None:
     host.say("units um")
-    host.say("gowave 0.55")
+    host.say("gowave 0.55; *wai")
     assert host.ask("wave?") == "0.550"
     assert bench.light.wavelength_nm == pytest.approx(550.0)
     host.say("units wn")
@@ -114,7 +114,7 @@ def test_errors_are_queued(host: Host, command: str, error: str) -> None:
 
 
 def test_it_is_busy_while_it_moves() -> None:
-    host = Host(Cornerstone260B(Bench(real_time_factor=0.2)))
+    host = Host(MockCornerstone260B(Bench(real_time_factor=0.2)))
     host.say("gowave 350")  # 2 s, a fifth of it really
     assert host.ask("idle?") == "0"
     host.say("abort")
@@ -135,7 +135,7 @@ def test_capabilities(host: Host) -> None:
 @settings(max_examples=60)
 @given(st.binary(max_size=80), st.booleans())
 def test_no_bytes_break_it(bench: Bench, data: bytes, framed: bool) -> None:
-    host = Host(Cornerstone260B(bench))
+    host = Host(MockCornerstone260B(bench))
     try:
         if framed:
             host.say(data.decode("latin-1").lower())

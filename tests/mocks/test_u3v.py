@@ -232,6 +232,8 @@ def test_line_trigger_exposes_both_at_the_same_time(bench: Bench) -> None:
         host.stream(transfer=307200)
         host.put(0x10002C, 1 | source << 4)
         host.put(host.register("AcquisitionStartReg"), 1)
+    for name in ("LineModeReg", "LineSourceReg"):  # its Line1 an output that follows the exposure
+        hosts[0].put(hosts[0].register(name) + 4, 1)
     hosts[0].put(hosts[0].register("TriggerSoftwareReg"), 1)
     stamps = [struct.unpack_from("<Q", host.into(0x82, 52), 20)[0] for host in hosts]
     assert stamps[0] == stamps[1]

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from mocks.bench import Bench
-from mocks.usb2000plus import DARK_COUNTS, DARK_PIXELS, NOISE_COUNTS, PIXELS, SATURATION_COUNTS, MockUsb2000Plus
+from mocks.usb2000plus import (
+    DARK_COUNTS,
+    DARK_PIXELS,
+    NOISE_COUNTS,
+    PIXELS,
+    SATURATION_COUNTS,
+    MockUsb2000Plus,
+    calibration_csv,
+)
 from mocks.usb_device import Abandoned, Stalled
 
 
@@ -66,3 +74,13 @@ def test_what_it_does_not_know_it_passes_over(device: MockUsb2000Plus) -> None:
         device.transfer(0x01, bytes(8), data, 0, lambda: False)
     with pytest.raises(Abandoned):
         device.transfer(0x81, bytes(8), None, 64, lambda: True)
+
+
+def test_a_calibration_may_be_off_as_real_ones_are() -> None:
+    exact, off = (
+        np.array([[float(v) for v in line.split(",")] for line in calibration_csv(percent).splitlines()[1:]])
+        for percent in (0.0, 2.0)
+    )
+    departure = off[:, 1] / exact[:, 1] - 1.0
+    assert np.max(np.abs(departure)) == pytest.approx(0.02, rel=0.01)  # the file holds seven digits
+    assert np.max(np.abs(np.diff(departure))) < 1e-3  # smooth

@@ -18,8 +18,9 @@ from drivers.camera.pixel_format import PIXEL_FORMATS, PixelFormat
 from drivers.camera.u3v import U3vCamera
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from mocks.bench import Bench
-from mocks.u3v import U3vDevice, pack_12p
+from mocks.u3v import GAMMA_ENABLE, U3vDevice, pack_12p
 from mocks.usb import InProcessBackend, UsbIpServer, serve_usbip, stereo_pair
+from mocks.wire import parse_faults
 
 
 class Wire:
@@ -264,7 +265,7 @@ def test_calls_out_of_order(device: U3vDevice) -> None:
         ("short", NoAnswer, r"has \d+ of 614400 bytes"),
         ("lost-trailer", NoAnswer, "no answer while reading a frame"),
         ("damaged", Garbled, "data discarded"),
-        ("halt", InstrumentError, "USB error while reading a frame"),
+        ("halt", NoAnswer, "halted its endpoint while reading a frame of 0.002 s; the halt is cleared"),
         ("unplug", Disconnected, "the connection was lost"),
         ("busy", Refused, "busy"),
         ("garbled", Garbled, "answered"),
@@ -314,7 +315,10 @@ def server(bench: Bench) -> Iterator[UsbIpServer]:
 
 
 def test_over_usbip_both_cameras_are_triggered_together(server: UsbIpServer, bench: Bench) -> None:
-    with U3vCamera(server.url("CB-U3V-0001")) as left, U3vCamera(server.url("CB-U3V-0002")) as right:
+    with (
+        U3vCamera(server.url("CB-U3V-0001"), output_line="Line1") as left,
+        U3vCamera(server.url("CB-U3V-0002")) as right,
+    ):
         left.configure(0.002)
         right.configure(0.001)
         assert (left.identity().serial_number, right.identity().serial_number) == ("CB-U3V-0001", "CB-U3V-0002")
@@ -326,6 +330,81 @@ def test_over_usbip_both_cameras_are_triggered_together(server: UsbIpServer, ben
     assert [frame.frame_id for frame in pair] == [0, 0]
     assert [frame.frame_id for frame in again] == [1, 1]
     assert all(frame.raw.shape == (480, 640) and frame.raw.mean() > 200 for frame in pair)
+
+
+def test_a_camera_that_is_told_no_output_line_triggers_no_other(server: UsbIpServer) -> None:
+    with (
+        U3vCamera(server.url("CB-U3V-0001")) as left,
+        U3vCamera(server.url("CB-U3V-0002"), timeout_s=0.5) as right,
+    ):
+        left.configure(0.001)
+        right.configure(0.001)
+        left.capture()
+        with pytest.raises(NoAnswer, match="it waited for Line0: the camera that leads needs output_line"):
+            capture_together([left, right])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"trigger_line": "Line3"}, "no trigger line Line3; it has Line0: name the one that is wired"),
+        ({"output_line": "Line7"}, "no line Line7; it has Line0, Line1: correct output_line"),
+        ({"output_line": "Line0"}, "Line0 can't be an output"),
+        (
+            {"output_line": "Line1", "output_source": "Timer9"},
+            "Line1 can't follow Timer9; it offers Off, ExposureActive",
+        ),
+    ],
+)
+def test_lines_are_checked_against_the_cameras_own(device: U3vDevice, settings: dict[str, str], message: str) -> None:
+    with pytest.raises(InstrumentError, match=message):
+        camera_of(device, **settings).connect()
+
+
+def test_what_bends_the_codes_is_switched_off_and_the_black_level_told(device: U3vDevice) -> None:
+    with camera_of(device) as camera:
+        assert camera.nodes.get("GammaEnable") is False
+        assert camera.sensor().black_level == 64.0
+
+
+def test_a_camera_that_keeps_its_gamma_is_refused(device: U3vDevice, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = U3vDevice._write_feature
+
+    def stubborn(self: U3vDevice, register: int, data: bytes) -> None:
+        if register != GAMMA_ENABLE:
+            write(self, register, data)
+
+    monkeypatch.setattr(U3vDevice, "_write_feature", stubborn)
+    with pytest.raises(InstrumentError, match="GammaEnable is True and can't be set to False: its codes aren't"):
+        camera_of(device).connect()
+
+
+@pytest.mark.parametrize(
+    ("spec", "error"),
+    [
+        ("half@2", NoAnswer),
+        ("wrong@2", Garbled),
+        ("error@2", NoAnswer),
+        ("drop@2", NoAnswer),
+        ("unplug=0.2@2", Disconnected),
+    ],
+)
+def test_faults_of_the_command_line_reach_cameras(
+    impatient: U3vCamera, device: U3vDevice, spec: str, error: type[Exception]
+) -> None:
+    device.fail(parse_faults(spec))
+    impatient.capture()
+    with pytest.raises(error):
+        impatient.capture()
+    end = time.monotonic() + 30
+    frame = None
+    while frame is None and time.monotonic() < end:
+        try:
+            frame = impatient.capture()
+        except Disconnected:
+            time.sleep(0.05)
+    assert frame is not None
+    assert frame.raw.mean() > 500
 
 
 def test_addresses(server: UsbIpServer) -> None:

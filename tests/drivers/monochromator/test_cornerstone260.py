@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 
-from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, InUse, NoAnswer, Refused
 from drivers.monochromator.cornerstone260 import Cornerstone260
 from mocks.bench import Bench, Clock
 from mocks.cornerstone260 import MockCornerstone260 as Mock
+from mocks.cornerstone260b_serial import MockCornerstone260BSerial
 from mocks.lamp import Lamp
 from mocks.wire import Pty, Tcp
 
@@ -28,8 +30,59 @@ def test_golden_transcript(scripted: Callable[[str], Any]) -> None:
         assert mono.bandwidth_nm() == pytest.approx(0.5 * 3.16)
         assert mono.identity().model == "Cornerstone 260"
     assert peer.strange == []
-    assert b"FILTER 2\n" in peer.requests
-    assert peer.requests[-1] == b"SHUTTER C\n"
+    assert b"FILTER 2\r\n" in peer.requests
+    assert peer.requests[-3:] == [b"SHUTTER C\r\n", b"UNITS UM\r\n", b"HANDSHAKE 0\r\n"]
+
+
+def test_a_cs260b_by_its_serial_port_is_asked_until_it_stands_still(scripted: Callable[[str], Any]) -> None:
+    peer = scripted("cornerstone260b-serial-driver.txt")
+    with Cornerstone260(peer.address, filters=[]) as mono:
+        mono.move_nm(500)
+        assert mono.identity().serial_number == "0815"
+    assert peer.strange == []
+    assert peer.requests.count(b"IDLE?\r\n") == 5 + 1  # twice connecting, three times moving, once closing
+    assert b"HANDSHAKE 0\r\n" not in peer.requests  # the host before had it on
+
+
+@pytest.mark.parametrize("echo", [True, False])
+def test_a_cs260b_answers_before_it_arrives(served: Callable[..., str], echo: bool) -> None:
+    bench = Bench()
+    bench.clock = Clock(real_time_factor=0.1)
+    with Cornerstone260(served(MockCornerstone260BSerial(bench, echo=echo), Pty())) as mono:
+        mono.move_nm(700)  # 4 s, a tenth of it really
+        assert (bench.light.wavelength_nm, bench.light.filter_place) == (pytest.approx(700, abs=0.0125), 3)
+
+
+@pytest.mark.parametrize("found", [False, True], ids=["off", "on"])
+def test_the_next_program_finds_the_handshake_as_it_was(served: Callable[..., str], found: bool) -> None:
+    mock = Mock(Lamp())
+    mock.receive(b"UNITS WN\nHANDSHAKE %d\n" % found)
+    address = served(mock, Tcp("127.0.0.1", 0))
+    mono = Cornerstone260(address)
+    mono.move_nm(500)
+    mono.close()
+    with serial.serial_for_url(address, timeout=30) as port:
+        port.write(b"WAVE?\n")
+        assert port.read_until(b"\r\n") == b"WAVE?\n20000.00\r\n"
+        port.timeout = 0.3
+        assert port.read(4) == (b"00\r\n" if found else b"")
+
+
+def test_a_motion_under_way_is_ended_on_connecting(served: Callable[..., str]) -> None:
+    bench = Bench()
+    bench.clock = Clock(real_time_factor=1.0)
+    mock = Mock(bench)
+    mock.receive(b"GOWAVE 1000\n")  # 5.8 s
+    mono = Cornerstone260(served(mock, Pty()), timeout_s=1.0)
+    mono.connect()
+    assert mono.wavelength_nm() == 0
+    mono.close()
+
+
+def test_two_instruments_on_one_port_are_told_so(served: Callable[..., str]) -> None:
+    address = served(Mock(Lamp()), Pty())
+    with Cornerstone260(address), pytest.raises(InUse, match="this port is in use, by another program or another"):
+        Cornerstone260(address).connect()
 
 
 @pytest.mark.parametrize("endpoint", [Pty, lambda: Tcp("127.0.0.1", 0)])
@@ -74,17 +127,17 @@ def test_a_host_before_that_left_half_a_statement_does_no_harm(served: Callable[
     mono.close()
 
 
-# Answers 1..4 are those to HANDSHAKE 1, ERROR?, INFO? and UNITS NM when the driver connects.
+# When the driver connects, answers 1..6 are those to INFO?, ERROR?, IDLE?, ERROR?, UNITS? and UNITS NM (the mock's HANDSHAKE 1 answers, too).
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ("never@5", NoAnswer, "no answer within 1 s"),
-        ("late=1.5@5", NoAnswer, "no answer within"),
-        ("half@5", NoAnswer, "only '00' within"),
-        ("drop@5", NoAnswer, "no answer within"),
-        ("wrong@5", Garbled, "answered 'SHUTTER O' with '"),
-        ("error=8@5", Refused, "error 8, wavelength drive can't find home"),
-        ("unplug=0.3@5", Disconnected, "the line broke"),
+        ("never@8", NoAnswer, "no answer within 3 s"),
+        ("late=4@8", NoAnswer, "no answer within"),
+        ("half@8", NoAnswer, "only '00', then nothing for 1 s"),
+        ("drop@8", NoAnswer, "no answer within"),
+        ("wrong@8", Garbled, "answered 'SHUTTER O' with '"),
+        ("error=8@8", Refused, "error 8, wavelength drive can't find home"),
+        ("unplug=0.3@8", Disconnected, "the line broke"),
     ],
 )
 def test_every_fault_is_one_error_and_then_it_works_again(
@@ -92,7 +145,7 @@ def test_every_fault_is_one_error_and_then_it_works_again(
 ) -> None:
     bench = Bench()
     address = served(Mock(bench), Pty(tmp_path / "mono"), fault)
-    mono = Cornerstone260(address, timeout_s=1.0, move_timeout_s=1.0)
+    mono = Cornerstone260(address, timeout_s=1.0, move_timeout_s=3.0)
     mono.connect()
     with pytest.raises(error, match=message) as caught:
         mono.open_shutter()

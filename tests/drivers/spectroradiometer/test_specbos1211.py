@@ -31,6 +31,17 @@ def test_golden_transcript(scripted: Callable[[str], Any]) -> None:
     assert peer.requests.count(b"*fetch:sprad\r") == 2
 
 
+def test_golden_transcript_of_a_spectraval(scripted: Callable[[str], Any]) -> None:
+    peer = scripted("spectraval1501-driver.txt")
+    with Specbos1211(peer.address, from_nm=500, to_nm=502) as radiometer:
+        measured = radiometer.measure()
+        assert radiometer.identity().model == "spectraval 1501"
+    assert measured.radiance_w_sr_m2_nm.wavelength_nm == (500.0, 501.0, 502.0)
+    assert measured.radiance_w_sr_m2_nm.value == (1e-3, 2e-3, 3e-3)
+    assert measured.integration_time_s is None
+    assert peer.strange == []
+
+
 @pytest.mark.parametrize("endpoint", [Pty, lambda: Tcp("127.0.0.1", 0)])
 def test_round_trip_with_the_mock(served: Callable[..., str], endpoint: Callable[[], Any]) -> None:
     lamp = Lamp(20.0)
@@ -55,15 +66,39 @@ def test_over_exposure_is_a_refusal_with_its_code(served: Callable[..., str]) ->
     radiometer.close()
 
 
-def test_a_range_outside_the_calibration_is_refused(served: Callable[..., str]) -> None:
+def test_a_range_outside_the_calibration_is_refused_before_it_measures(served: Callable[..., str]) -> None:
     radiometer = Specbos1211(served(Mock(Lamp()), Pty()), from_nm=300)
-    with pytest.raises(Refused, match="error 141, outside the calibrated range"):
+    with pytest.raises(
+        InstrumentError, match=r"300\.\.1000 nm isn't within the 350\.\.1000 nm for which it is calibrated"
+    ):
         radiometer.measure()
     radiometer.close()
 
 
-# Connecting takes 11 answers (*idn?, *para:spnum?, *vers?, 8 settings); then *init (12), its end (13), the fetch (14).
-@pytest.mark.parametrize("fault", ["half@14", "drop@14", "wrong@14", "never@14", "half@14,half@15,half@16,half@17"])
+@pytest.mark.parametrize("model", ["specbos 1201", "specbos 1211", "spectraval 1501"])
+def test_every_model_measures_as_far_as_it_is_calibrated(served: Callable[..., str], model: str) -> None:
+    """A 1201 with firmware 1.8.3 doesn't know maxtin; a spectraval has other commands."""
+    lamp = Lamp(20.0)
+    with Specbos1211(served(Mock(lamp, model=model, calibrated_nm=(380.0, 780.0)), Pty())) as radiometer:
+        assert radiometer.identity().model == model
+        measured = radiometer.measure().radiance_w_sr_m2_nm
+    assert (measured.wavelength_nm[0], measured.wavelength_nm[-1]) == (380.0, 780.0)
+    np.testing.assert_allclose(measured.value, lamp.radiance().at(np.arange(380, 781)), rtol=5e-7)
+
+
+def test_enq_inside_replies_is_passed_over(served: Callable[..., str]) -> None:
+    class Enquiring(Mock):
+        def receive(self, data: bytes) -> list[bytes]:
+            return [type(piece)(b"\x05" + piece[:3] + b"\x05" + piece[3:]) for piece in super().receive(data)]
+
+    with Specbos1211(served(Enquiring(Lamp()), Pty())) as radiometer:
+        assert radiometer.identity().serial_number == "1211427"
+        assert len(radiometer.measure().radiance_w_sr_m2_nm.value) == 651
+
+
+# Connecting takes 13 answers (*idn?, *para:spnum?, *vers?, 7 settings, both ends of the range, the range); then *init (14), its end (15),
+# the fetch (16).
+@pytest.mark.parametrize("fault", ["half@16", "drop@16", "wrong@16", "never@16", "half@16,half@17,half@18,half@19"])
 def test_a_broken_fetch_is_asked_for_again(served: Callable[..., str], fault: str) -> None:
     radiometer = Specbos1211(served(Mock(Lamp()), Pty(), fault), timeout_s=1.0, fetch_timeout_s=1.0)
     radiometer.connect()
@@ -72,7 +107,7 @@ def test_a_broken_fetch_is_asked_for_again(served: Callable[..., str], fault: st
 
 
 def test_a_fetch_that_stays_broken_is_given_up_after_five(served: Callable[..., str]) -> None:
-    radiometer = Specbos1211(served(Mock(Lamp()), Pty(), "half@14+"), timeout_s=1.0, fetch_timeout_s=0.2)
+    radiometer = Specbos1211(served(Mock(Lamp()), Pty(), "half@16+"), timeout_s=1.0, fetch_timeout_s=0.2)
     radiometer.connect()
     with pytest.raises(Garbled, match=r"asked 5 times"):
         radiometer.measure()
@@ -82,15 +117,15 @@ def test_a_fetch_that_stays_broken_is_given_up_after_five(served: Callable[..., 
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ("never@12,never@13", NoAnswer, "no answer within 1 s to '*init'"),
-        ("never@12", Garbled, r"answered '*init' with '\x07'"),
-        ("never@13", NoAnswer, "no answer within 1.2 s to '*init'"),
-        ("late=1.8@13", NoAnswer, "no answer within 1.2 s to '*init'"),
-        ("wrong@12", Garbled, "answered '*init' with '?'"),
-        ("error@13", Refused, "error 120"),
-        ("error=123@13", Refused, "error 123, no integration time fits"),
-        ("unplug=0.3@13", Disconnected, "the line broke"),
-        ("unplug=0.3@14", Disconnected, "the line broke"),
+        ("never@14,never@15", NoAnswer, "no answer within 1 s to '*init'"),
+        ("never@14", Garbled, r"answered '*init' with '\x07'"),
+        ("never@15", NoAnswer, "no answer within 1.2 s to '*init'"),
+        ("late=1.8@15", NoAnswer, "no answer within 1.2 s to '*init'"),
+        ("wrong@14", Garbled, "answered '*init' with '?'"),
+        ("error@15", Refused, "error 120"),
+        ("error=123@15", Refused, "error 123, no integration time fits"),
+        ("unplug=0.3@15", Disconnected, "the line broke"),
+        ("unplug=0.3@16", Disconnected, "the line broke"),
     ],
 )
 def test_every_fault_is_one_error_and_then_it_works_again(

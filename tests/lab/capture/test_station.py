@@ -87,6 +87,7 @@ def test_a_station_survives_the_registry(tmp_path: Path) -> None:
         ('"g.csv"', '"missing.csv"', "missing.csv"),
         ('address = "/dev/null"', "", "monochromator.address"),
         ("[stage]", "[stage", "isn't TOML"),
+        ("socket://127.0.0.1:1", "/dev/null", "[monochromator] and [stage] both have the address /dev/null"),
         ("[cameras.left]", "[cameras.middle]", "cameras.middle"),
     ],
 )

@@ -11,7 +11,7 @@ import usb.core
 
 from drivers.errors import Disconnected, InstrumentError, Interrupted
 from drivers.registry import driver
-from drivers.spectroradiometer.usb2000plus import Usb2000Plus
+from drivers.spectroradiometer.ocean_optics import OceanOptics
 from mocks import usb as mock_usb
 from mocks.bench import Bench
 from mocks.usb2000plus import NOISE_COUNTS, calibration_csv, response
@@ -38,7 +38,7 @@ def plugged(bench: Bench) -> usb.core.Device:
 
 
 def test_radiance_of_white_light(bench: Bench, calibration: str) -> None:
-    with Usb2000Plus("usb://x", calibration=calibration, device=plugged(bench)) as meter:
+    with OceanOptics("usb://x", calibration=calibration, device=plugged(bench)) as meter:
         identity = meter.identity()
         assert (identity.model, identity.serial_number) == ("USB2000+", "USB2+F00001")
         found = meter.measure()
@@ -53,7 +53,7 @@ def test_radiance_of_white_light(bench: Bench, calibration: str) -> None:
 
 def test_a_line_keeps_its_power_and_place(bench: Bench, calibration: str) -> None:
     bench.set_wavelength(550.0)
-    with Usb2000Plus("usb://x", calibration=calibration, device=plugged(bench)) as meter:
+    with OceanOptics("usb://x", calibration=calibration, device=plugged(bench)) as meter:
         found = meter.measure().radiance_w_sr_m2_nm
     truth = bench.radiance()
     assert found.integral(520.0, 580.0) == pytest.approx(truth.integral(520.0, 580.0), rel=0.003)
@@ -76,7 +76,7 @@ def test_over_the_network_by_the_registry(bench: Bench, calibration: str) -> Non
 
 def test_too_dark_says_so(bench: Bench, calibration: str) -> None:
     bench.set_shutter(False)
-    with Usb2000Plus("usb://x", calibration=calibration, device=plugged(bench)) as meter:
+    with OceanOptics("usb://x", calibration=calibration, device=plugged(bench)) as meter:
         with pytest.raises(InstrumentError, match=r"under-exposed.*max_integration_s"):
             meter.measure()
         bench.set_shutter(True)
@@ -86,7 +86,7 @@ def test_too_dark_says_so(bench: Bench, calibration: str) -> None:
 def test_too_bright_says_so(bench: Bench, calibration: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mocks.usb2000plus.response", lambda w: 1e12 * np.ones_like(w))
     with (
-        Usb2000Plus("usb://x", calibration=calibration, device=plugged(bench)) as meter,
+        OceanOptics("usb://x", calibration=calibration, device=plugged(bench)) as meter,
         pytest.raises(InstrumentError, match=r"over-exposed at its shortest time"),
     ):
         meter.measure()
@@ -94,7 +94,7 @@ def test_too_bright_says_so(bench: Bench, calibration: str, monkeypatch: pytest.
 
 def test_unplugged_and_plugged_again(bench: Bench, calibration: str) -> None:
     backend = mock_usb.backend("usb2000plus", bench)
-    meter = Usb2000Plus("usb://x", calibration=calibration, device=usb.core.find(backend=backend))
+    meter = OceanOptics("usb://x", calibration=calibration, device=usb.core.find(backend=backend))
     meter.connect()
     backend.plugged_in[0].unplug()
     with pytest.raises(Disconnected):
@@ -106,7 +106,7 @@ def test_unplugged_and_plugged_again(bench: Bench, calibration: str) -> None:
 
 
 def test_stop_ends_a_measurement(bench: Bench, calibration: str) -> None:
-    with Usb2000Plus("usb://x", calibration=calibration, device=plugged(bench), averages=10**6) as meter:
+    with OceanOptics("usb://x", calibration=calibration, device=plugged(bench), averages=10**6) as meter:
         timer = threading.Timer(0.5, meter.stop)
         timer.start()
         with pytest.raises(Interrupted):
@@ -116,8 +116,8 @@ def test_stop_ends_a_measurement(bench: Bench, calibration: str) -> None:
 
 def test_another_device_is_refused(bench: Bench, calibration: str) -> None:
     other = usb.core.find(backend=mock_usb.backend("cornerstone260b", bench))
-    with pytest.raises(InstrumentError, match=r"1fde:0014 is no USB2000\+"):
-        Usb2000Plus("usb://x", calibration=calibration, device=other).connect()
+    with pytest.raises(InstrumentError, match=r"1fde:0014 is no spectrometer"):
+        OceanOptics("usb://x", calibration=calibration, device=other).connect()
 
 
 @pytest.mark.parametrize(
@@ -135,10 +135,10 @@ def test_a_bad_calibration_is_one_line(tmp_path: Path, text: str, said: str) -> 
     file = tmp_path / "calibration.csv"
     file.write_text(text)
     with pytest.raises(InstrumentError, match=said) as caught:
-        Usb2000Plus("usb://x", calibration=str(file))
+        OceanOptics("usb://x", calibration=str(file))
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_calibration_is_one_line() -> None:
     with pytest.raises(InstrumentError, match=r"calibration file absent\.csv"):
-        Usb2000Plus("usb://x", calibration="absent.csv")
+        OceanOptics("usb://x", calibration="absent.csv")

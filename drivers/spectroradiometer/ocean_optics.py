@@ -1,21 +1,22 @@
-"""Ocean Optics USB2000+ through `seabreeze` (its pure-Python backend): counts, made a radiance by a calibration file.
+"""Ocean Optics spectrometers through `seabreeze` (its pure-Python backend): counts, made a radiance by a calibration file.
 
-The instrument has no radiometric calibration of its own. The file's two columns are
+Every model on USB that the library knows; only the USB2000+ was tried, on its mock. The instruments have no radiometric calibration of their own. The file's two columns are
 `wavelength_nm,counts_per_s_per_w_sr_m2_nm`: counts a second above dark, corrected for the instrument's nonlinearity, for a
 radiance of 1 W sr^-1 m^-2 nm^-1 at the place where it is used (fibre, lens and distance included).
 """
 
 from __future__ import annotations
 
-import csv
+import contextlib
 import threading
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import usb.core
+import usb.util
 from numpy.typing import NDArray
 
+from drivers.calibration_file import read_calibration
 from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted
 from drivers.instrument import Identity, Recorder
 from drivers.spectroradiometer.base import RadianceMeasurement, Spectroradiometer
@@ -35,11 +36,11 @@ _LEAST_OVER_NOISE = 5.0
 FloatArray = NDArray[np.float64]
 
 
-class Usb2000Plus(Spectroradiometer):
-    """A USB2000+ at `usb://SERIAL` or `usbip://HOST:PORT/SERIAL` (or an already found pyusb `device`).
+class OceanOptics(Spectroradiometer):
+    """A spectrometer at `usb://SERIAL` or `usbip://HOST:PORT/SERIAL` (or an already found pyusb `device`).
 
     `calibration`: the file described above. `max_integration_s`: longest integration time it may choose. `averages`: scans
-    that one measurement takes. The spectrum comes on whole nanometres from `from_nm` to `to_nm`, as far as the calibration
+    that one measurement takes. `dark_counts`: counts without light, needed for models that have no covered pixels. The spectrum comes on whole nanometres from `from_nm` to `to_nm`, as far as the calibration
     reaches. `recorder` is taken for the sake of the station file; `seabreeze` keeps the wire to itself.
     """
 
@@ -52,40 +53,46 @@ class Usb2000Plus(Spectroradiometer):
         to_nm: int = 1000,
         max_integration_s: float = 3.0,
         averages: int = 4,
+        dark_counts: float | None = None,
         device: usb.core.Device | None = None,
         recorder: Recorder | None = None,
     ) -> None:
         if averages < 1:
-            raise InstrumentError(f"USB2000+: averages = {averages} is below the limit of 1: take one scan at least")
+            raise InstrumentError(
+                f"spectrometer: averages = {averages} is below the limit of 1: take one scan at least"
+            )
         if not max_integration_s >= _SHORTEST_S:
             raise InstrumentError(
-                f"USB2000+: max_integration_s = {max_integration_s} s is below the limit of {_SHORTEST_S} s: allow it more"
+                f"spectrometer: max_integration_s = {max_integration_s} s is below the limit of {_SHORTEST_S} s: allow it more"
             )
         self.address, self._given = address, device
-        self._response = read_calibration(calibration)
+        self._response = read_calibration(calibration, COLUMNS, "spectrometer")
         low, high = self._response.wavelength_nm[0], self._response.wavelength_nm[-1]
         self._grid_nm = np.arange(max(from_nm, int(np.ceil(low))), min(to_nm, int(high)) + 1, dtype=float)
         if self._grid_nm.size < 2:
             raise InstrumentError(
-                f"USB2000+: {from_nm}..{to_nm} nm lies outside the calibration's {low:g}..{high:g} nm: ask for wavelengths inside"
+                f"spectrometer: {from_nm}..{to_nm} nm lies outside the calibration's {low:g}..{high:g} nm: ask for wavelengths inside"
             )
-        self.max_integration_s, self.averages = max_integration_s, averages
+        self.max_integration_s, self.averages, self.dark_counts = max_integration_s, averages, dark_counts
         self._lock = threading.RLock()
         self._stopped = threading.Event()
         self._open: Any = None
+        self._device: usb.core.Device | None = None
 
     def connect(self) -> None:
         with self._lock:
             self.close()
             # Slow to import, and needed by few stations.
             from seabreeze.pyseabreeze.devices import SeaBreezeDevice
-            from seabreeze.pyseabreeze.transport import USBTransportHandle
+            from seabreeze.pyseabreeze.transport import USBTransport, USBTransportHandle
 
             device = self._given if self._given is not None else open_device(self.address)
-            if (device.idVendor, device.idProduct) != (0x2457, 0x101E):
+            self._device = device
+            self._model = USBTransport.vendor_product_ids.get((device.idVendor, device.idProduct), "")
+            if not self._model:
                 raise InstrumentError(
-                    f"spectrometer {self.address}: USB device {device.idVendor:04x}:{device.idProduct:04x} is no USB2000+ "
-                    "(2457:101e): correct the address in the station file"
+                    f"spectrometer {self.address}: USB device {device.idVendor:04x}:{device.idProduct:04x} is no spectrometer that "
+                    "seabreeze knows: correct the address in the station file"
                 )
             try:
                 self._open = SeaBreezeDevice(USBTransportHandle(device))
@@ -96,20 +103,40 @@ class Usb2000Plus(Spectroradiometer):
                 # The library stretches counts so that saturation is at 65535; calibrations and the bend are in raw counts.
                 self._stretch = float(pixels._normalization_value)
                 self._full_scale = float(pixels.get_maximum_intensity()) / self._stretch
-                self._bend = np.array(self._open.f.nonlinearity_coefficients.get_nonlinearity_coefficients())
+                self._bend = self._nonlinearity()
+                self._shortest_s, longest_s = (limit * 1e-6 for limit in pixels.get_integration_time_micros_limits())
+                self._longest_s = min(self.max_integration_s, longest_s)
                 pixels.set_trigger_mode(0)
             except Exception as error:
                 self._drop()
                 raise self._error(error, "connecting") from error
+            if self._dark_pixels.size == 0 and self.dark_counts is None:
+                self._drop()
+                raise InstrumentError(
+                    f"spectrometer {self.address}: a {self._model} has no covered pixels: give dark_counts in the station file"
+                )
             if not (np.all(np.isfinite(self._wavelength_nm)) and np.all(np.diff(self._wavelength_nm) > 0)):
                 self._drop()
                 raise Garbled(
                     f"spectrometer {self.address}: its wavelength coefficients don't ascend: have its EEPROM restored"
                 )
 
+    def _nonlinearity(self) -> FloatArray:
+        """The maker's polynomial; 1 where the model keeps none."""
+        found = getattr(self._open.f, "nonlinearity_coefficients", None)
+        bend = np.array([] if found is None else found.get_nonlinearity_coefficients(), float)
+        return bend if bend.size and np.any(bend != 0) else np.ones(1)
+
+    def _dark(self, counts: FloatArray) -> float:
+        if self._dark_pixels.size:
+            return float(np.median(counts[self._dark_pixels]))
+        assert self.dark_counts is not None
+        return self.dark_counts
+
     def identity(self) -> Identity:
         with self._lock:
-            return Identity("Ocean Optics", "USB2000+", str(self._connected().serial_number))
+            serial_number = str(self._connected().serial_number)
+            return Identity("Ocean Optics", self._model.replace("PLUS", "+"), serial_number)
 
     def measure(self) -> RadianceMeasurement:
         """Spectral radiance: scans at an integration time of its own choice, dark pixels subtracted, corrected for
@@ -147,11 +174,13 @@ class Usb2000Plus(Spectroradiometer):
 
     def _drop(self) -> None:
         opened, self._open = self._open, None
+        device, self._device = self._device, None
         if opened is not None:
-            try:
+            with contextlib.suppress(Exception):  # the library raises what it likes, and the device may be gone
                 opened.close()
-            except Exception:  # the library raises what it likes, and the device may be gone
-                return
+        if device is not None:  # the library keeps it where closing failed
+            with contextlib.suppress(usb.core.USBError):
+                usb.util.dispose_resources(device)
 
     def _error(self, error: Exception, doing: str) -> InstrumentError:
         who = f"spectrometer {self.address}"
@@ -174,25 +203,25 @@ class Usb2000Plus(Spectroradiometer):
 
     def _choose_time(self, pixels: Any) -> float:
         """Set the integration time (s) at which the brightest pixel is near AIM of full scale."""
-        seconds = min(_FIRST_S, self.max_integration_s)
+        seconds = min(max(_FIRST_S, self._shortest_s), self._longest_s)
         for _ in range(_TRIES):
             pixels.set_integration_time_micros(round(seconds * 1e6))
             for _ in range(_SETTLING_SCANS):
                 self._scan(pixels)
             counts = self._scan(pixels)
-            dark = float(np.median(counts[self._dark_pixels]))
+            dark = self._dark(counts)
             peak = float(np.max(counts)) - dark
             room = self._full_scale - dark
             if np.max(counts) >= SATURATED * self._full_scale:
-                if seconds <= _SHORTEST_S:
+                if seconds <= self._shortest_s:
                     raise InstrumentError(
-                        f"spectrometer {self.address}: over-exposed at its shortest time of {_SHORTEST_S} s: dim the light"
+                        f"spectrometer {self.address}: over-exposed at its shortest time of {self._shortest_s:g} s: dim the light"
                     )
-                seconds = max(seconds / 5.0, _SHORTEST_S)
+                seconds = max(seconds / 5.0, self._shortest_s)
             elif peak >= LEAST * room:
                 return seconds
-            elif seconds >= self.max_integration_s:
-                noise = float(np.std(counts[self._dark_pixels], ddof=1))
+            elif seconds >= self._longest_s:
+                noise = float(np.std(counts[self._dark_pixels], ddof=1)) if self._dark_pixels.size > 1 else 0.0
                 if peak < _LEAST_OVER_NOISE * noise:
                     raise InstrumentError(
                         f"spectrometer {self.address}: under-exposed, {peak:.0f} counts above dark at {seconds:g} s with a noise of "
@@ -201,34 +230,12 @@ class Usb2000Plus(Spectroradiometer):
                 return seconds
             else:
                 grow = AIM * room / max(peak, 1e-3 * room)
-                seconds = min(seconds * min(grow, 10.0), self.max_integration_s)
+                seconds = min(seconds * min(grow, 10.0), self._longest_s)
         raise InstrumentError(
             f"spectrometer {self.address}: no integration time fits the light: check that it is steady"
         )
 
     def _signal(self, counts: FloatArray) -> FloatArray:
-        """Counts above the covered pixels' dark, corrected by the maker's nonlinearity polynomial."""
-        above = counts - np.median(counts[self._dark_pixels])
+        """Counts above the dark, corrected by the maker's nonlinearity polynomial."""
+        above = counts - self._dark(counts)
         return np.asarray(above / np.polynomial.polynomial.polyval(above, self._bend))
-
-
-def read_calibration(path: str) -> Spectrum:
-    """Counts a second per W sr^-1 m^-2 nm^-1 by wavelength, from the CSV file. Raises `InstrumentError`."""
-    file = Path(path)
-    try:
-        with file.open(newline="", encoding="utf-8") as lines:
-            head, *rows = [row for row in csv.reader(lines) if row]
-        return _calibration([name.strip() for name in head], rows)
-    except (OSError, ValueError) as error:
-        raise InstrumentError(f"USB2000+: calibration file {file.name}: {' '.join(str(error).split())}") from error
-
-
-def _calibration(head: list[str], rows: list[list[str]]) -> Spectrum:
-    if head != COLUMNS:
-        raise ValueError(f"the columns are {','.join(head)}, and have to be {','.join(COLUMNS)}")
-    table = np.array(rows, float)
-    if table.ndim != 2 or table.shape[1] != 2:
-        raise ValueError(f"every row has {len(COLUMNS)} numbers")
-    if not np.all(np.isfinite(table)) or np.any(table[:, 1] <= 0):
-        raise ValueError("responses have to be finite and above 0")
-    return Spectrum.of(table[:, 0], table[:, 1])

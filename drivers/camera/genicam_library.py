@@ -1,0 +1,315 @@
+"""What cameras have in common that a GenICam library reaches: pypylon (`drivers.camera.basler`), Aravis (`drivers.camera.aravis`).
+
+The library finds the camera, reads its XML and queues the buffers. What is asked of the camera, in which order, and what counts as a
+good frame is here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Protocol
+
+from drivers.camera.base import Camera, Frame, SensorInfo, Trigger
+from drivers.camera.genicam_settings import (
+    Features,
+    black_level,
+    give_pulses,
+    set_if_there,
+    switch_processing_off,
+    trigger_line,
+)
+from drivers.camera.pixel_format import PIXEL_FORMATS, PREFERENCE, PixelFormat
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
+from drivers.instrument import Identity, Recorder
+
+_LOOK_S = 0.1
+#: The exposure time's names: SFNC's, and that of cameras before it.
+_EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
+
+
+@dataclass(frozen=True)
+class Grabbed:
+    """A buffer that the library handed out: the payload, its layout, and what is wrong with it; nothing if it is whole."""
+
+    payload: bytes | bytearray
+    rows: int
+    cols: int
+    code: int
+    frame_id: int
+    padding: int = 0
+    damage: str = ""
+
+
+class _NoFrame(NoAnswer):
+    """A frame is missing from a camera that answers otherwise."""
+
+
+class LibraryFeatures(Features, Protocol):
+    """A camera's features, as a library gives them."""
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Least and greatest value of a number."""
+
+    def execute(self, name: str) -> None:
+        """Run a command."""
+
+
+class LibraryCamera(Camera):
+    """One camera at the library's own `address`.
+
+    `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits. `timeout_s`: longest time beyond the exposure.
+    `trigger_line`: the input wired to the camera that leads, None: Line0; `Software`: none is wired, the computer triggers it right
+    after the other, milliseconds apart. `output_line`, `output_source`: on which the camera that leads gives its pulses.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        pixel_format: str | None = None,
+        timeout_s: float = 3.0,
+        trigger_line: str | None = None,
+        output_line: str | None = None,
+        output_source: str = "ExposureActive",
+        recorder: Recorder | None = None,
+    ) -> None:
+        self.address = address
+        self._wanted_format, self._timeout_s = pixel_format, timeout_s
+        self._wanted_line, self._output_line, self._output_source = trigger_line, output_line, output_source
+        self._record = recorder or (lambda direction, data: None)
+        self._who = f"camera {address}"
+        self._lock = threading.RLock()
+        self._stopped = threading.Event()
+        self._features: LibraryFeatures | None = None
+        self._identity = Identity("", "")
+        self._format: PixelFormat = PREFERENCE[0]
+        self._armed: Trigger | None = None
+        self._follows = False
+        self._exposure_s: float | None = None
+        self._gain_db = 0.0
+        self._fired: datetime | None = None
+
+    # --- what a library does ----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _open(self) -> tuple[LibraryFeatures, Identity]:
+        """Find and open the camera."""
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Queue buffers and start acquisition."""
+
+    @abstractmethod
+    def _halt(self) -> None:
+        """Stop acquisition, discard what is queued."""
+
+    @abstractmethod
+    def _await_trigger_ready(self) -> None:
+        """Return once a software trigger will be heard."""
+
+    @abstractmethod
+    def _grab(self, timeout_s: float) -> Grabbed | None:
+        """The next buffer; None if none came in time."""
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Let the camera go; may raise whatever the library raises."""
+
+    # --- the abstraction --------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        with self._lock:
+            self._drop()
+            try:
+                self._features, self._identity = self._open()
+                self._who = f"camera {self._identity.serial_number or self.address}"
+                self._prepare(self._features)
+            except InstrumentError:
+                self._drop()
+                raise
+
+    def _prepare(self, features: LibraryFeatures) -> None:
+        set_if_there(features, "AcquisitionMode", "Continuous")
+        set_if_there(features, "ExposureMode", "Timed")
+        switch_processing_off(features, self._who)
+        set_if_there(features, "TriggerSelector", "FrameStart")
+        features.set("TriggerMode", "On")
+        offered = features.entries("PixelFormat")
+        names = [item.name for item in PREFERENCE] if self._wanted_format is None else [self._wanted_format]
+        known = {item.name: item for item in PREFERENCE}
+        name = next((name for name in names if name in offered and name in known), None)
+        if name is None:
+            raise InstrumentError(
+                f"{self._who}: pixel format {self._wanted_format or 'raw'} isn't offered or known; it offers {', '.join(offered)}"
+            )
+        features.set("PixelFormat", name)
+        self._format = known[name]
+        if self._wanted_line not in (None, "Software"):
+            trigger_line(features, self._who, self._wanted_line)
+        if self._output_line is not None:
+            give_pulses(features, self._who, self._output_line, self._output_source)
+
+    def identity(self) -> Identity:
+        with self._used():
+            return self._identity
+
+    def sensor(self) -> SensorInfo:
+        with self._used() as features:
+            pitch = float(features.get("SensorPixelWidth")) if features.has("SensorPixelWidth") else None
+            return SensorInfo(
+                rows=int(features.get("Height")),
+                cols=int(features.get("Width")),
+                pixel_format=self._format.name,
+                cfa=self._format.cfa,
+                bit_depth=self._format.bits,
+                pixel_pitch_um=pitch,
+                black_level=black_level(features),
+            )
+
+    def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
+        if not (math.isfinite(exposure_s) and exposure_s > 0 and math.isfinite(gain_db)):
+            raise InstrumentError(f"{self._who}: exposure {exposure_s} s at {gain_db} dB; give a positive time")
+        with self._used() as features:
+            name = next((name for name in _EXPOSURES if features.has(name)), None)
+            if name is None:
+                raise InstrumentError(f"{self._who}: it has no exposure time that can be set; use a camera that has")
+            self._set_within(features, name, exposure_s * 1e6, "us")
+            if features.has("Gain"):
+                self._set_within(features, "Gain", gain_db, "dB")
+            elif gain_db:
+                raise InstrumentError(f"{self._who}: it has no gain to set to {gain_db} dB; leave it at 0")
+            self._exposure_s = float(features.get(name)) * 1e-6
+            self._gain_db = float(features.get("Gain")) if features.has("Gain") else 0.0
+
+    def _set_within(self, features: LibraryFeatures, name: str, value: float, unit: str) -> None:
+        low, high = features.limits(name)
+        if not low <= value <= high:  # a library may clamp it without a word
+            raise InstrumentError(
+                f"{self._who}: {name} {value:g} {unit} is outside {low:g}..{high:g} {unit}; ask for a value in it"
+            )
+        features.set(name, value)
+
+    def arm(self, trigger: Trigger = "software") -> None:
+        with self._used() as features:
+            if self._exposure_s is None:
+                raise InstrumentError(f"{self._who}: no exposure time was set; call configure first")
+            self._follows = trigger == "line" and self._wanted_line == "Software"
+            if self._armed != trigger:
+                self._stop_acquisition()
+                line = "Software"
+                if trigger == "line" and not self._follows:
+                    line = trigger_line(features, self._who, self._wanted_line)
+                features.set("TriggerSource", line)
+                self._start()
+                self._armed = trigger
+            self._fired = datetime.now(UTC)
+
+    def fire(self) -> None:
+        with self._used() as features:
+            if self._armed != "software" and not (self._armed == "line" and self._follows):
+                raise InstrumentError(f"{self._who}: it isn't armed for a software trigger; call arm first")
+            self._await_trigger_ready()
+            self._fired = datetime.now(UTC)
+            features.execute("TriggerSoftware")
+
+    def follow(self) -> None:
+        if self._follows:
+            self.fire()
+
+    def collect(self) -> Frame:
+        with self._used() as features:
+            if self._armed is None or self._exposure_s is None or self._fired is None:
+                raise InstrumentError(f"{self._who}: no frame was asked for; call arm and fire first")
+            try:
+                grabbed = self._await_frame(self._exposure_s)
+                if grabbed.damage:
+                    raise Garbled(
+                        f"{self._who}: frame {grabbed.frame_id} is damaged: {grabbed.damage}; use another cable or port"
+                    )
+                pixel_format = PIXEL_FORMATS.get(grabbed.code)
+                if pixel_format is None:
+                    raise Garbled(
+                        f"{self._who}: frame {grabbed.frame_id} has the unknown pixel format {grabbed.code:#010x}"
+                    )
+                try:
+                    raw = pixel_format.unpack(grabbed.payload, grabbed.rows, grabbed.cols, grabbed.padding)
+                except ValueError as error:
+                    raise _NoFrame(f"{self._who}: frame {grabbed.frame_id} broke off: {error}") from error
+            except InstrumentError:
+                self._stop_acquisition()  # nothing of it may be taken for the next frame
+                raise
+            temperature = float(features.get("DeviceTemperature")) if features.has("DeviceTemperature") else None
+            return Frame(
+                raw, self._exposure_s, self._gain_db, temperature, self._fired, pixel_format.name, grabbed.frame_id
+            )
+
+    def capture(self) -> Frame:
+        with self._lock:
+            return super().capture()
+
+    def _await_frame(self, exposure_s: float) -> Grabbed:
+        deadline = time.monotonic() + exposure_s + self._timeout_s
+        while True:
+            if self._stopped.is_set():
+                raise Interrupted(f"{self._who}: stopped while waiting for a frame; start again")
+            grabbed = self._grab(min(_LOOK_S, max(0.0, deadline - time.monotonic())))
+            if grabbed is not None:
+                return grabbed
+            if time.monotonic() >= deadline:
+                waited = ""
+                if self._armed == "line" and not self._follows:
+                    waited = f"; it waited for {self._wanted_line or 'Line0'}: the camera that leads needs output_line"
+                raise _NoFrame(
+                    f"{self._who}: no frame within {self._timeout_s:g} s of its exposure of {exposure_s:g} s; check the cable{waited}"
+                )
+
+    def stop(self) -> None:
+        self._stopped.set()
+        with self._lock:
+            self._stopped.clear()
+            with contextlib.suppress(InstrumentError):
+                self._stop_acquisition()
+
+    def close(self) -> None:
+        self._stopped.set()
+        with self._lock:
+            self._stopped.clear()
+            self._drop()
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _used(self) -> Iterator[LibraryFeatures]:
+        """The camera, connected anew after a failure, with the exposure it had."""
+        with self._lock:
+            if self._features is None:
+                self.connect()
+                if self._exposure_s is not None:
+                    self.configure(self._exposure_s, self._gain_db)
+            assert self._features is not None
+            try:
+                yield self._features
+            except _NoFrame:
+                raise
+            except (Disconnected, NoAnswer):
+                self._drop()
+                raise
+
+    def _stop_acquisition(self) -> None:
+        if self._armed is not None:
+            self._armed = None
+            self._halt()
+
+    def _drop(self) -> None:
+        with contextlib.suppress(Exception):  # libraries raise what they like, and the camera may be gone
+            self._stop_acquisition()
+        self._features, self._armed = None, None
+        with contextlib.suppress(Exception):
+            self._release()

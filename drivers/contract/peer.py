@@ -1,0 +1,94 @@
+"""What stands at the other end while a driver is checked: a mock that can be silenced and unplugged, or a real instrument.
+
+A package that has drivers offers the peers of their checks by entry points of the group `calibench.peers`, under the drivers' names
+(`family.name`): a callable without arguments that returns a running `Peer`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from types import TracebackType
+from typing import Any, Self
+
+from drivers.errors import InstrumentError
+
+GROUP = "calibench.peers"
+
+
+class Peer(ABC):
+    """A running instrument that does what the checks ask of it. `address`, `settings`: what its driver is made with."""
+
+    address: str
+    settings: dict[str, Any]
+    #: Whether it can be silenced and unplugged.
+    can_fail = True
+
+    @abstractmethod
+    def mute(self, silent: bool) -> None:
+        """Hear and say nothing, as if it hung; or go on."""
+
+    @abstractmethod
+    def unplug(self) -> None:
+        """Be gone, whatever is under way."""
+
+    @abstractmethod
+    def plug(self) -> None:
+        """Be back at the same address."""
+
+    @abstractmethod
+    def slow(self, slowly: bool) -> bool:
+        """Take seconds for what takes an instrument long (a motion, a measurement, an exposure); False: it can't."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End it."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class RealInstrument(Peer):
+    """An instrument at its address: nobody silences or unplugs it, and what needs that is left out."""
+
+    can_fail = False
+
+    def __init__(self, address: str, settings: dict[str, Any]) -> None:
+        self.address, self.settings = address, settings
+
+    def mute(self, silent: bool) -> None:
+        """Can't be done."""
+
+    def unplug(self) -> None:
+        """Can't be done."""
+
+    def plug(self) -> None:
+        """It is."""
+
+    def slow(self, slowly: bool) -> bool:
+        return False
+
+    def close(self) -> None:
+        """It stays."""
+
+
+def peers() -> dict[str, EntryPoint]:
+    """The peers that installed packages offer, by the driver's name (`family.name`)."""
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def start_peer(reference: str) -> Peer:
+    """The peer that `module:callable` makes. Raises `InstrumentError` where there is none."""
+    module, _, name = reference.partition(":")
+    try:
+        make: Callable[[], Peer] = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InstrumentError(f"peer {reference!r} can't be loaded: {error}; write module:callable") from error
+    return make()

@@ -1,0 +1,242 @@
+"""Newport Cornerstone 260B and 130B on USB: USBTMC, SCPI-like commands. Motions overlap; `idle?` says when all have ended.
+
+After each command the driver asks `system:error?`: the instrument says of no command that it wasn't obeyed. Source: Newport, MCS260B
+manual, p. 43-46, 62.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator, Sequence
+
+import usb.core
+
+from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
+from drivers.instrument import Identity, Recorder
+from drivers.monochromator.base import Monochromator, checked_wavelength_nm, filter_place, order_sorting_filters
+from drivers.transport import shown
+from drivers.usbip import open_device
+from drivers.usbtmc import UsbTmc
+
+VENDOR, MODELS = 0x1FDE, {0x0014: "CS260B", 0x0006: "CS130B"}
+_LOOK_S = 0.05
+_SLIT_UM = (4.0, 3000.0)
+
+
+class Cornerstone260B(Monochromator):
+    """A CS260B or CS130B at `usb://SERIAL` or `usbip://HOST:PORT/SERIAL` (or an already found pyusb `device`).
+
+    `filters`, `grating`, `dispersion_nm_per_mm`, `upper_nm`, `tolerance_nm`: as of `cornerstone260`. `move_timeout_s`: longest motion;
+    a change of the grating takes 29 s.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        filters: Sequence[object] | None = None,
+        grating: int | None = None,
+        dispersion_nm_per_mm: float = 3.16,
+        upper_nm: float = 1400.0,
+        tolerance_nm: float = 0.5,
+        timeout_s: float = 2.0,
+        move_timeout_s: float = 60.0,
+        device: usb.core.Device | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self.address, self._given = address, device
+        self.filters = order_sorting_filters(filters)
+        self.grating = grating
+        self.dispersion_nm_per_mm, self.upper_nm, self.tolerance_nm = dispersion_nm_per_mm, upper_nm, tolerance_nm
+        self.timeout_s, self.move_timeout_s = timeout_s, move_timeout_s
+        self._recorder = recorder
+        self._who = f"Cornerstone 260B at {address}"
+        self._lock = threading.RLock()
+        self._stopped = threading.Event()
+        self._open: UsbTmc | None = None
+        self._met = False
+        self._found_units = ""
+        self._identity = Identity("Newport", "CS260B")
+
+    # --- the abstraction --------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        with self._conversation():
+            pass
+
+    def identity(self) -> Identity:
+        with self._conversation():
+            return self._identity
+
+    def move_nm(self, wavelength_nm: float) -> None:
+        wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
+        with self._conversation() as wire:
+            if self.filters:
+                self.select_filter(filter_place(self.filters, wanted))
+            self._do(f"gowave {wanted:.3f}")
+            reached = self._number(wire, "wave?")
+            if abs(reached - wanted) > self.tolerance_nm:
+                raise Garbled(
+                    f"{self._who}: stands at {reached:g} nm after a move to {wanted:g} nm; check its units and its calibration"
+                )
+
+    def wavelength_nm(self) -> float:
+        with self._conversation() as wire:
+            return self._number(wire, "wave?")
+
+    def open_shutter(self) -> None:
+        self._do("shutter 1")
+
+    def close_shutter(self) -> None:
+        self._do("shutter 0")
+
+    def shutter_is_open(self) -> bool:
+        with self._conversation() as wire:
+            answer = wire.ask("shutter?").upper()
+            if answer not in {"0", "1", "O", "C"}:
+                raise self._strange("shutter?", answer)
+            return answer in {"1", "O"}
+
+    def select_filter(self, place: int) -> None:
+        with self._conversation():
+            if self.selected_filter() != place:
+                self._do(f"filter {place}")
+
+    def selected_filter(self) -> int:
+        with self._conversation() as wire:
+            return round(self._number(wire, "filter?"))
+
+    def slit_um(self) -> float:
+        with self._conversation() as wire:
+            return self._number(wire, "slit1microns?")
+
+    def set_slit_um(self, width_um: float) -> None:
+        low, high = _SLIT_UM
+        if not low <= width_um <= high:
+            raise InstrumentError(
+                f"{self._who}: a slit of {width_um} um is outside {low:g}..{high:g} um; ask for a width in it"
+            )
+        with self._conversation():
+            for slit in (1, 2):
+                self._do(f"slit{slit}microns {round(width_um)}")
+
+    def bandwidth_nm(self) -> float:
+        return self.slit_um() * 1e-3 * self.dispersion_nm_per_mm
+
+    def stop(self) -> None:
+        if not self._met:
+            return
+        self._stopped.set()
+        with self._lock:
+            self._stopped.clear()
+            with self._conversation() as wire:
+                wire.write("abort")
+                self._do("shutter 0")
+
+    def close(self) -> None:
+        if self._met:
+            with contextlib.suppress(InstrumentError):
+                self.stop()
+        with self._lock:
+            if self._open is not None and self._found_units in {"UM", "WN"}:
+                with contextlib.suppress(InstrumentError):
+                    self._open.write(f"units {self._found_units.lower()}")
+            self._found_units, self._met = "", False
+            self._drop()
+
+    # --- the wire ---------------------------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _conversation(self) -> Iterator[UsbTmc]:
+        """The connection, opened anew after any failure but a refusal or a stop."""
+        with self._lock:
+            if self._open is None:
+                self._establish()
+            assert self._open is not None
+            try:
+                yield self._open
+            except (Refused, Interrupted):
+                raise
+            except InstrumentError:
+                self._drop()
+                raise
+
+    def _establish(self) -> None:
+        device = self._given if self._given is not None else open_device(self.address)
+        if device.idVendor != VENDOR or device.idProduct not in MODELS:
+            raise InstrumentError(
+                f"{self._who}: USB device {device.idVendor:04x}:{device.idProduct:04x} is neither CS260B (1fde:0014) nor CS130B "
+                "(1fde:0006): correct the address in the station file"
+            )
+        self._open = UsbTmc(device, self._who, timeout_s=self.timeout_s, recorder=self._recorder)
+        try:
+            wire = self._open
+            wire.write("abort")  # a motion that a host before left under way
+            maker, model, serial_number, firmware = (*wire.ask("*idn?").split(","), "", "", "", "")[:4]
+            self._identity = Identity(maker.strip(), model.strip(), serial_number.strip(), firmware.strip())
+            for _ in range(32):  # errors that stood from before
+                if self._error() is None:
+                    break
+            self._found_units = self._found_units or wire.ask("units?").upper()
+            self._do("units nm")
+            if self.grating is not None and round(self._number(wire, "grating?")) != self.grating:
+                self._do(f"grating {self.grating}")
+        except InstrumentError:
+            self._drop()
+            raise
+        self._met = True
+
+    def _do(self, command: str) -> None:
+        """A command, and the end of every motion. Raises `Refused` with the instrument's error."""
+        with self._conversation() as wire:
+            wire.write(command)
+            until = time.monotonic() + self.move_timeout_s
+            while not self._idle(wire):
+                if self._stopped.wait(_LOOK_S):
+                    wire.write("abort")
+                    raise Interrupted(f"{self._who}: stopped while waiting for {command!r}; start again")
+                if time.monotonic() > until:
+                    raise NoAnswer(
+                        f"{self._who}: still moving {self.move_timeout_s:g} s after {command!r}; listen whether its motors run"
+                    )
+            if (error := self._error()) is not None:
+                code, text = error
+                raise Refused(
+                    f"{self._who}: refused {command!r}: error {code}, {text}; check the value against the instrument",
+                    code,
+                )
+
+    def _idle(self, wire: UsbTmc) -> bool:
+        answer = wire.ask("idle?")
+        if answer not in {"0", "1"}:
+            raise self._strange("idle?", answer)
+        return answer == "1"
+
+    def _error(self) -> tuple[int, str] | None:
+        assert self._open is not None
+        answer = self._open.ask("system:error?")
+        code, _, text = answer.partition(",")
+        try:
+            number = int(code)
+        except ValueError:
+            raise self._strange("system:error?", answer) from None
+        return None if number == 0 else (number, text.strip().strip('"'))
+
+    def _number(self, wire: UsbTmc, query: str) -> float:
+        answer = wire.ask(query)
+        try:
+            return float(answer)
+        except ValueError:
+            raise self._strange(query, answer) from None
+
+    def _strange(self, asked: str, answer: str) -> Garbled:
+        return Garbled(
+            f"{self._who}: answered {asked!r} with {shown(answer.encode('latin-1'))}; check that a CS260B is at this address"
+        )
+
+    def _drop(self) -> None:
+        opened, self._open = self._open, None
+        if opened is not None:
+            opened.close()

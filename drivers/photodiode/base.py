@@ -1,0 +1,34 @@
+"""The reference photodiode: irradiance at the place of the sensor, as EMVA 1288 (release 4, section 6.1) has it measured."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+from drivers.instrument import Instrument
+
+
+@dataclass(frozen=True)
+class IrradianceMeasurement:
+    """Irradiance (W/m2) of light of one wavelength (nm), and what it was made of: current above dark (A) and its number of readings.
+
+    `sd_irradiance_w_m2` holds the scatter of the readings and of the dark readings, and the calibration's own uncertainty.
+    """
+
+    irradiance_w_m2: float
+    sd_irradiance_w_m2: float
+    wavelength_nm: float
+    current_a: float
+    readings: int
+
+
+class Photodiode(Instrument):
+    """A calibrated photodiode with a meter of its current."""
+
+    @abstractmethod
+    def measure_dark(self) -> float:
+        """Current (A) without light, mean of the readings; later measurements are above it."""
+
+    @abstractmethod
+    def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
+        """Irradiance of light of this wavelength. Raises `InstrumentError` outside the calibration, `Refused` for an overload."""

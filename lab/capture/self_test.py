@@ -1,0 +1,153 @@
+"""Self-tests of a station's instruments, and the station file that what is connected suggests."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.camera.base import Camera
+from drivers.contract.families import CONTRACTS, NotMet
+from drivers.discovery import Found
+from drivers.errors import InstrumentError
+from drivers.instrument import Instrument
+from drivers.registry import driver
+from drivers.transcript import TranscriptFile
+from lab.capture.station import Address, Drivers, Station, drivers_of
+from lab.errors import DeviceError, InputError
+
+#: Longest time (s) for the self-test of one instrument: a measurement of a dark source takes minutes.
+TEST_S = 300.0
+
+
+@dataclass(frozen=True)
+class SelfTest:
+    """One instrument's: its name in the station, who it is, and whether it works; in words if it doesn't."""
+
+    name: str
+    identity: str
+    works: bool
+    words: str
+
+
+def self_tests(drivers: Drivers) -> Iterator[SelfTest]:
+    """Connect to each instrument, bring it into its safe state, let it do what it is for once, and let it go."""
+    for name, instrument in drivers.all.items():
+        yield _self_test(name, instrument)
+
+
+def _self_test(name: str, instrument: Instrument) -> SelfTest:
+    told: list[SelfTest] = []
+
+    def test() -> None:
+        who = ""
+        try:
+            instrument.connect()
+            instrument.stop()
+            identity = instrument.identity()
+            who = " ".join(filter(None, (identity.maker, identity.model, identity.serial_number, identity.firmware)))
+            contract = CONTRACTS[name.split(maxsplit=1)[0]]
+            contract.everyday(instrument)
+            instrument.stop()
+            contract.is_safe(instrument)
+        except (InstrumentError, NotMet) as error:
+            told.append(SelfTest(name, who, False, str(error)))
+        else:
+            told.append(SelfTest(name, who, True, "works, and is in its safe state"))
+        finally:
+            instrument.close()
+
+    worker = threading.Thread(target=test, daemon=True)
+    worker.start()
+    worker.join(TEST_S)
+    return told[0] if told else SelfTest(name, "", False, f"didn't end within {TEST_S:g} s; switch it off and on")
+
+
+def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
+    """A self-test of one instrument (`monochromator`, `cameras.left`, ...) with all that goes over its wire in a file.
+
+    Raises InputError if the station has no such instrument or the file can't be written.
+    """
+    family, _, side = name.partition(".")
+    entry: Address | None = None
+    if family in ("camera", "cameras"):
+        entry = next((camera for at, camera in station.cameras.items() if at == side), None)
+    elif name in ("monochromator", "spectroradiometer", "display", "stage"):
+        entry = getattr(station, name)
+    if entry is None:
+        there = [f"cameras.{side}" for side in station.sides]
+        there += [one for one in ("monochromator", "spectroradiometer", "display", "stage") if getattr(station, one)]
+        raise InputError(f"the station has no {name}; it has {', '.join(there)}")
+    try:
+        recorder = TranscriptFile(file)
+    except OSError as error:
+        raise InputError(
+            f"{file}: can't be written ({error.strerror}); name a file in a folder that is yours"
+        ) from error
+    try:
+        kind = "camera" if side else name
+        try:
+            made = driver(kind, entry.driver)(entry.address, recorder=recorder, **entry.settings)
+        except (InstrumentError, TypeError) as error:
+            raise DeviceError(f"{name}: {error}") from error
+        return _self_test(f"camera {side}" if side else name, made)
+    finally:
+        recorder.close()
+
+
+def check_station(station: Station) -> list[SelfTest]:
+    """The self-tests of a whole station."""
+    return list(self_tests(drivers_of(station)))
+
+
+def station_text(found: Iterable[Found]) -> str:
+    """A station file (TOML) of what is connected. Cameras are asked for their size, filters and bits; what they don't tell stands as a
+    remark. Raises DeviceError where there is no camera."""
+    lines = [
+        "# Written by `calibench station init` from what is connected. Data sheets hold what the makers say: complete them."
+    ]
+    sides = iter(("left", "right"))
+    cameras = 0
+    taken: set[str] = set()
+    for one in found:
+        if one.family == "camera" and (side := next(sides, None)) is not None:
+            lines += ["", *_camera_table(side, one)]
+            cameras += 1
+        elif one.family and one.family != "camera" and one.family not in taken:
+            taken.add(one.family)
+            lines += ["", f"# {one.what}", f"[{one.family}]", f'driver = "{one.name}"', f'address = "{one.address}"']
+            lines += [f'{key} = ""  # to be filled in' for key in one.needs]
+        else:
+            lines += ["", f"# also connected: {one.what} at {one.address}"]
+    if not cameras:
+        raise DeviceError(
+            "no camera is connected that a driver here reaches: plug it in, give --usbip HOST:PORT, or install its library "
+            "(calibench[basler], Aravis); `calibench devices` shows what is"
+        )
+    lines += ["", "[targets.cap]", 'kind = "cap"']
+    return "\n".join(lines) + "\n"
+
+
+def _camera_table(side: str, one: Found) -> list[str]:
+    camera: Any = driver(one.family, one.name)(one.address)
+    assert isinstance(camera, Camera)
+    lines = [f"# {one.what}", f"[cameras.{side}]", f'driver = "{one.name}"', f'address = "{one.address}"']
+    try:
+        with camera:
+            sensor = camera.sensor()
+    except InstrumentError as error:
+        raise DeviceError(f"camera {side}: {error}") from error
+    lines += [f"[cameras.{side}.datasheet]", f"rows = {sensor.rows}", f"cols = {sensor.cols}"]
+    lines += [f'cfa = "{sensor.cfa or "MONO"}"' + ("" if sensor.cfa else "  # it doesn't say: correct this")]
+    bits = sensor.bit_depth
+    lines += [f"bit_depth = {bits or 12}" + ("" if bits else "  # it doesn't say: correct this")]
+    if sensor.pixel_pitch_um is not None:
+        lines += [f"pixel_pitch_um = {round(sensor.pixel_pitch_um, 4)}"]
+    else:
+        lines += ["# pixel_pitch_um ="]
+    if sensor.black_level is not None:
+        lines += [f"# it counts its black level as {sensor.black_level:g}; black_level_dn is that in codes"]
+    lines += ["# f_number =", "# focal_length_mm =", "# full_well_e ="]
+    return lines

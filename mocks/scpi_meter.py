@@ -1,0 +1,117 @@
+"""A picoammeter after Keithley's 6485 with a photodiode in the light: SCPI, commands and answers end LF.
+
+It begins with its input shorted (zero check): who doesn't switch that off reads nothing of the photodiode.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from mocks.wire import LONGEST_LINE, Grammar, MeasuredLight, Reply
+from sim.spectrum import FloatArray
+
+#: Area of the diode (m2), solid angle (sr) under which it sees the light's surface, and its dark current (A).
+AREA_M2, SOLID_ANGLE_SR, DARK_A = 1e-4, 0.1, 2e-12
+NOISE_A = 1e-11
+_RANGE_A = 0.02
+
+
+def responsivity_a_per_w(wavelength_nm: FloatArray) -> FloatArray:
+    """A silicon photodiode's: a quantum efficiency that falls off towards 300 nm and 1100 nm."""
+    efficiency = 0.85 / (1.0 + np.exp((wavelength_nm - 1050.0) / 25.0)) / (1.0 + np.exp((330.0 - wavelength_nm) / 20.0))
+    return np.asarray(efficiency * wavelength_nm / 1239.84)
+
+
+def calibration_csv(departure_percent: float = 0.8) -> str:
+    """The calibration that came with the diode; `departure_percent` is by how much it is off, as real ones are."""
+    at = np.arange(300.0, 1101.0, 10.0)
+    told = responsivity_a_per_w(at) * (1.0 + departure_percent / 100.0 * np.sin(at / 180.0))
+    return (
+        "\n".join(["wavelength_nm,responsivity_a_per_w", *(f"{w:.0f},{r:.6f}" for w, r in zip(at, told, strict=True))])
+        + "\n"
+    )
+
+
+class MockScpiMeter(Grammar):
+    """The meter; `light` is what the diode sees, `seed` that of its noise."""
+
+    line_end = b"\n"
+    fault_code = -310
+
+    def __init__(self, light: MeasuredLight, serial_number: str = "1234567", seed: int = 6485) -> None:
+        super().__init__(light.clock)
+        self._light = light
+        self._serial_number = serial_number
+        self._rng = np.random.default_rng(seed)
+        self._line = bytearray()
+        self._errors: deque[str] = deque()
+        self._zero_check = True
+        self._waiting: deque[str] = deque()
+        self._done_at: float | None = None
+
+    def receive(self, data: bytes) -> list[bytes]:
+        for value in data:
+            if value == 0x0A:
+                command = self._line.decode("latin-1").strip().upper()
+                self._line.clear()
+                self._waiting.extend(filter(None, (part.strip() for part in command.split(";"))))
+            elif len(self._line) < LONGEST_LINE:
+                self._line.append(value)
+        return self._run()
+
+    @property
+    def wait_s(self) -> float | None:
+        return None if self._done_at is None else max(0.0, self._done_at - self.clock.now())
+
+    def elapse(self) -> list[bytes]:
+        if self._done_at is None or self.clock.now() < self._done_at:
+            return []
+        self._done_at = None
+        return [Reply(self._reading()), *self._run()]
+
+    def _run(self) -> list[bytes]:
+        out: list[bytes] = []
+        while self._waiting and self._done_at is None:
+            answer = self._obey(self._waiting.popleft())
+            if answer:
+                out.append(Reply(answer))
+        return out
+
+    def _obey(self, command: str) -> bytes:
+        if command in ("SYST:ERR?", "SYSTEM:ERROR?"):
+            return (self._errors.popleft() if self._errors else '0,"No error"').encode() + b"\n"
+        if (code := self._failure()) is not None:
+            self._errors.append(f'{code},"System error"')
+            return b""
+        if command == "*IDN?":
+            return f"KEITHLEY INSTRUMENTS INC.,MODEL 6485,{self._serial_number},B03\n".encode()
+        if command == "*RST":
+            self._zero_check = True
+        elif command.startswith("SYST:ZCH "):
+            self._zero_check = command.endswith(("ON", "1"))
+        elif command in ("READ?", "MEAS?", "MEAS:CURR?", "MEAS:CURR:DC?"):
+            self._done_at = self.clock.now() + 0.1  # five cycles of the mains
+        elif command not in (
+            "*CLS",
+            "RANG:AUTO ON",
+            "CURR:RANG:AUTO ON",
+            "CONF:CURR",
+            "CONF:CURR:DC",
+            "FORM:ELEM READ",
+        ):
+            self._errors.append('-113,"Undefined header"')
+        return b""
+
+    def _reading(self) -> bytes:
+        current_a = 0.0 if self._zero_check else DARK_A + self._photocurrent()
+        current_a += NOISE_A * float(self._rng.standard_normal())
+        told = current_a if abs(current_a) <= _RANGE_A else 9.9e37
+        return f"{told:+.6E}A,{self.clock.now() % 1e5:+.6E},{0:+.6E}\n".encode()
+
+    def _photocurrent(self) -> float:
+        """Area x solid angle x the integral of radiance x responsivity."""
+        wavelength_nm = np.arange(340.0, 1100.5, 1.0)
+        seen = self._light.radiance().at(wavelength_nm) * responsivity_a_per_w(wavelength_nm)
+        return AREA_M2 * SOLID_ANGLE_SR * float(np.sum(seen))

@@ -1,0 +1,33 @@
+"""Every driver that has an entry point keeps its family's contract, with its mock or its library's own camera at the other end."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.contract.checks import check_driver
+from drivers.contract.peer import peers
+from drivers.errors import InstrumentError
+from drivers.registry import drivers
+
+#: Each call on a silent GigE camera takes the library seconds.
+SLOW = {("camera", "aravis")}
+
+
+@pytest.mark.parametrize(
+    ("family", "name"),
+    [pytest.param(*one, marks=[pytest.mark.slow] if one in SLOW else []) for one in drivers()],
+    ids=lambda part: part,
+)
+def test_it_keeps_the_contract(family: str, name: str) -> None:
+    if (family, name) == ("spectroradiometer", "usb2000plus"):
+        pytest.skip("another name of ocean_optics")
+    point = peers().get(f"{family}.{name}")
+    assert point is not None, "a driver without a peer is a driver without a check: add one under calibench.peers"
+    try:
+        peer = point.load()()
+    except InstrumentError as error:
+        pytest.skip(str(error))  # a library that isn't installed here
+    with peer:
+        found = list(check_driver(family, name, peer))
+    assert [(outcome.asks, outcome.why) for outcome in found if outcome.ended == "not met"] == []
+    assert sum(outcome.ended == "met" for outcome in found) >= (5 if peer.can_fail else 4)
