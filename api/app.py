@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Iterable
 from importlib.metadata import version
@@ -30,6 +31,7 @@ from api.security import (
 )
 from api.service import Here, Limits, Service
 from api.upload import Inbox
+from lab.capture.recovery import Recovery
 from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
@@ -118,20 +120,27 @@ def create_app(
     limits: Limits | None = None,
     connect: Callable[[Station], Drivers] = drivers_of,
     jobs_runner: JobRunner | None = None,
+    recovery: Recovery | None = None,
 ) -> FastAPI:
     """The application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
     the service is reached, beside this computer's own. `connect` makes a station's drivers. When the application ends, it cancels
-    its jobs and aborts its sessions, which can be resumed; shutters are closed.
+    its jobs and aborts its sessions, which can be resumed; shutters are closed. `recovery` may have begun already; by default the
+    application's start begins it.
     """
     folder = stations or store.root / "stations"
     folder.mkdir(parents=True, exist_ok=True)
     caps = limits or Limits()
 
+    rescue = recovery or Recovery(store, connect)
+
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        rescue.resume_with(app.state.service.live.resume)
+        rescue.start()
         yield
+        await asyncio.to_thread(rescue.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
 

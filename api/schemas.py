@@ -110,7 +110,7 @@ class SessionResume(Schema):
     station: str | None = Field(
         default=None,
         max_length=100,
-        description="a station with the same instruments at other addresses; null: as it began",
+        description="a station with the same instruments at other addresses; null: as in its last run",
     )
 
 
@@ -179,7 +179,7 @@ class JobStart(Schema):
     station: str | None = Field(
         default=None,
         max_length=100,
-        description="pipeline of a session: a station with the same instruments at other addresses; null: as it began",
+        description="pipeline of a session: a station with the same instruments at other addresses; null: as in its last run",
     )
 
 

@@ -202,13 +202,18 @@ class Store:
             found = [self._info(db, row) for row in rows]
         return [self._now(one) for one in found]
 
+    def under_way(self) -> list[str]:
+        """Ids of the sessions that are recorded as running or paused, also where their process ended without a word."""
+        with self.reading() as db:
+            return list(db.scalars(sa.select(SessionRow.id).where(SessionRow.state.in_(("running", "paused")))))
+
     def has_session(self, session_id: str) -> bool:
         """Whether there is such a session."""
         with self.reading() as db:
             return db.get(SessionRow, session_id) is not None
 
     def station(self, session_id: str) -> Station:
-        """The station that a session was started on."""
+        """The station of a session's last run, or that it was started on."""
         with self.reading() as db:
             return Station.model_validate(self._row(db, session_id).station)
 
@@ -218,14 +223,21 @@ class Store:
             return [RunRecord.model_validate(run) for run in self._row(db, session_id).runs]
 
     def set_state(
-        self, session_id: str, state: SessionState, error: str | None = None, run: RunRecord | None = None
+        self,
+        session_id: str,
+        state: SessionState,
+        error: str | None = None,
+        run: RunRecord | None = None,
+        station: Station | None = None,
     ) -> None:
-        """Record the state of a session; `run` is added to its provenance."""
+        """Record the state of a session; `run` is added to its provenance, `station` is where it runs now."""
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.state, row.error = state, error
             if run is not None:
                 row.runs = [*row.runs, run.model_dump(mode="json")]
+            if station is not None:
+                row.station = station.model_dump(mode="json")
 
     # --- the journal -----------------------------------------------------------------------------------------------------
 
