@@ -79,7 +79,7 @@ class _Reporter:
                 return
             self._written_s = time.monotonic()
         with self.store.transaction() as db:
-            row = db.get_one(JobRow, self.job_id)
+            row = db.get_one(JobRow, self.job_id, with_for_update=True)
             if row.cancel_requested:
                 raise Cancelled
             row.progress = min(max(progress.share, 0.0), 1.0)
@@ -93,7 +93,7 @@ def run_job(
     store = Store(root, database_url)
     try:
         with store.transaction() as db:
-            row = db.get_one(JobRow, job_id)
+            row = db.get_one(JobRow, job_id, with_for_update=True)
             if row.state != "queued":
                 return
             if row.cancel_requested:
@@ -134,7 +134,7 @@ def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: bool) 
 
 def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None:
     with store.transaction() as db:
-        row = db.get_one(JobRow, job_id)
+        row = db.get_one(JobRow, job_id, with_for_update=True)
         row.state, row.error, row.finished = state, error, now()
         if state == "done":
             row.progress, row.message = 1.0, ""
@@ -270,7 +270,7 @@ class JobRunner:
     def cancel(self, job_id: str) -> JobInfo:
         """Ask a job to end: at once if it is queued, else at its next progress. A finished job stays as it is."""
         with self.store.transaction() as db:
-            row = db.get(JobRow, job_id)
+            row = db.get(JobRow, job_id, with_for_update=True)
             if row is not None:
                 row.cancel_requested = True
                 if row.state == "queued":

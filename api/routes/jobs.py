@@ -9,6 +9,7 @@ from sse_starlette.sse import EventSourceResponse
 from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
 from api.keys import Permission
+from api.routes.sessions import state_now
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
@@ -45,12 +46,17 @@ def start_session_job(
     service: Here, request: Request, session_id: SessionId, start: JobStart, response: Response
 ) -> Job:
     """Start work on a session; `Location` says where to look. `validate`, `diagnose` and `report` rest on the newest results of a
-    finished session, and make those that are missing. `pipeline` captures what is left of the session, then makes all of them
+    finished session, and make those that are missing; 409 while the session isn't finished. `pipeline` captures what is left of the session, then makes all of them
     anew; where it captures or resolves, the key's scope has to be `admin`."""
     info = service.session(session_id)
     if start.kind != "pipeline":
         if start.station is not None:
             raise HTTPException(422, f"station: a job of the kind {start.kind} doesn't capture; leave it out")
+        if info.state != "finished":  # its frames would be packed away under the job
+            raise Conflict(
+                f"session {session_id} is {state_now(info, service.live.find(session_id))}, not finished; wait for its end "
+                "or resume it, then start the job; a pipeline does both"
+            )
         return _accepted(service, service.jobs.submit(start.kind, session_id, resolve=start.resolve), response)
     if start.resolve or info.state != "finished":
         Demand(Permission.ADMIN)(request, None, None)

@@ -69,7 +69,8 @@ def list_stations(service: Here) -> list[StationState]:
 # --- sessions ----------------------------------------------------------------------------------------------------------
 
 
-def _state(info: SessionInfo, live: LiveSession | None) -> Any:
+def state_now(info: SessionInfo, live: LiveSession | None) -> Any:
+    """What state a session is in: as this service runs it, else as the registry has it."""
     if live is None:
         return info.state
     if live.latest is None:
@@ -79,7 +80,7 @@ def _state(info: SessionInfo, live: LiveSession | None) -> Any:
 
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     live = service.live.find(info.id)
-    fields = info.model_dump(exclude={"packed"}) | {"state": _state(info, live)}
+    fields = info.model_dump(exclude={"packed"}) | {"state": state_now(info, live)}
     return fields | (
         {"error": None} if live is not None else {}
     )  # the error of an earlier run doesn't concern this one
