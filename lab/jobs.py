@@ -261,11 +261,21 @@ class JobRunner:
                 raise InputError(f"job {job_id!r} isn't in {self.store.root}; list the jobs for their ids")
             return JobInfo.model_validate(row)
 
-    def jobs(self) -> list[JobInfo]:
-        """All jobs, the newest first."""
+    def jobs(self, after: str | None = None, limit: int | None = None) -> list[JobInfo]:
+        """Jobs, the newest first: `limit` at most, those that follow the job `after` in this order."""
+        asked = sa.select(JobRow).order_by(JobRow.created.desc(), JobRow.id.desc()).limit(limit)
         with self.store.reading() as db:
-            rows = db.scalars(sa.select(JobRow).order_by(JobRow.created.desc()))
-            return [JobInfo.model_validate(row) for row in rows]
+            if after is not None:
+                last = db.get(JobRow, after)
+                if last is None:
+                    raise InputError(f"job {after!r} isn't in {self.store.root}; list the jobs for their ids")
+                asked = asked.where(sa.tuple_(JobRow.created, JobRow.id) < sa.tuple_(last.created, last.id))
+            return [JobInfo.model_validate(row) for row in db.scalars(asked)]
+
+    def count_jobs(self) -> int:
+        """How many jobs there are."""
+        with self.store.reading() as db:
+            return db.scalars(sa.select(sa.func.count()).select_from(JobRow)).one()
 
     def cancel(self, job_id: str) -> JobInfo:
         """Ask a job to end: at once if it is queued, else at its next progress. A finished job stays as it is."""

@@ -9,6 +9,7 @@ from sse_starlette.sse import EventSourceResponse
 from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
 from api.keys import Permission
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.routes.sessions import state_now
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
@@ -97,10 +98,19 @@ def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, r
     return _accepted(service, service.jobs.submit(start.kind, folder, resolve=start.resolve), response)
 
 
-@router.get("/jobs", tags=["jobs"], dependencies=[READ], responses=answers(401))
-def list_jobs(service: Here) -> list[Job]:
-    """All jobs, the newest first."""
-    return [_job(service, info) for info in service.jobs.jobs()]
+@router.get(
+    "/jobs",
+    tags=["jobs"],
+    dependencies=[READ],
+    responses=answers(401, 422) | {200: {"headers": HEADERS}},
+)
+def list_jobs(
+    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
+) -> list[Job]:
+    """Jobs, the newest first, in pages."""
+    found = service.jobs.jobs(after, limit)
+    page_headers(request, response, service.jobs.count_jobs(), limit, [info.id for info in found])
+    return [_job(service, info) for info in found]
 
 
 @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[READ], responses=answers(401, 404, 422))

@@ -120,7 +120,7 @@ def test_a_device_that_fails_is_503_and_a_defect_500(
     shared: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def failing(error: Exception) -> Any:
-        def sessions(self: Any) -> Any:
+        def sessions(*_: Any) -> Any:
             raise error
 
         return sessions

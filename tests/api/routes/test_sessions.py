@@ -222,10 +222,32 @@ def test_captures_by_kind_and_side(shared: Running) -> None:
         assert client.get(here, params={"kind": "dark"}).json() == every
         assert client.get(here, params={"kind": "flat"}).json() == []
         assert client.get(here, params={"kind": "soup"}).status_code == 422
-        assert client.get(here, params={"offset": 2, "limit": 3}).json() == every[2:5]
+        newest = client.get(here, params={"order": "newest", "limit": 3}).json()
+        assert newest == every[::-1][:3]
         one = client.get(f"{here}/{every[0]['id']}").json()
         assert one == every[0]
         assert one["document"]["kind"] == "dark" and one["document"]["exposure_s"] == one["exposure_s"]
+
+
+def test_lists_come_in_pages_with_their_total(shared: Running) -> None:
+    here = f"/api/v1/sessions/{only_session(shared)}/captures"
+    with shared.client("read") as client:
+        every = client.get(here).json()
+        found, path = [], f"{here}?limit=5&side=left"
+        while path:
+            response = client.get(path)
+            assert int(response.headers["x-total-count"]) == len(every) // 2
+            found += response.json()
+            path = response.links.get("next", {}).get("url", "")
+        assert found == [one for one in every if one["side"] == "left"]
+        assert client.get(here, params={"after": every[-1]["id"]}).json() == []
+        counts = client.get(f"/api/v1/sessions/{only_session(shared)}").json()["captures"]
+        assert sum(one["captures"] for one in counts) == len(every)
+        assert client.get("/api/v1/sessions").headers["x-total-count"] == "1"
+        assert client.get("/api/v1/sessions", params={"after": only_session(shared)}).json() == []
+        for path in ("/api/v1/sessions", "/api/v1/jobs"):
+            response = client.get(path, params={"after": "nothing"})
+            assert response.status_code == 422 and "nothing" in response.json()["detail"]
 
 
 def test_a_frame_is_what_was_captured(shared: Running) -> None:
