@@ -277,6 +277,12 @@ class JobRunner:
         with self.store.reading() as db:
             return db.scalars(sa.select(sa.func.count()).select_from(JobRow)).one()
 
+    def count_states(self) -> dict[str, int]:
+        """State -> how many jobs are in it."""
+        with self.store.reading() as db:
+            counted = db.execute(sa.select(JobRow.state, sa.func.count()).group_by(JobRow.state))
+            return {state: number for state, number in counted}  # noqa: C416  (rows, not pairs, to a type checker)
+
     def cancel(self, job_id: str) -> JobInfo:
         """Ask a job to end: at once if it is queued, else at its next progress. A finished job stays as it is."""
         with self.store.transaction() as db:

@@ -226,6 +226,12 @@ class Store:
         with self.reading() as db:
             return db.scalars(sa.select(sa.func.count()).select_from(SessionRow)).one()
 
+    def count_states(self) -> dict[str, int]:
+        """State -> how many sessions the registry has in it."""
+        with self.reading() as db:
+            counted = db.execute(sa.select(SessionRow.state, sa.func.count()).group_by(SessionRow.state))
+            return {state: number for state, number in counted}  # noqa: C416  (rows, not pairs, to a type checker)
+
     def under_way(self) -> list[str]:
         """Ids of the sessions that are recorded as running or paused, also where their process ended without a word."""
         with self.reading() as db:

@@ -125,6 +125,19 @@ class KeyRow(Base):
     created: Mapped[datetime]
 
 
+class IdempotentRow(Base):
+    """A request with an idempotency key (see `api.idempotency`). `status` None: it isn't answered yet."""
+
+    __tablename__ = "idempotent_requests"
+
+    id: Mapped[str] = mapped_column(sa.String(64), primary_key=True)
+    fingerprint: Mapped[str] = mapped_column(sa.String(64))
+    created: Mapped[datetime] = mapped_column(index=True)
+    status: Mapped[int | None]
+    location: Mapped[str | None] = mapped_column(sa.Text)
+    body: Mapped[str | None] = mapped_column(sa.Text)
+
+
 # --- the database ------------------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import Disconnected
+from lab.capture.tables import IdempotentRow
 from tests.api.conftest import Running, events, serving, until, until_state
 from tests.lab.fake_bench import BLACK, COLS, ROWS
 
@@ -208,6 +210,37 @@ def test_two_follow_and_one_leaves(tmp_path: Path) -> None:
         assert events(client, path, "progress")  # leaves after the first word
         listener.join(30.0)
     assert heard[-1] == "end"
+
+
+# --- once --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_request_that_is_sent_twice_is_carried_out_once(running: Running) -> None:
+    asked = {"station": "fakes", "quick": True, "sequences": ["dark"]}
+    once = {"Idempotency-Key": "b7e1-1"}
+    with running.client("operate") as client:
+        first = client.post("/api/v1/sessions", json=asked, headers=once)
+        again = client.post("/api/v1/sessions", json=asked, headers=once)
+        assert (first.status_code, again.status_code) == (201, 201)
+        assert again.json() == first.json() and again.headers["location"] == first.headers["location"]
+        assert again.headers["idempotency-replayed"] == "true" and "idempotency-replayed" not in first.headers
+        other = client.post("/api/v1/sessions", json=asked | {"name": "another"}, headers=once)
+        assert other.status_code == 422 and "another request" in other.json()["detail"]
+        assert client.post("/api/v1/sessions", json=asked, headers={"Idempotency-Key": "a b"}).status_code == 422
+        with running.client(None) as nobody:  # a key opens nothing
+            assert nobody.post("/api/v1/sessions", json=asked, headers=once).status_code == 401
+        assert len(running.store.sessions()) == 1
+        # What was refused changed nothing, so the same key may be used again.
+        unknown = {"Idempotency-Key": "b7e1-2"}
+        assert client.post("/api/v1/sessions", json={"station": "none"}, headers=unknown).status_code == 404
+        until_state(client, first.json()["id"], "finished")
+        assert client.post("/api/v1/sessions", json=asked, headers=unknown).status_code == 201
+        with running.store.transaction() as db:  # a day later
+            for row in db.query(IdempotentRow):
+                row.created -= timedelta(days=1, seconds=1)
+        until_state(client, running.store.sessions()[0].id, "finished")
+        assert "idempotency-replayed" not in client.post("/api/v1/sessions", json=asked, headers=once).headers
+        assert len(running.store.sessions()) == 3
 
 
 # --- captures ----------------------------------------------------------------------------------------------------------
