@@ -8,7 +8,7 @@ COPY drivers drivers
 COPY lab lab
 COPY api api
 COPY mocks mocks
-RUN pip install --no-cache-dir -c constraints.txt .
+RUN pip install --no-cache-dir -c constraints.txt '.[postgresql]'
 USER calibench
 ENV CALIBENCH_DATA=/data PYTHONUNBUFFERED=1
 VOLUME /data

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import logging
+import tempfile
 from collections.abc import AsyncIterator, Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
@@ -10,13 +13,17 @@ from typing import Any
 
 from fastapi import APIRouter, FastAPI, HTTPException, Request, Response
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, PlainTextResponse
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.middleware import Middleware
 
 from api import errors, schemas
 from api.errors import DefectMiddleware, Problem, answers
+from api.idempotency import PARAMETER, Idempotency
 from api.keys import LOOPBACK, holder, stored_keys
 from api.live import LiveSessions
+from api.metrics import CountedRequests, Metrics
 from api.routes import jobs, knowledge, recordings, sessions
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -28,13 +35,15 @@ from api.security import (
     SmallBodies,
     set_cookie,
 )
-from api.service import Here, Limits, Service
+from api.service import READ, Here, Limits, Service
 from api.upload import Inbox
+from lab.capture.recovery import Recovery
 from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.jobs import JobRunner
 
+log = logging.getLogger(__name__)
 PREFIX = "/api/v1"
 PAGES = Path(__file__).parent / "pages"
 ASSETS = {
@@ -51,6 +60,10 @@ TAGS = [
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
     {"name": "knowledge", "description": "What the models know."},
 ]
+#: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that is too large,
+#: a foreign Origin; and a defect.
+EVERYWHERE = (400, 405, 413, 500)
+EVERY_CHANGE = (*EVERYWHERE, 403)
 open_to_all = APIRouter()
 
 
@@ -61,6 +74,28 @@ open_to_all = APIRouter()
 def health() -> Health:
     """Whether the service is up."""
     return Health(version=version("calibench"))
+
+
+@open_to_all.get("/healthz", tags=["access"], responses=answers(503))
+def ready(service: Here) -> Health:
+    """Whether the service can work: its registry answers and its data folder takes files. For a supervisor or a balancer."""
+    try:
+        service.store.under_way()
+        with tempfile.TemporaryFile(dir=service.store.root):
+            pass
+    except (OSError, SQLAlchemyError):
+        log.exception("not ready")
+        raise HTTPException(503, "the registry or the data folder can't be used; the service's log says more") from None
+    return Health(version=version("calibench"))
+
+
+@open_to_all.get(
+    "/metrics", tags=["access"], dependencies=[READ], response_class=PlainTextResponse, responses=answers(401)
+)
+def metrics(request: Request) -> Response:
+    """Requests, sessions and jobs, as Prometheus reads them. Needs a key, in Prometheus' `authorization`."""
+    found: Metrics = request.app.state.metrics
+    return Response(found.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @open_to_all.post("/login", tags=["access"], responses=answers(401, 403, 413, 422, 429))
@@ -118,23 +153,32 @@ def create_app(
     limits: Limits | None = None,
     connect: Callable[[Station], Drivers] = drivers_of,
     jobs_runner: JobRunner | None = None,
+    recovery: Recovery | None = None,
 ) -> FastAPI:
     """The application on a store.
 
     `stations`: the folder of the station files, by default `stations` in the data folder. `hosts`: names under which
     the service is reached, beside this computer's own. `connect` makes a station's drivers. When the application ends, it cancels
-    its jobs and aborts its sessions, which can be resumed; shutters are closed.
+    its jobs and aborts its sessions, which can be resumed; shutters are closed. `recovery` may have begun already; by default the
+    application's start begins it.
     """
     folder = stations or store.root / "stations"
     folder.mkdir(parents=True, exist_ok=True)
     caps = limits or Limits()
 
+    rescue = recovery or Recovery(store, connect)
+
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        rescue.resume_with(app.state.service.live.resume)
+        rescue.start()
         yield
+        await asyncio.to_thread(rescue.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
 
+    jobs_of = jobs_runner or JobRunner(store)
+    counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})
     app = FastAPI(
         title="calibench",
         summary="Captures with, calibrates and explains cameras.",
@@ -147,19 +191,22 @@ def create_app(
         license_info={"name": "BSD-3-Clause", "identifier": "BSD-3-Clause"},
         middleware=[
             Middleware(SafeHeaders),
+            Middleware(CountedRequests, metrics=counted),
             Middleware(DefectMiddleware),
             Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
             Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_path=f"{PREFIX}/recordings"),
+            Middleware(Idempotency, store=store, prefix=PREFIX, except_path=f"{PREFIX}/recordings"),
         ],
     )
     gate = Gate(lambda: stored_keys(store))
     app.state.gate = gate
+    app.state.metrics = counted
     app.state.patience = Patience()
     app.state.service = Service(
         store=store,
         stations=folder,
         live=LiveSessions(store, connect),
-        jobs=jobs_runner or JobRunner(store),
+        jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
         gate=gate,
         limits=caps,
@@ -187,6 +234,12 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             tags=app.openapi_tags,
             license_info=app.license_info,
         )
+        for path, operations in made["paths"].items():
+            for method, operation in operations.items():
+                if method == "post" and path.startswith(PREFIX) and path != f"{PREFIX}/recordings":
+                    operation.setdefault("parameters", []).append(PARAMETER)
+                for status, response in answers(*(EVERYWHERE if method == "get" else EVERY_CHANGE)).items():
+                    operation["responses"].setdefault(str(status), response)
         known = made["components"]["schemas"]
         for model in (Problem, Progress, schemas.StoredSession, schemas.Job):
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import os
 import socket
@@ -24,6 +25,8 @@ Folder = Annotated[
     Path | None, typer.Option("--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
 ]
 FIRST_KEY = "first"
+#: How long (s) the stations of sessions that ended without a word are waited for before the service is loaded.
+RESCUE_FIRST_S = 4.0
 _ANY = ("0.0.0.0", "::", "")  # addresses that listen everywhere and name no computer
 
 
@@ -80,24 +83,30 @@ def serve(
     data: Folder = None,
 ) -> None:
     """Run the REST service and the operator's page. The first start on loopback makes a key and prints it."""
-    import uvicorn
-
-    from api.app import create_app
-
     if (tls_certificate is None) != (tls_key is None):
         raise InputError("--tls-certificate and --tls-key belong together; give both")
     for file in (tls_certificate, tls_key):
         if file is not None and not os.access(file, os.R_OK):
             raise InputError(f"{file}: can't be read; give a PEM file")
+    from lab.capture.recovery import Recovery
+
     store = _store(data)
     makes_key = (is_loopback(host) or create_first_key) and not stored_keys(store)
     if not makes_key:
         check_bind(host, stored_keys(store))
-    with _listening(host, port) as line:
+    with _listening(host, port) as line, contextlib.closing(Recovery(store)) as recovery:
+        recovery.start(
+            RESCUE_FIRST_S
+        )  # before the service itself is loaded, which takes seconds: a shutter may be open
+
+        import uvicorn
+
+        from api.app import create_app
+
         if makes_key:
             _first_key(store)
         names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
-        app = create_app(store, hosts=names)
+        app = create_app(store, hosts=names, recovery=recovery)
         server = uvicorn.Server(
             uvicorn.Config(
                 app,

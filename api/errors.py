@@ -1,15 +1,17 @@
-"""Errors as HTTP responses: one line in `detail`, and a status."""
+"""Errors as HTTP responses: problem details (RFC 9457), with one line in `detail`."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
 from typing import Any, TypeVar
 
-from fastapi import FastAPI, HTTPException, Request
+from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
+from starlette.exceptions import HTTPException as RouterException
+from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from lab.errors import DeviceError, InputError
@@ -23,33 +25,52 @@ class Conflict(Exception):
 
 
 class Problem(BaseModel):
-    """The body of every error response."""
+    """The body of every error response: problem details (RFC 9457). `detail` is one line: what, where, remedy."""
 
     model_config = ConfigDict(
         json_schema_extra={
-            "example": {"detail": "no session '20300101-120000-abcdef'; GET /api/v1/sessions lists them"}
+            "example": {
+                "type": "about:blank",
+                "title": "Not Found",
+                "status": 404,
+                "detail": "no session '20300101-120000-abcdef'; GET /api/v1/sessions lists them",
+            }
         }
     )
 
+    type: str = "about:blank"
+    title: str
+    status: int
     detail: str
 
 
+MEDIA_TYPE = "application/problem+json"
+
+
+def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
+    """An error response."""
+    body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail)
+    return Response(body.model_dump_json(), status, headers, MEDIA_TYPE)
+
+
 _MEANINGS = {
-    400: "a Host that isn't this service's",
+    400: "a Host that isn't this service's, or a body that isn't JSON",
     401: "no valid key",
     403: "the key's scope doesn't reach, or a foreign Origin",
     404: "there is no such thing",
+    405: "not this method; `Allow` names those of the path",
     409: "conflicts with what is under way",
     413: "larger than allowed",
     422: "can't be used: what, where, remedy",
     429: "too often",
-    503: "an instrument failed",
+    500: "a defect of calibench; its log says more",
+    503: "an instrument or the data folder failed",
 }
 
 
 def answers(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI's error responses of a route. They are JSON whatever the route returns, so FastAPI's `model` doesn't fit."""
-    content = {"application/json": {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
+    """OpenAPI's error responses of a route. They are problem details whatever the route returns, so FastAPI's `model` doesn't fit."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
     return {status: {"description": _MEANINGS[status], "content": content} for status in statuses}
 
 
@@ -65,20 +86,44 @@ def _one_line(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip()) or type(error).__name__
 
 
-def _answer(status: int) -> Callable[[Request, Exception], JSONResponse]:
-    def handler(request: Request, error: Exception) -> JSONResponse:
-        return JSONResponse({"detail": _one_line(error)}, status)
+def _public(request: Request, text: str) -> str:
+    """A text without the data folder's path: where the server keeps its files is nobody's business."""
+    return text.replace(f"{request.app.state.service.store.root}/", "").replace(
+        str(request.app.state.service.store.root), "the data folder"
+    )
+
+
+def _answer(status: int) -> Callable[[Request, Exception], Response]:
+    def handler(request: Request, error: Exception) -> Response:
+        return problem(status, _public(request, _one_line(error)))
 
     return handler
 
 
-def _invalid(request: Request, error: Exception) -> JSONResponse:
+def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     lines = []
     for one in error.errors():
         where = ".".join(str(part) for part in one["loc"] if part != "body") or "body"
         lines.append(f"{where}: {one['msg']}")
-    return JSONResponse({"detail": "; ".join(lines)}, 422)
+    return problem(422, "; ".join(lines))
+
+
+def _refused(request: Request, error: Exception) -> Response:
+    """What a route or the router refuses; of a wrong method, `Allow` names the methods of all routes of the path."""
+    assert isinstance(error, RouterException)
+    headers = dict(error.headers or {})
+    if error.status_code == 405:
+        paths = request.app.openapi()["paths"]
+        methods = [
+            method.upper()
+            for path, operations in paths.items()
+            if compile_path(path)[0].match(request.url.path)
+            for method in operations
+        ]
+        headers["allow"] = ", ".join(dict.fromkeys(methods)) or headers.get("allow", "GET")
+        return problem(405, f"{request.method} isn't for this path; use {headers['allow']}", headers)
+    return problem(error.status_code, str(error.detail), headers)
 
 
 class DefectMiddleware:
@@ -103,7 +148,7 @@ class DefectMiddleware:
             if begun:
                 raise
             said = f"{type(error).__name__}: a defect of calibench; its log says more"
-            await JSONResponse({"detail": said}, 500)(scope, receive, send)
+            await problem(500, said)(scope, receive, send)
 
 
 def install(app: FastAPI) -> None:
@@ -112,3 +157,4 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(DeviceError, _answer(503))
     app.add_exception_handler(Conflict, _answer(409))
     app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(RouterException, _refused)

@@ -259,9 +259,10 @@ class LiveSessions:
         for id, session in self._live.items():
             if not session.ended and wanted & _addresses(session.station):
                 return id
-        for info in self._store.sessions():
-            if info.state in RUNS and self.find(info.id) is None and wanted & _addresses(self._store.station(info.id)):
-                return info.id
+        for id in self._store.under_way():
+            elsewhere = self.find(id) is None and self._store.session(id).state in RUNS
+            if elsewhere and wanted & _addresses(self._store.station(id)):
+                return id
         return None
 
 

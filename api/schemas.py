@@ -110,7 +110,7 @@ class SessionResume(Schema):
     station: str | None = Field(
         default=None,
         max_length=100,
-        description="a station with the same instruments at other addresses; null: as it began",
+        description="a station with the same instruments at other addresses; null: as in its last run",
     )
 
 
@@ -144,12 +144,21 @@ class StoredSession(Schema):
     steps_done: int
 
 
+class CaptureCount(Schema):
+    """How many captures a session has of a kind and a side."""
+
+    kind: str
+    side: Side
+    captures: int
+
+
 class SessionDetail(StoredSession):
     """A session with its station, its progress and its provenance."""
 
     station: str
     progress: Progress | None = Field(description="null unless this service runs it now")
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
+    captures: tuple[CaptureCount, ...] = Field(description="how many there are of each kind and side")
 
 
 class StoredCapture(Schema):
@@ -179,7 +188,7 @@ class JobStart(Schema):
     station: str | None = Field(
         default=None,
         max_length=100,
-        description="pipeline of a session: a station with the same instruments at other addresses; null: as it began",
+        description="pipeline of a session: a station with the same instruments at other addresses; null: as in its last run",
     )
 
 

@@ -16,11 +16,11 @@ from typing import Annotated
 from urllib.parse import urlsplit
 
 from fastapi import HTTPException, Request, Response, Security
-from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from api.errors import problem
 from api.keys import Permission, StoredKey, digest, holder
 
 COOKIE = "calibench"
@@ -168,9 +168,8 @@ class SameHost:
         except ValueError:
             host = ""
         if host not in self.hosts:
-            return JSONResponse(
-                {"detail": f"Host {host[:80]!r} is not one of this service's; `calibench serve --allow-host` adds one"},
-                400,
+            return problem(
+                400, f"Host {host[:80]!r} is not one of this service's; `calibench serve --allow-host` adds one"
             )
         origin = headers.get("origin")
         if origin is not None and scope["method"] not in ("GET", "HEAD", "OPTIONS"):
@@ -179,7 +178,7 @@ class SameHost:
             except ValueError:
                 origin_host = ""
             if origin_host != named[0].lower():
-                return JSONResponse({"detail": f"Origin {origin[:80]!r} is not this service"}, 403)
+                return problem(403, f"Origin {origin[:80]!r} is not this service")
         return None
 
 
@@ -259,4 +258,4 @@ class SmallBodies:
         return f"the body is larger than {self.limit_bytes} bytes; send less"
 
     async def _refuse(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await JSONResponse({"detail": self._why}, 413, headers={"Connection": "close"})(scope, receive, send)
+        await problem(413, self._why, {"Connection": "close"})(scope, receive, send)

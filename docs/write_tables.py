@@ -1,13 +1,15 @@
 """Write the pages and tables that are generated from declarations and from the reference study.
 
 python docs/write_tables.py                   all of them; about a minute
-python docs/write_tables.py PAGE ...          only these of decision-policy, effects, command-line, from what is kept
+python docs/write_tables.py PAGE ...          only these of decision-policy, effects, command-line, openapi, from what is kept
 """
 
 from __future__ import annotations
 
 import inspect
+import json
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -161,10 +163,24 @@ def _cell(text: str) -> str:
     return _one_line(text).replace("|", "\\|")
 
 
+def openapi() -> str:
+    """docs/reference/openapi.json."""
+    from api.app import create_app
+    from lab.capture.store import Store
+
+    with tempfile.TemporaryDirectory() as folder:
+        service = create_app(Store(folder))
+        try:
+            return json.dumps(service.openapi(), indent=1, ensure_ascii=False) + "\n"
+        finally:
+            service.state.service.jobs.close()
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "decision-policy": policy_page,
     "effects": effects_page,
     "command-line": command_page,
+    "openapi": openapi,
 }
 
 
@@ -174,7 +190,8 @@ def main() -> None:
     if not names:
         TABLE.write_text(as_toml(derived_visibility()), encoding="utf-8")
     for name in names or PAGES:
-        (REFERENCE / f"{name}.md").write_text(PAGES[name](), encoding="utf-8")
+        file = REFERENCE / (f"{name}.json" if name == "openapi" else f"{name}.md")
+        file.write_text(PAGES[name](), encoding="utf-8")
 
 
 if __name__ == "__main__":

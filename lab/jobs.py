@@ -79,7 +79,7 @@ class _Reporter:
                 return
             self._written_s = time.monotonic()
         with self.store.transaction() as db:
-            row = db.get_one(JobRow, self.job_id)
+            row = db.get_one(JobRow, self.job_id, with_for_update=True)
             if row.cancel_requested:
                 raise Cancelled
             row.progress = min(max(progress.share, 0.0), 1.0)
@@ -93,7 +93,7 @@ def run_job(
     store = Store(root, database_url)
     try:
         with store.transaction() as db:
-            row = db.get_one(JobRow, job_id)
+            row = db.get_one(JobRow, job_id, with_for_update=True)
             if row.state != "queued":
                 return
             if row.cancel_requested:
@@ -134,7 +134,7 @@ def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: bool) 
 
 def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None:
     with store.transaction() as db:
-        row = db.get_one(JobRow, job_id)
+        row = db.get_one(JobRow, job_id, with_for_update=True)
         row.state, row.error, row.finished = state, error, now()
         if state == "done":
             row.progress, row.message = 1.0, ""
@@ -261,16 +261,32 @@ class JobRunner:
                 raise InputError(f"job {job_id!r} isn't in {self.store.root}; list the jobs for their ids")
             return JobInfo.model_validate(row)
 
-    def jobs(self) -> list[JobInfo]:
-        """All jobs, the newest first."""
+    def jobs(self, after: str | None = None, limit: int | None = None) -> list[JobInfo]:
+        """Jobs, the newest first: `limit` at most, those that follow the job `after` in this order."""
+        asked = sa.select(JobRow).order_by(JobRow.created.desc(), JobRow.id.desc()).limit(limit)
         with self.store.reading() as db:
-            rows = db.scalars(sa.select(JobRow).order_by(JobRow.created.desc()))
-            return [JobInfo.model_validate(row) for row in rows]
+            if after is not None:
+                last = db.get(JobRow, after)
+                if last is None:
+                    raise InputError(f"job {after!r} isn't in {self.store.root}; list the jobs for their ids")
+                asked = asked.where(sa.tuple_(JobRow.created, JobRow.id) < sa.tuple_(last.created, last.id))
+            return [JobInfo.model_validate(row) for row in db.scalars(asked)]
+
+    def count_jobs(self) -> int:
+        """How many jobs there are."""
+        with self.store.reading() as db:
+            return db.scalars(sa.select(sa.func.count()).select_from(JobRow)).one()
+
+    def count_states(self) -> dict[str, int]:
+        """State -> how many jobs are in it."""
+        with self.store.reading() as db:
+            counted = db.execute(sa.select(JobRow.state, sa.func.count()).group_by(JobRow.state))
+            return {state: number for state, number in counted}  # noqa: C416  (rows, not pairs, to a type checker)
 
     def cancel(self, job_id: str) -> JobInfo:
         """Ask a job to end: at once if it is queued, else at its next progress. A finished job stays as it is."""
         with self.store.transaction() as db:
-            row = db.get(JobRow, job_id)
+            row = db.get(JobRow, job_id, with_for_update=True)
             if row is not None:
                 row.cancel_requested = True
                 if row.state == "queued":

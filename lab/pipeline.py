@@ -392,7 +392,12 @@ class _Pipeline:
 
         self._validation = self._kept("validate", ValidationResult)
         if self._validation is None:
-            self._validation = validate(self.recordings, self.fitted, models=self.request.models)
+            self._validation = validate(
+                self.recordings,
+                self.fitted,
+                models=self.request.models,
+                progress=lambda what, share: self._say("validate", what, share),
+            )
             self._keep("validate", self._validation)
 
     def _diagnose_step(self) -> None:

@@ -206,7 +206,7 @@ function sessionRow(session) {
     "tr",
     {},
     element("td", { textContent: session.name || session.id, title: session.id }),
-    element("td", { textContent: time(session.created) }),
+    element("td", { className: "when", textContent: time(session.created) }),
     stateCell(session),
     element("td", { className: "number", textContent: `${session.steps_done}/${session.steps}` }),
     actions,
@@ -237,7 +237,7 @@ function jobRow(job) {
     {},
     element("td", { textContent: job.kind }),
     element("td", { textContent: job.of }),
-    element("td", { textContent: time(job.created) }),
+    element("td", { className: "when", textContent: time(job.created) }),
     state,
     actions,
   );
@@ -268,24 +268,77 @@ async function select(session) {
 
 const option = (value) => element("option", { value, textContent: value || "all" });
 
-async function showCaptures() {
-  const captures = await ask(`/sessions/${selected}/captures?limit=5000`);
+// The captures that are shown, newest first as they were asked for; a live session adds those after the newest one only.
+let captures = [];
+let total = 0;
+let shownFor = ""; // session and filter that `captures` are of
+
+const filtered = () => {
+  const filter = $("capture-filter").elements;
+  const asked = new URLSearchParams({ limit: "200" });
+  for (const key of ["kind", "side"]) if (filter[key].value) asked.set(key, filter[key].value);
+  return asked;
+};
+
+async function page(asked) {
+  const response = await fetch(`${api}/sessions/${selected}/captures?${asked}`);
+  if (!response.ok) throw new Problem((await response.json()).detail);
+  total = Number(response.headers.get("X-Total-Count"));
+  return response.json();
+}
+
+async function showFilter() {
+  const counts = (await ask(`/sessions/${selected}`)).captures;
   const filter = $("capture-filter").elements;
   for (const key of ["kind", "side"]) {
-    const values = ["", ...new Set(captures.map((c) => c[key]))];
+    const values = ["", ...new Set(counts.map((c) => c[key]))];
     const kept = filter[key].value;
     if (filter[key].options.length !== values.length) filter[key].replaceChildren(...values.map(option));
     filter[key].value = values.includes(kept) ? kept : "";
   }
+}
+
+async function showCaptures() {
+  const wanted = `${selected} ${filtered()}`;
+  if (shownFor !== wanted) {
+    captures = [];
+    await showFilter();
+    const asked = filtered();
+    asked.set("order", "newest");
+    captures = await page(asked);
+    shownFor = `${selected} ${filtered()}`;
+  } else if (live === selected) {
+    const known = captures.length;
+    for (let more = true; more; ) {
+      const asked = filtered();
+      if (captures.length) asked.set("after", captures[0].id);
+      const found = await page(asked);
+      captures = [...found.reverse(), ...captures];
+      more = found.length === 200;
+    }
+    if (known !== captures.length) await showFilter();
+  }
+  drawCaptures();
+}
+
+async function olderCaptures() {
+  const asked = filtered();
+  asked.set("order", "newest");
+  asked.set("after", captures.at(-1).id);
+  captures = [...captures, ...(await page(asked))];
+}
+
+function drawCaptures() {
   // Captures of one frame (an edge's regions, say) are one picture.
   const frames = new Map();
   for (const c of captures) frames.set(c.document.frame, [...(frames.get(c.document.frame) ?? []), c]);
   const pictures = [...frames.values()].map((of) => ({ ...of[0], more: of.length - 1 }));
-  const chosen = pictures.filter((c) => (!filter.kind.value || c.kind === filter.kind.value) && (!filter.side.value || c.side === filter.side.value));
-  const shown = chosen.slice(-atOnce);
-  $("capture-count").textContent = chosen.length ? `${shown.length} of ${chosen.length} frames, the newest last` : "None yet.";
-  $("more").hidden = shown.length === chosen.length;
-  show("captures", shown.map((c) => ({ ...c, picture: `${c.preview}?width=320${filter.stretch.checked ? "&stretch=true" : ""}` })), (c) =>
+  const shown = pictures.slice(0, atOnce);
+  const left = pictures.length - shown.length + (captures.length < total ? 1 : 0);
+  $("capture-count").textContent = total ? `${total} captures; ${shown.length} frames shown, the newest first` : "None yet.";
+  $("more").hidden = left === 0;
+  const stretch = $("capture-filter").elements.stretch.checked;
+  show("captures", shown.map((c) => ({ ...c, picture: `${c.preview}?width=320${stretch ? "&stretch=true" : ""}` })), (c) =>
     element(
       "figure",
       {},
@@ -302,15 +355,16 @@ async function showCaptures() {
 $("more").addEventListener(
   "click",
   guarded("session-problem", async () => {
-    atOnce = Infinity;
-    await showCaptures();
+    atOnce += PICTURES_AT_ONCE;
+    if (captures.length < total) await olderCaptures();
+    drawCaptures();
   }),
 );
 $("capture-filter").addEventListener("change", guarded("session-problem", showCaptures));
 
 async function refresh() {
   if ($("desk").hidden) return;
-  const [sessions, jobs] = await Promise.all([ask("/sessions"), ask("/jobs")]);
+  const [sessions, jobs] = await Promise.all([ask("/sessions?limit=50"), ask("/jobs?limit=50")]);
   const names = new Map(sessions.map((s) => [s.id, s.name || s.id]));
   const running = sessions.find((s) => LIVE.includes(s.state));
   if (!running && live) await showStations();
@@ -322,5 +376,6 @@ async function refresh() {
   if (live && live === selected) await showCaptures();
 }
 
-setInterval(() => refresh().catch(() => {}), 3000);
+// What runs tells of itself through its events; the lists are looked at now and then, and not where nobody sees them.
+setInterval(() => document.hidden || refresh().catch(() => {}), 3000);
 enter().catch(() => showLogin());

@@ -9,6 +9,8 @@ from sse_starlette.sse import EventSourceResponse
 from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
 from api.keys import Permission
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
+from api.routes.sessions import state_now
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
@@ -45,12 +47,17 @@ def start_session_job(
     service: Here, request: Request, session_id: SessionId, start: JobStart, response: Response
 ) -> Job:
     """Start work on a session; `Location` says where to look. `validate`, `diagnose` and `report` rest on the newest results of a
-    finished session, and make those that are missing. `pipeline` captures what is left of the session, then makes all of them
+    finished session, and make those that are missing; 409 while the session isn't finished. `pipeline` captures what is left of the session, then makes all of them
     anew; where it captures or resolves, the key's scope has to be `admin`."""
     info = service.session(session_id)
     if start.kind != "pipeline":
         if start.station is not None:
             raise HTTPException(422, f"station: a job of the kind {start.kind} doesn't capture; leave it out")
+        if info.state != "finished":  # its frames would be packed away under the job
+            raise Conflict(
+                f"session {session_id} is {state_now(info, service.live.find(session_id))}, not finished; wait for its end "
+                "or resume it, then start the job; a pipeline does both"
+            )
         return _accepted(service, service.jobs.submit(start.kind, session_id, resolve=start.resolve), response)
     if start.resolve or info.state != "finished":
         Demand(Permission.ADMIN)(request, None, None)
@@ -91,10 +98,19 @@ def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, r
     return _accepted(service, service.jobs.submit(start.kind, folder, resolve=start.resolve), response)
 
 
-@router.get("/jobs", tags=["jobs"], dependencies=[READ], responses=answers(401))
-def list_jobs(service: Here) -> list[Job]:
-    """All jobs, the newest first."""
-    return [_job(service, info) for info in service.jobs.jobs()]
+@router.get(
+    "/jobs",
+    tags=["jobs"],
+    dependencies=[READ],
+    responses=answers(401, 422) | {200: {"headers": HEADERS}},
+)
+def list_jobs(
+    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
+) -> list[Job]:
+    """Jobs, the newest first, in pages."""
+    found = service.jobs.jobs(after, limit)
+    page_headers(request, response, service.jobs.count_jobs(), limit, [info.id for info in found])
+    return [_job(service, info) for info in found]
 
 
 @router.get("/jobs/{job_id}", tags=["jobs"], dependencies=[READ], responses=answers(401, 404, 422))

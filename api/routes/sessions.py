@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import anyio
 from fastapi import APIRouter, HTTPException, Query, Request, Response
@@ -14,8 +14,10 @@ from sse_starlette.sse import EventSourceResponse
 from api.errors import answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
 from api.preview import preview_png
 from api.schemas import (
+    CaptureCount,
     CaptureKind,
     SessionDetail,
     SessionResume,
@@ -69,7 +71,8 @@ def list_stations(service: Here) -> list[StationState]:
 # --- sessions ----------------------------------------------------------------------------------------------------------
 
 
-def _state(info: SessionInfo, live: LiveSession | None) -> Any:
+def state_now(info: SessionInfo, live: LiveSession | None) -> Any:
+    """What state a session is in: as this service runs it, else as the registry has it."""
     if live is None:
         return info.state
     if live.latest is None:
@@ -79,7 +82,7 @@ def _state(info: SessionInfo, live: LiveSession | None) -> Any:
 
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     live = service.live.find(info.id)
-    fields = info.model_dump(exclude={"packed"}) | {"state": _state(info, live)}
+    fields = info.model_dump(exclude={"packed"}) | {"state": state_now(info, live)}
     return fields | (
         {"error": None} if live is not None else {}
     )  # the error of an earlier run doesn't concern this one
@@ -89,10 +92,19 @@ def _session(service: Service, session_id: str) -> StoredSession:
     return StoredSession(**_fields(service, service.session(session_id)))
 
 
-@router.get("/sessions", tags=["sessions"], dependencies=[READ], responses=answers(401))
-def list_sessions(service: Here) -> list[StoredSession]:
-    """All sessions, newest first."""
-    return [StoredSession(**_fields(service, info)) for info in service.store.sessions()]
+@router.get(
+    "/sessions",
+    tags=["sessions"],
+    dependencies=[READ],
+    responses=answers(401, 422) | {200: {"headers": HEADERS}},
+)
+def list_sessions(
+    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
+) -> list[StoredSession]:
+    """Sessions, newest first, in pages."""
+    found = service.store.sessions(after, limit)
+    page_headers(request, response, service.store.count_sessions(), limit, [info.id for info in found])
+    return [StoredSession(**_fields(service, info)) for info in found]
 
 
 @router.post(
@@ -119,6 +131,10 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
         station=service.store.station(session_id).name,
         progress=service.progress(session_id),
         runs=tuple(service.store.runs(session_id)),
+        captures=tuple(
+            CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
+            for (kind, side), n in sorted(service.store.count_captures(session_id).items())
+        ),
     )
 
 
@@ -223,23 +239,35 @@ def _known_capture(service: Service, session_id: str, capture_id: int) -> Captur
     return info
 
 
-@router.get("/sessions/{session_id}/captures", tags=["captures"], dependencies=[READ], responses=answers(401, 404, 422))
+@router.get(
+    "/sessions/{session_id}/captures",
+    tags=["captures"],
+    dependencies=[READ],
+    responses=answers(401, 404, 422) | {200: {"headers": HEADERS}},
+)
 def list_captures(
     service: Here,
+    request: Request,
+    response: Response,
     session_id: SessionId,
     kind: Annotated[CaptureKind | None, Query(description="only of this kind")] = None,
     side: Annotated[Side | None, Query(description="only of this camera")] = None,
-    offset: Annotated[int, Query(ge=0)] = 0,
-    limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
+    order: Annotated[Literal["oldest", "newest"], Query(description="which come first")] = "oldest",
+    after: NumberCursor = None,
+    limit: Limit = PAGE,
 ) -> list[StoredCapture]:
-    """The captures of a session, in the order in which they were taken."""
+    """The captures of a session, in the order in which they were taken or the newest first, in pages."""
     service.session(session_id)
-    chosen = [
-        info
-        for info in service.store.captures(session_id)
-        if (kind is None or info.kind == kind) and (side is None or info.side == side)
-    ]
-    return [_capture(info) for info in chosen[offset : offset + limit]]
+    found = service.store.captures(
+        session_id, kind=kind, side=side, after=after, newest_first=order == "newest", limit=limit
+    )
+    total = sum(
+        n
+        for of, n in service.store.count_captures(session_id).items()
+        if kind in (None, of[0]) and side in (None, of[1])
+    )
+    page_headers(request, response, total, limit, [str(info.id) for info in found])
+    return [_capture(info) for info in found]
 
 
 @router.get(

@@ -69,7 +69,7 @@ class Instruments:
                 driver.stop()
                 found[name] = driver.identity()
             except InstrumentError as error:
-                raise DeviceError(_named(name, error)) from error
+                raise DeviceError(named_complaint(name, error)) from error
         for side, camera in self.drivers.cameras.items():
             sensor, sheet = camera.sensor(), self.station.cameras[side].datasheet
             if (sensor.rows, sensor.cols) != (sheet.rows, sheet.cols):
@@ -98,7 +98,7 @@ class Instruments:
             except TimeoutError:
                 complaints.append(f"{name}: didn't stop within {STOP_S:g} s")
             except Exception as error:
-                complaints.append(_named(name, error))
+                complaints.append(named_complaint(name, error))
         return complaints
 
     def close(self) -> None:
@@ -112,6 +112,7 @@ class Instruments:
                 continue
 
 
-def _named(name: str, error: Exception) -> str:
+def named_complaint(name: str, error: Exception) -> str:
+    """What an instrument complains of, as a line that names it."""
     text = str(error)
     return text if name.split(maxsplit=1)[0] in text.lower() else f"{name}: {text}"

@@ -59,9 +59,10 @@ class ResultInfo(_Record):
 
 
 class RunRecord(Frozen):
-    """Provenance of one run of a session: when, with which instruments and which versions."""
+    """Provenance of one run of a session: when, after how many finished steps, with which instruments and which versions."""
 
     started: datetime
+    steps_done: int = 0
     instruments: dict[str, dict[str, str]]
     versions: dict[str, str]
 

@@ -112,7 +112,7 @@ class _Writes:
 class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
-    `station`: None for the station that the session began on; another one where its instruments have new addresses.
+    `station`: None for the station of its last run, or that it began on; another one where its instruments have new addresses.
     `on_progress` is called from a thread of the run. An exception that it raises ends the run.
     """
 
@@ -259,7 +259,7 @@ class CaptureSession:
         try:
             identities = instruments.connect()
             self._check_identities(identities)
-            self.store.set_state(self.id, "running", run=_provenance(identities))
+            self.store.set_state(self.id, "running", run=_provenance(identities, self._done), station=self.station)
             self._drive(instruments)
         except BaseException as error:
             failure = error
@@ -447,11 +447,14 @@ def _plain(error: BaseException, complaints: list[str]) -> BaseException:
     return error
 
 
-def _provenance(identities: dict[str, Identity]) -> RunRecord:
+def _provenance(identities: dict[str, Identity], steps_done: int) -> RunRecord:
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             versions[package] = version(package)
     return RunRecord(
-        started=now(), instruments={name: vars(identity) for name, identity in identities.items()}, versions=versions
+        started=now(),
+        steps_done=steps_done,
+        instruments={name: vars(identity) for name, identity in identities.items()},
+        versions=versions,
     )

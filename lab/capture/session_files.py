@@ -48,6 +48,8 @@ class SessionFiles:
         try:
             content = (self.folder / path).read_bytes()
         except OSError as error:
+            if self.pack.exists() and place.pack_index is None and path.startswith("frames/"):
+                raise InputError("was packed with its session while it was read; read the session again") from error
             raise InputError(f"can't be read ({error.strerror}); restore it from a backup") from error
         return _intact(content, place)
 

@@ -76,9 +76,13 @@ class StationCamera(Address):
 
 
 class Station(Frozen):
-    """The content of a station file. `cameras` has a left one at least. None: the station has no such instrument."""
+    """The content of a station file. `cameras` has a left one at least. None: the station has no such instrument.
+
+    resume_automatically : whether the service goes on with a session by itself whose process ended without a word
+    """
 
     name: str = ""
+    resume_automatically: bool = False
     monochromator: Address | None = None
     spectroradiometer: Address | None = None
     display: Address | None = None

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
-from sqlalchemy.orm import Session, sessionmaker
+from sqlalchemy.orm import Session, defer, sessionmaker
 
 from lab.capture.durable_files import Lock, npy_bytes, write_durably
 from lab.capture.nexus import write_nexus
@@ -160,22 +160,37 @@ class Store:
             raise InputError(f"session {session_id!r} isn't in {self.root}; `calibench sessions` lists those that are")
         return row
 
+    def _infos(self, db: Session, rows: Sequence[SessionRow]) -> list[SessionInfo]:
+        """The sessions of these rows, their steps counted in one query."""
+        counts = {
+            session_id: (steps, done)
+            for session_id, steps, done in db.execute(
+                sa.select(StepRow.session_id, sa.func.count(), sa.func.count(StepRow.finished))
+                .where(StepRow.session_id.in_([row.id for row in rows]))
+                .group_by(StepRow.session_id)
+            )
+        }
+        found = []
+        for row in rows:
+            steps, done = counts.get(row.id, (0, 0))
+            found.append(
+                SessionInfo(
+                    id=row.id,
+                    name=row.name,
+                    notes=row.notes,
+                    created=_aware(row.created),
+                    closed=row.closed and _aware(row.closed),
+                    state=row.state,  # type: ignore[arg-type]
+                    error=row.error,
+                    packed=row.packed,
+                    steps=steps,
+                    steps_done=done,
+                )
+            )
+        return found
+
     def _info(self, db: Session, row: SessionRow) -> SessionInfo:
-        steps, done = db.execute(
-            sa.select(sa.func.count(), sa.func.count(StepRow.finished)).where(StepRow.session_id == row.id)
-        ).one()
-        return SessionInfo(
-            id=row.id,
-            name=row.name,
-            notes=row.notes,
-            created=_aware(row.created),
-            closed=row.closed and _aware(row.closed),
-            state=row.state,  # type: ignore[arg-type]
-            error=row.error,
-            packed=row.packed,
-            steps=steps,
-            steps_done=done,
-        )
+        return self._infos(db, [row])[0]
 
     def _now(self, read: SessionInfo) -> SessionInfo:
         """The state as it is now.
@@ -195,12 +210,32 @@ class Store:
             found = self._info(db, self._row(db, session_id))
         return self._now(found)
 
-    def sessions(self) -> list[SessionInfo]:
-        """All sessions, the newest first."""
+    def sessions(self, after: str | None = None, limit: int | None = None) -> list[SessionInfo]:
+        """Sessions, the newest first: `limit` at most, those that follow the session `after` in this order."""
+        asked = sa.select(SessionRow).options(defer(SessionRow.station), defer(SessionRow.cameras))
         with self.reading() as db:
-            rows = db.scalars(sa.select(SessionRow).order_by(SessionRow.created.desc(), SessionRow.id.desc()))
-            found = [self._info(db, row) for row in rows]
+            if after is not None:
+                last = self._row(db, after)
+                asked = asked.where(sa.tuple_(SessionRow.created, SessionRow.id) < sa.tuple_(last.created, last.id))
+            asked = asked.order_by(SessionRow.created.desc(), SessionRow.id.desc()).limit(limit)
+            found = self._infos(db, db.scalars(asked).all())
         return [self._now(one) for one in found]
+
+    def count_sessions(self) -> int:
+        """How many sessions there are."""
+        with self.reading() as db:
+            return db.scalars(sa.select(sa.func.count()).select_from(SessionRow)).one()
+
+    def count_states(self) -> dict[str, int]:
+        """State -> how many sessions the registry has in it."""
+        with self.reading() as db:
+            counted = db.execute(sa.select(SessionRow.state, sa.func.count()).group_by(SessionRow.state))
+            return {state: number for state, number in counted}  # noqa: C416  (rows, not pairs, to a type checker)
+
+    def under_way(self) -> list[str]:
+        """Ids of the sessions that are recorded as running or paused, also where their process ended without a word."""
+        with self.reading() as db:
+            return list(db.scalars(sa.select(SessionRow.id).where(SessionRow.state.in_(("running", "paused")))))
 
     def has_session(self, session_id: str) -> bool:
         """Whether there is such a session."""
@@ -208,7 +243,7 @@ class Store:
             return db.get(SessionRow, session_id) is not None
 
     def station(self, session_id: str) -> Station:
-        """The station that a session was started on."""
+        """The station of a session's last run, or that it was started on."""
         with self.reading() as db:
             return Station.model_validate(self._row(db, session_id).station)
 
@@ -218,14 +253,21 @@ class Store:
             return [RunRecord.model_validate(run) for run in self._row(db, session_id).runs]
 
     def set_state(
-        self, session_id: str, state: SessionState, error: str | None = None, run: RunRecord | None = None
+        self,
+        session_id: str,
+        state: SessionState,
+        error: str | None = None,
+        run: RunRecord | None = None,
+        station: Station | None = None,
     ) -> None:
-        """Record the state of a session; `run` is added to its provenance."""
+        """Record the state of a session; `run` is added to its provenance, `station` is where it runs now."""
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.state, row.error = state, error
             if run is not None:
                 row.runs = [*row.runs, run.model_dump(mode="json")]
+            if station is not None:
+                row.station = station.model_dump(mode="json")
 
     # --- the journal -----------------------------------------------------------------------------------------------------
 
@@ -314,12 +356,31 @@ class Store:
 
     # --- captures --------------------------------------------------------------------------------------------------------
 
-    def captures(self, session_id: str) -> list[CaptureInfo]:
-        """The captures of a session in the order in which they were taken."""
+    def captures(
+        self,
+        session_id: str,
+        *,
+        kind: str | None = None,
+        side: str | None = None,
+        after: int | None = None,
+        newest_first: bool = False,
+        limit: int | None = None,
+    ) -> list[CaptureInfo]:
+        """The captures of a session in the order in which they were taken, or the newest first: of one kind and side, or all;
+        `limit` at most, those that follow the capture of the id `after` in this order."""
+        asked = _captures_of(sa.select(CaptureRow), session_id, kind, side)
+        if after is not None:
+            asked = asked.where(CaptureRow.id < after if newest_first else CaptureRow.id > after)
+        asked = asked.order_by(CaptureRow.id.desc() if newest_first else CaptureRow.id).limit(limit)
         with self.reading() as db:
             self._row(db, session_id)
-            rows = db.scalars(sa.select(CaptureRow).where(CaptureRow.session_id == session_id).order_by(CaptureRow.id))
-            return [CaptureInfo.model_validate(row) for row in rows]
+            return [CaptureInfo.model_validate(row) for row in db.scalars(asked)]
+
+    def count_captures(self, session_id: str) -> dict[tuple[str, str], int]:
+        """(kind, side) -> how many captures a session has of them."""
+        asked = sa.select(CaptureRow.kind, CaptureRow.side, sa.func.count()).group_by(CaptureRow.kind, CaptureRow.side)
+        with self.reading() as db:
+            return {(kind, side): n for kind, side, n in db.execute(_captures_of(asked, session_id))}
 
     def capture(self, capture_id: int) -> CaptureInfo:
         """One capture by its id in the registry."""
@@ -451,6 +512,14 @@ class Store:
             if row is None:
                 raise InputError(f"no API key is called {name!r}; list them for their names")
             db.delete(row)
+
+
+def _captures_of(asked: Any, session_id: str, kind: str | None = None, side: str | None = None) -> Any:
+    """A query of captures, confined to a session, a kind and a side."""
+    for column, wanted in ((CaptureRow.session_id, session_id), (CaptureRow.kind, kind), (CaptureRow.side, side)):
+        if wanted is not None:
+            asked = asked.where(column == wanted)
+    return asked
 
 
 def _file_row(session_id: str, file: StoredFile) -> FileRow:

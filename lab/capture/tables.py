@@ -125,15 +125,38 @@ class KeyRow(Base):
     created: Mapped[datetime]
 
 
+class IdempotentRow(Base):
+    """A request with an idempotency key (see `api.idempotency`). `status` None: it isn't answered yet."""
+
+    __tablename__ = "idempotent_requests"
+
+    id: Mapped[str] = mapped_column(sa.String(64), primary_key=True)
+    fingerprint: Mapped[str] = mapped_column(sa.String(64))
+    created: Mapped[datetime] = mapped_column(index=True)
+    status: Mapped[int | None]
+    location: Mapped[str | None] = mapped_column(sa.Text)
+    body: Mapped[str | None] = mapped_column(sa.Text)
+
+
 # --- the database ------------------------------------------------------------------------------------------------------
 
 
 def open_engine(url: str) -> sa.Engine:
-    """The database at a URL. Raises InputError where it can't be opened."""
+    """The database at a URL, PostgreSQL through psycopg. Raises InputError where it can't be opened."""
     try:
-        engine = sa.create_engine(url)
-    except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError, ImportError) as error:
-        raise InputError(f"registry {url!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error
+        address = sa.make_url(url)
+        if address.drivername in ("postgres", "postgresql"):
+            address = address.set(drivername="postgresql+psycopg")
+        # A connection that the server has closed, as after its restart, is replaced before it is used.
+        engine = sa.create_engine(address, pool_pre_ping=address.get_backend_name() != "sqlite")
+    except sa.exc.ArgumentError as error:
+        raise InputError("CALIBENCH_DATABASE_URL: isn't a database's URL; give postgresql://USER@HOST/NAME") from error
+    except ImportError as error:
+        raise InputError(
+            f"registry {address!r}: its driver isn't installed ({error}); pip install 'calibench[postgresql]'"
+        ) from error
+    except sa.exc.NoSuchModuleError as error:
+        raise InputError(f"registry {address!r} can't be opened ({error}); correct CALIBENCH_DATABASE_URL") from error
     if engine.dialect.name != "sqlite":
         return engine
 
@@ -167,6 +190,11 @@ def upgrade(engine: sa.Engine, folder: Path) -> None:
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
             connection.commit()
+    except sa.exc.OperationalError as error:
+        raise InputError(
+            f"registry {engine.url!r}: can't be reached ({' '.join(str(error.orig).split())}); start it, or correct "
+            "CALIBENCH_DATABASE_URL"
+        ) from error
     except sa.exc.DatabaseError as error:
         raise InputError(
             f"{engine.url}: isn't a registry ({str(error.orig or error).splitlines()[0]}); "

@@ -81,6 +81,7 @@ def run(
 ) -> None:
     """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench."""
     from lab.report import words
+    from lab.report.answers import answers
 
     store = open_store(out_folder)
     session = CaptureRequest(session=resume, quick=quick, only=tuple(only or ()), name=name)
@@ -92,12 +93,12 @@ def run(
     print_fit(found.recordings, found.fit)
     badge, _, headline = words.headline(found.diagnosis)
     out.print(f"\n[bold]{badge}[/]: {headline}")
-    for sentence in words.summary(found.fit, found.validation, found.diagnosis):
-        out.print(escape(sentence))
+    for question, lines in answers(found.fit, found.validation, found.diagnosis):
+        out.print(f"[bold]{question}[/]" if lines else "")
+        for line in lines:
+            out.print(escape(line))
     for taken in found.diagnosis.resolutions:
         out.print(f"Resolved with: {escape(taken.capture)} (session {taken.session})")
-    if found.diagnosis.next_capture:
-        out.print(f"Next: {escape(found.diagnosis.next_capture)}")
     out.print(f"\nsession: {found.session}")
     out.print(f"report: {found.report}")
 

@@ -5,7 +5,7 @@ The model is the fitted camera, or a camera file with its effects. Nothing is fi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -50,15 +50,25 @@ MTF_FREQUENCIES = np.arange(1, 26) * 0.02
 MTF_FLOOR = 0.002
 CELL_PX = 4.0  # of a cell of the random pattern on a screen, where the recordings don't state it
 KERNEL_FLOOR = 0.002  # of the kernel's maximum
+_Checking = Callable[
+    [RecordingSet, Side, CameraFit, CameraModel, Sequence[Effect], Callable[[str], None]],
+    list[Check],
+]
 
 
 def validate(
-    recordings: RecordingSet, fit: FitResult, models: Mapping[Side, CameraFile] | None = None
+    recordings: RecordingSet,
+    fit: FitResult,
+    models: Mapping[Side, CameraFile] | None = None,
+    progress: Callable[[str, float], None] | None = None,
 ) -> ValidationResult:
     """Checks of every side: `colorchecker`, `mtf`, `psf`. `models`: cameras with their effects, in place of the fitted ones.
 
-    A check passes where chi2 lies within its 99.9 % quantile. What the recordings don't allow stands in `skipped`.
+    A check passes where chi2 lies within its 99.9 % quantile. What the recordings don't allow stands in `skipped`. `progress` is
+    called with what is under way and the share (0..1) that is done, before each edge and kernel; what it raises ends the work.
     """
+    kinds: tuple[tuple[str, _Checking], ...] = (("colorchecker", _charts), ("mtf", _edges), ("psf", _kernels))
+    begun = 0
     checks: list[Check] = []
     skipped: list[Skipped] = []
     for side in recordings.sides:
@@ -66,9 +76,17 @@ def validate(
         improved = (models or {}).get(side)
         model = improved.camera if improved else camera_model(recordings, side, camera_fit)
         with_effects = improved.effects if improved else ()
-        for name, check in (("colorchecker", _charts), ("mtf", _edges), ("psf", _kernels)):
+        for name, check in kinds:
+            share = begun / (len(kinds) * len(recordings.sides))
+            begun += 1
+
+            def tell(capture: str, name: str = name, side: Side = side, share: float = share) -> None:
+                if progress is not None:
+                    progress(f"{name}, {side}: {capture}" if capture else f"{name}, {side}", share)
+
+            tell("")
             try:
-                checks += check(recordings, side, camera_fit, model, with_effects)
+                checks += check(recordings, side, camera_fit, model, with_effects, tell)
             except NotDetermined as refused:
                 skipped.append(Skipped(step=f"validate {name}", reason=refused.reason, side=side))
     return ValidationResult(source=recordings.source, checks=tuple(checks), skipped=tuple(skipped))
@@ -96,7 +114,12 @@ def _check(
 
 
 def _charts(
-    recordings: RecordingSet, side: Side, fit: CameraFit, model: CameraModel, effects: Sequence[Effect]
+    recordings: RecordingSet,
+    side: Side,
+    fit: CameraFit,
+    model: CameraModel,
+    effects: Sequence[Effect],
+    tell: Callable[[str], None],
 ) -> list[Check]:
     if fit.spectral is None:
         raise NotDetermined("colorchecker", "the sensitivities weren't fitted: capture narrowband light")
@@ -109,7 +132,11 @@ def _charts(
     by_capture: dict[tuple[str, ...], list[PatchLevel]] = {}
     for point in points:
         by_capture.setdefault(tuple(c.id for c in point.captures), []).append(point)
-    return [_chart(study, side, model, effects, captures, members) for captures, members in by_capture.items()]
+    checks = []
+    for captures, members in by_capture.items():
+        tell(captures[0])
+        checks.append(_chart(study, side, model, effects, captures, members))
+    return checks
 
 
 def _chart(
@@ -173,7 +200,12 @@ def _curve_std(model: CameraModel, channel: str, wavelength_nm: FloatArray) -> f
 
 
 def _edges(
-    recordings: RecordingSet, side: Side, fit: CameraFit, model: CameraModel, effects: Sequence[Effect]
+    recordings: RecordingSet,
+    side: Side,
+    fit: CameraFit,
+    model: CameraModel,
+    effects: Sequence[Effect],
+    tell: Callable[[str], None],
 ) -> list[Check]:
     stated = recordings.camera(side)
     if stated.f_number is None or stated.pixel_pitch_um is None:
@@ -188,6 +220,7 @@ def _edges(
     checks, reason = [], ""
     for repeats in settings.values():
         capture = repeats[0]
+        tell(capture.id)
         curves, residuals, blocks, reference = [], [], [], []
         for channel in model.channels:
             try:
@@ -244,7 +277,12 @@ def _diagonal(blocks: Sequence[NDArray[Any]]) -> FloatArray:
 
 
 def _kernels(
-    recordings: RecordingSet, side: Side, fit: CameraFit, model: CameraModel, effects: Sequence[Effect]
+    recordings: RecordingSet,
+    side: Side,
+    fit: CameraFit,
+    model: CameraModel,
+    effects: Sequence[Effect],
+    tell: Callable[[str], None],
 ) -> list[Check]:
     if not fit.psf:
         raise NotDetermined("psf", "no kernel was fitted")
@@ -254,6 +292,7 @@ def _kernels(
     for found in fit.psf:
         if found.sample_pitch_px != 1.0:
             continue
+        tell(found.capture)
         screen = screens.get(found.capture)
         light = recordings.spectrum(screen.radiance) if screen and screen.radiance else None
         cell_px = screen.cell_camera_px if screen else None

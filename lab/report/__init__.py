@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from importlib import metadata
@@ -11,8 +10,6 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
@@ -30,8 +27,9 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
-from lab.report import charts, geometry, words
+from lab.report import answers, charts, geometry, words
 from lab.report import diagnosis as diagnosis_page
+from lab.report.chart_data import ChartData, plotly_base64
 from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
@@ -117,22 +115,6 @@ def _threshold_text(diagnosis: DiagnosisResult | None) -> str:
     return f" (threshold {diagnosis.threshold:.1f} sigma{rate})"
 
 
-def _chart_json(figure: dict[str, Any]) -> Markup:
-    """A figure as JSON that can't end its script element; numbers rounded to 7 digits."""
-
-    def rounded(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: rounded(item) for key, item in value.items()}
-        if isinstance(value, list | tuple):
-            return [rounded(item) for item in value]
-        if isinstance(value, float):
-            return float(f"{value:.7g}") if np.isfinite(value) else None
-        return value
-
-    text = json.dumps(rounded(figure), separators=(",", ":"), allow_nan=False)
-    return Markup(text.replace("<", "\\u003c"))  # within JSON's strings the same, and no way out of the element
-
-
 def page_environment() -> jinja2.Environment:
     """The templates of the pages, with their filters."""
     environment = jinja2.Environment(
@@ -151,12 +133,12 @@ def page_environment() -> jinja2.Environment:
     environment.filters |= {
         "words": lambda text: str(text).replace("_", " "),
         "measurement": measurement_title,
-        "chart_json": _chart_json,
         "effect_name": words.effect_name,
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,
         "mood": diagnosis_page.mood,
+        "check_name": lambda name: words.CHECK_NAMES.get(name, name),
     }
     return environment
 
@@ -171,7 +153,6 @@ def render_report(
     """The report as HTML text; see `write_report`."""
     sides = tuple(fit.cameras)
     checks = validation.checks if validation is not None else ()
-    badge, mood, headline = words.headline(diagnosis)
     curves = diagnosis.curves if diagnosis is not None else ()
     rows = by_side(fit, recordings.manifest.cameras)
     skipped: dict[tuple[str, str, str], Skipped] = {}
@@ -190,10 +171,7 @@ def render_report(
         "made": provenance.made.strftime("%Y-%m-%d %H:%M UTC"),
         "captures": len(recordings.captures()),
         "sides": sides,
-        "badge": badge,
-        "mood": mood,
-        "headline": headline,
-        "summary": list(words.summary(fit, validation, diagnosis)),
+        **answers.context(fit, validation, diagnosis, len(skipped), len(recordings.warnings)),
         "diagnosis": diagnosis,
         "threshold_text": _threshold_text(diagnosis),
         "mismatch_map": charts.mismatch_map(diagnosis) if diagnosis is not None else None,
@@ -250,7 +228,8 @@ def render_report(
         "provenance": provenance,
         "notes": recordings.manifest.notes,
         "listed": recordings.captures(),
-        "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+        "chart_data": ChartData(),
+        "plotly": plotly_base64(),
     }
     return page_environment().get_template("page.html").render(context)
 

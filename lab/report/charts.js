@@ -1,16 +1,51 @@
 "use strict";
+// Draws a chart when it comes into view: neither the library nor the charts of closed sections cost the page's opening anything.
 (() => {
-  const charts = [...document.querySelectorAll(".chart")].map(box => ({ box, text: box.querySelector("script").textContent }));
-  for (const { box } of charts) box.replaceChildren();
-  const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  function draw() {
-    const colours = { "@fg": colour("--fg"), "@muted": colour("--muted"), "@grid": colour("--grid") };
-    for (const { box, text } of charts) {
-      const figure = JSON.parse(text, (key, value) => colours[value] ?? value);
-      Plotly.react(box, figure.data, figure.layout, { responsive: true, displaylogo: false, displayModeBar: false });
-    }
+  const boxes = [...document.querySelectorAll(".chart")];
+  const drawn = new Set();
+  let figures = [];
+  let loaded = null;
+  function expanded(id) {
+    const packed = Uint8Array.from(atob(document.getElementById(id).textContent), letter => letter.charCodeAt(0));
+    return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
   }
-  draw();
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => draw());
-  matchMedia("print").addEventListener("change", () => { draw(); for (const { box } of charts) Plotly.Plots.resize(box); });
+  function library() {
+    loaded ??= (async () => {
+      figures = (await expanded("charts")).split("\n");
+      const script = document.createElement("script");
+      script.textContent = await expanded("plotly");
+      document.head.append(script);
+    })();
+    return loaded;
+  }
+  const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  function draw(box) {
+    const colours = { "@fg": colour("--fg"), "@muted": colour("--muted"), "@grid": colour("--grid") };
+    const figure = JSON.parse(figures[box.dataset.chart], (key, value) => colours[value] ?? value);
+    Plotly.react(box, figure.data, figure.layout, { responsive: true, displaylogo: false, displayModeBar: false });
+    drawn.add(box);
+  }
+  const seen = new IntersectionObserver(entries => {
+    const coming = entries.filter(entry => entry.isIntersecting).map(entry => entry.target);
+    for (const box of coming) seen.unobserve(box);
+    if (coming.length) library().then(() => coming.forEach(draw));
+  }, { rootMargin: "300px" });
+  for (const box of boxes) seen.observe(box);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => drawn.forEach(draw));
+  // Print what is open, in the print's colours and width.
+  const shown = box => !box.closest("details:not([open])");
+  const print = () => window.Plotly && boxes.filter(shown).forEach(box => { draw(box); Plotly.Plots.resize(box); });
+  matchMedia("print").addEventListener("change", print);
+  addEventListener("beforeprint", print);
+  // A link to a section opens it.
+  const reveal = () => {
+    const target = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+    for (let at = target; at; at = at.parentElement) if (at.tagName === "DETAILS") at.open = true;
+    if (target) target.scrollIntoView();
+  };
+  addEventListener("hashchange", reveal);
+  reveal();
+  document.getElementById("open-all")?.addEventListener("click", () => {
+    for (const section of document.querySelectorAll("details.section")) section.open = true;
+  });
 })();

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from lab.formats.results import Change, ComparisonResult, ProjectionChange
 from lab.report import page_environment, write_page
+from lab.report.chart_data import ChartData, plotly_base64
 from lab.report.charts import AFTER, BEFORE, Figure, axis, layout
 from lab.report.figures import measured
 from lab.report.geometry import frame_layout, lines_of_vectors
@@ -97,7 +96,8 @@ def render_comparison(comparison: ComparisonResult) -> str:
         "significances": significances(comparison),
         "shown": min(SHOWN, len(comparison.changes)),
         "projections": [(item, projection_vectors(item)) for item in comparison.projection],
-        "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+        "chart_data": ChartData(),
+        "plotly": plotly_base64(),
     }
     return page_environment().get_template("compare.html").render(context)
 

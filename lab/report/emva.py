@@ -16,7 +16,7 @@ from lab.report.emva_spatial import spatial_plots
 from lab.report.emva_temporal import joint_fit_plots, temporal_plots
 from lab.report.figures import NOISE, measured
 from lab.report.maps import MAPS
-from lab.report.pictures import map_picture, png_data_uri
+from lab.report.pictures import map_picture, photograph_data_uri
 from sim.camera import Side
 
 MAP_WIDTH_PX = 300
@@ -187,4 +187,4 @@ def _maps(recordings: RecordingSet, side: Side) -> Iterator[tuple[str, str, str]
         if values is None:
             continue
         picture, low, high = map_picture(values, MAP_WIDTH_PX)
-        yield title, png_data_uri(picture), f"from {low:.4g} (dark) to {high:.4g} (bright) {unit}"
+        yield title, photograph_data_uri(picture), f"from {low:.4g} (dark) to {high:.4g} (bright) {unit}"

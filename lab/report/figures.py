@@ -12,11 +12,11 @@ from sim.camera import Side
 
 #: Field of `NoiseFit` -> (name, unit), in the order of the table; the maker's value has the same field name.
 NOISE = {
-    "conversion_gain_dn_per_e": ("conversion gain", "DN/e"),
-    "read_noise_e": ("read noise", "e"),
+    "conversion_gain_dn_per_e": ("system gain K", "DN/e"),
+    "read_noise_e": ("temporal dark noise (read noise)", "e"),
     "black_level_dn": ("black level", "DN"),
     "dark_current_e_per_s": ("dark current", "e/s"),
-    "full_well_e": ("full well", "e"),
+    "full_well_e": ("saturation capacity (full well)", "e"),
     "dsnu_e": ("DSNU", "e"),
     "prnu_percent": ("PRNU", "%"),
     "linearity_error_percent": ("linearity error", "%"),
@@ -27,6 +27,14 @@ NOISE = {
 }
 
 
+#: Names of the distortion's coefficients, in OpenCV's order.
+DISTORTION = (
+    "radial distortion k1",
+    "radial distortion k2",
+    "tangential distortion p1",
+    "tangential distortion p2",
+    "radial distortion k3",
+)
 #: Units whose printed form differs from their form in names.
 SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "percent": "%"}
 
@@ -93,7 +101,9 @@ def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[
             peak = max(range(len(curve)), key=lambda k: curve[k])
             std = fit.spectral.quantum_efficiency_std.get(channel)
             at = fit.spectral.wavelength_nm[peak]
-            yield KeyFigure(f"QE peak {channel}", "1", curve[peak], std[peak] if std else None, note=f"at {at:g} nm")
+            yield KeyFigure(
+                f"peak quantum efficiency {channel}", "1", curve[peak], std[peak] if std else None, note=f"at {at:g} nm"
+            )
     for channel in ("R", "G", "B", "Y"):
         if (span := mtf50_range(fit.mtf, channel)) is not None:
             lowest, highest, number = span
@@ -107,12 +117,17 @@ def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[
 def geometry_figures(geometry: GeometryFit) -> Iterator[KeyFigure]:
     """Pinhole camera matrix and distortion."""
     matrix, matrix_std = geometry.camera_matrix, geometry.camera_matrix_std
-    for name, row, col in (("focal length x", 0, 0), ("focal length y", 1, 1), ("centre x", 0, 2), ("centre y", 1, 2)):
+    for name, row, col in (
+        ("focal length x", 0, 0),
+        ("focal length y", 1, 1),
+        ("principal point x", 0, 2),
+        ("principal point y", 1, 2),
+    ):
         yield KeyFigure(name, "px", matrix[row][col], matrix_std[row][col] if matrix_std else None)
     for number, value in enumerate(geometry.distortion):
-        name = ("k1", "k2", "p1", "p2", "k3")[number] if number < 5 else f"distortion {number}"
+        name = DISTORTION[number] if number < len(DISTORTION) else f"distortion {number}"
         yield KeyFigure(name, "1", value, geometry.distortion_std[number] if geometry.distortion_std else None)
-    yield KeyFigure("reprojection rms", "px", geometry.rms_px)
+    yield KeyFigure("reprojection error, rms", "px", geometry.rms_px)
 
 
 def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
@@ -124,7 +139,7 @@ def stereo_figures(stereo: StereoFit) -> Iterator[KeyFigure]:
     for name, value, number in zip("xyz", rotation_vector_mrad(stereo.rotation), range(3), strict=True):
         turns = stereo.rotation_std_rad
         yield KeyFigure(f"stereo rotation about {name}", "mrad", value, 1e3 * turns[number] if turns else None)
-    yield KeyFigure("stereo rms", "px", stereo.rms_px)
+    yield KeyFigure("stereo reprojection error, rms", "px", stereo.rms_px)
 
 
 def rotation_vector_mrad(rotation: tuple[tuple[float, float, float], ...]) -> tuple[float, float, float]:

@@ -17,7 +17,7 @@ from lab.formats.recording_set import RecordingSet
 from lab.formats.results import ChannelGeometry, DepthUncertainty, GeometryFit, ProjectionUncertainty, StereoFit
 from lab.report.charts import CHANNEL, Figure, Trace, axis, band, layout
 from lab.report.figures import measured
-from lab.report.pictures import png_data_uri
+from lab.report.pictures import photograph_data_uri
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
@@ -290,7 +290,7 @@ def rectified_picture(recordings: RecordingSet, stereo: StereoFit, width_px: int
     for row in np.linspace(0, size[1] - 1, STRIPES + 2)[1:-1].round().astype(int):
         coloured[row] = (np.array([224, 138, 30]) * 0.8 + 0.2 * coloured[row]).astype(np.uint8)
     coloured[:, width_px // 2 - 1 : width_px // 2 + 1] = 255
-    return png_data_uri(coloured), pose
+    return photograph_data_uri(coloured), pose
 
 
 def context(geometry: GeometryFit | None) -> dict[str, Any]:

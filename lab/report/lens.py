@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from lab.predict.lens import LensResult, TracedPrescription
 from lab.report import page_environment, write_page
+from lab.report.chart_data import ChartData, plotly_base64
 from lab.report.charts import Figure, Trace, axis, layout
 from lab.report.pictures import kernel_picture
 from sim.optics import rays as rt
@@ -270,7 +269,8 @@ def render_lens(traced: TracedPrescription) -> str:
         "mosaic": _mosaic(table),
         "window": f"{window:.1f}",
         "pitch": f"{table.sample_pitch_um:.2f}",
-        "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+        "chart_data": ChartData(),
+        "plotly": plotly_base64(),
     }
     return page_environment().get_template("lens.html").render(context)
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -95,6 +99,38 @@ def serving(root: Path, *, limits: Limits | None = None, delay_s: float = 0.0) -
         thread.join(30.0)
         assert not thread.is_alive()
         store.close()
+
+
+@contextmanager
+def served(data: Path, *options: str) -> Iterator[tuple[str, subprocess.Popen[str], Path]]:
+    """The service as its own process: its address, the process, the file of its output."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    output = data.with_suffix(".log")
+    arguments = ["serve", "--data", str(data), "--port", str(port), *options]
+    with output.open("w") as file:
+        code = "import sys; from lab.cli import main; sys.exit(main(sys.argv[1:]))"
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, *arguments],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        )
+    url = f"http://127.0.0.1:{port}"
+    try:
+        until = time.monotonic() + 60.0
+        while True:
+            try:
+                httpx.get(f"{url}/health")
+                break
+            except httpx.TransportError:
+                assert time.monotonic() < until and process.poll() is None, output.read_text()
+                time.sleep(0.1)
+        yield url, process, output
+    finally:
+        process.kill()
+        process.wait(10.0)
 
 
 @pytest.fixture

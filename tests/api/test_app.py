@@ -18,6 +18,41 @@ def test_health_needs_no_key(shared: Running) -> None:
         assert client.get("/health").json()["status"] == "ok"
 
 
+def test_ready_only_while_the_data_folder_takes_files(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    with running.client(None) as client:
+        assert client.get("/healthz").json()["status"] == "ok"
+
+        def full(**_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr("api.app.tempfile.TemporaryFile", full)
+        response = client.get("/healthz")
+        assert response.status_code == 503 and "data folder" in response.json()["detail"]
+
+
+def test_metrics_count_requests_by_route_and_sessions_by_state(shared: Running) -> None:
+    with shared.client("read") as client:
+        assert client.get("/api/v1/sessions/none").status_code == 404
+        assert client.get("/no/such/page").status_code == 404
+        text = client.get("/metrics").text
+    assert 'calibench_sessions{state="finished"} 1.0' in text
+    route = re.search(r'calibench_requests_total\{method="GET",route="([^"]*session_id[^"]*)",status="404"\} 1.0', text)
+    assert route is not None and "none" not in route[1]
+    assert "calibench_first_byte_seconds_bucket" in text and "/no/such/page" not in text
+    with shared.client(None) as client:
+        assert client.get("/metrics").status_code == 401
+
+
+def test_errors_are_problem_details_without_a_path_of_the_server(shared: Running) -> None:
+    with shared.client("read") as client:
+        for path, status in (("/api/v1/jobs/" + "0" * 16, 404), ("/nothing", 404), ("/api/v1/jobs?after=x", 422)):
+            response = client.get(path)
+            assert response.status_code == status and response.headers["content-type"] == "application/problem+json"
+            found = response.json()
+            assert set(found) == {"type", "title", "status", "detail"} and found["status"] == status
+            assert str(shared.store.root) not in found["detail"] and found["detail"]
+
+
 def operations(shared: Running) -> list[tuple[str, str, dict[str, Any]]]:
     paths = shared.app.openapi()["paths"]
     return [(method, path, one) for path, methods in paths.items() for method, one in methods.items()]
@@ -37,16 +72,16 @@ def test_every_route_says_what_it_answers(shared: Running) -> None:
             assert content["schema"] or kind in ("image/png", "application/x-npy"), where
         for status, answer in one["responses"].items():
             if status.startswith("4"):
-                assert answer["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Problem"}, (
-                    where
-                )
+                assert answer["content"]["application/problem+json"]["schema"] == {
+                    "$ref": "#/components/schemas/Problem"
+                }, where
 
 
 def test_all_but_logins_and_health_state_their_security(shared: Running) -> None:
     schemes = shared.app.openapi()["components"]["securitySchemes"]
     assert schemes["key"]["scheme"] == "bearer" and schemes["login"]["in"] == "cookie"
     for _, path, one in operations(shared):
-        wanted = [{"key": []}, {"login": []}] if path.startswith("/api/") else None
+        wanted = [{"key": []}, {"login": []}] if path.startswith("/api/") or path == "/metrics" else None
         assert one.get("security") == wanted, path
 
 
@@ -120,7 +155,7 @@ def test_a_device_that_fails_is_503_and_a_defect_500(
     shared: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def failing(error: Exception) -> Any:
-        def sessions(self: Any) -> Any:
+        def sessions(*_: Any) -> Any:
             raise error
 
         return sessions
@@ -128,7 +163,7 @@ def test_a_device_that_fails_is_503_and_a_defect_500(
     with shared.client("admin") as client:
         monkeypatch.setattr(type(shared.store), "sessions", failing(DeviceError("lamp: out\nburnt")))
         response = client.get("/api/v1/sessions")
-        assert (response.status_code, response.json()) == (503, {"detail": "lamp: out; burnt"})
+        assert (response.status_code, response.json()["detail"]) == (503, "lamp: out; burnt")
         monkeypatch.setattr(type(shared.store), "sessions", failing(KeyError(str(Path("/secret/place")))))
         response = client.get("/api/v1/sessions")
         assert response.status_code == 500

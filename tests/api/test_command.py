@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -21,6 +15,7 @@ from api.command import commands
 from api.keys import stored_keys
 from lab.capture.store import Store
 from lab.cli import main
+from tests.api.conftest import served
 
 KEY = re.compile(r"calibench_[A-Za-z0-9_-]{43}")
 
@@ -61,38 +56,6 @@ def test_what_cannot_be_is_one_line_and_exit_2(
     store = Store(tmp_path)
     assert stored_keys(store) == []  # no key was made behind anyone's back
     store.close()
-
-
-@contextmanager
-def served(data: Path, *options: str) -> Iterator[tuple[str, subprocess.Popen[str], Path]]:
-    """The service as its own process: its address, the process, the file of its output."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
-    output = data.with_suffix(".log")
-    arguments = ["serve", "--data", str(data), "--port", str(port), *options]
-    with output.open("w") as file:
-        code = "import sys; from lab.cli import main; sys.exit(main(sys.argv[1:]))"
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, *arguments],
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env=os.environ | {"PYTHONUNBUFFERED": "1"},
-        )
-    url = f"http://127.0.0.1:{port}"
-    try:
-        until = time.monotonic() + 60.0
-        while True:
-            try:
-                httpx.get(f"{url}/health")
-                break
-            except httpx.TransportError:
-                assert time.monotonic() < until and process.poll() is None, output.read_text()
-                time.sleep(0.1)
-        yield url, process, output
-    finally:
-        process.kill()
-        process.wait(10.0)
 
 
 def test_the_first_start_prints_a_key_once_and_no_log_shows_one(tmp_path: Path) -> None:

@@ -57,7 +57,9 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         tell("half of it", 0.5)
         return FitResult(source=recordings.source, cameras={})
 
-    def validate(recordings: RecordingSet, fitted: FitResult, models: Any = None) -> ValidationResult:
+    def validate(
+        recordings: RecordingSet, fitted: FitResult, models: Any = None, progress: Any = None
+    ) -> ValidationResult:
         taken.append("validate")
         return ValidationResult(source=recordings.source, checks=())
 

@@ -149,6 +149,18 @@ def test_unknown_work_is_refused(shared: Running) -> None:
         assert client.get("/api/v1/jobs/abc").status_code == 422
 
 
+def test_a_job_on_a_session_that_is_not_finished_is_refused_and_nothing_changes(tmp_path: Path) -> None:
+    with serving(tmp_path, delay_s=0.05) as running, running.client("admin") as client:
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark"]}
+        session_id = client.post("/api/v1/sessions", json=asked).json()["id"]
+        for state in ("running", "interrupted"):
+            until_state(client, session_id, state)
+            response = client.post(f"/api/v1/sessions/{session_id}/jobs", json={"kind": "fit"})
+            assert response.status_code == 409 and f"is {state}, not finished" in response.json()["detail"]
+            client.post(f"/api/v1/sessions/{session_id}/abort")
+        assert client.get("/api/v1/jobs").json() == []
+
+
 # --- pipelines -----------------------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import Disconnected
+from lab.capture.tables import IdempotentRow
 from tests.api.conftest import Running, events, serving, until, until_state
 from tests.lab.fake_bench import BLACK, COLS, ROWS
 
@@ -210,6 +212,37 @@ def test_two_follow_and_one_leaves(tmp_path: Path) -> None:
     assert heard[-1] == "end"
 
 
+# --- once --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_request_that_is_sent_twice_is_carried_out_once(running: Running) -> None:
+    asked = {"station": "fakes", "quick": True, "sequences": ["dark"]}
+    once = {"Idempotency-Key": "b7e1-1"}
+    with running.client("operate") as client:
+        first = client.post("/api/v1/sessions", json=asked, headers=once)
+        again = client.post("/api/v1/sessions", json=asked, headers=once)
+        assert (first.status_code, again.status_code) == (201, 201)
+        assert again.json() == first.json() and again.headers["location"] == first.headers["location"]
+        assert again.headers["idempotency-replayed"] == "true" and "idempotency-replayed" not in first.headers
+        other = client.post("/api/v1/sessions", json=asked | {"name": "another"}, headers=once)
+        assert other.status_code == 422 and "another request" in other.json()["detail"]
+        assert client.post("/api/v1/sessions", json=asked, headers={"Idempotency-Key": "a b"}).status_code == 422
+        with running.client(None) as nobody:  # a key opens nothing
+            assert nobody.post("/api/v1/sessions", json=asked, headers=once).status_code == 401
+        assert len(running.store.sessions()) == 1
+        # What was refused changed nothing, so the same key may be used again.
+        unknown = {"Idempotency-Key": "b7e1-2"}
+        assert client.post("/api/v1/sessions", json={"station": "none"}, headers=unknown).status_code == 404
+        until_state(client, first.json()["id"], "finished")
+        assert client.post("/api/v1/sessions", json=asked, headers=unknown).status_code == 201
+        with running.store.transaction() as db:  # a day later
+            for row in db.query(IdempotentRow):
+                row.created -= timedelta(days=1, seconds=1)
+        until_state(client, running.store.sessions()[0].id, "finished")
+        assert "idempotency-replayed" not in client.post("/api/v1/sessions", json=asked, headers=once).headers
+        assert len(running.store.sessions()) == 3
+
+
 # --- captures ----------------------------------------------------------------------------------------------------------
 
 
@@ -222,10 +255,32 @@ def test_captures_by_kind_and_side(shared: Running) -> None:
         assert client.get(here, params={"kind": "dark"}).json() == every
         assert client.get(here, params={"kind": "flat"}).json() == []
         assert client.get(here, params={"kind": "soup"}).status_code == 422
-        assert client.get(here, params={"offset": 2, "limit": 3}).json() == every[2:5]
+        newest = client.get(here, params={"order": "newest", "limit": 3}).json()
+        assert newest == every[::-1][:3]
         one = client.get(f"{here}/{every[0]['id']}").json()
         assert one == every[0]
         assert one["document"]["kind"] == "dark" and one["document"]["exposure_s"] == one["exposure_s"]
+
+
+def test_lists_come_in_pages_with_their_total(shared: Running) -> None:
+    here = f"/api/v1/sessions/{only_session(shared)}/captures"
+    with shared.client("read") as client:
+        every = client.get(here).json()
+        found, path = [], f"{here}?limit=5&side=left"
+        while path:
+            response = client.get(path)
+            assert int(response.headers["x-total-count"]) == len(every) // 2
+            found += response.json()
+            path = response.links.get("next", {}).get("url", "")
+        assert found == [one for one in every if one["side"] == "left"]
+        assert client.get(here, params={"after": every[-1]["id"]}).json() == []
+        counts = client.get(f"/api/v1/sessions/{only_session(shared)}").json()["captures"]
+        assert sum(one["captures"] for one in counts) == len(every)
+        assert client.get("/api/v1/sessions").headers["x-total-count"] == "1"
+        assert client.get("/api/v1/sessions", params={"after": only_session(shared)}).json() == []
+        for path in ("/api/v1/sessions", "/api/v1/jobs"):
+            response = client.get(path, params={"after": "nothing"})
+            assert response.status_code == 422 and "nothing" in response.json()["detail"]
 
 
 def test_a_frame_is_what_was_captured(shared: Running) -> None:

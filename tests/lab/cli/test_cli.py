@@ -160,7 +160,7 @@ def test_fit_prints_figures_and_writes_what_the_results_say(
     file = tmp_path / "fit.json"
     assert cli.main(["fit", str(flats), "--json", str(file)]) == 0
     shown = capsys.readouterr().out
-    assert "conversion gain" in shown
+    assert "system gain K" in shown
     assert "skipped: spectral (left)" in shown
     fit = FitResult.model_validate_json(file.read_text())
     noise = fit.cameras["left"].noise
@@ -210,7 +210,7 @@ def test_a_check_that_falls_short(
 ) -> None:
     check = Check(name="mtf", side="left", capture="edge-1", n=10, chi2=11.0, rms_relative_percent=1.0, passed=passed)
     result = ValidationResult(source="x", checks=(check,))
-    monkeypatch.setattr(validation, "validate", lambda *_, models: result)
+    monkeypatch.setattr(validation, "validate", lambda *_, **__: result)
     assert cli.main(["validate", str(flats), "--json", str(tmp_path / "v.json")]) == code
     assert ValidationResult.model_validate_json((tmp_path / "v.json").read_text()) == result
 
@@ -377,11 +377,11 @@ def test_the_main_job_says_where_the_report_is_and_what_it_says(
     assert asked == [PipelineRequest("pipeline", capture=session, resolve=True)]
     shown = capsys.readouterr().out
     for words in (
-        "conversion gain",
+        "system gain K",
         "0.4 DN/e",
         "The baseline model explains",
         "Resolved with: dark frames (session session-2)",
-        "Next: Darks.",
+        "Next capture: Darks.",
         "session: session-1",
         "report: somewhere/report.html",
     ):

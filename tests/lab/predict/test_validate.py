@@ -4,12 +4,13 @@ model mends it."""
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
 from lab.challenge.recordings import recordings_of
+from lab.errors import Cancelled
 from lab.fit import fit_recording_set
 from lab.fit.psf.expected_kernel import expected_kernel
 from lab.formats.camera_file import fitted_camera
@@ -25,6 +26,7 @@ from sim.point import kernel, optical_transfer
 DISPLACEMENT_UM = 1.6
 
 
+@cache
 def _fitted(*concealed: Law) -> tuple[RecordingSet, FitResult]:
     # f/2: the lens leaves much beyond the pixels' Nyquist frequency
     recordings = recordings_of(ConcealedCamera(931, concealed, cfa="MONO", f_number=2.0))
@@ -53,6 +55,19 @@ def test_a_concealed_filter_shows_in_edges_and_kernels_and_its_model_mends_it() 
     for check in mended.checks:
         if check.name == "mtf":
             assert check.chi2 < 0.1 * before[check.capture]
+
+
+def test_it_tells_what_it_checks_and_ends_where_that_raises() -> None:
+    told: list[tuple[str, float]] = []
+
+    def tell(what: str, share: float) -> None:
+        told.append((what, share))
+        if what.startswith("mtf, left: "):  # within the edges, not between two kinds of check
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        validate(*_fitted(), progress=tell)
+    assert [share for _, share in told] == sorted(share for _, share in told) and told[-1][1] < 1.0
 
 
 def test_what_isn_t_there_is_skipped_with_its_reason() -> None:

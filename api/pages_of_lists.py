@@ -1,0 +1,38 @@
+"""Long lists in pages: `limit` items, those after a cursor; the number of all items and the next page stand in headers."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Query, Request, Response
+
+#: Items of a page where the request doesn't say how many.
+PAGE = 100
+MOST = 1000
+
+Limit = Annotated[int, Query(ge=1, le=MOST, description="items of this page, at most")]
+IdCursor = Annotated[
+    str | None,
+    Query(
+        pattern=r"^[0-9A-Za-z-]{1,40}$",
+        description="the id of the last item of the page before; without it, the first page",
+    ),
+]
+NumberCursor = Annotated[
+    int | None,
+    Query(ge=1, le=2**31 - 1, description="the id of the last item of the page before; without it, the first page"),
+]
+
+#: OpenAPI's description of the headers that `page_headers` sets.
+HEADERS = {
+    "X-Total-Count": {"description": "how many items there are on all pages", "schema": {"type": "integer"}},
+    "Link": {"description": 'the next page, rel="next", where there may be one', "schema": {"type": "string"}},
+}
+
+
+def page_headers(request: Request, response: Response, total: int, limit: int, ids: list[str]) -> None:
+    """Say how many items there are, and where the next page is (RFC 8288). `ids`: those of this page."""
+    response.headers["X-Total-Count"] = str(total)
+    if len(ids) == limit:
+        there = request.url.include_query_params(after=ids[-1])
+        response.headers["Link"] = f'<{there.path}?{there.query}>; rel="next"'

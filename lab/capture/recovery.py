@@ -1,0 +1,171 @@
+"""What becomes of a session whose process ended without a word: kill -9, a power cut, a crash.
+
+Such a session may have left the shutter open. Its station is made safe (shutter closed, screen dark, motion stopped), the reason
+is recorded, and the session is resumed where its station says so (`resume_automatically`) or where only packing is left.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+
+from drivers.instrument import Instrument
+from lab.capture.blocking_calls import STOP_S, in_thread
+from lab.capture.instruments import named_complaint
+from lab.capture.records import now
+from lab.capture.station import Drivers, Station, drivers_of
+from lab.capture.store import Store
+from lab.errors import DeviceError, InputError
+
+log = logging.getLogger(__name__)
+#: How often (s) the registry is searched for sessions whose process ended, and the longest pause between two tries to reach
+#: instruments that didn't answer.
+LOOK_S, LONGEST_PAUSE_S = 5.0, 60.0
+
+
+def make_station_safe(station: Station, connect: Callable[[Station], Drivers] = drivers_of) -> list[str]:
+    """Connect to every instrument of a station and stop it, all at once: shutter closed, screen dark, motion stopped.
+
+    Returns one line for each instrument that wasn't reached or didn't stop within `STOP_S`. Raises nothing.
+    """
+    try:
+        drivers = connect(station).all
+    except (InputError, DeviceError) as error:
+        return [str(error)]
+
+    def stopped(driver: Instrument) -> None:
+        driver.connect()
+        driver.stop()
+
+    stopping: dict[str, Future[None]] = {
+        name: in_thread(lambda one=driver: stopped(one))  # type: ignore[misc]
+        for name, driver in drivers.items()
+    }
+    complaints, until = [], time.monotonic() + STOP_S
+    for name, future in stopping.items():
+        try:
+            future.result(max(0.0, until - time.monotonic()))
+        except TimeoutError:
+            complaints.append(f"{name}: didn't stop within {STOP_S:g} s")
+        except Exception as error:
+            complaints.append(named_complaint(name, error))
+    closing = [in_thread(driver.close) for driver in drivers.values()]
+    for done in closing:
+        try:
+            done.result(max(0.0, until - time.monotonic()))
+        except Exception:
+            log.debug("a connection wasn't closed", exc_info=True)
+    return complaints
+
+
+def ended_without_progress_twice(store: Store, session_id: str) -> bool:
+    """Whether the last two runs of a session finished no step: resuming by itself would go on for ever."""
+    done, runs = store.session(session_id).steps_done, store.runs(session_id)
+    return len(runs) >= 2 and all(run.steps_done == done for run in runs[-2:])
+
+
+class Recovery:
+    """Looks for sessions whose process ended, makes their stations safe, and resumes those that may go on by themselves.
+
+    It works in a thread from `start` to `close`. `connect` makes a station's drivers. An instrument that doesn't answer is tried
+    again until it does: its session keeps the reason until then.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        connect: Callable[[Station], Drivers] = drivers_of,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._store, self._connect, self._clock = store, connect, clock
+        self._resume: Callable[[str], None] | None = None
+        self._waiting: list[str] = []  # sessions that are safe and go on by themselves
+        self._next_try_s: dict[str, tuple[float, float]] = {}  # session -> (when, the pause before it)
+        self._looked, self._ended = threading.Event(), threading.Event()
+        self._wake = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="recovery", daemon=True)
+
+    def start(self, patience_s: float = 0.0) -> None:
+        """Begin, if that isn't done yet, and wait until the first stations are safe, for `patience_s` at most."""
+        if self._thread.ident is None:
+            self._thread.start()
+        self._looked.wait(patience_s)
+
+    def resume_with(self, resume: Callable[[str], None]) -> None:
+        """How a session is resumed; those that wait for it are resumed now."""
+        self._resume = resume
+        self._wake.set()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended.set()
+        self._wake.set()
+        if self._thread.ident is not None:
+            self._thread.join(STOP_S)
+
+    def _work(self) -> None:
+        while not self._ended.is_set():
+            try:
+                self.look()
+            except Exception:
+                log.exception("looking for sessions whose process ended: a defect")
+            self._looked.set()
+            self._wake.wait(LOOK_S)
+            self._wake.clear()
+
+    def look(self) -> None:
+        """Make the stations of all sessions safe whose process ended, and resume those that may go on by themselves."""
+        for session_id in self._store.under_way():
+            at, _ = self._next_try_s.get(session_id, (0.0, 0.0))
+            if self._clock() >= at and not self._ended.is_set():
+                self._recover(session_id)
+        while self._waiting and self._resume is not None and not self._ended.is_set():
+            session_id = self._waiting.pop()
+            try:
+                self._resume(session_id)
+            except Exception as error:
+                log.warning("session %s: not resumed by itself: %s", session_id, error)
+
+    def _recover(self, session_id: str) -> None:
+        lock = self._store.lock(session_id)
+        if not lock.acquire(patience_s=0.0):
+            return  # its process is alive
+        try:
+            if session_id not in self._store.under_way():
+                return  # it ended in good order, just now
+            station = self._store.station(session_id)
+            began = f"the process that ran it ended without a word (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
+            complaints = make_station_safe(station, self._connect)
+            if complaints:
+                _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
+                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+                self._next_try_s[session_id] = (self._clock() + pause_s, pause_s)
+                said = f"{began}; not brought into a safe state: {'; '.join(complaints)}; look after them, they are tried again"
+                self._store.set_state(session_id, "running", error=said)  # so that the next look finds it
+                log.error("session %s: %s", session_id, said)
+                return
+            self._next_try_s.pop(session_id, None)
+            then, again = self._what_next(session_id, station)
+            self._store.set_state(session_id, "interrupted", error=f"{began}; its station was made safe; {then}")
+            log.warning("session %s: %s; its station was made safe; %s", session_id, began, then)
+            if again:
+                self._waiting.append(session_id)
+        finally:
+            lock.release()
+
+    def _what_next(self, session_id: str, station: Station) -> tuple[str, bool]:
+        """What becomes of the session, as the end of a sentence, and whether it is resumed."""
+        info = self._store.session(session_id)
+        if info.steps_done == info.steps:
+            return "only packing was left, which goes on by itself", True
+        if not station.resume_automatically:
+            return "resume it when the bench is ready", False
+        if ended_without_progress_twice(self._store, session_id):
+            return (
+                "its last two runs finished no step, so it isn't resumed by itself: look after the bench, then resume it",
+                False,
+            )
+        return "it goes on by itself, as its station says", True

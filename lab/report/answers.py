@@ -1,0 +1,217 @@
+"""The report's first screen: what was found, how sure that is, what it means, what to do; and the two charts that prove it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lab.diagnose.measurements.library import measurement_title
+from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ResidualCurve, ValidationResult
+from lab.report import charts, words
+from lab.report.diagnosis import worst_of_each
+from lab.report.figures import KeyFigure, camera_figures, measured
+from sim.camera import Side
+from sim.effects.library import effects as library
+
+#: A parameter within so many standard deviations of zero isn't told on the first screen.
+TOLD_SIGMA = 2.0
+PROOFS = 2
+#: Effects that the first screen names; the others follow in the diagnosis.
+NAMED = 4
+#: Prefixes of the key figures that the first screen has.
+STRIP = ("system gain", "temporal dark noise", "saturation capacity", "dark current", "DSNU", "PRNU")
+
+
+@dataclass(frozen=True)
+class Proof:
+    """A chart of the first screen with what it shows."""
+
+    title: str
+    caption: str
+    figure: charts.Figure
+
+
+def _short(value: float) -> str:
+    """Two digits, without a power of ten."""
+    return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
+
+
+def effect_line(effect: NamedEffect) -> str:
+    """An effect, its cameras, and its parameters that differ from zero, in the library's words."""
+    described = library()[effect.name].quantities() if effect.name in library() else {}
+    sizes = [
+        f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
+        f"{measured(value.value, value.std, value.unit)}"
+        for name, value in effect.parameters.items()
+        if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
+    ]
+    where = " and ".join(effect.sides)
+    return f"{words.effect_name(effect.name).capitalize()}, {where}: {'; '.join(sizes)}."
+
+
+def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
+    """The named effects, what has no name, and the cameras without a mismatch."""
+    if diagnosis is None:
+        return
+    yield from (effect_line(effect) for effect in diagnosis.effects[:NAMED])
+    if len(diagnosis.effects) > NAMED:
+        more = ", ".join(words.effect_name(effect.name) for effect in diagnosis.effects[NAMED:])
+        yield f"Also: {more}."
+    if diagnosis.unexplained:
+        places = sorted({f"{measurement_title(item.measurement)} ({item.side})" for item in diagnosis.unexplained})
+        yield f"Without a name so far: {', '.join(places)}."
+    named = {side for effect in diagnosis.effects for side in effect.sides}
+    missed = named | {item.side for item in diagnosis.mismatches}
+    if named and (clean := [side for side in fit.cameras if side not in missed]):
+        yield f"The {' and '.join(clean)} camera shows no mismatch in these recordings."
+
+
+def _sure_of(effect: NamedEffect) -> str:
+    share = f"{100 * effect.probability:.1f} %" if effect.probability < 0.9995 else "above 99.9 %"
+    rivals = ", ".join(f"{words.effect_name(rival.name)} ({rival.probability:.2g})" for rival in effect.rivals)
+    return f"{words.effect_name(effect.name).capitalize()}: probability {share}" + (
+        f"; rivals: {rivals}." if rivals else "."
+    )
+
+
+def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
+    """Probabilities and rivals, the held-out captures, and the rate of false alarms."""
+    if diagnosis is None:
+        yield "The fits' own standard deviations; nothing was compared with a model."
+        return
+    yield from (_sure_of(effect) for effect in diagnosis.effects[:NAMED])
+    held = diagnosis.held_out
+    if held is not None and held.n and diagnosis.effects:
+        yield (
+            f"On {len(held.captures)} held-out captures, χ² per number falls from {_short(held.chi2_before / held.n)} to "
+            f"{_short(held.chi2_after / held.n)} (noise alone: 1)."
+        )
+    if diagnosis.false_alarm_rate is not None:
+        yield f"A healthy camera is told a mismatch in {100 * diagnosis.false_alarm_rate:.2g} % of all diagnoses."
+
+
+def meaning(diagnosis: DiagnosisResult | None, validation: ValidationResult | None) -> Iterator[str]:
+    """What the effects do to the light and the signal, and by how much the baseline's predictions are off."""
+    for effect in diagnosis.effects[:NAMED] if diagnosis is not None else ():
+        yield effect.statement.split(" Seen in ")[0]
+    for side, worst in _worst(validation.checks if validation is not None else ()).items():
+        off = [check for check in worst if not check.passed]
+        said = ", ".join(f"{words.CHECK_NAMES[check.name]} by {check.rms_relative_percent:.2g} % rms" for check in off)
+        if off:
+            yield f"Without these effects, the {side} camera's prediction misses: {said}."
+        elif worst:
+            names = ", ".join(words.CHECK_NAMES[check.name] for check in worst)
+            yield f"The {side} camera is predicted within its uncertainty: {names}."
+
+
+def _worst(checks: Iterable[Check]) -> dict[Side, list[Check]]:
+    """Side -> the check of each kind that has the highest chi2 per number."""
+    worst: dict[tuple[Side, str], Check] = {}
+    for check in checks:
+        before = worst.get((check.side, check.name))
+        if before is None or check.chi2 / max(check.n, 1) > before.chi2 / max(before.n, 1):
+            worst[check.side, check.name] = check
+    sides: dict[Side, list[Check]] = {}
+    for (side, _), check in worst.items():
+        sides.setdefault(side, []).append(check)
+    return sides
+
+
+def to_do(diagnosis: DiagnosisResult | None, left_out: int, warnings: int) -> Iterator[str]:
+    """The next capture, the checks that the mismatches ask for, and which model to predict with."""
+    if diagnosis is None:
+        yield "Diagnose the recordings: calibench diagnose."
+    else:
+        if diagnosis.next_capture:
+            yield f"Next capture: {diagnosis.next_capture}"
+        yield from dict.fromkeys(item.check for item in diagnosis.unexplained if item.check)
+        if diagnosis.effects:
+            yield "Predict with the improved camera model, which holds the named effects; not with the baseline."
+        if diagnosis.verdict == "no_mismatch":
+            yield "Nothing: the calibration stands. Compare the next one with it: calibench compare."
+        if diagnosis.verdict == "nothing_judged":
+            yield "Capture what the steps that were left out ask for."
+    if warnings:
+        yield f"Look at the {warnings} warning{'s' if warnings > 1 else ''} about the recordings, under Left out."
+    if left_out:
+        yield f"{left_out} step{'s were' if left_out > 1 else ' was'} left out, each with its remedy, under Left out."
+
+
+def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
+    std = np.maximum(np.asarray(curve.measured_std), 1e-12)
+    return float(np.sqrt(np.mean(np.square((np.asarray(curve.measured) - np.asarray(values)) / std))))
+
+
+def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
+    """The two measurements that the baseline fits worst, with both models; of a healthy or an undiagnosed camera, the photon
+    transfer of each."""
+    shown = []
+    if diagnosis is not None and diagnosis.effects:
+        curves = [curve for curve in diagnosis.curves if len(curve.x) > 3]
+        for curve in worst_of_each(curves, PROOFS):
+            before, after = _missed(curve.before, curve), _missed(curve.after, curve)
+            title = measurement_title(curve.measurement)
+            shown.append(
+                Proof(
+                    title=f"{title[0].upper()}{title[1:]}, {curve.side}, {curve.channel}",
+                    caption=f"{curve.label}{', held out' if curve.held_out else ''}: rms residual {_short(before)} σ without "
+                    f"the effects, {_short(after)} σ with them.",
+                    figure=charts.residual_curve(curve),
+                )
+            )
+    for side, camera in fit.cameras.items():
+        figure = charts.photon_transfer(camera.noise) if camera.noise is not None else None
+        if len(shown) < PROOFS and figure is not None:
+            caption = "Temporal variance against signal; the dashed line has the fitted system gain as its slope."
+            shown.append(Proof(title=f"Photon transfer, {side}", caption=caption, figure=figure))
+    return shown
+
+
+def strip(fit: FitResult) -> list[tuple[str, list[KeyFigure]]]:
+    """The key figures of the first screen, by side, then the stereo baseline."""
+    rows = [
+        (str(side), [figure for figure in camera_figures(camera) if figure.name.startswith(STRIP)])
+        for side, camera in fit.cameras.items()
+    ]
+    if fit.stereo is not None:
+        baseline = KeyFigure("baseline", "mm", fit.stereo.baseline_mm, fit.stereo.baseline_mm_std)
+        rows.append(("stereo", [baseline, KeyFigure("reprojection error, rms", "px", fit.stereo.rms_px)]))
+    return [(name, figures) for name, figures in rows if figures]
+
+
+def answers(
+    fit: FitResult,
+    validation: ValidationResult | None,
+    diagnosis: DiagnosisResult | None,
+    left_out: int = 0,
+    warnings: int = 0,
+) -> list[tuple[str, list[str]]]:
+    """The four questions with their answers, a sentence each. `left_out`: steps, `warnings`: about the recordings."""
+    return [
+        ("What was found", list(found(fit, diagnosis))),
+        ("How sure", list(certainty(diagnosis))),
+        ("What it means", list(meaning(diagnosis, validation))),
+        ("What to do", list(to_do(diagnosis, left_out, warnings))),
+    ]
+
+
+def context(
+    fit: FitResult,
+    validation: ValidationResult | None,
+    diagnosis: DiagnosisResult | None,
+    left_out: int,
+    warnings: int,
+) -> dict[str, Any]:
+    """Variables of `answers.html`."""
+    badge, mood, headline = words.headline(diagnosis)
+    return {
+        "badge": badge,
+        "mood": mood,
+        "headline": headline,
+        "answers": answers(fit, validation, diagnosis, left_out, warnings),
+        "proofs": proofs(fit, diagnosis),
+        "strip": strip(fit),
+    }
