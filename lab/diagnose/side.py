@@ -18,6 +18,7 @@ from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import located, shown_in, unexplained, vetoed_names
+from lab.diagnose.outcome.misstated_light import misstated_light
 from lab.diagnose.outcome.next_capture import Proposal, proposals
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.policy import DecisionPolicy
@@ -117,7 +118,10 @@ def diagnose_side(
         mismatches=tuple(located(side, verdict)),
         named=tuple(NamedCandidate(c, shown_in(verdict, c, policy)) for c in verdict.named),
         abstained=verdict.abstained,
-        unexplained=tuple(unexplained(recordings, side, verdict, corrections, policy)),
+        unexplained=(
+            *unexplained(recordings, side, verdict, corrections, policy),
+            *misstated_light(side, fit.cameras.get(side) if fit is not None else None),
+        ),
         vetoed=tuple(vetoed_names(side, verdict)),
         held_out=held_out(verdict),
         curves=tuple(residual_curves(side, verdict)),
