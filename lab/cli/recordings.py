@@ -10,13 +10,18 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import out, warn
+from lab.cli.console import check_writable, out, warn, write_json
 from lab.cli.sources import StoreFolder, open_store
+from lab.cli.tables import print_fit
 from lab.errors import InputError
 from lab.formats import recording_set as recording
+from lab.formats.importers.import_options import ImportOptions
+from lab.formats.recording_set import Manifest, RecordingSet
 from lab.pipeline import session_recordings
 
 commands = typer.Typer()
+#: `--from` this: a CSV of channel means and variances, which becomes a fit.
+LEVEL_TABLE = "photon-transfer-table"
 
 
 @commands.command("import")
@@ -28,7 +33,9 @@ def import_(
             "--from", metavar="KIND", help="emva1288, raw-folder, fits, slanted-edge, colorchecker or dot-grid"
         ),
     ],
-    out_folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="the recording set to write")],
+    out_folder: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="the recording set to write; of a table, the fit's JSON")
+    ],
     checkerboard: Annotated[
         str, typer.Option(metavar="ROWSxCOLS", help="raw-folder: inner corners; the images are pairs leftNN, rightNN")
     ] = "",
@@ -57,7 +64,7 @@ def import_(
     ] = None,
 ) -> None:
     """Turn another format into a recording set."""
-    from lab.formats.importers import ImportOptions, read_foreign
+    from lab.formats.importers import read_foreign
 
     if transfer not in ("", "linear", "srgb"):
         raise InputError(f"--transfer {transfer}: give linear or srgb")
@@ -74,10 +81,32 @@ def import_(
         white_patch=white_patch,
         tap=tap or None,
     )
+    if kind == LEVEL_TABLE:
+        _import_level_table(path, options, out_folder)
+        return
     recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
     folder = recording.write(recordings, out_folder)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
+
+
+def _import_level_table(path: Path, options: ImportOptions, file: Path) -> None:
+    """A table holds no frames: its import is a fit."""
+    from lab.fit.noise.level_table import fit_level_table
+    from lab.formats.importers.images import read_camera_file
+
+    if [name for name in options.stated() if name != "--camera"]:
+        raise InputError(f"--from {LEVEL_TABLE} takes --camera alone")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the table (CSV)")
+    described = options.camera if options.camera is not None else path.parent / "camera.toml"
+    camera = read_camera_file(described, {"left": {"rows": 1, "cols": 1}}).get("left")
+    if camera is None:
+        raise InputError(f"{described}: describes no left camera; write the keys without a table")
+    check_writable(file)
+    result = fit_level_table(path, camera)
+    write_json(result, file)
+    print_fit(RecordingSet(Manifest(cameras={"left": camera}, captures=())), result)
 
 
 def _pair(option: str, text: str) -> tuple[int, int] | None:
