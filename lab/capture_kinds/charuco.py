@@ -89,16 +89,22 @@ class CharucoCapture(Capture):
     kind: Literal["charuco"]
     # An imported photograph may not say how long it was exposed; the geometry doesn't need it.
     exposure_s: float | None = Field(ge=0)  # type: ignore[assignment]
-    dictionary: str  # OpenCV's name, or "none": a plain checkerboard of `squares`, without markers
+    # OpenCV's name; "none": a plain checkerboard of `squares`, without markers; "dots": a grid of (rows - 1) x (cols - 1) dots
+    dictionary: str
     squares: tuple[int, int]  # rows, cols
     square_mm: float = Field(gt=0)
     marker_mm: float | None = Field(default=None, gt=0)  # None only where there are no markers
     pose: PoseName
 
+    @property
+    def has_markers(self) -> bool:
+        """Whether the board has markers that tell its corners apart."""
+        return self.dictionary not in ("none", "dots")
+
     def problems(self, rows: int, cols: int) -> Iterator[str]:
-        if self.marker_mm is None and self.dictionary != "none":
+        if self.marker_mm is None and self.has_markers:
             yield "marker_mm is missing; give the markers' side, or dictionary 'none' for a plain checkerboard"
-        if self.marker_mm is not None and self.marker_mm >= self.square_mm and self.dictionary != "none":
+        if self.marker_mm is not None and self.marker_mm >= self.square_mm and self.has_markers:
             yield f"markers of {self.marker_mm:g} mm don't fit squares of {self.square_mm:g} mm; correct one"
         if min(self.squares) < 2:
             yield f"squares {list(self.squares)} make no board; give [rows, cols] of squares, 2 at least"

@@ -78,7 +78,9 @@ def _write_cameras(recordings: RecordingSet, result: FitResult, folder: Path) ->
     make_folder(folder)
     for side, fitted in result.cameras.items():
         write_camera(folder / f"{side}.toml", fitted_camera(recordings, side, fitted))
-        taken = "; ".join(f"{one.quantity} taken as {one.value}" for one in assumptions(recordings.camera(side)))
+        taken = "; ".join(
+            f"{one.quantity} taken as {one.value}" for one in assumptions(recordings.camera(side), fitted)
+        )
         note = f" (neither fitted nor stated: {taken})" if taken else ""
         err.print(escape(f"camera: {folder / f'{side}.toml'}{note}"))
 

@@ -10,40 +10,128 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.cli.console import out, warn
+from lab.cli.console import check_writable, out, warn, write_json
 from lab.cli.sources import StoreFolder, open_store
+from lab.cli.tables import print_fit
 from lab.errors import InputError
 from lab.formats import recording_set as recording
+from lab.formats.importers.import_options import ImportOptions
+from lab.formats.recording_set import Manifest, RecordingSet
 from lab.pipeline import session_recordings
 
 commands = typer.Typer()
+#: `--from` this: a CSV of channel means and variances, which becomes a fit.
+LEVEL_TABLE = "photon-transfer-table"
 
 
 @commands.command("import")
 def import_(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="the folder of the recordings")],
-    kind: Annotated[str, typer.Option("--from", metavar="KIND", help="emva1288 or raw-folder")],
-    out_folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="the recording set to write")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="the folder of the recordings, or the picture")],
+    kind: Annotated[
+        str,
+        typer.Option(
+            "--from", metavar="KIND", help="emva1288, raw-folder, fits, slanted-edge, colorchecker or dot-grid"
+        ),
+    ],
+    out_folder: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="the recording set to write; of a table, the fit's JSON")
+    ],
     checkerboard: Annotated[
         str, typer.Option(metavar="ROWSxCOLS", help="raw-folder: inner corners; the images are pairs leftNN, rightNN")
     ] = "",
-    square_mm: Annotated[float, typer.Option(help="side of that checkerboard's squares")] = 0.0,
+    dots: Annotated[str, typer.Option(metavar="ROWSxCOLS", help="dot-grid: dots of the plane grid")] = "",
+    square_mm: Annotated[float, typer.Option(help="side of the checkerboard's squares, or spacing of the dots")] = 0.0,
+    tap: Annotated[str, typer.Option(metavar="NAME", help="raw-folder, fits: this tap of the sensor alone")] = "",
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="a picture's camera.toml, where it isn't beside it")
+    ] = None,
+    exposure_s: Annotated[float | None, typer.Option(help="a picture's exposure")] = None,
+    transfer: Annotated[
+        str, typer.Option(metavar="linear|srgb", help="what the codes of a PNG, TIFF or JPEG picture are")
+    ] = "",
+    channel: Annotated[str, typer.Option(metavar="R|G|B", help="slanted-edge: the channel of a colour picture")] = "",
+    corners: Annotated[
+        str,
+        typer.Option(
+            metavar="R,C,R,C,R,C,R,C", help="colorchecker: row, column of dark skin, bluish green, black, white"
+        ),
+    ] = "",
+    light: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="colorchecker: radiance (CSV) of a perfect diffuser there")
+    ] = None,
+    white_patch: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="colorchecker: radiance (CSV) of the white patch")
+    ] = None,
 ) -> None:
     """Turn another format into a recording set."""
-    from lab.formats.importers import read_checkerboard_pairs, read_foreign
+    from lab.formats.importers import read_foreign
 
-    if checkerboard:
-        corners = re.fullmatch(r"(\d+)x(\d+)", checkerboard)
-        if kind != "raw-folder" or corners is None or square_mm <= 0:
-            raise InputError(
-                "--checkerboard: give --from raw-folder --checkerboard ROWSxCOLS --square-mm S, as in 6x9 and 25"
-            )
-        recordings = read_checkerboard_pairs(path, (int(corners[1]), int(corners[2])), square_mm)
-    else:
-        recordings = read_foreign(kind, path)
+    if transfer not in ("", "linear", "srgb"):
+        raise InputError(f"--transfer {transfer}: give linear or srgb")
+    options = ImportOptions(
+        checkerboard=_pair("--checkerboard", checkerboard),
+        dots=_pair("--dots", dots),
+        square_mm=square_mm or None,
+        camera=camera,
+        exposure_s=exposure_s,
+        channel=channel or None,
+        transfer="srgb" if transfer == "srgb" else "linear" if transfer else None,
+        corners=_corners(corners),
+        light=light,
+        white_patch=white_patch,
+        tap=tap or None,
+    )
+    if kind == LEVEL_TABLE:
+        _import_level_table(path, options, out_folder)
+        return
+    recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
     folder = recording.write(recordings, out_folder)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
+
+
+def _import_level_table(path: Path, options: ImportOptions, file: Path) -> None:
+    """A table holds no frames: its import is a fit."""
+    from lab.fit.noise.level_table import fit_level_table
+    from lab.formats.importers.images import read_camera_file
+
+    if [name for name in options.stated() if name != "--camera"]:
+        raise InputError(f"--from {LEVEL_TABLE} takes --camera alone")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the table (CSV)")
+    described = options.camera if options.camera is not None else path.parent / "camera.toml"
+    camera = read_camera_file(described, {"left": {"rows": 1, "cols": 1}}).get("left")
+    if camera is None:
+        raise InputError(f"{described}: describes no left camera; write the keys without a table")
+    check_writable(file)
+    result = fit_level_table(path, camera)
+    write_json(result, file)
+    print_fit(RecordingSet(Manifest(cameras={"left": camera}, captures=())), result)
+
+
+def _pair(option: str, text: str) -> tuple[int, int] | None:
+    """ROWSxCOLS."""
+    if not text:
+        return None
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if found is None:
+        raise InputError(f"{option} {text}: give ROWSxCOLS, as in 6x9")
+    return int(found[1]), int(found[2])
+
+
+def _corners(text: str) -> tuple[tuple[float, float], ...] | None:
+    """Eight numbers with commas."""
+    if not text:
+        return None
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 8:
+        raise InputError(
+            f"--corners {text}: give eight numbers, row and column of dark skin, bluish green, black, white"
+        )
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 @commands.command()

@@ -18,8 +18,10 @@ from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
+from lab.diagnose.outcome.misstated_light import misstated_light
 from lab.diagnose.outcome.next_capture import Proposal, proposals
 from lab.diagnose.outcome.residual_pictures import residual_pictures
+from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
@@ -57,7 +59,7 @@ class NamedCandidate:
 @dataclass(frozen=True)
 class SideFindings:
     """What one side shows. `is_judged`: anything could be looked at; `threshold` is None where no effect acts on it.
-    `improved`: the model with what was found."""
+    `improved`: the model with what was found. `settling`: what to capture for what is left without a name."""
 
     side: Side
     skipped: tuple[Skipped, ...]
@@ -72,6 +74,7 @@ class SideFindings:
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
     proposals: tuple[Proposal, ...] = ()
+    settling: str | None = None
     places: tuple[ExaminedPlace, ...] = ()
     measurements: tuple[MeasurementFit, ...] = ()
     visibility: tuple[Visibility, ...] = ()
@@ -111,6 +114,10 @@ def diagnose_side(
     improved, corrections = improved_model(
         recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies
     )
+    left = (
+        *unexplained(recordings, side, verdict, corrections, policy),
+        *misstated_light(side, fit.cameras.get(side) if fit is not None else None),
+    )
     return SideFindings(
         side=side,
         skipped=skipped,
@@ -122,12 +129,13 @@ def diagnose_side(
             for c in verdict.named
         ),
         abstained=verdict.abstained,
-        unexplained=tuple(unexplained(recordings, side, verdict, corrections, policy)),
+        unexplained=left,
         vetoed=tuple(vetoed_names(side, verdict)),
         held_out=held_out(verdict),
         curves=tuple(residual_curves(side, verdict)),
         improved=improved,
         proposals=proposals(recordings, side, verdict, policy),
+        settling=settling_sentence(recordings, side, left),
         places=tuple(places(side, verdict, policy)),
         measurements=tuple(measurement_fits(side, verdict)),
         visibility=tuple(detectability(side, verdict, policy)),

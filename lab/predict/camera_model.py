@@ -76,8 +76,8 @@ def camera_model(
     )
 
 
-def assumptions(camera: DataSheet) -> tuple[Assumed, ...]:
-    """What `camera_model` has to assume of this camera whatever the fits find."""
+def assumptions(camera: DataSheet, fit: CameraFit | None = None) -> tuple[Assumed, ...]:
+    """What `camera_model` has to assume of this camera, with what the fit found."""
     found = []
     if camera.f_number is None:
         found.append(Assumed("f_number", "8"))
@@ -89,8 +89,13 @@ def assumptions(camera: DataSheet) -> tuple[Assumed, ...]:
         found.append(Assumed("pixel_pitch_um", f"{USUAL_PITCH_UM:g}"))
     if camera.fill_factor is None:
         found.append(Assumed("fill_factor", "1"))
-    if not camera.quantum_efficiency:
-        found.append(Assumed("quantum_efficiency", "typical curves"))
+    unknown = set(camera.channels) - set(camera.quantum_efficiency or {})
+    if fit is not None and fit.spectral is not None:
+        unknown -= set(fit.spectral.quantum_efficiency)
+    if unknown:
+        measured = _measured_efficiency(fit)
+        through = f", scaled to {measured[1]:.4g} as measured at {measured[0]:g} nm" if measured else ""
+        found.append(Assumed("quantum_efficiency", f"typical curves{through}"))
     return tuple(found)
 
 
@@ -114,8 +119,20 @@ def _curves(
         else:
             peak, width = TYPICAL_SENSITIVITY_NM[channel]
             grid = np.arange(380.0, 781.0, 5.0)
-            curves[channel] = Spectrum.of(grid, 0.5 * np.exp(-0.5 * ((grid - peak) / width) ** 2))
+            shape = np.exp(-0.5 * ((grid - peak) / width) ** 2)
+            level = 0.5
+            if channel == "Y" and (measured := _measured_efficiency(fit)) is not None:
+                level = measured[1] / float(np.exp(-0.5 * ((measured[0] - peak) / width) ** 2))
+            curves[channel] = Spectrum.of(grid, np.clip(level * shape, 0.0, 1.0))
     return curves, spread
+
+
+def _measured_efficiency(fit: CameraFit | None) -> tuple[float, float] | None:
+    """Wavelength (nm) and quantum efficiency of a MONO camera by photon numbers; None where either isn't known."""
+    noise = fit.noise if fit is not None else None
+    if noise is None or noise.quantum_efficiency is None or noise.quantum_efficiency_wavelength_nm is None:
+        return None
+    return noise.quantum_efficiency_wavelength_nm, noise.quantum_efficiency
 
 
 def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:

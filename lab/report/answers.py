@@ -41,7 +41,7 @@ def _short(value: float) -> str:
 
 def effect_line(effect: NamedEffect) -> str:
     """An effect, its cameras, and its parameters that differ from zero, in the library's words."""
-    described = library()[effect.name].quantities() if effect.name in library() else {}
+    described = library()[effect.nearest_law].quantities() if effect.nearest_law in library() else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
         f"{measured(value.value, value.std, value.unit)}"

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.measurements.flat_light import misstated_levels
 from lab.diagnose.measurements.library import measurements
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -41,9 +42,10 @@ def measurement_model(
             reason=f"neither stated nor fitted; taken as {a.value}{FREE_BESIDE.get(a.quantity, '')}",
             side=side,
         )
-        for a in assumptions(recordings.camera(side))
+        for a in assumptions(recordings.camera(side), camera_fit)
     ]
-    study = Study(recordings, side, camera, _saturation_dn(camera_fit))
+    misstated = frozenset(name for level in misstated_levels(camera_fit) for name in level.captures)
+    study = Study(recordings, side, camera, _saturation_dn(camera_fit), misstated)
     skipped += [Skipped(step="diagnose recordings", reason=reason, side=side) for _, reason in study.stale]
     blocks = []
     for measurement in measurements():

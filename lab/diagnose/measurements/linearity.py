@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from lab.capture_kinds.base import Capture
+from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_level import added_dark_dn
+from lab.diagnose.measurements.flat_light import Reading, reading, relative_rates
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.line_means import line_mean_jacobian
 from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
-from lab.diagnose.measurements.repeatability import level_std
+from lab.diagnose.measurements.repeatability import level_std, weighted_median
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
@@ -28,13 +30,16 @@ RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels, where
 def linearity_block(study: Study) -> Block:
     """Mean of every flat frame by channel, DN, against the exposure.
 
-    Nuisance parameters: black level, dark current, each channel's rate, the radiometer's readings. What remains is nonlinearity.
+    Against the number of photons where that is stated in place of a radiance. Nuisance parameters: black level, dark current, each
+    channel's rate, the readings of the light. What remains is nonlinearity.
     """
-    groups = study.flat_levels()
+    groups = [g for g in study.flat_levels() if reading(study, g[0]) is not None and g[0].id not in study.misstated]
+    if not groups and study.flat_levels():
+        raise NotDetermined(
+            "photon_transfer", "flat captures without a radiance file or photon numbers: their levels aren't comparable"
+        )
     if len({(g[0].exposure_s, g[0].photons_per_pixel) for g in groups}) < 3:
         raise NotDetermined("photon_transfer", "fewer than three levels of flat captures")
-    if any(g[0].radiance is None for g in groups):
-        raise NotDetermined("photon_transfer", "flat captures without a radiance file: their levels aren't comparable")
     points = _flat_points(study, groups)
     if len(points) < 4:
         raise NotDetermined("photon_transfer", "almost all flat captures are clipped: expose them shorter")
@@ -42,31 +47,34 @@ def linearity_block(study: Study) -> Block:
     value = np.array([mean for _, _, mean, _ in points])
     noise = study.noise
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 1e-3)
-    lights = list(dict.fromkeys(c.radiance for c, *_ in points))
+    of = {c.id: found for c, *_ in points if (found := reading(study, c)) is not None}
+    readings = list({one.name: one for one in of.values()}.values())
     # one reading of a lamp against its first, by channel: what the radiometer says changed between passes
-    first = {study.lamps[path]: path for path in reversed(lights)}
-    read = {(path, c): electron_rate(study.camera, c, study.spectrum(path)) for path in lights for c in study.channels}
-    relative = {(path, c): rate / max(read[first[study.lamps[path]], c], 1e-300) for (path, c), rate in read.items()}
-    key = [(study.lamps[c.radiance], channel) for c, channel, *_ in points]
-    scaled = exposures * np.array([relative[c.radiance, channel] for c, channel, *_ in points])
+    relative = relative_rates(study, readings)
+    key = [(of[c.id].lamp, channel) for c, channel, *_ in points]
+    scaled = exposures * np.array([relative[of[c.id].name, channel] for c, channel, *_ in points])
     rate = {}
-    for pair in sorted(set(key)):
+    for pair in dict.fromkeys(key):
         mine = np.array([k == pair for k in key])
         low = mine & (signal < 0.6 * (study.saturation_dn - noise.black))
         use = low if low.sum() > 1 else mine
-        rate[pair] = float(np.sum(signal[use]) / np.sum(scaled[use])) / noise.gain / float(study.field.light.mean())
-    covariance = _level_covariance(study, groups, points, signal)
+        # the median: a level that contradicts the others mustn't move where the model is linear about
+        typical = weighted_median(signal[use] / scaled[use], scaled[use])
+        rate[pair] = typical / noise.gain / float(study.field.light.mean())
+    covariance = _level_covariance(study, study.flat_levels(), points, signal)
 
     def predict(effects: Effects) -> Prediction:
-        changed = _changed(study, relative, effects)
+        changed = _changed(study, readings, relative, effects)
         model, beside = Uniform(study.camera, effects), beside_light_dn(study, effects)
         field = model.field(study.field)
         mean, lit = np.empty(len(points)), np.empty(len(points))
         done: dict[str, dict[str, float]] = {}
         for i, (capture, channel, _, _) in enumerate(points):
             if capture.id not in done:
-                lamp, elapsed = study.lamps[capture.radiance], study.elapsed_s(capture)
-                rates = {c: rate[lamp, c] * changed[capture.radiance, c] for c in study.channels if (lamp, c) in rate}
+                light, elapsed = of[capture.id], study.elapsed_s(capture)
+                rates = {
+                    c: rate[light.lamp, c] * changed[light.name, c] for c in study.channels if (light.lamp, c) in rate
+                }
                 collected = model.electrons(rates, capture.exposure_s, field=field, elapsed_s=elapsed)
                 done[capture.id] = model.mean_dn(collected)
             lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
@@ -75,31 +83,35 @@ def linearity_block(study: Study) -> Block:
         jacobian |= line_mean_jacobian(study, [(c, channel) for c, channel, *_ in points], effects)
         for lamp, channel in rate:
             jacobian[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
-        if len(lights) > len(set(study.lamps.values())):
-            for path in lights:
-                read_there = np.array([c.radiance == path for c, *_ in points])
-                jacobian[f"reading:{path}"] = np.where(read_there, RADIOMETER_STD * lit, 0.0)
-                for channel in study.channels if len(study.channels) > 1 else ():
+        if len(readings) > len({one.lamp for one in readings}):
+            for one in readings:
+                read_there = np.array([of[c.id] == one for c, *_ in points])
+                jacobian[f"reading:{one.name}"] = np.where(read_there, RADIOMETER_STD * lit, 0.0)
+                for channel in study.channels if len(study.channels) > 1 and one.path is not None else ():
                     mine = read_there & np.array([c == channel for _, c, *_ in points])
-                    jacobian[f"reading:{path}:{channel}"] = np.where(mine, READING_COLOUR_STD * lit, 0.0)
+                    jacobian[f"reading:{one.name}:{channel}"] = np.where(mine, READING_COLOUR_STD * lit, 0.0)
         return Prediction(mean, jacobian)
 
     return Block(
         measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
-        labels=tuple(Label(float(v), channel, f"{c.exposure_s:.4g} s", (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
+        labels=tuple(Label(float(v), channel, _setting(c), (c.id,), out) for (c, channel, _, out), v in zip(points, value, strict=True)),
         reads=LEVEL | LAG | DARK_CURRENT, scattered_by=LINES, predict=predict, scale=signal,
     )  # fmt: skip
 
 
-def _changed(study: Study, relative: dict[tuple[str, str], float], effects: Effects) -> dict[tuple[str, str], float]:
-    """Rates of light in each channel, by (spectrum, channel), over those of the lamp's first reading, as effects change them."""
+def _changed(
+    study: Study, readings: list[Reading], relative: Mapping[tuple[str, str], float], effects: Effects
+) -> Mapping[tuple[str, str], float]:
+    """Rates of light in each channel, by (reading, channel), over those of the lamp's first reading, as effects change them. Light of one
+    wavelength, of which the photons are stated, changes alike at all levels: that is in its rate."""
     if not acting(effects, SPECTRAL):
         return relative
-    changed = {}
-    for (path, channel), share in relative.items():
-        below = electron_rate(study.camera, channel, study.spectrum(path))
-        above = electron_rate(study.camera, channel, study.spectrum(path), effects)
-        changed[path, channel] = share * (above / below if below > 0 else 1.0)
+    changed = dict(relative)
+    for one in readings:
+        for channel in study.channels if one.path is not None else ():
+            below = electron_rate(study.camera, channel, study.spectrum(one.path or ""))
+            above = electron_rate(study.camera, channel, study.spectrum(one.path or ""), effects)
+            changed[one.name, channel] *= above / below if below > 0 else 1.0
     return changed
 
 
@@ -131,6 +143,13 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
     lamp = signal * level_std(study, groups)[group]
     covariance += same * (np.outer(lamp, lamp) + noise.jitter_dn**2)
     return np.asarray(covariance)
+
+
+def _setting(capture: FlatCapture) -> str:
+    """What flats of one level share, in words."""
+    if capture.photons_per_pixel is None:
+        return f"{capture.exposure_s:.4g} s"
+    return f"{capture.photons_per_pixel:.6g} photons, {capture.exposure_s:.4g} s"
 
 
 def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:

@@ -73,7 +73,7 @@ def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
     free = np.array([len(r.away) - 1 for r in repeats], float)
     size = np.array([float(r.elapsed_s @ r.elapsed_s) for r in repeats])
     slope = np.array([float(r.elapsed_s @ r.away) for r in repeats]) / np.where(size > 0, size, 1.0)
-    trend = _weighted_median(slope, size / (noise + LAMP_FLOOR**2)) if size.any() else 0.0
+    trend = weighted_median(slope, size / (noise + LAMP_FLOOR**2)) if size.any() else 0.0
     square = np.array([float(np.sum(np.square(r.away - trend * r.elapsed_s))) for r in repeats])
     usual = square / stats.chi2.median(free)
 
@@ -90,7 +90,8 @@ def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
     return [r for r, is_out in zip(repeats, out, strict=True) if not is_out]
 
 
-def _weighted_median(value: FloatArray, weight: FloatArray) -> float:
+def weighted_median(value: FloatArray, weight: FloatArray) -> float:
+    """The value below which half of the weight lies."""
     order = np.argsort(value)
     below = np.cumsum(weight[order])
     return float(value[order][int(np.searchsorted(below, 0.5 * below[-1]))])

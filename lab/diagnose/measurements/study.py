@@ -43,8 +43,15 @@ class Study:
     """One side of a recording set, each frame summarised once. Measurements are made from it."""
 
     def __init__(
-        self, recordings: RecordingSet, side: Side, camera: CameraModel, saturation_dn: float | None = None
+        self,
+        recordings: RecordingSet,
+        side: Side,
+        camera: CameraModel,
+        saturation_dn: float | None = None,
+        misstated: frozenset[str] = frozenset(),
     ) -> None:
+        #: Ids of flats whose stated number of photons contradicts the others'.
+        self.misstated = misstated
         #: Captures that are left out, as their frames weren't taken: (id, reason in one line).
         self.stale: tuple[tuple[str, str], ...] = stale(recordings, side)
         left_out = {name for name, _ in self.stale}

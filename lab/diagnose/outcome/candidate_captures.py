@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.capture.plan import CapturePlan
-from lab.capture_kinds.dark import DarkSequence
+from lab.capture_kinds.dark import DarkCapture, DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandSequence
 from lab.capture_kinds.slanted_edge import EdgeSequence
@@ -18,6 +18,7 @@ from lab.diagnose.measurements.curves import CURVE_ROUGH_STD
 from lab.diagnose.measurements.narrowband import NARROWBAND_FLOOR
 from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN
 from lab.diagnose.measurements.repeatability import LAMP_FLOOR
+from lab.diagnose.outcome.settling_capture import FEW_REPEATS, MORE_REPEATS, repeats_of
 from lab.formats.recording_set import RecordingSet
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
@@ -67,7 +68,7 @@ def designs(recordings: RecordingSet, side: Side, model: MeasurementModel) -> It
     yield from _ladders(camera, lamp)
     yield from _steady(camera, lamp)
     yield from _darks(camera)
-    yield from _again(model)
+    yield from _again(recordings, side, model)
 
 
 def _lamp(recordings: RecordingSet, side: Side) -> Spectrum:
@@ -247,13 +248,21 @@ def _darks(camera: CameraModel) -> Iterator[Design]:
         yield Design(words, predict, covariance, plan if exposures else None)
 
 
-def _again(model: MeasurementModel) -> Iterator[Design]:
-    """Every measurement once more, with the same captures."""
+def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[Design]:
+    """Every measurement once more, with the same captures; those of few dark frames with more repeats, which lowers their covariance."""
+    darks = {c.id: c for c in recordings.captures(DarkCapture, side)}
+    repeats = repeats_of(darks.values())
     for block, at in zip(model.blocks, model.slices, strict=True):
 
         def predict(h: Hypothesis, at: slice = at) -> FloatArray:
             return model.fitted_mean(tuple(e for e in h.effects if e not in model.always))[at]
 
-        yield Design(
-            f"the captures of {block.measurement.title} again, with as many repeats", predict, block.covariance
-        )
+        title = block.measurement.title
+        names = {name for label in block.labels for name in label.captures}
+        if 0 < repeats < FEW_REPEATS and names <= set(darks):
+            exposures = tuple(sorted({darks[name].exposure_s for name in names if darks[name].exposure_s > 0}))
+            plan = CapturePlan((DarkSequence(exposures_s=exposures, frames=MORE_REPEATS),)) if exposures else None
+            words = f"the dark frames of {title} again, {MORE_REPEATS} at each setting in place of {repeats}"
+            yield Design(words, predict, block.covariance * repeats / MORE_REPEATS, plan)
+        else:
+            yield Design(f"the captures of {title} again, with as many repeats", predict, block.covariance)

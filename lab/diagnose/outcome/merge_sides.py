@@ -59,7 +59,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         held_out=held_out,
         next_capture=LEAST_CAPTURES
         if verdict == "nothing_judged"
-        else next_sentence(offered, bool(unexplained), policy),
+        else next_sentence(offered, " ".join(f.settling for f in found if f.settling) or None, policy),
         next_captures=offered,
         places=tuple(p for f in found for p in f.places),
         measurements=tuple(m for f in found for m in f.measurements),

@@ -28,6 +28,7 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.curves import freed_curve
 from lab.diagnose.outcome.candidate_captures import Hypothesis, designs
 from lab.diagnose.policy import DecisionPolicy
+from lab.diagnose.visibility import visibility
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import NextCapture
 from sim.camera import Side
@@ -35,16 +36,22 @@ from sim.effects.base import Effect
 from sim.effects.library import effects as library
 
 #: What to vary where no predicted capture tells two effects apart, but one depends on a condition and the other
-#: doesn't.
-SETTLING = {
-    "f_number": "the slanted edges again at twice the f-number",
-    "wavelength": "slanted edges in narrowband light, at 450 and at 650 nm",
-    "orientation": "slanted edges at four orientations, 5, 50, 95 and 140 degrees from the vertical",
-    "exposure": "the same captures at a quarter of the exposure and four times the light",
-    "level": "the same captures at a quarter of the light",
-    "field": "the same captures at the corners of the field",
-    "time": "the same captures again, in the reverse order",
+#: doesn't; and the kind of capture in which it has to show (None: any; `LIT`: any with light).
+LIT = "light"
+SETTLING: dict[str, tuple[str, str | None]] = {
+    "f_number": ("the slanted edges again at twice the f-number", "slanted_edge"),
+    "wavelength": ("slanted edges in narrowband light, at 450 and at 650 nm", "slanted_edge"),
+    "orientation": (
+        "slanted edges at four orientations, 5, 50, 95 and 140 degrees from the vertical",
+        "slanted_edge",
+    ),
+    "exposure": ("the same captures at a quarter of the exposure and four times the light", LIT),
+    "level": ("the same captures at a quarter of the light", LIT),
+    "field": ("the same captures at the corners of the field", LIT),
+    "time": ("the same captures again, in the reverse order", None),
 }
+#: Distance below which no capture is worth listing beside others: predictions within a fifth of a standard deviation.
+LEAST_DISTANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,8 @@ def proposals(recordings: RecordingSet, side: Side, verdict: Verdict, policy: De
         nearest = min(pairs, key=lambda pair: pairs[pair])
         found.append((pairs[nearest], nearest, design))
     found.sort(key=lambda item: -item[0])
+    # a capture that neither rival changes tells nothing: an f-number for darks
+    found = [item for item in found if item[0] >= LEAST_DISTANCE] or found[:1]
     return tuple(
         Proposal(
             NextCapture(
@@ -120,14 +129,10 @@ def _hypothesis(model: MeasurementModel, name: str, effects: tuple[Effect, ...])
     return Hypothesis(name, (*model.always, *effects), camera)
 
 
-def next_sentence(found: Sequence[NextCapture], is_unexplained: bool, policy: DecisionPolicy) -> str | None:
-    """The best capture of all sides as a sentence. `is_unexplained`: a mismatch is left without a name."""
+def next_sentence(found: Sequence[NextCapture], settling: str | None, policy: DecisionPolicy) -> str | None:
+    """The best capture of all sides as a sentence. `settling`: what to capture for a mismatch that is left without a name."""
     if not found:
-        return (
-            "Repeat the captures that are off at another exposure and another f-number: what the mismatch follows says where it arises."
-            if is_unexplained
-            else None
-        )
+        return settling
     best = max(found, key=lambda one: one.distance)
     one, other = best.rivals
     if best.distance >= policy.next_capture_distance:
@@ -137,8 +142,17 @@ def next_sentence(found: Sequence[NextCapture], is_unexplained: bool, policy: De
         )
     beyond = f"no capture that can be predicted tells {one} from {other} by more than {np.sqrt(2.0 * best.distance):.1f} standard deviations"
     differs = library()[one].invariances ^ library()[other].invariances
-    for thing, capture in SETTLING.items():
+    for thing, (capture, kind) in SETTLING.items():
         if thing in differs:
-            steady = one if thing in library()[one].invariances else other
-            return f"{capture[0].upper()}{capture[1:]} may tell them apart ({beyond}): only {steady} stays the same."
+            steady, moving = (one, other) if thing in library()[one].invariances else (other, one)
+            if _shows_in(moving, kind):
+                return (
+                    f"{capture[0].upper()}{capture[1:]} may tell them apart ({beyond}): only {steady} stays the same."
+                )
     return f"{beyond[0].upper()}{beyond[1:]}: both depend on the same things."
+
+
+def _shows_in(effect: str, kind: str | None) -> bool:
+    """Whether an effect shows in captures of a kind."""
+    kinds = set(visibility()[effect].capture_kinds) if effect in visibility() else set()
+    return kind is None or bool(kinds - {"dark"} if kind == LIT else kinds & {kind})

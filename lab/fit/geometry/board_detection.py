@@ -3,7 +3,8 @@
 The boards are the `charuco` captures. A plain checkerboard is a `charuco` capture whose `dictionary` is `"none"`:
 `squares` counts its squares `[rows, cols]`, so that it has `rows - 1` x `cols - 1` inner corners. `marker_mm` is
 ignored then, and all inner corners have to be in view. Pictures of a plain checkerboard become a recording set that
-way, each picture one capture, the pictures of a pair under one `pose`.
+way, each picture one capture, the pictures of a pair under one `pose`. A grid of dots is one whose `dictionary` is `"dots"`: its
+`rows - 1` x `cols - 1` dots stand where a checkerboard has its inner corners (`dot_grid`).
 
 Corners are found on the raw mosaic. A board is black and white, so that each plane of the mosaic, levelled by itself,
 shows the same picture. Interleaved they are the luminance, sampled at every pixel. No demosaicing moves a corner. Each
@@ -25,6 +26,7 @@ from scipy import ndimage
 from lab.capture_kinds.charuco import CharucoCapture
 from lab.errors import NotDetermined
 from lab.fit.geometry.corners import CornerFits, fit_corners
+from lab.fit.geometry.dots import dot_centres, dot_grid
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Skipped
 from sim.camera import Side
@@ -73,6 +75,8 @@ def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
     """
     rows, cols = capture.squares
     grey = np.clip(255.0 * ndimage.gaussian_filter(picture, 0.7), 0, 255).astype(np.uint8)
+    if capture.dictionary == "dots":
+        return _dot_view(picture, grey, capture)
     if capture.dictionary == "none":
         index, points = _plain_corners(grey, rows - 1, cols - 1)
         marker_mm = 0.0
@@ -81,7 +85,7 @@ def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
         marker_mm = float(capture.marker_mm or 0.0)
     if len(index) < MIN_CORNERS:
         mirrored = np.ascontiguousarray(grey[:, ::-1])
-        if capture.dictionary != "none" and len(_charuco_corners(mirrored, capture)[0]) >= MIN_CORNERS:
+        if capture.has_markers and len(_charuco_corners(mirrored, capture)[0]) >= MIN_CORNERS:
             raise NotDetermined(
                 "geometry", "the picture is mirrored: its board is found in the reflection; flip the frames"
             )
@@ -181,15 +185,35 @@ def _plain_corners(grey: NDArray[np.uint8], rows: int, cols: int) -> tuple[NDArr
             "geometry", f"no checkerboard of {rows} x {cols} inner corners found: all of it has to be in view"
         )
     grid = corners.reshape(rows, cols, 2).astype(float)
+    return np.arange(rows * cols), numbered(grid, grey if (rows + cols) % 2 else None)
+
+
+def numbered(grid: Array, grey: NDArray[np.uint8] | None = None) -> Array:
+    """The points of a grid (rows, cols, 2) in the order of the board, (rows x cols, 2). `grey`: a checkerboard's picture, by whose dark
+    first square it is numbered."""
+    rows, cols = grid.shape[:2]
     candidates = [np.rot90(grid, k) for k in range(4)] if rows == cols else [grid, grid[::-1, ::-1]]
     candidates += [g[:, ::-1] for g in candidates]
     # Seen from the front, a row and a column turn clockwise. Of these, the one whose first square is dark, so that both
     # cameras of a pair number alike. Boards that look the same rotated by 180 deg begin at the top left.
     front = [g for g in candidates if _cross(g[0, -1] - g[0, 0], g[-1, 0] - g[0, 0]) > 0]
-    if (rows + cols) % 2:
+    if grey is not None:
         front = [g for g in front if _first_square_is_dark(grey, g)] or front
-    first = min(front, key=lambda g: float(g[0, 0].sum()))
-    return np.arange(rows * cols), first.reshape(-1, 2)
+    return min(front, key=lambda g: float(g[0, 0].sum())).reshape(-1, 2)
+
+
+def _dot_view(picture: Array, grey: NDArray[np.uint8], capture: CharucoCapture) -> BoardView:
+    """The centres of a grid of dots."""
+    rows, cols = capture.squares
+    points = numbered(dot_grid(grey, rows - 1, cols - 1))
+    index = np.arange((rows - 1) * (cols - 1))
+    fits = dot_centres(picture, points, rows - 1, cols - 1)
+    if fits.trusted.sum() < MIN_CORNERS:
+        raise NotDetermined(
+            "geometry",
+            f"only {fits.trusted.sum()} dots are clear enough, {MIN_CORNERS} needed: focus or light the grid better",
+        )
+    return BoardView(capture, index, board_points(capture, index), fits.points, fits.std_px).only(fits.trusted)
 
 
 def _cross(a: Array, b: Array) -> float:
@@ -276,15 +300,12 @@ def channel_corners(frame: NDArray[np.generic], cfa: Any, view: BoardView) -> di
             plane = np.asarray(frame[row::2, col::2], dtype=float)
             low, high = np.quantile(plane, [0.02, 0.98])
             plane = (plane - low) / max(high - low, 1e-12)
-            fits = refined_corners(
-                plane,
-                (view.image_px - [col, row]) / 2.0,
-                view.board_mm[:, :2],
-                capture.square_mm,
-                0.0 if capture.dictionary == "none" else float(capture.marker_mm or 0.0),
-                rows,
-                cols,
-            )
+            guess = (view.image_px - [col, row]) / 2.0
+            if capture.dictionary == "dots":
+                fits = dot_centres(plane, guess, rows - 1, cols - 1, view.index)
+            else:
+                marker_mm = float(capture.marker_mm or 0.0) if capture.has_markers else 0.0
+                fits = refined_corners(plane, guess, view.board_mm[:, :2], capture.square_mm, marker_mm, rows, cols)
             of_phases.append(CornerFits(2.0 * fits.points + [col, row], fits.trusted, 2.0 * fits.std_px))
         found[channel] = CornerFits(
             np.mean([fits.points for fits in of_phases], axis=0),

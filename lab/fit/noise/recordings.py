@@ -16,6 +16,7 @@ from lab.fit.noise.defective_pixels import defective_pixels
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.noise_fit import noise_fit
 from lab.fit.noise.recorded_levels import rounded_c
+from lab.fit.noise.stated_light import stated_light
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from sim.camera import Side
@@ -51,13 +52,13 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     flat_levels = [
         MeasuredLevel(
             group[0].exposure_s,
-            _light(group[0]),
+            stated_light(group[0]).amount,
             lamps[group[0].id],
             stack_of(recordings, group, pixels.bad).statistics(),
             group[0].temperature_c,
             tuple(flat.id for flat in group),
         )
-        for group in _grouped(flats, lambda flat: (flat.exposure_s, _light(flat), lamps[flat.id]))
+        for group in _grouped(flats, lambda flat: (flat.exposure_s, stated_light(flat).amount, lamps[flat.id]))
     ]
     return noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
 
@@ -67,11 +68,6 @@ def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C
     for capture in captures:
         groups.setdefault(key(capture), []).append(capture)
     return list(groups.values())
-
-
-def _light(flat: FlatCapture) -> float:
-    """Photons per pixel where they are stated, else the exposure."""
-    return flat.photons_per_pixel if flat.photons_per_pixel is not None else flat.exposure_s
 
 
 def _lamps_of(recordings: RecordingSet, flats: Sequence[FlatCapture]) -> dict[str, Hashable]:
@@ -91,7 +87,7 @@ def _lamps_of(recordings: RecordingSet, flats: Sequence[FlatCapture]) -> dict[st
         else:
             seen.append((path, spectrum))
             names[path] = path
-    return {flat.id: (names[flat.radiance], flat.photons_per_pixel is not None, flat.wavelength_nm) for flat in flats}
+    return {flat.id: (names[flat.radiance], *stated_light(flat).lamp) for flat in flats}
 
 
 def _dark_levels(

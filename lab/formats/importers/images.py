@@ -1,4 +1,4 @@
-"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, camera raws, .npy. They are decoded on access."""
+"""Image files as frames: grey PNG, JPEG, BMP, PGM, TIFF of 8 to 16 bit, FITS, camera raws, .npy. They are decoded on access."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from lab.errors import InputError
+from lab.formats.importers.fits_file import FITS, load_fits
 from lab.formats.recording_set import RAWS, DataSheet, FolderFiles, Frame, load_frame
 from sim.camera import Side
 
@@ -26,8 +27,10 @@ def read_image(file: Path) -> Frame:
     suffix = file.suffix.lower()
     if suffix == ".npy" or suffix in RAWS:
         return load_frame(file)
+    if suffix in FITS:
+        return load_fits(file)
     if suffix not in IMAGES:
-        raise InputError(f"can't be read; give one of {' '.join((*IMAGES, *RAWS, '.npy'))}")
+        raise InputError(f"can't be read; give one of {' '.join((*IMAGES, *FITS, *RAWS, '.npy'))}")
     return _grey(decoded(file))
 
 
@@ -96,9 +99,9 @@ class ImageFiles(FolderFiles):
         return str(self.images[path]) if path in self.images else super().where(path)
 
 
-def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> dict[Side, DataSheet]:
-    """The cameras that `camera.toml` describes: the keys of a recording set's camera, at the top for a single (left) camera,
-    or in the tables `[left]` and `[right]`. Keys that it leaves out come from that side's `defaults`; a missing file is an empty one."""
+def described_sides(file: Path) -> dict[Side, dict[str, Any]]:
+    """What `camera.toml` says of each side: its keys at the top are of a single (left) camera, or of every side where it has the tables
+    `[left]` and `[right]`. A missing file says nothing of the left one."""
     written: dict[str, Any] = {}
     if file.is_file():
         try:
@@ -111,10 +114,17 @@ def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> 
             sides[side] = written.pop(side)
     if not sides:
         sides, written = {"left": written}, {}
+    return {side: written | keys for side, keys in sides.items()}
+
+
+def read_camera_file(file: Path, defaults: Mapping[Side, Mapping[str, Any]]) -> dict[Side, DataSheet]:
+    """The cameras that `camera.toml` describes, by the keys of a recording set's camera. Keys that it leaves out come from that side's
+    `defaults`; a missing file is an empty one."""
     cameras = {}
-    for side, keys in sides.items():
+    for side, keys in described_sides(file).items():
+        known = {key: value for key, value in keys.items() if key != "taps"}  # of the readout, not of the data sheet
         try:
-            cameras[side] = DataSheet.model_validate({**defaults.get(side, {}), **written, **keys})
+            cameras[side] = DataSheet.model_validate({**defaults.get(side, {}), **known})
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(str(part) for part in first["loc"])

@@ -5,8 +5,9 @@ members of `screen` as `screen.pose`, `screen.cell_camera_px`, `screen.radiance`
 (`region`: `92 156 292 356`; `corners`: eight numbers). An empty cell is an unknown value. `side` may be left out (left), and
 `id` too (the file's name). Spectra (CSV) and targets (.npy) are named as in a recording set, relative to the folder.
 
-`camera.toml` has the keys of a recording set's camera, at the top for one camera, or in `[left]` and `[right]`. Without `rows`,
-`cols` and `bit_depth`, these are taken from the images.
+`camera.toml` has the keys of a recording set's camera, at the top for one camera, or in `[left]` and `[right]`. Without `rows`
+and `cols` these are taken from the images, and without `bit_depth` where the files themselves have 8 bit. Its `[[taps]]` are those of
+`lab.formats.importers.readout`.
 
 A board without markers is a `charuco` capture with `dictionary` `none`. The stereo pairs of OpenCV's samples, for example
 (6 x 9 inner corners, so 7 x 10 squares; how long they were exposed isn't known), with `cfa = "MONO"` in `[left]` and in
@@ -26,29 +27,45 @@ import csv
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
+import numpy as np
+
 from lab.capture_kinds.base import CAPTURES, Capture
 from lab.errors import InputError
-from lab.formats.importers.images import IMAGES, ImageFiles, read_camera_file, read_image
-from lab.formats.recording_set import DataSheet, FolderFiles, RecordingError, RecordingSet, parse_manifest
+from lab.formats.importers.fits_file import FITS
+from lab.formats.importers.images import IMAGES, decoded, described_sides, read_camera_file, read_image
+from lab.formats.importers.readout import Readout, Tap, TapFiles, parse_taps, readout
+from lab.formats.recording_set import RAWS, DataSheet, FolderFiles, RecordingError, RecordingSet, parse_manifest
 from sim.camera import Side
 
 INDEX, CAMERA = "index.csv", "camera.toml"
 
 
-def read_raw_folder(path: Path) -> RecordingSet:
-    """The captures that `index.csv` in the folder `path` lists, as a recording set.
+def read_raw_folder(path: Path, tap: str = "") -> RecordingSet:
+    """The captures that `index.csv` in the folder `path` lists, as a recording set. `tap`: that tap of the sensor alone.
 
     Raises RecordingError with one line for every row that can't be used.
     """
-    index, cameras = path / INDEX, path / CAMERA
-    rows = list(_rows(index))
+    index = path / INDEX
+    return recordings_of_rows(path, list(index_rows(index)), str(index), tap)
+
+
+def recordings_of_rows(path: Path, rows: list[tuple[int, dict[str, str]]], where: str, tap: str = "") -> RecordingSet:
+    """The captures of `rows`, (number, column -> cell) each, with the `camera.toml` of the folder `path`."""
+    cameras = path / CAMERA
     if not cameras.is_file():
         raise InputError(f"{cameras}: missing; write the camera's keys, `cfa` at least")
-    return _recording_set(path, rows, str(index), lambda measured: read_camera_file(cameras, measured))
+    taps: dict[Side, tuple[Tap, ...]] = {}
+    for side, keys in described_sides(cameras).items():
+        listed = parse_taps(keys.get("taps", ()), str(cameras))
+        taps[side] = tuple(one for one in listed if one.name == tap) if tap else listed
+        if tap and not taps[side]:
+            names = ", ".join(one.name for one in listed) or "none"
+            raise InputError(f"--tap {tap}: {cameras} describes no such tap of the {side} camera; it has {names}")
+    return _recording_set(path, rows, where, lambda measured: read_camera_file(cameras, measured), taps)
 
 
 def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: float) -> RecordingSet:
@@ -82,11 +99,25 @@ def read_checkerboard_pairs(path: Path, corners: tuple[int, int], square_mm: flo
     return recordings
 
 
+def read_dot_grids(path: Path, dots: tuple[int, int], spacing_mm: float) -> RecordingSet:
+    """Pictures of a plane grid of `dots` (rows, cols), each in another pose, as a recording set of one camera.
+
+    Images in the folder `path` in the order of their names; `camera.toml` beside them has the camera's keys, `cfa` at least.
+    """
+    files = [file.name for file in sorted(path.iterdir()) if file.suffix.lower() in (*IMAGES, *FITS, *RAWS, ".npy")]
+    if not files:
+        raise InputError(f"{path}: no images; give the folder of the pictures")
+    board = {"dictionary": "dots", "squares": f"{dots[0] + 1} {dots[1] + 1}", "square_mm": f"{spacing_mm:g}"}
+    rows = [{"frame": name, "kind": "charuco", "pose": f"p{k:03d}"} | board for k, name in enumerate(files)]
+    return recordings_of_rows(path, list(enumerate(rows, start=1)), str(path))
+
+
 def _recording_set(
     path: Path,
     rows: list[tuple[int, dict[str, str]]],
     where: str,
     cameras: Callable[[dict[Side, dict[str, Any]]], dict[Side, DataSheet]],
+    taps: Mapping[Side, tuple[Tap, ...]] = {},
 ) -> RecordingSet:
     folder = FolderFiles(path)
     images: dict[str, Path] = {}
@@ -107,7 +138,15 @@ def _recording_set(
         images[frame] = found or path / capture["frame"]
     if problems:
         raise RecordingError(problems)
-    described = cameras(_measured(captures, images))
+    measured = _measured(captures, images)
+    readouts: dict[Side, Readout] = {}
+    for side, listed in taps.items():
+        if listed and side in measured:
+            own = [images[capture["frame"]] for capture in captures if capture["side"] == side]
+            cut = readout(listed, own, (measured[side]["rows"], measured[side]["cols"]), str(path / CAMERA))
+            measured[side] |= {"rows": cut.shape[0], "cols": cut.shape[1], "black_level_dn": cut.black_level_dn}
+            readouts[side] = cut
+    described = cameras(measured)
     text = json.dumps(
         {
             "format": "calibench-recording",
@@ -119,10 +158,14 @@ def _recording_set(
         }
     )
     manifest, warnings = parse_manifest(text, where)
-    return RecordingSet(manifest, source=str(path), warnings=tuple(warnings), files=ImageFiles(path, images))
+    warnings += [remark for one in readouts.values() for remark in one.remarks]
+    by_frame = {capture["frame"]: readouts[capture["side"]] for capture in captures if capture["side"] in readouts}
+    return RecordingSet(
+        manifest, source=str(path), warnings=tuple(dict.fromkeys(warnings)), files=TapFiles(path, images, by_frame)
+    )
 
 
-def _rows(index: Path) -> Iterator[tuple[int, dict[str, str]]]:
+def index_rows(index: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """(row number in the file, column -> cell), cells without blanks, empty ones left out."""
     try:
         text = index.read_text(encoding="utf-8-sig")
@@ -188,7 +231,7 @@ def _list(key: str, cell: str, size: int) -> list[Any]:
 
 
 def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> dict[Side, dict[str, Any]]:
-    """Rows, columns and the least bit depth of each side's first image: what `camera.toml` may leave out."""
+    """Rows and columns of each side's first image, and the bit depth of files of 8 bit: what `camera.toml` may leave out."""
     measured: dict[Side, dict[str, Any]] = {}
     for side in get_args(Side):
         first = next((images[capture["frame"]] for capture in captures if capture["side"] == side), None)
@@ -198,6 +241,7 @@ def _measured(captures: list[dict[str, Any]], images: dict[str, Path]) -> dict[S
             frame = read_image(first)
         except InputError as error:
             raise InputError(f"{first}: {error}") from error
-        bits = next(bits for bits in (8, 10, 12, 14, 16) if int(frame.max()) < 2**bits)
-        measured[side] = {"rows": frame.shape[0], "cols": frame.shape[1], "bit_depth": bits}
+        measured[side] = {"rows": frame.shape[0], "cols": frame.shape[1]}
+        if first.suffix.lower() in IMAGES and decoded(first).dtype == np.uint8:
+            measured[side]["bit_depth"] = 8
     return measured

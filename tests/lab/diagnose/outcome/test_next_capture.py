@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.outcome.candidate_captures import Hypothesis, designs
 from lab.diagnose.outcome.next_capture import next_sentence, proposals
+from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
+from lab.diagnose.visibility import visibility
 from lab.formats.camera_file import default_camera
 from lab.formats.recording_set import Manifest, RecordingSet
-from lab.formats.results import NextCapture
+from lab.formats.results import NextCapture, Unexplained
 from sim.effects.base import Effect
 from sim.effects.black_level_drift import BlackLevelDrift
 from sim.effects.infrared_cut_filter import InfraredCutFilter
@@ -114,7 +117,7 @@ def test_proposals_are_sorted_and_name_their_nearest_rivals() -> None:
 
 def test_nothing_undecided_needs_no_capture() -> None:
     assert proposals(SET, "left", _undecided(Nonlinearity(), ("unknown", 0.02)), DecisionPolicy()) == ()
-    assert next_sentence((), False, DecisionPolicy()) is None
+    assert next_sentence((), None, DecisionPolicy()) is None
 
 
 @pytest.mark.parametrize(
@@ -129,7 +132,107 @@ def test_the_sentence_says_what_can_be_hoped(distance: float, words: str) -> Non
         distance=distance,
         told_apart=told,
     )
-    sentence = next_sentence((capture,), False, DecisionPolicy())
+    sentence = next_sentence((capture,), None, DecisionPolicy())
     assert sentence is not None
     assert words in sentence
     assert f"{np.sqrt(2 * distance):.1f} standard deviations" in sentence
+
+
+def _capture_told(one: str, other: str) -> str:
+    capture = NextCapture(side="left", capture="x", rivals=(one, other), distance=0.001, told_apart=0.51)
+    sentence = next_sentence((capture,), None, DecisionPolicy())
+    assert sentence is not None
+    return sentence
+
+
+def test_no_lens_is_proposed_for_what_shows_in_darks_alone() -> None:
+    """Line noise and telegraph noise differ in that one follows the f-number's invariance list and the other doesn't: no edge shows either."""
+    dark_only = [name for name, seen in visibility().items() if set(seen.capture_kinds) == {"dark"}]
+    assert len(dark_only) > 2
+    for one, other in combinations(dark_only, 2):
+        said = _capture_told(one, other)
+        assert "f-number" not in said
+        assert "edges" not in said
+        assert "light" not in said
+
+
+def test_contrast_still_asks_for_another_f_number() -> None:
+    assert "f-number" in _capture_told("defocus", "charge_diffusion")
+
+
+def test_captures_that_neither_rival_changes_are_not_listed() -> None:
+    """A filter against defocus: dark frames, flats and narrowband levels see neither."""
+    verdict = _undecided(effect("optical_low_pass_filter")(displacement_x_um=1.0), ("defocus", 0.3))
+    every = DecisionPolicy(next_captures_listed=1000)
+    found = [p.capture for p in proposals(SET, "left", verdict, every)]
+    assert len(found) > 2
+    assert all(c.distance >= 0.02 for c in found)
+    assert all("edges" in c.capture or "slanted_edge" in c.capture for c in found)
+
+
+def _dark_set(repeats: int) -> RecordingSet:
+    captures = [
+        {"id": f"d{e}-{k}", "kind": "dark", "side": "left", "frame": f"d{e}-{k}.npy", "exposure_s": e}
+        for e in (0.001, 1.0)
+        for k in range(repeats)
+    ]
+    content = SET.manifest.model_dump(mode="json") | {"captures": captures}
+    return RecordingSet(Manifest.model_validate(content))
+
+
+def _dark_model(recordings: RecordingSet) -> MeasurementModel:
+    """A level of each dark frame that the black level's drift moves."""
+
+    def predict(effects: Sequence[Effect]) -> Prediction:
+        moved = sum(float(getattr(e, next(iter(type(e).quantities())))) for e in effects)
+        return Prediction(np.full(len(names), 64.0 + moved), {})
+
+    names = [c.id for c in recordings.captures()]
+    block = Block(
+        measurement=declared("dark", "exposure", "s"), reach=1.0, value=predict(()).mean, covariance=np.eye(len(names)),
+        labels=tuple(Label(1.0, "all", "", (n,), False) for n in names), reads=frozenset({"signal.offset_dn"}),
+        predict=predict, scale=np.ones(len(names)),
+    )  # fmt: skip
+    return MeasurementModel((block,), CAMERA)
+
+
+@pytest.mark.parametrize(("repeats", "told"), [(2, True), (12, False)])
+def test_more_darks_are_asked_for_where_they_are_few(repeats: int, told: bool) -> None:
+    """Eight times as many repeats have an eighth of the variance."""
+    recordings = _dark_set(repeats)
+    model = _dark_model(recordings)
+    again = [d for d in designs(recordings, "left", model) if "again" in d.words]
+    assert len(again) == 1
+    assert ("16 at each setting in place of 2" in again[0].words) == told
+    assert again[0].covariance[0, 0] == pytest.approx(repeats / 16 if told else 1.0)
+    assert (again[0].plan is not None) == told
+
+
+def _left(measurement: str, axis: str, captures: tuple[str, ...], check: str = "") -> Unexplained:
+    return Unexplained(
+        side="left", measurement=measurement, axis=axis, where="", shape="", significance_sigma=9.0, chi2_before=90.0,
+        chi2_after=1.0, n=4, captures=captures, check=check,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("repeats", "words"), [(2, "16 dark frames at each setting (there are 2)"), (12, "temperature of the sensor")]
+)
+def test_a_mismatch_in_darks_asks_for_darks(repeats: int, words: str) -> None:
+    recordings = _dark_set(repeats)
+    said = settling_sentence(recordings, "left", [_left("dark_row_noise", "spatial_frequency", ("d1.0-0",))])
+    assert said is not None
+    assert words in said
+    assert "f-number" not in said
+    assert settling_sentence(recordings, "left", []) is None
+
+
+def test_wrong_metadata_is_corrected_before_anything_is_captured() -> None:
+    recordings = _dark_set(2)
+    wrong = _left("photon_transfer", "level", ("d1.0-0",), check="stated with 3 photons")
+    assert settling_sentence(recordings, "left", [wrong]) == (
+        "Correct what is stated of the captures above, or take them again."
+    )
+    said = settling_sentence(recordings, "left", [wrong, _left("dark", "exposure", ("d1.0-0",))])
+    assert said is not None
+    assert "dark frames" in said

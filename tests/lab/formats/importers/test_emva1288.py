@@ -213,9 +213,9 @@ def test_camera_file_tells_what_the_descriptor_does_not(tmp_path: Path) -> None:
 
 
 def test_unknown_format_and_missing_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="choose emva1288 or raw-folder"):
+    with pytest.raises(InputError, match="choose emva1288, raw-folder"):
         read_foreign("exif", tmp_path)
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="no such file or folder"):
         read_foreign("emva1288", tmp_path / "nowhere")
 
 

@@ -1,0 +1,100 @@
+"""A plane grid of dots in a picture: which there are, and their centres to hundredths of a pixel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.errors import NotDetermined
+from lab.fit.geometry.corners import CornerFits
+
+Array = NDArray[np.floating[Any]]
+
+#: Of the spacing of the dots: radius of the window about a dot, and its inner radius from which on it is taken for background.
+WINDOW, BACKGROUND = 0.5, 0.8
+#: Share of a dot's contrast below which a pixel counts as background; least contrast, of the picture's.
+LEAST_SHARE, LEAST_CONTRAST = 0.1, 0.1
+PASSES = 4
+
+
+def dot_grid(grey: NDArray[np.uint8], rows: int, cols: int) -> Array:
+    """First guesses of the dots' centres, (rows, cols, 2) in (x, y), dark on light or light on dark; all of them have to be in view.
+
+    Raises `NotDetermined` where no grid of that size is found.
+    """
+    for picture in (grey, np.ascontiguousarray(255 - grey)):
+        for flags in (cv2.CALIB_CB_SYMMETRIC_GRID, cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING):
+            found, centres = cv2.findCirclesGrid(picture, (cols, rows), flags=flags)
+            if found:
+                return np.asarray(centres.reshape(rows, cols, 2), float)
+    raise NotDetermined("geometry", f"no grid of {rows} x {cols} dots found: all of it has to be in view, and in focus")
+
+
+def dot_centres(
+    picture: Array, points: Array, rows: int, cols: int, index: NDArray[np.int64] | None = None
+) -> CornerFits:
+    """Centroids of the dots at `points` (n, 2), (x, y), in a picture (rows, cols) of 0..1.
+
+        c = sum w r / sum w,   w = (I - background) / (peak - background) less `LEAST_SHARE`, 0 at least
+
+    within half a spacing; the background is the median beyond 0.8 of that. Standard deviation by the noise s of the background:
+    s sqrt(sum |r - c|^2 / 2) / sum w. The centroid of an ellipse isn't the dot's centre in perspective: with dots of radius a at distance z
+    the two differ by some f (a / z)^2 sin(2 tilt) / 2 pixels, f the focal length in pixels.
+    """
+    points = np.array(points, float)
+    index = np.arange(rows * cols) if index is None else index
+    spacing = _spacing(points, index, cols)
+    radius = np.maximum(WINDOW * spacing, 2.0)
+    size = int(np.ceil(radius.max())) + 1
+    offset = np.arange(-size, size + 1)
+    dx, dy = (grid.ravel() for grid in np.meshgrid(offset, offset))
+    std = np.full(len(points), np.inf)
+    trusted = np.zeros(len(points), bool)
+    for k in range(len(points)):
+        found = _centroid(picture, points[k], float(radius[k]), dx, dy)
+        if found is not None:
+            points[k], std[k], trusted[k] = found[0], found[1], True
+    return CornerFits(points, trusted, std)
+
+
+def _centroid(
+    picture: Array, start: Array, radius: float, dx: NDArray[np.int64], dy: NDArray[np.int64]
+) -> tuple[Array, float] | None:
+    """One dot's centroid and the standard deviation of a coordinate; None where there is no dot, or it is at the picture's border."""
+    height, width = picture.shape
+    at, std = start, np.inf
+    for _ in range(PASSES):
+        x, y = np.rint(at[0]) + dx, np.rint(at[1]) + dy
+        away = np.hypot(x - at[0], y - at[1])
+        near = away <= radius
+        x, y, away = x[near], y[near], away[near]
+        if min(x.min(), y.min()) < 0 or x.max() >= width or y.max() >= height:
+            return None
+        value = picture[y.astype(int), x.astype(int)]
+        rim, inner, inside = value[away > BACKGROUND * radius], value[away < 0.3 * radius], away <= BACKGROUND * radius
+        background = float(np.median(rim)) if rim.size else np.nan
+        contrast = float(np.mean(inner)) - background if inner.size else np.nan
+        if not abs(contrast) >= LEAST_CONTRAST:
+            return None
+        share = (value - background) / contrast
+        weight = np.where(inside, np.maximum(share - LEAST_SHARE, 0.0), 0.0)
+        total = float(weight.sum())
+        at = np.array([weight @ x, weight @ y]) / total
+        noise = float(np.median(np.abs(rim - background))) / 0.6745 / abs(contrast)
+        std = noise * float(np.sqrt(0.5 * np.sum(np.square(away[weight > 0])))) / total
+    return (at, std) if np.hypot(*(at - start)) < 0.5 * radius else None
+
+
+def _spacing(points: Array, index: NDArray[np.int64], cols: int) -> Array:
+    """Distance of each dot to the nearest of its neighbours in the grid, px."""
+    place = {int(number): k for k, number in enumerate(index)}
+    found = np.full(len(points), np.inf)
+    for number, k in place.items():
+        for other in (number + cols, number + 1 if (number + 1) % cols else -1):
+            if other in place:
+                distance = float(np.hypot(*(points[place[other]] - points[k])))
+                found[k], found[place[other]] = min(found[k], distance), min(found[place[other]], distance)
+    return np.where(np.isfinite(found), found, np.nanmedian(found))

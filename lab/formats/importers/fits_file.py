@@ -1,0 +1,110 @@
+"""FITS frames: one image of integers, and what its header says of the exposure.
+
+The first row of the array is row 0, as it is stored; some programs show it at the bottom.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lab.errors import InputError, one_line
+from lab.formats.recording_set import Frame
+
+FITS = (".fits", ".fit", ".fts")
+#: Words of IMAGETYP, in small letters, and the kind of capture.
+IMAGE_TYPES = {"dark": "dark", "bias": "dark", "zero": "dark", "flat": "flat"}
+
+
+@dataclass(frozen=True)
+class FitsHeader:
+    """What a header states; None where it has no such keyword.
+
+    `kind` of IMAGETYP or OBSTYPE; `exposure_s` of EXPTIME or EXPOSURE; `temperature_c` of CCD-TEMP; `time` of DATE-OBS (UTC).
+    """
+
+    image_type: str | None
+    kind: str | None
+    exposure_s: float | None
+    temperature_c: float | None
+    time: datetime | None
+
+
+def load_fits(file: Path) -> Frame:
+    """The only image of a FITS file, uint16 (rows, cols) with BZERO and BSCALE applied. InputError without the path."""
+    found, _ = _opened(file)
+    if found.ndim != 2:
+        raise InputError(f"has the shape {found.shape}, not (rows, cols); save one file a frame")
+    if found.dtype.kind not in "iu" and not np.array_equal(found, np.rint(found)):
+        raise InputError(f"its values are {found.dtype} with fractions; save raw DN as integers")
+    if found.size and (found.min() < 0 or found.max() > np.iinfo(np.uint16).max):
+        raise InputError(
+            f"its values are {found.min():g} .. {found.max():g}; raw DN are 0 .. 65535: save them unscaled"
+        )
+    return np.ascontiguousarray(found, dtype=np.uint16)
+
+
+def fits_header(file: Path) -> FitsHeader:
+    """What the header says; InputError without the path."""
+    _, header = _opened(file)
+    stated = header.get("IMAGETYP", header.get("OBSTYPE"))
+    words = str(stated).lower() if stated is not None else ""
+    kind = next((kind for word, kind in IMAGE_TYPES.items() if word in words), None)
+    return FitsHeader(
+        str(stated).strip() if stated is not None else None,
+        kind,
+        _number(header, "EXPTIME", "EXPOSURE"),
+        _number(header, "CCD-TEMP"),
+        _time(header.get("DATE-OBS")),
+    )
+
+
+def _opened(file: Path) -> tuple[Any, Any]:
+    """The image's values and header. A file whose data or checksum is damaged is refused."""
+    from astropy.io import fits
+    from astropy.io.fits.verify import VerifyWarning
+    from astropy.utils.exceptions import AstropyUserWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AstropyUserWarning)  # truncated, or a wrong checksum
+        warnings.simplefilter("ignore", VerifyWarning)  # a header that is only untidy
+        try:
+            with file.open("rb") as stream, fits.open(stream, memmap=False, checksum=True) as opened:
+                images = [hdu for hdu in opened if getattr(hdu, "is_image", False) and hdu.data is not None]
+                first = opened[0]
+                found = [
+                    (np.asarray(hdu.data), hdu.header if hdu is first else first.header + hdu.header) for hdu in images
+                ]
+        except Exception as error:
+            raise InputError(f"damaged FITS ({one_line(error)}); copy it again or recapture") from error
+    if len(found) != 1:
+        raise InputError(f"holds {len(found)} images, not 1; save one file a frame")
+    return found[0]
+
+
+def _number(header: Any, *names: str) -> float | None:
+    for name in names:
+        value = header.get(name)
+        if value is None:
+            continue
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = np.nan
+        if not np.isfinite(number):
+            raise InputError(f"{name} = {value!r} isn't a number; correct the header")
+        return number
+    return None
+
+
+def _time(stated: Any) -> datetime | None:
+    try:
+        time = datetime.fromisoformat(str(stated))
+    except ValueError:
+        return None
+    return time if time.tzinfo is not None else time.replace(tzinfo=UTC)

@@ -1,0 +1,289 @@
+"""One picture of a slanted edge, or of a ColorChecker: PNG, TIFF, JPEG, FITS, .npy or a camera raw.
+
+`camera.toml` beside it (or `--camera FILE`) has the camera's keys: `cfa`, `bit_depth` and `black_level_dn` have to be stated, and everything
+else that is known helps. A colour picture is no mosaic: of an edge one channel is taken as that of a monochrome camera, a chart is sampled like
+an RGGB mosaic of the same size. Its noise is that of a demosaiced picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from lab.errors import InputError
+from lab.formats.importers.images import IMAGES, decoded, described_sides, read_image
+from lab.formats.importers.import_options import ImportOptions
+from lab.formats.recording_set import DataSheet, Frame, Manifest, RecordingSet
+from lab.formats.spectrum_csv import parse_spectrum
+from sim.scene.colorchecker import reflectances
+from sim.sensor import mosaic
+from sim.spectrum import Spectrum
+
+CAMERA = "camera.toml"
+#: Highest code of a picture that was decoded from sRGB.
+LINEAR_BITS = 16
+#: Least ratio of the chart's white patch to its black one for a chart to be believed.
+WHITE_OVER_BLACK = 3.0
+CHART = "ColorChecker24"
+PATCH_ROWS, PATCH_COLS = 4, 6
+#: Enlargements of the picture in which a chart is looked for, in turn: the detector finds patches of some sizes only.
+SCALES = (1, 2, 3, 4, 6)
+
+Corners = tuple[tuple[float, float], ...]
+
+
+def read_slanted_edge(path: Path, options: ImportOptions) -> RecordingSet:
+    """A picture with slanted edges as a recording set of one capture, whose edges are looked for.
+
+    Raises InputError with all that isn't stated, in one line, or where no edge is found in the picture.
+    """
+    from lab.errors import NotDetermined
+    from lab.fit.mtf.edges_in_frame import find_edges
+
+    frame, camera, notes = _picture(path, options, lambda image: _one_channel(image, options), ())
+    try:
+        found = find_edges(frame, camera.cfa, camera.saturation_dn)
+    except NotDetermined as refused:
+        raise InputError(f"{path}: no slanted edge: {refused.reason}; give a picture of one") from refused
+    capture = {"id": "edge", "kind": "slanted_edge"}
+    angles = ", ".join(f"{edge.angle_deg:.1f}" for edge in found)
+    notes = (*notes, f"{path}: {len(found)} edges, at {angles} degrees from the vertical")
+    return _recordings(path, frame, camera, options, capture, notes, {})
+
+
+def read_colour_chart(path: Path, options: ImportOptions) -> RecordingSet:
+    """A picture of a ColorChecker of 24 patches as a recording set of one capture; the patches are located, or given by their corners.
+
+    Raises InputError with all that isn't stated, in one line, or where no chart is found.
+    """
+    lit = options.light is None and options.white_patch is None
+    missing = ("--light or --white-patch (CSV of the light's radiance)",) if lit else ()
+    frame, camera, notes = _picture(path, options, _remosaiced, missing)
+    corners = options.corners
+    if corners is None:
+        corners = located_chart(frame, camera)
+        if corners is None:
+            raise InputError(f"{path}: no ColorChecker of 24 patches found; give its --corners")
+        said = " ".join(f"{value:.0f}" for corner in corners for value in corner)
+        notes = (*notes, f"{path}: the chart's corners were found at {said} (row, column): check that")
+    _check_grey_row(path, frame, camera, corners)
+    capture = {"id": "chart", "kind": "chart", "chart": CHART, "corners": corners, "radiance": "spectra/light.csv"}
+    return _recordings(path, frame, camera, options, capture, notes, {"spectra/light.csv": _light(options)})
+
+
+def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
+    """Corners of the grid of patches, [row, col] of dark skin, bluish green, black, white; None where no chart is found.
+
+    Patches are found by OpenCV's MCC detector in the mosaic binned to its period; a homography through the 24 centres gives the corners.
+    """
+    step = mosaic.step(camera.cfa)
+    picture = _small_colours(frame, camera)
+    for scale in SCALES:
+        larger = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        cv2.setRNGSeed(0)  # the detector clusters colours from random starts
+        detector = cv2.mcc.CCheckerDetector.create()
+        if detector.process(larger, 1):
+            charts = np.asarray(detector.getBestColorChecker().getColorCharts(), float).reshape(-1, 4, 2)
+            if len(charts) == PATCH_ROWS * PATCH_COLS:
+                break
+    else:
+        return None
+    centres = (charts.mean(axis=1) + 0.5) / scale - 0.5
+    row, col = np.divmod(np.arange(len(centres)), PATCH_COLS)
+    grid = np.column_stack([(col + 0.5) / PATCH_COLS, (row + 0.5) / PATCH_ROWS])
+    homography, _ = cv2.findHomography(grid, centres)
+    square = np.array([[[0.0, 0.0]], [[1.0, 0.0]], [[1.0, 1.0]], [[0.0, 1.0]]])
+    found = cv2.perspectiveTransform(square, homography)[:, 0] * step + 0.5 * (step - 1)
+    corners = tuple((float(y), float(x)) for x, y in found)
+    return _upright(frame, camera, corners)
+
+
+def _upright(frame: Frame, camera: DataSheet, corners: Corners) -> Corners:
+    """The corners in the order of a chart that isn't mirrored, of whose two the grey row falls: the detector may take it turned or
+    mirrored where light has one colour."""
+    orders = ((0, 1, 2, 3), (2, 3, 0, 1), (1, 0, 3, 2), (3, 2, 1, 0))
+    found = [tuple(corners[k] for k in order) for order in orders]
+
+    def is_front(c: Corners) -> bool:
+        (y0, x0), (y1, x1), _, (y3, x3) = c
+        return (x1 - x0) * (y3 - y0) - (y1 - y0) * (x3 - x0) > 0
+
+    front = [c for c in found if is_front(c)]
+    return max(front, key=lambda c: -float(np.polyfit(np.arange(PATCH_COLS), grey_levels(frame, c), 1)[0]))
+
+
+def _picture(
+    path: Path,
+    options: ImportOptions,
+    plane_of: Callable[[NDArray[Any]], tuple[Frame, str]],
+    missing: tuple[str, ...],
+) -> tuple[Frame, DataSheet, tuple[str, ...]]:
+    """The frame, its camera, and what was done to it. Raises InputError that names everything that isn't stated. `plane_of`: frame and
+    mosaic of a colour picture (rows, cols, 3) in R, G, B."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give one picture")
+    file, keys = _stated_camera(path, options)
+    is_image = path.suffix.lower() in IMAGES
+    try:
+        image = decoded(path) if is_image else read_image(path)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    colours = image.ndim == 3 and image.shape[2] >= 3 and bool(np.ptp(image[..., :3], axis=2).any())
+    lacking = [] if colours or "cfa" in keys else ["cfa"]
+    if image.dtype == np.uint8:
+        keys.setdefault("bit_depth", 8)
+    lacking += [key for key in ("bit_depth", "black_level_dn") if key not in keys]
+    told = ([f"{', '.join(lacking)} ({file})"] if lacking else []) + list(missing)
+    if options.exposure_s is None:
+        told.append("--exposure-s")
+    if is_image and options.transfer is None:
+        told.append("--transfer linear, or srgb where the picture is made for a screen")
+    if told:
+        raise InputError(f"{path}: isn't stated: {'; '.join(told)}; state them")
+    notes: tuple[str, ...] = ()
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: its values are {image.dtype}; save 8 or 16 bit")
+    if colours:
+        values, keys["cfa"] = plane_of(image[..., 2::-1])
+        notes = (f"{path}: a colour picture: its pixels are no mosaic's, and neighbours share their noise",)
+    else:
+        values = image[..., 0] if image.ndim == 3 else image
+    frame = np.ascontiguousarray(values, dtype=np.uint16)
+    if options.transfer == "srgb":
+        frame, keys = _linear(frame, keys)
+        notes += (
+            f"{path}: decoded from sRGB to linear codes of {LINEAR_BITS} bit; a screen's tone curve isn't undone",
+        )
+    try:
+        camera = DataSheet.model_validate(keys | {"rows": frame.shape[0], "cols": frame.shape[1]})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from error
+    return frame, camera, notes
+
+
+def _stated_camera(path: Path, options: ImportOptions) -> tuple[Path, dict[str, Any]]:
+    """The camera file of a picture, and its keys."""
+    file = options.camera if options.camera is not None else path.parent / CAMERA
+    if options.camera is not None and not file.is_file():
+        raise InputError(f"{file}: no such file; give the camera file of --camera")
+    sides = described_sides(file)
+    if "left" not in sides:
+        raise InputError(f"{file}: describes no left camera; write the keys without a table")
+    return file, dict(sides["left"])
+
+
+def _linear(frame: Frame, keys: dict[str, Any]) -> tuple[Frame, dict[str, Any]]:
+    """Codes in proportion to the light (IEC 61966-2-1), and the camera's levels in them."""
+
+    def light(code: NDArray[Any] | float) -> NDArray[Any]:
+        value = np.asarray(code, float) / (2.0 ** int(keys["bit_depth"]) - 1.0)
+        low = value / 12.92
+        return np.asarray(np.where(value <= 0.04045, low, ((value + 0.055) / 1.055) ** 2.4) * (2.0**LINEAR_BITS - 1.0))
+
+    changed = {key: float(light(keys[key])) for key in ("black_level_dn", "white_level_dn") if key in keys}
+    made = np.ascontiguousarray(np.rint(light(frame)).clip(0, 2**LINEAR_BITS - 1), dtype=np.uint16)
+    return made, keys | changed | {"bit_depth": LINEAR_BITS}
+
+
+def _one_channel(image: NDArray[Any], options: ImportOptions) -> tuple[Frame, str]:
+    if options.channel not in ("R", "G", "B"):
+        raise InputError("a colour picture: state --channel R, G or B, or give the raw")
+    return image[..., "RGB".index(options.channel)], "MONO"
+
+
+def _remosaiced(image: NDArray[Any]) -> tuple[Frame, str]:
+    """A colour picture (rows, cols, 3) sampled like a mosaic."""
+    rows, cols = (n // 2 * 2 for n in image.shape[:2])
+    made = np.empty((rows, cols), image.dtype)
+    for channel, places in mosaic.phases("RGGB").items():
+        for row, col in places:
+            made[row::2, col::2] = image[row:rows:2, col:cols:2, "RGB".index(channel)]
+    return made, "RGGB"
+
+
+def _small_colours(frame: Frame, camera: DataSheet) -> NDArray[np.uint8]:
+    """The mosaic binned to its period as a picture for a screen, (rows, cols, 3) in B, G, R: each channel over its brightest per mille."""
+    step = mosaic.step(camera.cfa)
+    black = camera.black_level_dn or 0.0
+    rows, cols = (n // step for n in frame.shape)
+    planes = []
+    for channel in "BGR" if camera.cfa != "MONO" else "YYY":
+        phases = mosaic.phases(camera.cfa)[channel]
+        plane = np.mean([frame[r::step, c::step][:rows, :cols] for r, c in phases], axis=0) - black
+        planes.append(np.clip(plane / max(float(np.quantile(plane, 0.999)), 1.0), 0.0, 1.0) ** (1.0 / 2.2))
+    return np.ascontiguousarray(np.rint(255.0 * np.dstack(planes)), dtype=np.uint8)
+
+
+def _check_grey_row(path: Path, frame: Frame, camera: DataSheet, corners: Corners) -> None:
+    """Refuse corners inside which the grey row doesn't fall from white to black."""
+    corner = np.array(corners, float)
+    if not np.all((corner >= -0.5) & (corner <= np.array(frame.shape) - 0.5)):
+        raise InputError(
+            f"{path}: a corner of the chart is outside the frame of {frame.shape[0]} x {frame.shape[1]}; give [row, col]"
+        )
+    level = grey_levels(frame, corners) - (camera.black_level_dn or 0.0)
+    if np.any(np.diff(level) >= 0) or level[0] < WHITE_OVER_BLACK * max(level[-1], 1e-9):
+        said = ", ".join(f"{value:.4g}" for value in level)
+        raise InputError(
+            f"{path}: the grey row doesn't fall from white to black between these corners ({said} DN above black); give --corners as "
+            "row and column of dark skin, bluish green, black, white"
+        )
+
+
+def grey_levels(frame: Frame, corners: Corners) -> NDArray[np.floating[Any]]:
+    """Mean DN of the inner parts of the patches of the grey row, white first."""
+    corner, v = np.array(corners, float), (PATCH_ROWS - 0.5) / PATCH_ROWS
+    half = max(int(0.15 * np.linalg.norm(corner[1] - corner[0]) / PATCH_COLS), 1)
+    levels = []
+    for col in range(PATCH_COLS):
+        u = (col + 0.5) / PATCH_COLS
+        at = (1 - v) * ((1 - u) * corner[0] + u * corner[1]) + v * ((1 - u) * corner[3] + u * corner[2])
+        row0, col0 = (max(int(n) - half, 0) for n in at)
+        part = frame[row0 : row0 + 2 * half + 1, col0 : col0 + 2 * half + 1]
+        levels.append(float(part.mean()) if part.size else np.nan)
+    return np.nan_to_num(np.array(levels))
+
+
+def _light(options: ImportOptions) -> Spectrum:
+    """Radiance of a perfect diffuser in the chart's place."""
+    file = options.light if options.light is not None else options.white_patch
+    assert file is not None
+    try:
+        spectrum = parse_spectrum(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: can't be read ({type(error).__name__}); give a CSV wavelength_nm,value") from error
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    if options.light is not None:
+        return spectrum
+    white = next(value for name, value in reflectances(CHART).items() if name.startswith("white"))
+    wavelength_nm, value = spectrum.arrays
+    return Spectrum.of(wavelength_nm, value / white.at(wavelength_nm))
+
+
+def _recordings(
+    path: Path,
+    frame: Frame,
+    camera: DataSheet,
+    options: ImportOptions,
+    capture: dict[str, Any],
+    notes: tuple[str, ...],
+    spectra: dict[str, Spectrum],
+) -> RecordingSet:
+    stored = f"frames/{capture['id']}.npy"
+    manifest = Manifest.model_validate(
+        {
+            "name": path.stem,
+            "notes": f"imported from the picture {path.name}",
+            "cameras": {"left": camera.model_dump(exclude_unset=True)},
+            "captures": [capture | {"side": "left", "frame": stored, "exposure_s": options.exposure_s}],
+        }
+    )
+    return RecordingSet(manifest, {stored: frame}, spectra, source=str(path), warnings=notes)
