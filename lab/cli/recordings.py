@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lab.cli.console import check_writable, out, warn, write_json
+from lab.cli.progress import progress_bar
 from lab.cli.sources import StoreFolder, open_store
 from lab.cli.tables import print_fit
 from lab.errors import InputError
@@ -86,7 +87,8 @@ def import_(
         return
     recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
-    folder = recording.write(recordings, out_folder)
+    with progress_bar("import") as advance:
+        folder = recording.write(recordings, out_folder, progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
@@ -155,5 +157,6 @@ def export(
     """Write a stored session as a recording set."""
     recordings = session_recordings(open_store(data), session)
     warn(recordings.warnings)
-    folder = recording.write(recordings, to)
+    with progress_bar("export") as advance:
+        folder = recording.write(recordings, to, progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")

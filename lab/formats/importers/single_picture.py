@@ -34,6 +34,8 @@ CHART = "ColorChecker24"
 PATCH_ROWS, PATCH_COLS = 4, 6
 #: Enlargements of the picture in which a chart is looked for, in turn: the detector finds patches of some sizes only.
 SCALES = (1, 2, 3, 4, 6)
+#: Grey rim laid about the picture, over its shorter side, and its code: a chart that fills the frame isn't found without.
+PADS, RIM_CODE = (0.0, 0.125), 110
 
 Corners = tuple[tuple[float, float], ...]
 
@@ -84,8 +86,10 @@ def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
     """
     step = mosaic.step(camera.cfa)
     picture = _small_colours(frame, camera)
-    for scale in SCALES:
-        larger = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    for pad, scale in ((pad, scale) for pad in PADS for scale in SCALES):
+        rim = round(pad * min(picture.shape[:2]))
+        padded = cv2.copyMakeBorder(picture, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=(RIM_CODE,) * 3)
+        larger = cv2.resize(padded, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         cv2.setRNGSeed(0)  # the detector clusters colours from random starts
         detector = cv2.mcc.CCheckerDetector.create()
         if detector.process(larger, 1):
@@ -94,7 +98,7 @@ def located_chart(frame: Frame, camera: DataSheet) -> Corners | None:
                 break
     else:
         return None
-    centres = (charts.mean(axis=1) + 0.5) / scale - 0.5
+    centres = (charts.mean(axis=1) + 0.5) / scale - 0.5 - rim
     row, col = np.divmod(np.arange(len(centres)), PATCH_COLS)
     grid = np.column_stack([(col + 0.5) / PATCH_COLS, (row + 0.5) / PATCH_ROWS])
     homography, _ = cv2.findHomography(grid, centres)

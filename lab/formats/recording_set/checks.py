@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -20,12 +20,21 @@ from lab.formats.recording_set.clipping import (
     saturated_flats,
     wrong_lights,
 )
+from lab.formats.recording_set.frame_files import Frame
 from lab.formats.recording_set.manifest import DataSheet, Findings
 from lab.formats.recording_set.recordings import RecordingSet
 from sim.camera import Side
 
 #: A warning is given where a narrowband light's centre is off the wavelength set by more than this plus a quarter of its bandwidth.
 OFF_NAME_NM = 3.0
+
+
+#: Called with each capture, its frame, and the share of the captures that are done.
+Loaded = Callable[[Capture, Frame, float], None]
+
+
+def _not_used(capture: Capture, frame: Frame, share: float) -> None:
+    """Frames that are checked and not used otherwise."""
 
 
 def _unknown_keys(where: str, item: Open) -> Iterator[str]:
@@ -50,17 +59,19 @@ def _camera_problems(camera: DataSheet) -> Iterator[str]:
             )
 
 
-def _check_frames(recordings: RecordingSet, found: Findings) -> None:
-    """Load every frame once; find damaged frames, saturated flats and clipped captures."""
+def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> None:
+    """Load every frame once and hand it to `loaded`; find damaged frames, saturated flats and clipped captures."""
     flats: dict[Side, list[ClippedLevel]] = defaultdict(list)
     clipped_of: dict[tuple[Side, str], list[str]] = defaultdict(list)
-    for capture in recordings.manifest.captures:
+    captures = recordings.manifest.captures
+    for number, capture in enumerate(captures, start=1):
         camera = recordings.manifest.cameras[capture.side]
         try:
             frame = recordings.frame(capture)
         except InputError as error:
             found.problems.append(str(error))
             continue
+        loaded(capture, frame, number / len(captures))
         if not capture.clipping_matters:
             continue
         clipped = clipped_share(frame, camera)
@@ -171,14 +182,14 @@ def _lights_off_their_names(recordings: RecordingSet) -> Iterator[str]:
         )
 
 
-def inspect(recordings: RecordingSet) -> tuple[list[str], list[str]]:
+def inspect(recordings: RecordingSet, loaded: Loaded = _not_used) -> tuple[list[str], list[str]]:
     """(problems, warnings) of a recording set, one line each. `read` refuses a set with problems.
 
-    Every frame, spectrum and target is read once.
+    Every frame, spectrum and target is read once; frames are handed to `loaded`.
     """
     found = Findings(warnings=list(_unknown_keys(f"{recordings.source}: manifest", recordings.manifest)))
     _check_cameras(recordings, found)
     _check_captures(recordings, found)
     _check_spectra_and_targets(recordings, found)
-    _check_frames(recordings, found)
+    _check_frames(recordings, found, loaded)
     return found.problems, found.warnings

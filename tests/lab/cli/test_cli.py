@@ -434,7 +434,7 @@ def test_import_writes_a_set_or_nothing(tmp_path: Path, flats: Path, capsys: pyt
     raws = tmp_path / "raws"
     raws.mkdir()
     shutil.copy(flats / "frames/0.npy", raws / "a.npy")
-    (raws / "camera.toml").write_text('cfa = "MONO"\n')
+    (raws / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 12\n')
     (raws / "index.csv").write_text("frame,kind,exposure_s\na.npy,dark,0.5\n")
     assert cli.main(["import", "--from", "raw-folder", str(raws), "--out", str(tmp_path / "out")]) == 0
     assert recording.read(tmp_path / "out").captures()[0].exposure_s == 0.5
