@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from scipy.ndimage import spline_filter
 
+from sim.optics.bspline import spline_weights
 from sim.spectrum import FloatArray
 
 
@@ -66,10 +67,6 @@ def _taps(place, count, weight, at):  # type: ignore[no-untyped-def]
     """Weights of the four cubic B-splines about a place, and whose they are, the ends standing for what lies outside."""
     place = min(max(place, -1.0), float(count))
     first = int(np.floor(place))
-    t = place - first
-    weight[0] = (1 - t) ** 3 / 6
-    weight[1] = 2 / 3 - t * t * (1 - t / 2)
-    weight[2] = 2 / 3 - (1 - t) ** 2 * (1 + t) / 2
-    weight[3] = t**3 / 6
+    weight[0], weight[1], weight[2], weight[3] = spline_weights(place - first)
     for k in range(4):
         at[k] = min(max(first - 1 + k, 0), count - 1)
