@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mocks.cornerstone260 import ALREADY_THERE, MockCornerstone260, _Done, _Refusal
-from mocks.wire import MeasuredLight
+from mocks.wire import LONGEST_LINE, MeasuredLight
 
 
 class MockCornerstone260BSerial(MockCornerstone260):
@@ -31,8 +31,10 @@ class MockCornerstone260BSerial(MockCornerstone260):
             ended = value == 0x0A and self._line.endswith(b"\r")
             if ended:
                 out += self._end_line()
-            elif len(self._line) < 512:
+            elif len(self._line) < LONGEST_LINE:
                 self._line.append(value)
+            else:  # so that the end of too long a line is seen
+                self._line[-1] = value
         return out
 
     def quiet(self) -> list[bytes]:
