@@ -144,7 +144,7 @@ class Cornerstone260(WireInstrument, Monochromator):
         # An empty statement ends whatever half a statement an earlier host left behind; ABORT, a motion under way.
         line.write(b"\r\n")
         line.write(b"ABORT\r\n")
-        line.drain(quiet_s=0.1)
+        line.drain(quiet_s=0.3)  # an instrument that moves is slow to echo
         model, _, serial_number = self._first_answer().partition(" SN ")
         self._identity = Identity("Newport", model.strip() or "Cornerstone 260", serial_number.strip())
         line.write(b"HANDSHAKE 1\r\n")

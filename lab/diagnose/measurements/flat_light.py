@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Reading:
+class FlatLight:
     """One statement of the light: of a radiometer (`path` of the spectrum), or of a number of photons in an exposure."""
 
     name: str
@@ -26,20 +26,20 @@ class Reading:
     photons_per_s: float = 0.0
 
 
-def reading(study: Study, flat: FlatCapture) -> Reading | None:
+def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
     """What is stated of a flat's light; None where nothing is, or where no time was exposed."""
     if flat.radiance is not None:
-        return Reading(flat.radiance, study.lamps[flat.radiance], flat.radiance)
+        return FlatLight(flat.radiance, study.lamps[flat.radiance], flat.radiance)
     light = stated_light(flat)
     if light.unit != "photons" or flat.exposure_s <= 0 or light.amount <= 0:
         return None
     name = f"{light.amount:.9g} photons in {flat.exposure_s:.9g} s"
-    return Reading(name, light.lamp, None, light.amount / flat.exposure_s)
+    return FlatLight(name, light.lamp, None, light.amount / flat.exposure_s)
 
 
-def relative_rates(study: Study, readings: Sequence[Reading]) -> Mapping[tuple[str, str], float]:
+def relative_rates(study: Study, readings: Sequence[FlatLight]) -> Mapping[tuple[str, str], float]:
     """Rate of light in each channel by (reading, channel), over that of the first reading of its lamp."""
-    first: dict[Hashable, Reading] = {}
+    first: dict[Hashable, FlatLight] = {}
     for one in readings:
         first.setdefault(one.lamp, one)
     found = {}
@@ -50,7 +50,7 @@ def relative_rates(study: Study, readings: Sequence[Reading]) -> Mapping[tuple[s
     return found
 
 
-def _rate(study: Study, one: Reading, channel: str) -> float:
+def _rate(study: Study, one: FlatLight, channel: str) -> float:
     if one.path is None:
         return one.photons_per_s
     spectrum: Spectrum = study.spectrum(one.path)

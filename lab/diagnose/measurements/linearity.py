@@ -11,7 +11,7 @@ from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_level import added_dark_dn
-from lab.diagnose.measurements.flat_light import Reading, reading, relative_rates
+from lab.diagnose.measurements.flat_light import FlatLight, reading, relative_rates
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.line_means import line_mean_jacobian
 from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
@@ -100,7 +100,7 @@ def linearity_block(study: Study) -> Block:
 
 
 def _changed(
-    study: Study, readings: list[Reading], relative: Mapping[tuple[str, str], float], effects: Effects
+    study: Study, readings: list[FlatLight], relative: Mapping[tuple[str, str], float], effects: Effects
 ) -> Mapping[tuple[str, str], float]:
     """Rates of light in each channel, by (reading, channel), over those of the lamp's first reading, as effects change them. Light of one
     wavelength, of which the photons are stated, changes alike at all levels: that is in its rate."""

@@ -70,10 +70,10 @@ def test_the_next_program_finds_the_handshake_as_it_was(served: Callable[..., st
 
 def test_a_motion_under_way_is_ended_on_connecting(served: Callable[..., str]) -> None:
     bench = Bench()
-    bench.clock = Clock(real_time_factor=5.0)
+    bench.clock = Clock(real_time_factor=1.0)
     mock = Mock(bench)
-    mock.receive(b"GOWAVE 1000\n")  # 29 s: a busy machine may take some to connect
-    mono = Cornerstone260(served(mock, Pty()), timeout_s=5.0)
+    mock.receive(b"GOWAVE 1000\n")  # 5.8 s
+    mono = Cornerstone260(served(mock, Pty()), timeout_s=1.0)
     mono.connect()
     assert mono.wavelength_nm() == 0
     mono.close()
