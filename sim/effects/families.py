@@ -83,7 +83,11 @@ _TOLD = {
         "Signals aren't in proportion to the light, or pixels of one colour answer it differently.",
         "the same levels once by exposure and once by the light's radiance: the camera's response follows the signal, the shutter follows the time",
     ),
-    Family.CONVERTER: _Told("converter", "The converter's codes are unequal."),
+    Family.CONVERTER: _Told(
+        "converter",
+        "The converter's codes are unequal.",
+        "many flat frames over the whole range of codes: wrong bit weights are steps at their codes, a ripple returns with its period",
+    ),
     Family.DEFECTIVE_PIXELS: _Told(
         "defective pixels",
         "A few pixels, always the same ones, are far from the others.",
