@@ -129,7 +129,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     return SessionDetail(
         **_fields(service, info),
         station=service.store.station(session_id).name,
-        progress=service.progress(session_id),
+        progress=service.progress(session_id) if info.closed is None else None,
         runs=tuple(service.store.runs(session_id)),
         captures=tuple(
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]

@@ -15,6 +15,7 @@ from sim.stages import Codes
 
 #: Periods that are tried first: parts of the converter's range, in which folding and subranging converters divide it.
 PARTS = (4, 8, 16, 32)
+SHORTEST_DN = 16.0  # period: shorter ones are single codes
 
 
 class AdcRipple(Effect):
@@ -44,7 +45,7 @@ class AdcRipple(Effect):
         Quantity("DN", "amplitude of the cosine from code 0 on", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0),
     ] = 0.0
     period_dn: Annotated[
-        float, Quantity("DN", "codes after which it repeats", lower=16.0, upper=65536.0, absent=512.0)
+        float, Quantity("DN", "codes after which it repeats", lower=SHORTEST_DN, upper=65536.0, absent=512.0)
     ] = 512.0
 
     @classmethod
@@ -56,6 +57,7 @@ class AdcRipple(Effect):
                 for sine, cosine in ((0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3))
             )
             for part in PARTS
+            if full / part >= SHORTEST_DN
         )
 
     def on_codes(self, codes: Codes) -> Codes:

@@ -23,7 +23,7 @@ def family_claim(search: Search, named: Sequence[Candidate], candidate: Candidat
     no family holds it."""
     model, policy = search.model, search.policy
     others = tuple(c.effect for c in named)
-    if not candidate.among_listed:
+    if not candidate.among_listed or candidate.remark:  # what wrong metadata would explain as well is no claim
         return None
     kind = library()[candidate.among_listed[0][0]]
     members = tuple((name, p) for name, p in candidate.among_listed if library()[name].family is kind.family)

@@ -51,7 +51,10 @@ def test_real_frames_show_defective_pixels_filters_off_their_names_and_what_cant
     runpy.run_path(str(ROOT / "docs" / "convert_llanos.py"), run_name="__main__")
     result = diagnose(read_foreign("raw-folder", tmp_path / "darks"))
     assert "defective_pixels" in {m.measurement for m in result.mismatches}
-    assert {e.name for e in result.effects} <= {"hot_pixels"}  # nothing else may be named from these
+    assert {e.name for e in result.effects} <= {
+        "hot_pixels",
+        "defective_pixels",
+    }  # nothing else may be named from these
     reasons = " ".join(item.reason for item in result.skipped)
     assert "codes are too coarse" in reasons
     assert "f-number or pixel pitch isn't stated" in reasons
