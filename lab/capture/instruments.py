@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,17 +90,7 @@ class Instruments:
 
         Returns one line for each instrument that failed to.
         """
-        stopping = {name: in_thread(driver.stop) for name, driver in self.drivers.all.items()}
-        complaints = []
-        until = time.monotonic() + STOP_S
-        for name, future in stopping.items():
-            try:
-                future.result(max(0.0, until - time.monotonic()))
-            except TimeoutError:
-                complaints.append(f"{name}: didn't stop within {STOP_S:g} s")
-            except Exception as error:
-                complaints.append(named_complaint(name, error))
-        return complaints
+        return stop_complaints({name: in_thread(driver.stop) for name, driver in self.drivers.all.items()})
 
     def close(self) -> None:
         """Close all connections. Never raises."""
@@ -110,6 +101,19 @@ class Instruments:
                 future.result(max(0.0, until - time.monotonic()))
             except Exception:
                 continue
+
+
+def stop_complaints(stopping: Mapping[str, Future[None]]) -> list[str]:
+    """Wait for instruments that are being stopped, `STOP_S` for all together; one line for each that failed to."""
+    complaints, until = [], time.monotonic() + STOP_S
+    for name, future in stopping.items():
+        try:
+            future.result(max(0.0, until - time.monotonic()))
+        except TimeoutError:
+            complaints.append(f"{name}: didn't stop within {STOP_S:g} s")
+        except Exception as error:
+            complaints.append(named_complaint(name, error))
+    return complaints
 
 
 def named_complaint(name: str, error: Exception) -> str:

@@ -14,7 +14,7 @@ from concurrent.futures import Future
 
 from drivers.instrument import Instrument
 from lab.capture.blocking_calls import STOP_S, in_thread
-from lab.capture.instruments import named_complaint
+from lab.capture.instruments import stop_complaints
 from lab.capture.records import now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
@@ -44,14 +44,7 @@ def make_station_safe(station: Station, connect: Callable[[Station], Drivers] = 
         name: in_thread(lambda one=driver: stopped(one))  # type: ignore[misc]
         for name, driver in drivers.items()
     }
-    complaints, until = [], time.monotonic() + STOP_S
-    for name, future in stopping.items():
-        try:
-            future.result(max(0.0, until - time.monotonic()))
-        except TimeoutError:
-            complaints.append(f"{name}: didn't stop within {STOP_S:g} s")
-        except Exception as error:
-            complaints.append(named_complaint(name, error))
+    complaints, until = stop_complaints(stopping), time.monotonic() + STOP_S
     closing = [in_thread(driver.close) for driver in drivers.values()]
     for done in closing:
         try:
