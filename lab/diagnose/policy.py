@@ -201,7 +201,7 @@ class DecisionPolicy(Frozen):
             "least share of the excess chi2, in the measurements that its nearest law acts on, that a family of which no law holds explains",
             "a straight line explains three quarters of a step, so that a difference between taps would be uneven light by less",
         ),
-    ] = 0.8
+    ] = 0.76
     exact_share: Annotated[
         float, Rule("name", "1", "share of the excess chi2 from which on a name explains it nearly all", TUNED)
     ] = 0.95
