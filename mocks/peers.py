@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.camera.basler import pylon_library
-from drivers.contract.peer import Peer
+from drivers.contract.peer import Peer, RealInstrument
 from drivers.errors import InstrumentError
 from mocks.bench import Bench
 from mocks.cornerstone260 import MockCornerstone260
@@ -267,30 +267,13 @@ class PromptPeer(Peer):
         """Nothing is held."""
 
 
-class EmulatedBasler(Peer):
+class EmulatedBasler(RealInstrument):
     """The first of the two cameras that pypylon emulates itself: it can't be silenced or unplugged."""
-
-    can_fail = False
 
     def __init__(self) -> None:
         os.environ.setdefault("PYLON_CAMEMU", "2")
         pylon_library()  # raises where it isn't installed
-        self.address, self.settings = "0815-0000", {}
-
-    def mute(self, silent: bool) -> None:
-        """Can't be done."""
-
-    def unplug(self) -> None:
-        """Can't be done."""
-
-    def plug(self) -> None:
-        """It is."""
-
-    def slow(self, slowly: bool) -> bool:
-        return False
-
-    def close(self) -> None:
-        """Nothing is held."""
+        super().__init__("0815-0000", {})
 
 
 class AravisFakeCamera(Peer):

@@ -390,14 +390,14 @@ def _scattered(image: FloatArray, state: Image, shade: FloatArray) -> FloatArray
     """A channel's irradiance with its reflections, the fall-off, and what is scattered evenly. A traced lens's image is a mosaic already:
     colour by colour."""
     traced = isinstance(state.camera.lens.imaging, TracedLens)
-    shaded = image * shade
-    if not state.copies and not state.veils:
-        return shaded
-    if state.copies:
-        shaded = image.copy()
-        for plane in mosaic.planes(shaded, state.camera.cfa).values() if traced else [shaded]:
-            plane[:] = state.with_copies(plane)
-        shaded = shaded * shade
-    for plane in mosaic.planes(shaded, state.camera.cfa).values() if traced else [shaded]:
+
+    def colours(frame: FloatArray) -> list[FloatArray]:
+        return list(mosaic.planes(frame, state.camera.cfa).values()) if traced else [frame]
+
+    reflected = image.copy()
+    for plane in colours(reflected):
+        plane[:] = state.with_copies(plane)
+    shaded = reflected * shade
+    for plane in colours(shaded):
         plane[:] = state.veiled(plane)
     return shaded

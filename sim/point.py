@@ -7,10 +7,10 @@ values, the result is the baseline bit for bit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline
 
@@ -160,6 +160,24 @@ def dispersal(
         turns = np.multiply.outer(across, fx_cy_per_px) + np.multiply.outer(down, fy_cy_per_px)
         factor += np.exp(-2j * np.pi * turns)
     return np.asarray(factor / x.size, complex)
+
+
+def detected_transfer(
+    camera: CameraModel,
+    wavelength_nm: FloatArray,
+    shares: FloatArray,
+    transfers: NDArray[np.inexact[Any]],
+    fx_cy_per_px: FloatArray,
+    fy_cy_per_px: FloatArray,
+    effects: Sequence[Acts],
+    places_um: Sequence[tuple[float, float]],
+) -> ComplexArray:
+    """Transfer functions of sights, (sights, *frequencies), of those of single wavelengths, (wavelengths, *frequencies): the sum over
+    wavelengths of share x transfer x `dispersal`."""
+    apart = dispersal(camera, wavelength_nm, shares, fx_cy_per_px, fy_cy_per_px, effects, places_um)
+    if apart is None:
+        return np.asarray(np.tensordot(shares, transfers, 1), complex)
+    return np.asarray(np.einsum("sw,sw...,w...->s...", shares, apart, transfers), complex)
 
 
 def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:

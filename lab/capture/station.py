@@ -6,7 +6,6 @@ beforehand: addresses, data sheets, nominal layouts. Nothing in it is measured. 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from lab.capture_kinds.base import AnyTarget, CaptureLimits, Target, TargetT
 from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import DataSheet
 from lab.formats.spectrum_csv import parse_spectrum
+from lab.formats.toml_file import read_toml
 from sim.camera import Side
 from sim.parameters import Frozen
 from sim.spectrum import Spectrum
@@ -157,14 +157,7 @@ def _complaints(error: ValidationError) -> Iterator[str]:
 def read_station(path: str | Path) -> Station:
     """The station in a TOML file. Raises InputError, one line that names every wrong key."""
     file = Path(path)
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{file}: can't be read ({error.strerror}); give a station file, `calibench bench --station FILE` writes one"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: isn't TOML ({error}); correct that place") from error
+    tables = read_toml(file, "give a station file, `calibench bench --station FILE` writes one")
     try:
         return Station.model_validate(_with_curves(tables, file.parent))
     except ValidationError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +12,7 @@ from rich.table import Table
 from lab.cli.console import check_writable, err, out
 from lab.cli.exit_codes import EXIT_CHECK
 from lab.errors import DeviceError, InputError
+from lab.formats.toml_file import read_toml
 
 if TYPE_CHECKING:
     from drivers.contract.peer import Peer
@@ -166,15 +166,7 @@ def _table(*headings: str) -> Table:
 
 
 def _contract_entries(file: Path) -> list[dict[str, object]]:
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{file}: can't be read ({error.strerror}); give a file with a table [[instrument]] a driver"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: isn't TOML ({error}); correct that place") from error
-    entries = tables.get("instrument")
+    entries = read_toml(file, "give a file with a table [[instrument]] a driver").get("instrument")
     if not isinstance(entries, list) or not entries:
         raise InputError(
             f"{file}: names no instrument; write a table [[instrument]] with driver and peer, or driver and address"

@@ -10,7 +10,7 @@ from lab.diagnose.measurements.pattern_fit import EVEN_TERMS, Pattern, even_powe
 from lab.diagnose.measurements.reads import SHOWN
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from sim.point import TRANSFER_AT, common_wavelengths, dispersal, transfer_at
+from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, transfer_at
 from sim.spectrum import FloatArray
 
 LARGEST_STD = 0.04  # of a band's contrast: beyond, it says nothing
@@ -86,10 +86,7 @@ def _transfers(
     lit = [(channel, first.light) for channel in sights]
     nodes, shares = common_wavelengths(study.camera, lit, effects, "bernoulli")
     whole = [transfer_at(study.camera, float(w), fx, fy, effects) for w in nodes]
-    apart = dispersal(study.camera, nodes, shares, fx, fy, effects, first.places_um)
-    if apart is None:
-        return np.asarray(np.tensordot(shares, np.array(whole), 1), complex)
-    return np.asarray(np.einsum("cw,cwf,wf->cf", shares, apart, np.array(whole)), complex)
+    return detected_transfer(study.camera, nodes, shares, np.array(whole), fx, fy, effects, first.places_um)
 
 
 def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -39,7 +39,7 @@ from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.point import (
     TRANSFER_AT,
     common_wavelengths,
-    dispersal,
+    detected_transfer,
     halos,
     transfer_at,
     varies_over_field,
@@ -272,10 +272,7 @@ class _Edges:
 
         def blurred() -> ComplexArray:
             whole = np.array([transfer_at(self._camera, float(w), fx, fy, optical, place_um=place_um) for w in nodes])
-            apart = dispersal(self._camera, nodes, shares, fx, fy, optical, [place_um])
-            if apart is not None:
-                return np.asarray(np.einsum("sw,sw...,w...->s...", shares, apart, whole) + kink, complex)
-            return np.asarray(np.tensordot(shares, whole, 1) + kink, complex)
+            return detected_transfer(self._camera, nodes, shares, whole, fx, fy, optical, [place_um]) + kink
 
         otf = _kept(self._blurred, (spectral, optical, place_um), blurred)
         return self._mixed(otf, moving) if moving else otf

@@ -1,0 +1,19 @@
+"""TOML files that a user wrote."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from lab.errors import InputError
+
+
+def read_toml(file: Path, remedy: str) -> dict[str, Any]:
+    """The tables of a file. Raises InputError, one line, where it can't be read, with the `remedy`, or isn't TOML."""
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{file}: can't be read ({error.strerror}); {remedy}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: isn't TOML ({error}); correct that place") from error
