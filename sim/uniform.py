@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -168,18 +168,36 @@ class Uniform:
     # --- charge ------------------------------------------------------------------------------------------------------
 
     def electrons(
-        self, rates: Mapping[str, float], exposure_s: float, *, field: FieldPoints, elapsed_s: float = 0.0
+        self,
+        rates: Mapping[str, FloatArray | float],
+        exposure_s: FloatArray | float,
+        *,
+        field: FieldPoints,
+        elapsed_s: FloatArray | float = 0.0,
     ) -> dict[str, FloatArray]:
-        """Mean electrons (points of `field`,) by channel of light with `rates` (e/s on axis, with the effects on radiance and
-        transmittance in them), dark current included. `field` is that of `Uniform.field`."""
-        source_s = self._light.source(elapsed_s) * self._charge.collected_s(exposure_s)
-        dark = self.camera.dark_current_e_per_s * exposure_s
+        """Mean electrons (..., points of `field`) by channel of light with `rates` (e/s on axis, with the effects on radiance and
+        transmittance in them), dark current included. Rates, exposures and times of several captures have the same shape (...).
+        `field` is that of `Uniform.field`."""
+        collected_s = _of_each(self._charge.collected_s, exposure_s)
+        source_s = _of_each(self._light.source, elapsed_s) * collected_s
         typical_s = source_s * float(np.mean(field.light))
-        mixed = self.mixing({c: rates.get(c, 1.0) * typical_s for c in self.camera.channels})
-        return {
-            c: (rate * source_s * field.light + self.ambient_e(c, exposure_s)) * mixed.get(c, 1.0) + dark
-            for c, rate in rates.items()
-        }
+        mixed = self._mixed({c: np.asarray(rates.get(c, 1.0)) * typical_s for c in self.camera.channels})
+        dark = self.camera.dark_current_e_per_s * np.asarray(exposure_s)[..., None]
+        found = {}
+        for channel, rate in rates.items():
+            ambient = (self._light.ambient(channel) * collected_s)[..., None]
+            light = (rate * source_s)[..., None] * field.light
+            found[channel] = (light + ambient) * mixed.get(channel, np.ones(()))[..., None] + dark
+        return found
+
+    def _mixed(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """`mixing` of every capture."""
+        if not self._charge.mixes:
+            return {}
+        level = dict(zip(electrons, np.broadcast_arrays(*electrons.values()), strict=True))
+        shape = next(iter(level.values())).shape
+        each = [self.mixing({c: float(v[at]) for c, v in level.items()}) for at in np.ndindex(shape)]
+        return {c: np.array([one[c] for one in each]).reshape(shape) for c in electrons}
 
     def mixing(self, electrons: Mapping[str, float]) -> dict[str, float]:
         """Factor on each channel's mean by charge that moves between neighbouring pixels, from a small uniform mosaic of these electrons;
@@ -272,14 +290,20 @@ class Uniform:
         """What the converter makes of levels in DN before it rounds."""
         return self._codes.converted(dn)
 
-    def mean_dn(self, electrons: Mapping[str, FloatArray]) -> dict[str, float]:
-        """Mean DN above the black level over the points, by channel, after read-out; codes are averaged over shot and read noise."""
+    def mean_dn(self, electrons: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Mean DN (...) above the black level over the points, by channel, after read-out of (..., points); codes are averaged over
+        shot and read noise."""
         camera, means = self.camera, {}
         for channel, value in electrons.items():
             dn = camera.conversion_gain_dn_per_e * self.response(value)
             if not self.has_even_codes:
                 noise = camera.conversion_gain_dn_per_e * np.sqrt(np.maximum(value, 0.0) + camera.read_noise_e**2)
                 dn = self.codes(camera.black_level_dn + dn[..., None] + noise[..., None] * NOISE_NODES)
-                dn = dn - camera.black_level_dn
-            means[channel] = float(np.mean(dn))
+                dn = dn.mean(axis=-1) - camera.black_level_dn
+            means[channel] = dn.mean(axis=-1)
         return means
+
+
+def _of_each(law: Callable[[float], float], value: FloatArray | float) -> FloatArray:
+    """A law of one number at every number of an array."""
+    return np.array([law(float(one)) for one in np.ravel(value)]).reshape(np.shape(value))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, ClassVar, Literal, Self, get_args
 
 import numpy as np
@@ -10,6 +11,7 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
+from sim.spectrum import FloatArray
 from sim.stages import Charge
 
 Corner = Literal["top_left", "top_right", "bottom_left", "bottom_right"]
@@ -51,10 +53,14 @@ class AmplifierGlow(Effect):
         if self.glow_e_per_s == 0.0:
             return charge
         camera = charge.camera
-        side, end = self.corner.split("_")
-        down, across = np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float)
-        down = down if side == "top" else down[::-1]
-        across = across if end == "left" else across[::-1]
-        distance_mm = np.hypot(down[:, None], across[None, :]) * camera.pixel_pitch_um * 1e-3
-        glow = self.glow_e_per_s * np.exp(-distance_mm / self.reach_mm)
-        return charge.adding(dark_current=lambda e_per_s, temperature_c: e_per_s + glow)
+
+        @cache
+        def glow() -> FloatArray:
+            side, end = self.corner.split("_")
+            down, across = np.arange(camera.rows, dtype=float), np.arange(camera.cols, dtype=float)
+            down = down if side == "top" else down[::-1]
+            across = across if end == "left" else across[::-1]
+            distance_mm = np.hypot(down[:, None], across[None, :]) * camera.pixel_pitch_um * 1e-3
+            return np.asarray(self.glow_e_per_s * np.exp(-distance_mm / self.reach_mm))
+
+        return charge.adding(dark_current=lambda e_per_s, temperature_c: e_per_s + glow())

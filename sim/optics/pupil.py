@@ -301,7 +301,7 @@ def _mean(
     return np.where(share < 1.0, ratio, 1.0)
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=1024)
 def _mean_of_few(
     share: bytes, cos: bytes, sin: bytes, wavelength_um: float, bend: Wavefront
 ) -> FloatArray | ComplexArray:
@@ -388,7 +388,7 @@ def _to_series(count: int) -> FloatArray:
     return np.asarray(table)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=4096)
 def _series(angle: float, wavelength_um: float, bend: Wavefront) -> ComplexArray:
     """Chebyshev's expansion of the ratio in one direction over the share of the cutoff: smooth, so that few terms do."""
     count = 16

@@ -148,14 +148,20 @@ class MeasurementModel:
         acting = self._numbered((*self.always, *effects))
         return np.concatenate([self._prediction(i, acting).mean for i in range(len(self.blocks))])
 
-    def nuisance_jacobian(self, effects: Effects = ()) -> dict[str, FloatArray]:
-        """Columns (n,) of the Jacobian by every nuisance parameter, per prior standard deviation. One that several
-        blocks name is one column."""
-        columns = dict(self.unstated_jacobian)
+    def nuisance_jacobian(
+        self, effects: Effects = (), without: frozenset[str] = frozenset()
+    ) -> dict[str, FloatArray]:
+        """Columns (n,) of the Jacobian by every nuisance parameter that isn't in `without`, per prior standard
+        deviation. One that several blocks name is one column."""
+        columns = {name: column for name, column in self.unstated_jacobian.items() if name not in without}
         acting = self._numbered((*self.always, *effects))
         for index, at in enumerate(self.slices):
             for name, column in self._prediction(index, acting).jacobian.items():
-                columns.setdefault(name, np.zeros(len(self.value)))[at] = column
+                if name in without:
+                    continue
+                if name not in columns:
+                    columns[name] = np.zeros(len(self.value))
+                columns[name][at] = column
         return columns
 
     @cached_property
@@ -166,7 +172,7 @@ class MeasurementModel:
 
     def _shared_jacobian(self, effects: Effects) -> FloatArray:
         """The Jacobian by nuisance parameters of several blocks, (n, k)."""
-        columns = [c for name, c in self.nuisance_jacobian(effects).items() if name not in self._single_block_nuisances]
+        columns = list(self.nuisance_jacobian(effects, self._single_block_nuisances).values())
         return np.column_stack(columns) if columns else np.zeros((len(self.value), 0))
 
     # --- distributions -----------------------------------------------------------------------------------------------

@@ -88,7 +88,8 @@ def chart_block(study: Study) -> Block:
         dark = noise.dark_dn_per_s * exposures + np.array([more(p.captures[0]) for p in points])
         out = model.response(electrons + dark / noise.gain)
         lit = out * noise.gain - dark
-        shift = np.array([study.offset(p.captures[0], effects) for p in points])
+        offset = study.offset(effects)
+        shift = np.array([offset(p.captures[0]) for p in points])
         jacobian = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
         jacobian |= {k: v * lit / np.maximum(rates, 1e-30) for k, v in curves.jacobian(effects).items()}
         jacobian["chart:scale"] = CHART_SCALE_STD * lit

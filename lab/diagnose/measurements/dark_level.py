@@ -11,7 +11,7 @@ import numpy as np
 from lab.capture_kinds.base import Capture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import DarkStatistics, conditions, dark_frames
-from lab.diagnose.measurements.line_means import line_mean_jacobian
+from lab.diagnose.measurements.line_means import LineMeans
 from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
 from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES
 from lab.diagnose.measurements.study import Study
@@ -63,15 +63,15 @@ def dark_level_block(study: Study) -> Block:
     exposures = np.array([c.exposure_s for c, *_ in captures])
     noise, gain = study.noise, study.noise.gain
     base = noise.black + noise.dark_dn_per_s * exposures
+    lines = LineMeans(study, [(c, None) for c, *_ in captures])
 
     def predict(effects: Effects) -> Prediction:
-        mean = base + np.array([study.offset(c, effects) for c, *_ in captures])
-        more = added_dark_dn(study, effects)
+        offset, more, carried = study.offset(effects), added_dark_dn(study, effects), study.carried_e(effects)
+        mean = base.copy()
         for i, (capture, _, _) in enumerate(captures):
-            carried = np.mean([study.carried_e(capture, c, effects) for c in study.channels])
-            mean[i] += more(capture) + gain * float(carried)
-        lines = line_mean_jacobian(study, [(c, None) for c, *_ in captures], effects)
-        return Prediction(mean, study.free_offsets(exposures) | lines)
+            lag_e = np.mean([carried(capture, c) for c in study.channels])
+            mean[i] += offset(capture) + more(capture) + gain * float(lag_e)
+        return Prediction(mean, study.free_offsets(exposures) | lines.jacobian(effects))
 
     # codes as coarse as the noise move a mean, depending on where it lies between two of them
     coarse = np.array([_rounding_dn(f) for f in frames for _ in f.condition.captures])

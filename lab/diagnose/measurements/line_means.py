@@ -7,7 +7,7 @@ odd lines S(1/2) / n. In a mosaic, channels on the same lines share both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -18,27 +18,47 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
+#: Strengths of a disturbance whose columns are kept.
+MOST_KEPT = 16
 
-def line_mean_jacobian(
-    study: Study, points: Sequence[tuple[Capture, str | None]], effects: Effects
-) -> dict[str, FloatArray]:
-    """Jacobian (points,) of means by the disturbances that the lines of each capture have in the mean, per standard deviation, DN.
 
-    `points`: capture and channel of every mean, no channel: of the whole frame. Nothing without effects that disturb lines.
-    """
-    columns: dict[str, FloatArray] = {}
-    for one in Uniform(study.camera, effects).lines:
-        count = study.camera.rows if one.lines == "rows" else study.camera.cols
-        for name, frequency in (("mean", 0.0), ("odd", 0.5)):
-            std_dn = study.noise.gain * float(np.sqrt(one.spectrum_e2(np.array([frequency]), fixed=False)[0] / count))
-            if std_dn == 0.0:
-                continue
-            sign = np.array([1.0 if name == "mean" else _even_over_odd(study, one.lines, c) for _, c in points])
-            for capture in dict.fromkeys(capture.id for capture, _ in points):
-                mine = np.array([c.id == capture for c, _ in points])
-                if np.any(sign[mine]):
-                    columns[f"{one.lines}:{name}:{capture}"] = std_dn * sign * mine
-    return columns
+class LineMeans:
+    """Jacobian of a list of means by the disturbances that the lines of each capture have in them."""
+
+    def __init__(self, study: Study, points: Sequence[tuple[Capture, str | None]]) -> None:
+        """`points`: capture and channel of every mean, no channel: of the whole frame."""
+        self._study = study
+        self._channels = [channel for _, channel in points]
+        at: dict[str, list[int]] = {}
+        for number, (capture, _) in enumerate(points):
+            at.setdefault(capture.id, []).append(number)
+        self._at = {name: np.array(numbers) for name, numbers in at.items()}
+        self._kept: dict[tuple[str, str, float], dict[str, FloatArray]] = {}
+
+    def jacobian(self, effects: Effects) -> dict[str, FloatArray]:
+        """Columns (points,), per standard deviation, DN. Nothing without effects that disturb lines."""
+        columns: dict[str, FloatArray] = {}
+        camera, gain = self._study.camera, self._study.noise.gain
+        for one in Uniform(camera, effects).lines:
+            count = camera.rows if one.lines == "rows" else camera.cols
+            for name, frequency in (("mean", 0.0), ("odd", 0.5)):
+                std_dn = gain * float(np.sqrt(one.spectrum_e2(np.array([frequency]), fixed=False)[0] / count))
+                key = one.lines, name, std_dn
+                if std_dn > 0.0 and key not in self._kept:
+                    if len(self._kept) > MOST_KEPT:
+                        self._kept.clear()
+                    self._kept[key] = dict(self._of_captures(*key))
+                columns |= self._kept.get(key, {})
+        return columns
+
+    def _of_captures(self, lines: str, name: str, std_dn: float) -> Iterator[tuple[str, FloatArray]]:
+        sign = {c: 1.0 if name == "mean" else _even_over_odd(self._study, lines, c) for c in {*self._channels}}
+        change = std_dn * np.array([sign[c] for c in self._channels])
+        for capture, mine in self._at.items():
+            if np.any(change[mine]):
+                column = np.zeros(len(change))
+                column[mine] = change[mine]
+                yield f"{lines}:{name}:{capture}", column
 
 
 def _even_over_odd(study: Study, lines: str, channel: str | None) -> float:

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from lab.capture_kinds.base import Capture
 from lab.capture_kinds.flat import FlatCapture
 from lab.diagnose.measurements.block import LEVEL_REACH, Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.flat_light import FlatLight, reading, relative_rates
 from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.line_means import line_mean_jacobian
 from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.diagnose.measurements.repeatability import level_std, weighted_median
 from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.uniform_levels import UniformLevels
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
 from sim.spectrum import FloatArray
-from sim.uniform import LEVEL, SPECTRAL, Uniform, electron_rate
+from sim.uniform import LEVEL, SPECTRAL, electron_rate
 
 LEVEL_FLOOR = 1.0e-4  # of a level, one for its repeats: non-linearity below what a linear camera may have, and rounding
 READING_COLOUR_STD = 5e-4  # of a lamp's reading, by channel: the radiometer's noise by wavelength
@@ -63,34 +61,22 @@ def linearity_block(study: Study) -> Block:
         rate[pair] = typical / noise.gain / float(study.field.light.mean())
     covariance = _level_covariance(study, study.flat_levels(), points, signal)
 
+    levels = UniformLevels(study, [(c, channel) for c, channel, *_ in points])
+    lights = [of[c.id] for c in levels.captures]
+    baseline = {c: np.array([rate.get((one.lamp, c), 0.0) for one in lights]) for c in study.channels}
+    of_lamp = {(lamp, channel): np.array([k == (lamp, channel) for k in key]) for lamp, channel in rate}
+    of_reading = _of_readings(study, [of[c.id] for c, *_ in points], [channel for _, channel, *_ in points])
+
     def predict(effects: Effects) -> Prediction:
         changed = _changed(study, readings, relative, effects)
-        model, beside = Uniform(study.camera, effects), beside_light_dn(study, effects)
-        field = model.field(study.field)
-        mean, lit = np.empty(len(points)), np.empty(len(points))
-        done: dict[str, dict[str, float]] = {}
-        for i, (capture, channel, _, _) in enumerate(points):
-            if capture.id not in done:
-                light, elapsed = of[capture.id], study.elapsed_s(capture)
-                rates = {
-                    c: rate[light.lamp, c] * changed[light.name, c] for c in study.channels if (light.lamp, c) in rate
-                }
-                collected = model.electrons(rates, capture.exposure_s, field=field, elapsed_s=elapsed)
-                done[capture.id] = model.mean_dn(collected)
-            lit[i] = done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s
-            mean[i] = done[capture.id][channel] + beside(capture, channel)
+        rates = {c: level * np.array([changed[one.name, c] for one in lights]) for c, level in baseline.items()}
+        light_dn = levels.of_light_dn(effects, rates)
+        lit = light_dn - noise.dark_dn_per_s * exposures
         jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
-        jacobian |= line_mean_jacobian(study, [(c, channel) for c, channel, *_ in points], effects)
-        for lamp, channel in rate:
-            jacobian[f"rate:{lamp}:{channel}"] = np.where([k == (lamp, channel) for k in key], 0.05 * lit, 0.0)
-        if len(readings) > len({one.lamp for one in readings}):
-            for one in readings:
-                read_there = np.array([of[c.id] == one for c, *_ in points])
-                jacobian[f"reading:{one.name}"] = np.where(read_there, RADIOMETER_STD * lit, 0.0)
-                for channel in study.channels if len(study.channels) > 1 and one.path is not None else ():
-                    mine = read_there & np.array([c == channel for _, c, *_ in points])
-                    jacobian[f"reading:{one.name}:{channel}"] = np.where(mine, READING_COLOUR_STD * lit, 0.0)
-        return Prediction(mean, jacobian)
+        jacobian |= levels.lines.jacobian(effects)
+        jacobian |= {f"rate:{lamp}:{channel}": 0.05 * lit * mine for (lamp, channel), mine in of_lamp.items()}
+        jacobian |= {name: std * lit * mine for name, (std, mine) in of_reading.items()}
+        return Prediction(light_dn + levels.beside_light_dn(effects), jacobian)
 
     return Block(
         measurement=PHOTON_TRANSFER, reach=LEVEL_REACH, along=np.log(np.maximum(signal, 1.0)), value=value, covariance=covariance,
@@ -115,16 +101,20 @@ def _changed(
     return changed
 
 
-def beside_light_dn(study: Study, effects: Effects) -> Callable[[Capture, str], float]:
-    """DN of a capture's mean by channel that are neither of light nor of the camera's own dark current: black level, image lag,
-    offsets, additional dark current."""
-    more = added_dark_dn(study, effects)
-
-    def beside(capture: Capture, channel: str) -> float:
-        lag_dn = study.noise.gain * study.carried_e(capture, channel, effects)
-        return study.noise.black + lag_dn + study.offset(capture, effects) + more(capture)
-
-    return beside
+def _of_readings(study: Study, lights: list[FlatLight], channels: list[str]) -> dict[str, tuple[float, np.ndarray]]:
+    """Relative standard deviations of the lamps' readings, and of each in every channel, by the name of their nuisance parameter, with
+    masks (n,) of the means that they move. Nothing where every lamp was read once: that is in its rate."""
+    found: dict[str, tuple[float, np.ndarray]] = {}
+    readings = list({one.name: one for one in lights}.values())
+    if len(readings) == len({one.lamp for one in readings}):
+        return found
+    for one in readings:
+        read_there = np.array([light == one for light in lights])
+        found[f"reading:{one.name}"] = RADIOMETER_STD, read_there
+        for channel in study.channels if len(study.channels) > 1 and one.path is not None else ():
+            mine = read_there & np.array([c == channel for c in channels])
+            found[f"reading:{one.name}:{channel}"] = READING_COLOUR_STD, mine
+    return found
 
 
 def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:

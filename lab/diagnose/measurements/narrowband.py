@@ -12,14 +12,14 @@ from lab.capture_kinds.narrowband import NarrowbandCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.curves import CurveJacobian
 from lab.diagnose.measurements.held_out import held_out_of
-from lab.diagnose.measurements.line_means import line_mean_jacobian
-from lab.diagnose.measurements.linearity import RADIOMETER_STD, beside_light_dn
+from lab.diagnose.measurements.linearity import RADIOMETER_STD
 from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES, acting
 from lab.diagnose.measurements.study import Study
+from lab.diagnose.measurements.uniform_levels import UniformLevels
 from lab.errors import NotDetermined
 from lab.fit.rounding import rounding_std_dn
 from sim.spectrum import FloatArray, Spectrum
-from sim.uniform import LEVEL, SPECTRAL, Uniform
+from sim.uniform import LEVEL, SPECTRAL
 
 NARROWBAND_FLOOR = 1e-4  # of a level, each channel by itself, one for its repeats
 
@@ -66,10 +66,13 @@ def narrowband_block(study: Study) -> Block:
     )
     covariance = _narrowband_covariance(study, points, signal, curves)
 
+    levels = UniformLevels(study, [(c, channel) for c, channel, *_ in points])
+    light_of = np.array([every.index(path) for path in {c.id: c.radiance for c, *_ in points}.values()])
+
     def jacobian_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
         """By the nuisance parameters; `share`: DN over electrons a second on axis."""
         jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
-        jacobian |= line_mean_jacobian(study, [(c, channel) for c, channel, *_ in points], effects)
+        jacobian |= levels.lines.jacobian(effects)
         return jacobian | {k: v * share for k, v in curves.jacobian(effects).items()}
 
     def predict(effects: Effects) -> Prediction:
@@ -80,22 +83,10 @@ def narrowband_block(study: Study) -> Block:
             return Prediction(
                 noise.black + noise.dark_dn_per_s * exposures + share * rates, jacobian_of(effects, share)
             )
-        lit = dict(zip(every, whole.rates(effects).reshape(len(every), len(known)), strict=True))
-        model = Uniform(study.camera, effects)
-        field = model.field(study.field)
-        beside = beside_light_dn(study, effects)
-        mean, share = np.empty(len(points)), np.empty(len(points))
-        done: dict[str, dict[str, float]] = {}
-        for i, (capture, channel, _, _) in enumerate(points):
-            if capture.id not in done:
-                by_channel = dict(zip(known, lit[capture.radiance].tolist(), strict=True))
-                electrons = model.electrons(
-                    by_channel, capture.exposure_s, field=field, elapsed_s=study.elapsed_s(capture)
-                )
-                done[capture.id] = model.mean_dn(electrons)
-            mean[i] = done[capture.id][channel] + beside(capture, channel)
-            share[i] = (done[capture.id][channel] - noise.dark_dn_per_s * capture.exposure_s) / max(rates[i], 1e-30)
-        return Prediction(mean, jacobian_of(effects, share))
+        lit = whole.rates(effects).reshape(len(every), len(known))[light_of]
+        light_dn = levels.of_light_dn(effects, dict(zip(known, lit.T, strict=True)))
+        share = (light_dn - noise.dark_dn_per_s * exposures) / np.maximum(rates, 1e-30)
+        return Prediction(light_dn + levels.beside_light_dn(effects), jacobian_of(effects, share))
 
     return Block(
         measurement=NARROWBAND, reach=25.0, value=value, covariance=covariance,

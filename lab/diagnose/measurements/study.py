@@ -200,22 +200,27 @@ class Study:
         found = [c for c in group if c.id in self._before and self._before[c.id].id in names]
         return found if len(found) > 1 else list(group)
 
-    def carried_e(self, capture: Capture, channel: str, effects: Effects) -> float:
-        """By how many electrons image lag changes a channel's mean, given what was read of it and of the capture
+    def carried_e(self, effects: Effects) -> Callable[[Capture, str], float]:
+        """By how many electrons image lag changes a channel's mean of a capture, given what was read of it and of the capture
         before: read is y_t = (1 - q) x_t + q y_(t-1), of which q (y_(t-1) - y_t) is new. The first one follows empty pixels."""
         if not acting(effects, LAG):
-            return 0.0
+            return lambda capture, channel: 0.0
         model = Uniform(self.camera, effects)
-        before = self._before.get(capture.id)
-        read, left = (
-            max(self.levels(c).whole[channel] - self.noise.black, 0.0) / self.noise.gain if c is not None else 0.0
-            for c in (capture, before)
-        )
-        return float(np.mean(model.lag_e(np.array([left])) - model.lag_e(np.array([read]))))
 
-    def offset(self, capture: Capture, effects: Effects) -> float:
-        elapsed = self.elapsed_s(capture)
-        return Uniform(self.camera, effects).offset_dn(elapsed, capture.temperature_c)
+        def carried(capture: Capture, channel: str) -> float:
+            before = self._before.get(capture.id)
+            read, left = (
+                max(self.levels(c).whole[channel] - self.noise.black, 0.0) / self.noise.gain if c is not None else 0.0
+                for c in (capture, before)
+            )
+            return float(np.mean(model.lag_e(np.array([left])) - model.lag_e(np.array([read]))))
+
+        return carried
+
+    def offset(self, effects: Effects) -> Callable[[Capture], float]:
+        """DN that effects add to the black level of a capture."""
+        model = Uniform(self.camera, effects)
+        return lambda capture: model.offset_dn(self.elapsed_s(capture), capture.temperature_c)
 
     def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
         """Jacobian by black level and dark current, per prior standard deviation: that of their first guess."""

@@ -94,7 +94,7 @@ def _means(h: Hypothesis, light: Spectrum, kind: str, exposure_s: float, elapsed
     field = model.field(FieldPoints.of(h.camera))
     collected = model.electrons(rates, exposure_s, field=field, elapsed_s=elapsed_s)
     gain = h.camera.conversion_gain_dn_per_e
-    return {c: value / gain for c, value in model.mean_dn(collected).items()}
+    return {c: float(value) / gain for c, value in model.mean_dn(collected).items()}
 
 
 def _narrowband(camera: CameraModel) -> Iterator[Design]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.diagnose.measurements.line_means import line_mean_jacobian
+from lab.diagnose.measurements.line_means import LineMeans
 from lab.diagnose.measurements.linearity import linearity_block
 from sim.effects.row_noise import RowNoise
 from sim.sensor import mosaic
@@ -21,7 +21,7 @@ def test_means_scatter_as_drawn_rows_do(correlation: float) -> None:
     at = study(rendered(3))
     capture = at.recordings.captures("flat", "left")[0]
     effects = (RowNoise(noise_e=3.0, correlation=correlation),)
-    jacobian = np.array(list(line_mean_jacobian(at, [(capture, c) for c in at.channels], effects).values()))
+    jacobian = np.array(list(LineMeans(at, [(capture, c) for c in at.channels]).jacobian(effects).values()))
     rng, shape, step = np.random.default_rng(5), (at.camera.rows, at.camera.cols), mosaic.step(at.camera.cfa)
     noise = LineNoise("rows", 3.0, correlation)
     means = np.zeros((DRAWS, len(at.channels)))
