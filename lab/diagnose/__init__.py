@@ -5,22 +5,23 @@ measurements/   what is looked at: numbers with covariance, and how a model pred
 inference/      the measurement model; locate, score, search, weigh, name
 outcome/        what is told: result, improved model, next capture
 visibility.py   which measurements show each effect, and which effects are rivals
-side.py         the chain for one side; processes.py runs the sides at the same time
+side.py         the chain for one side; lab/side_processes.py runs the sides at the same time
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from lab.diagnose.outcome.merge_sides import merged
 from lab.diagnose.outcome.next_capture import Proposal
 from lab.diagnose.policy import DecisionPolicy
-from lab.diagnose.processes import in_processes
-from lab.diagnose.side import SideFindings, diagnose_side
+from lab.diagnose.side import diagnose_side
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult
+from lab.side_processes import in_processes
 from sim.camera import Side
 
 __all__ = ["DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
@@ -80,22 +81,23 @@ def examine(
         if progress is not None:
             progress(f"{text} ({side})", sum(shares.values()) / len(shares))
 
-    def alone(side: Side) -> SideFindings:
-        return diagnose_side(
+    tasks = {
+        side: partial(
+            diagnose_side,
             recordings,
             side,
             fit,
             cameras.get(side),
-            lambda text: report(side, text),
             policy=policy,
             pictures=pictures,
             bootstrap=bootstrap,
         )
-
-    if at_once and len(shares) > 1:
-        found = in_processes(recordings, fit, cameras, report, policy=policy, pictures=pictures, bootstrap=bootstrap)
+        for side in recordings.sides
+    }
+    if at_once and len(tasks) > 1:
+        found = [*in_processes(recordings, tasks, report, "diagnose").values()]
     else:
-        found = [alone(side) for side in recordings.sides]
+        found = [task(partial(report, side)) for side, task in tasks.items()]
     if progress is not None:
         progress("done", 1.0)
     improved = {findings.side: findings.improved for findings in found if findings.improved is not None}

@@ -6,83 +6,58 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
+from lab.side_processes import in_processes
 from sim.camera import Side
 
 #: Called with what was just done and the share of the work that is done, 0..1; from any thread, one call at a time.
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
-WORKERS = 2
 STEPS = ("noise", "spectral", "mtf", "psf", "geometry")
+#: Pixels of all frames from which on a process a side is worth its start, which takes 1.5 s: as long as the fits of so many.
+WORTH_PROCESSES_PX = 2e7
 
 
-class _Run:
-    """State common to the steps of one fit: the skipped ones, and the number of those done."""
+@dataclass(frozen=True)
+class SideFit:
+    """What was fitted of one side, and the steps that its recordings don't determine."""
 
-    def __init__(self, total: int, progress: Progress | None) -> None:
-        self.total, self.progress = total, progress
-        self.done = 0
-        self.skipped: list[Skipped] = []
-        self.lock = threading.Lock()
-
-    def step(self, name: str, side: Side | None, work: Callable[[], T]) -> T | None:
-        """The result of `work`, or None and a line in `skipped` where the recordings don't determine it."""
-        result: T | None = None
-        try:
-            result = work()
-        except NotDetermined as refused:
-            with self.lock:
-                self.skipped.append(Skipped(step=refused.step, reason=refused.reason, side=side))
-        with self.lock:
-            self.done += 1
-            if self.progress:
-                self.progress(f"{name} of the {side} camera" if side else name, self.done / self.total)
-        return result
+    camera: CameraFit
+    skipped: tuple[Skipped, ...]
 
 
 def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None) -> FitResult:
     """Run every fit on every side, and the stereo pair. What the recordings don't determine is in `skipped`, with the
     reason.
 
-    Both sides, and the geometry and the radiometry of each side, run at the same time. `progress` is called after each
-    step.
+    Several sides with many frames are fitted at the same time, each in a process of its own. `progress` is called after each step.
     """
-    from lab.fit.geometry.recordings import fit_geometry
-    from lab.fit.mtf.recordings import fit_mtf
-    from lab.fit.noise.recordings import fit_noise
-    from lab.fit.psf.recordings import fit_psf_field
-    from lab.fit.spectral.recordings import fit_spectral
     from lab.fit.stereo import fit_stereo
 
     sides = recordings.sides
-    run = _Run(len(STEPS) * len(sides) + 1, progress)
+    total, done = len(STEPS) * len(sides) + 1, 0
+    lock = threading.Lock()
 
-    def radiometry(side: Side) -> CameraFit:
-        levels = run.step("noise", side, lambda: fit_noise(recordings, side))
-        kernels = run.step("psf", side, lambda: fit_psf_field(recordings, side))
-        return CameraFit(
-            noise=levels,
-            spectral=run.step("spectral", side, lambda: fit_spectral(recordings, side, levels)),
-            mtf=run.step("mtf", side, lambda: fit_mtf(recordings, side, levels)) or (),
-            psf=kernels.kernels if kernels else (),
-            psf_field=kernels.parts if kernels else (),
-            psf_symmetry=kernels.symmetry if kernels else None,
-        )
+    def told(side: Side | None, step: str) -> None:
+        nonlocal done
+        with lock:
+            done += 1
+            if progress:
+                progress(f"{step} of the {side} camera" if side else step, done / total)
 
-    def pinhole(side: Side) -> GeometryFit | None:
-        return run.step("geometry", side, lambda: fit_geometry(recordings, side))
-
-    with ThreadPoolExecutor(WORKERS, thread_name_prefix="fit") as pool:
-        radiometries: dict[Side, Future[CameraFit]] = {side: pool.submit(radiometry, side) for side in sides}
-        pinholes = {side: pool.submit(pinhole, side) for side in sides}
-        cameras = {
-            side: radiometries[side].result().model_copy(update={"geometry": pinholes[side].result()}) for side in sides
-        }
+    if len(sides) > 1 and _pixels(recordings) > WORTH_PROCESSES_PX:
+        tasks = {side: partial(fit_side, recordings, side) for side in sides}
+        fitted = in_processes(recordings, tasks, told, "fit")
+    else:
+        fitted = {side: fit_side(recordings, side, partial(told, side)) for side in sides}
+    cameras = {side: one.camera for side, one in fitted.items()}
 
     def pair() -> StereoFit:
         both = {side: camera.geometry for side, camera in cameras.items() if camera.geometry is not None}
@@ -91,14 +66,68 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
             raise NotDetermined("stereo", f"no geometry of the {missing} side; capture charuco poses with both cameras")
         return fit_stereo(recordings, both["left"], both["right"])
 
-    found = run.step("stereo", None, pair)
-    order = {side: number for number, side in enumerate((*sides, None))}
-    steps = {step: number for number, step in enumerate((*STEPS, "stereo"))}
+    found, refused = _step(pair, None)
+    told(None, "stereo")
     return FitResult(
         source=recordings.source,
         cameras=cameras,
         stereo=found,
-        skipped=tuple(  # independent of the order of the threads
-            sorted(run.skipped, key=lambda item: (order[item.side], steps.get(item.step, len(steps))))
-        ),
+        skipped=(*(skipped for one in fitted.values() for skipped in one.skipped), *refused),
+    )
+
+
+def fit_side(recordings: RecordingSet, side: Side, told: Callable[[str], None]) -> SideFit:
+    """Every fit of one side; geometry beside radiometry, in a thread of its own. `told` is called with each step that was done."""
+    from lab.fit.geometry.recordings import fit_geometry
+    from lab.fit.mtf.recordings import fit_mtf
+    from lab.fit.noise.recordings import fit_noise
+    from lab.fit.psf.recordings import fit_psf_field
+    from lab.fit.spectral.recordings import fit_spectral
+
+    skipped: list[Skipped] = []
+
+    def step(name: str, work: Callable[[], T]) -> T | None:
+        result, refused = _step(work, side)
+        skipped.extend(refused)
+        told(name)
+        return result
+
+    def pinhole() -> GeometryFit | None:
+        return step("geometry", lambda: fit_geometry(recordings, side))
+
+    with ThreadPoolExecutor(1, thread_name_prefix="fit") as pool:
+        geometry = pool.submit(pinhole)
+        levels = step("noise", lambda: fit_noise(recordings, side))
+        kernels = step("psf", lambda: fit_psf_field(recordings, side))
+        camera = CameraFit(
+            noise=levels,
+            spectral=step("spectral", lambda: fit_spectral(recordings, side, levels)),
+            mtf=step("mtf", lambda: fit_mtf(recordings, side, levels)) or (),
+            psf=kernels.kernels if kernels else (),
+            psf_field=kernels.parts if kernels else (),
+            psf_symmetry=kernels.symmetry if kernels else None,
+            geometry=geometry.result(),
+        )
+    # independent of the order of the threads; a fit may name a part of its step
+    order = {name: number for number, name in enumerate(STEPS)}
+    return SideFit(camera, tuple(sorted(skipped, key=lambda item: order.get(item.step, len(order)))))
+
+
+def _step(work: Callable[[], T], side: Side | None) -> tuple[T | None, tuple[Skipped, ...]]:
+    """The result of a step; None and why it was skipped where the recordings don't determine it."""
+    try:
+        return work(), ()
+    except NotDetermined as refused:
+        return None, (Skipped(step=refused.step, reason=refused.reason, side=side),)
+
+
+def _pixels(recordings: RecordingSet) -> float:
+    """Of all frames; of a side whose size isn't stated, none."""
+    return float(
+        sum(
+            len(recordings.captures(side=side))
+            * (recordings.camera(side).rows or 0)
+            * (recordings.camera(side).cols or 0)
+            for side in recordings.sides
+        )
     )

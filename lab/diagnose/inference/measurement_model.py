@@ -148,9 +148,7 @@ class MeasurementModel:
         acting = self._numbered((*self.always, *effects))
         return np.concatenate([self._prediction(i, acting).mean for i in range(len(self.blocks))])
 
-    def nuisance_jacobian(
-        self, effects: Effects = (), without: frozenset[str] = frozenset()
-    ) -> dict[str, FloatArray]:
+    def nuisance_jacobian(self, effects: Effects = (), without: frozenset[str] = frozenset()) -> dict[str, FloatArray]:
         """Columns (n,) of the Jacobian by every nuisance parameter that isn't in `without`, per prior standard
         deviation. One that several blocks name is one column."""
         columns = {name: column for name, column in self.unstated_jacobian.items() if name not in without}

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import lab.fit
 from lab.errors import InputError, NotDetermined
 from lab.fit import fit_recording_set
 from lab.formats.recording_set import RecordingSet
@@ -137,3 +138,14 @@ def test_real_steps_refuse_frames_of_noise_without_falling_over(small_set: Calla
     assert all(";" in item.reason or ":" in item.reason or len(item.reason) > 10 for item in result.skipped)
     noise = result.cameras["left"].noise
     assert noise is None or np.isfinite(noise.conversion_gain_dn_per_e or 0.0)
+
+
+def test_sides_in_processes_give_the_same_fit(
+    small_set: Callable[..., RecordingSet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[float] = []
+    here = fit_recording_set(small_set())
+    monkeypatch.setattr(lab.fit, "WORTH_PROCESSES_PX", 0.0)
+    assert fit_recording_set(small_set(), lambda text, share: told.append(share)) == here
+    assert told == sorted(told)
+    assert (len(told), told[-1]) == (11, 1.0)

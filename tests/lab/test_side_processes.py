@@ -116,4 +116,4 @@ def _children(of: int | None = None) -> list[int]:
     found = []
     for task in Path(f"/proc/{parent}/task").iterdir():
         found += [int(child) for child in (task / "children").read_text().split()]
-    return [child for child in found if b"lab.diagnose" in Path(f"/proc/{child}/cmdline").read_bytes()]
+    return [child for child in found if b"lab.side_processes" in Path(f"/proc/{child}/cmdline").read_bytes()]

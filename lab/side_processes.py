@@ -1,0 +1,167 @@
+"""The sides of a recording set at the same time, each in an OS process of its own, as Python computes in one thread at
+a time.
+
+A process is `python -m lab.side_processes`. It receives its task on standard input, and sends progress and findings as
+pickles on standard output. Unlike a pool's worker it needs nothing of the caller's main module, may be started by a
+pool's worker, and ends with the process that started it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+from lab.errors import InputError
+from lab.formats.recording_set import RecordingSet
+from sim.camera import Side
+
+#: What is found of one side. It and the task have to be picklable: functions by their module's name, results by value.
+F = TypeVar("F")
+#: Computes a side; the argument is called with progress.
+Task = Callable[[Callable[[Any], None]], F]
+
+#: How often (s) a waiting main thread wakes to let Python run signal handlers.
+WAKE_S = 0.2
+#: Two processes on two cores: a library's own threads would only get into each other's way.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True)
+class _Found(Generic[F]):
+    """The end of a task, told apart from its progress."""
+
+    findings: F
+
+
+def in_processes(
+    recordings: RecordingSet, tasks: Mapping[Side, Task[F]], report: Callable[[Side, Any], None], doing: str
+) -> dict[Side, F]:
+    """The findings of every side. `tasks` are partials of functions that a module has by name; `recordings` are those that they read.
+
+    `report` is called in the caller's thread with what a task tells. An exception in it, or in a process, ends all processes. `doing`:
+    the command, for messages. Raises InputError where a process was ended from outside, and what a task raises.
+    """
+    recordings.let_go()  # every process reads its own frames
+    said: queue.SimpleQueue[tuple[Side, Any]] = queue.SimpleQueue()
+    found: dict[Side, F] = {}
+    with contextlib.ExitStack() as stack:
+        for side, task in tasks.items():
+            # registered before it starts: an interrupt in between must find it
+            stack.enter_context(_Process(side, task, said, doing)).start()
+        while len(found) < len(tasks):
+            try:
+                side, what = said.get(timeout=WAKE_S)
+            except queue.Empty:
+                continue
+            if isinstance(what, BaseException):
+                raise what
+            if isinstance(what, _Found):
+                found[side] = what.findings
+            else:
+                report(side, what)
+    return {side: found[side] for side in tasks}
+
+
+class _Process:
+    """One side's process, and a thread that reads its output. Leaving the context ends both."""
+
+    def __init__(self, side: Side, task: Task[Any], said: queue.SimpleQueue[tuple[Side, Any]], doing: str) -> None:
+        self._side, self._task, self._said, self._doing = side, task, said, doing
+
+        self._process: subprocess.Popen[bytes] | None = None
+        self._listener = threading.Thread(target=self._listen, name=f"{doing}-{side}", daemon=True)
+
+    def __enter__(self) -> _Process:
+        return self
+
+    def start(self) -> None:
+        # Of its own session: Ctrl-C is for the caller, who ends this process.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "lab.side_processes"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | ONE_THREAD,
+            start_new_session=True,
+        )
+        self._listener.start()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._process is None:
+            return
+        if kind is not None:
+            self._process.kill()
+        self._process.wait()
+        if self._listener.is_alive():
+            self._listener.join()
+
+    def _listen(self) -> None:
+        """Send the task; put what the process sends into the queue until its findings have come."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError), self._process.stdin as to:
+            pickle.dump(self._task, to, pickle.HIGHEST_PROTOCOL)
+        with self._process.stdout as heard:
+            try:
+                while True:
+                    what = pickle.load(heard)
+                    self._said.put((self._side, what))
+                    if isinstance(what, _Found | BaseException):
+                        return
+            except (EOFError, pickle.UnpicklingError):
+                ended = self._process.wait()
+                by = f"signal {-ended}" if ended < 0 else f"exit code {ended}"
+                self._said.put((self._side, InputError(
+                    f"{self._doing}: the process for the {self._side} side ended with {by}; where memory was short, free about 1 GB a side "
+                    "and start again"
+                )))  # fmt: skip
+
+
+# --- the process ---------------------------------------------------------------------------------------------------------
+
+
+def serve() -> None:
+    """Read a task from standard input, carry it out, and write progress and findings as pickles to standard output."""
+    with os.fdopen(os.dup(1), "wb") as to:
+        os.dup2(2, 1)  # what a library prints goes to standard error
+
+        def say(what: Any) -> None:
+            to.write(pickle.dumps(what, pickle.HIGHEST_PROTOCOL))
+            to.flush()
+
+        try:
+            task = pickle.load(sys.stdin.buffer)
+        except (EOFError, pickle.UnpicklingError):
+            os._exit(1)  # the caller was interrupted before it had sent the task
+        try:
+            say(_Found(task(say)))
+        except BrokenPipeError:
+            os._exit(1)  # the caller is gone
+        except Exception as error:
+            error.add_note(traceback.format_exc())
+            say(_sendable(error))
+
+
+def _sendable(error: Exception) -> Exception:
+    """The error itself where it can be pickled, else one with the same text."""
+    try:
+        return error if isinstance(pickle.loads(pickle.dumps(error)), Exception) else RuntimeError(str(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+
+
+if __name__ == "__main__":
+    # The module by its name, not as `__main__`: what it sends is unpickled by the caller.
+    from lab.side_processes import serve as serve_task
+
+    serve_task()
