@@ -41,6 +41,9 @@ RADII, ANGLES, PAD = 256, 256, 8
 IN_CACHE = 20_000
 #: A polar grid is fine enough where the last coefficients of its expansion are below this.
 SETTLED = 1e-7
+#: Sizes of path errors, as the largest coefficient in waves, are tabulated by octaves: up to `FIRST_WAVES`, to twice that, and so on
+#: to the octave `LAST_OCTAVE`; each at `SIZES` sizes at most.
+FIRST_WAVES, LAST_OCTAVE, SIZES = 0.125, 3, 32
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,16 @@ class Wavefront:
             ):
                 return False
         return True
+
+    @cached_property
+    def size_um(self) -> float:
+        """Largest coefficient's magnitude."""
+        return max((abs(um) for *_, um in self.terms), default=0.0)
+
+    @cached_property
+    def shape(self) -> Wavefront:
+        """W over its size, to 12 digits: the same for errors that differ by their size alone."""
+        return Wavefront(tuple((i, j, float(f"{um / self.size_um:.12g}")) for i, j, um in self.terms))
 
     @cached_property
     def range_um(self) -> float:
@@ -388,14 +401,52 @@ def _to_series(count: int) -> FloatArray:
     return np.asarray(table)
 
 
-@lru_cache(maxsize=4096)
 def _series(angle: float, wavelength_um: float, bend: Wavefront) -> ComplexArray:
-    """Chebyshev's expansion of the ratio in one direction over the share of the cutoff: smooth, so that few terms do."""
-    count = 16
+    """Chebyshev's expansion of the ratio in one direction over the share of the cutoff: smooth, so that few terms do.
+
+    At a share and in a direction the ratio depends on the path error in waves alone: a table over its size serves all wavelengths,
+    f-numbers and sizes of an error of one shape.
+    """
+    waves = bend.size_um / wavelength_um
+    octave = max(int(np.ceil(np.log2(waves / FIRST_WAVES))), 0)
+    table = _octave(angle, bend.shape, octave) if octave <= LAST_OCTAVE else None
+    if table is None:
+        return _expanded(angle, bend.shape, waves)
+    low, high = _waves_of(octave)
+    return np.asarray(chebyshev.chebval(2.0 * (waves - low) / (high - low) - 1.0, table), complex)
+
+
+def _waves_of(octave: int) -> tuple[float, float]:
+    """Least and largest size in waves; the first octave begins at 0."""
+    high = FIRST_WAVES * 2.0**octave
+    return (0.5 * high if octave else 0.0), high
+
+
+@lru_cache(maxsize=1024)
+def _octave(angle: float, shape: Wavefront, octave: int) -> ComplexArray | None:
+    """Chebyshev's coefficients over the size in waves of those over the share, (sizes, shares); None where `SIZES` don't do."""
+    low, high = _waves_of(octave)
+    count = 8
+    while count <= SIZES:
+        node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+        series = [_expanded(angle, shape, float(low + 0.5 * (at + 1.0) * (high - low))) for at in node]
+        table = np.zeros((count, max(len(one) for one in series)), complex)
+        for k, one in enumerate(series):
+            table[k, : len(one)] = one
+        table = _to_series(count) @ table
+        if np.max(np.sum(np.abs(table[-2:]), axis=1)) < SETTLED:
+            return np.asarray(table)
+        count *= 2
+    return None
+
+
+def _expanded(angle: float, shape: Wavefront, waves: float) -> ComplexArray:
+    """The expansion over the share, of `waves` times a shape."""
+    bend, count = shape.scaled(waves), 16
     while True:
         node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
         cos, sin = np.full(count, np.cos(angle)), np.full(count, np.sin(angle))
-        value = _mean(0.5 * (node + 1.0), cos, sin, wavelength_um, bend)
+        value = _mean(0.5 * (node + 1.0), cos, sin, 1.0, bend)
         series = np.asarray(_to_series(count) @ value, complex)
         if np.max(np.abs(series[-3:])) < SETTLED or count >= 512:
             return series

@@ -7,7 +7,18 @@ import pytest
 from scipy import integrate
 
 from sim.optics.diffraction import diffraction_otf
-from sim.optics.pupil import Wavefront, noll_order, osa_order, pupil_otf, pupil_ratio, seidel, zernike
+from sim.optics.pupil import (
+    Wavefront,
+    _along,
+    _mean,
+    _octave,
+    noll_order,
+    osa_order,
+    pupil_otf,
+    pupil_ratio,
+    seidel,
+    zernike,
+)
 
 CUTOFF = 1 / (0.55 * 4.0)
 
@@ -172,3 +183,20 @@ def test_wavefronts_add_and_know_their_symmetry() -> None:
     assert [w.is_isotropic for w in (seidel(), seidel(spherical_um=1.0, defocus_um=2.0), zernike(6, 0))] == [True] * 3
     assert not any(w.is_isotropic for w in (both, zernike(2, 2), zernike(4, -4), Wavefront.of({(1, 1): 0.1})))
     assert all(seidel(astigmatism_um=a, astigmatism_deg=d).is_isotropic == (a == 0.0) for a, d in product((0.0, 0.1), (0.0, 20.0)))  # fmt: skip
+
+
+def test_one_table_serves_all_sizes_and_wavelengths_of_a_shape() -> None:
+    """The table's expansion against the overlap integrated anew: sizes in every octave of it and beyond, wavelengths at random."""
+    rng = np.random.default_rng(4)
+    share = np.linspace(0.05, 0.95, 19)
+    for waves in (0.03, 0.125, 0.2, 0.4, 0.9, 1.7):
+        wavelength_um = float(rng.uniform(0.4, 0.7))
+        bend = seidel(
+            coma_um=(0.8 * waves * wavelength_um, 0.6 * waves * wavelength_um), spherical_um=0.1 * wavelength_um
+        )
+        exact = _mean(share, np.full(19, np.cos(0.3)), np.full(19, np.sin(0.3)), wavelength_um, bend)
+        assert np.allclose(_along(share, 0.3, wavelength_um, bend), exact, atol=1e-6)
+    _octave.cache_clear()
+    for size_um in (0.02, 0.03, 0.06):
+        _along(share, 0.3, 0.5, seidel(spherical_um=size_um / 2))
+    assert _octave.cache_info().misses == 1
