@@ -44,6 +44,8 @@ VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
 #: Periods of combs that are looked at, in cycles a code.
 COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
 AROUND = 9  # pixels a side of a colour's plane, whose mean is the light's own course
+#: Width of the levels whose pixels are spread together, over the standard deviation of the noise.
+STEP_OF_LEVELS = 0.2
 PARTS = 4  # of the range of codes; each has a variance about the smooth curve of its own
 FINE = 8  # samples a code of the converter's law
 
@@ -151,13 +153,18 @@ def _expect(plane: Any, study: Study, expected: FloatArray) -> None:
     own = AROUND**2 / (AROUND**2 - 1.0)
     signal = max(float(surface.mean()) - study.noise.black, 1.0)
     variance = own * float(np.mean(np.square(plane - surface), dtype=float))
-    level, number = np.unique(np.rint(surface).astype(int), return_counts=True)
-    shift = np.bincount(
-        np.rint(surface).astype(int).ravel() - level[0], (surface - np.rint(surface)).ravel().astype(float)
-    )
-    for k, n in zip(level, number, strict=True):
-        middle = k + shift[k - level[0]] / n
-        sigma = np.sqrt(max(variance * max(middle - study.noise.black, 1.0) / signal, 1e-2))
+    # pixels of about one level together, in steps that are narrow beside the noise: their mean, and their variance on top of it
+    step = max(STEP_OF_LEVELS * np.sqrt(variance), 1.0)
+    above = surface.ravel().astype(float) - float(surface.min())
+    group = (above / step).astype(int)
+    number = np.bincount(group)
+    share = np.maximum(number, 1)
+    mean = np.bincount(group, above) / share
+    within = np.maximum(np.bincount(group, np.square(above)) / share - np.square(mean), 0.0)
+    for n, middle, added in zip(number, mean + float(surface.min()), within, strict=True):
+        if n == 0:
+            continue
+        sigma = np.sqrt(max(variance * max(middle - study.noise.black, 1.0) / signal + added, 1e-2))
         low, high = max(int(middle - 6.0 * sigma), 0), min(int(middle + 6.0 * sigma) + 1, len(expected) - 1)
         if low < high:
             edges = (np.arange(low, high + 2) - 0.5 - middle) / sigma

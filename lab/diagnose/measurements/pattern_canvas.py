@@ -157,39 +157,62 @@ class Canvas:
 
         Cells of whole pixels repeat their spectrum: what aliases is coherent with what doesn't.
         """
+        above = self._above(otf, fill_factor)
+        found = []
+        for edges in BEYOND_CY_PER_PX:
+            for side in (above.fx >= np.abs(above.fy), above.fx < np.abs(above.fy)):
+                parts = []
+                for low, end in pairwise(edges):
+                    part = np.where(above.between(low, end) & side, above.spectrum, 0.0)
+                    power = np.abs(part) ** 2
+                    if power.any():
+                        parts.append(BeyondPart.of(self._aliased(part, above.rows), above.fx, above.fy, power))
+                if parts:
+                    found.append(parts)
+        return found
+
+    def beyond_picture(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
+        """All of `beyond` together, at the pixels (rows, cols)."""
+        above = self._above(otf, fill_factor)
+        inside = above.between(BEYOND_CY_PER_PX[0][0], BEYOND_CY_PER_PX[-1][-1])
+        return self._aliased(np.where(inside, above.spectrum, 0.0), above.rows)
+
+    def _above(self, otf: CubicSpline, fill_factor: float) -> _Above:
         rows, cols = (OVERSAMPLE * n for n in self.shape)
         highest = min(float(otf.x[-1]), 0.5 * OVERSAMPLE)
         keep = np.abs(fft.fftfreq(rows, 1.0 / OVERSAMPLE)) < highest
         fy = fft.fftfreq(rows, 1.0 / OVERSAMPLE)[keep, None]
         fx = fft.rfftfreq(cols, 1.0 / OVERSAMPLE)[None, :]
         fx = fx[:, fx[0] < highest]
-        high = (
-            self.drawn[keep][:, : fx.shape[1]]
-            * otf(np.minimum(np.hypot(fy, fx), highest))
-            * aperture_otf(fx, fy, fill_factor)
-        )
+        radius = np.hypot(fy, fx)
+        high = self.drawn[keep][:, : fx.shape[1]] * otf(np.minimum(radius, highest)) * aperture_otf(fx, fy, fill_factor)
         high *= np.exp(1j * np.pi * fx * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fx / OVERSAMPLE)
         high *= np.exp(1j * np.pi * fy * (1.0 - 1.0 / OVERSAMPLE)) / np.sinc(fy / OVERSAMPLE)
-        largest, across = np.maximum(np.abs(fy), fx), fx >= np.abs(fy)
-        passes = np.hypot(fy, fx) < highest
-        found = []
-        for edges in BEYOND_CY_PER_PX:
-            for side in (across, ~across):
-                parts = []
-                for low, end in pairwise(edges):
-                    part = np.where((largest >= low) & (largest < end) & passes & side, high, 0.0)
-                    power = np.abs(part) ** 2
-                    if not power.any():
-                        continue
-                    spread = np.zeros((rows, part.shape[1]), complex)
-                    spread[keep] = part
-                    folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
-                    folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
-                    picture = np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
-                    parts.append(BeyondPart.of(picture, fx, fy, power))
-                if parts:
-                    found.append(parts)
-        return found
+        return _Above(np.where(radius < highest, high, 0.0), fx, fy, keep)
+
+    def _aliased(self, part: NDArray[np.complex128], rows: NDArray[np.bool_]) -> FloatArray:
+        """A part of the spectrum above, as the pixels sample it."""
+        cols = OVERSAMPLE * self.shape[1]
+        spread = np.zeros((len(rows), part.shape[1]), complex)
+        spread[rows] = part
+        folded = np.zeros((self.shape[0], cols // 2 + 1), complex)
+        folded[:, : part.shape[1]] = spread.reshape(OVERSAMPLE, self.shape[0], -1).sum(axis=0) / OVERSAMPLE
+        return np.asarray(fft.irfft(fft.ifft(folded, axis=0), cols, axis=1)[:, ::OVERSAMPLE])
+
+
+@dataclass(frozen=True)
+class _Above:
+    """The drawn spectrum as far as the lens passes it, (kept rows, cols), its frequencies (cy/px), and which rows are kept."""
+
+    spectrum: NDArray[np.complex128]
+    fx: FloatArray
+    fy: FloatArray
+    rows: NDArray[np.bool_]
+
+    def between(self, low: float, end: float) -> NDArray[np.bool_]:
+        """Where the larger of both frequencies lies in [low, end)."""
+        largest = np.maximum(np.abs(self.fy), self.fx)
+        return np.asarray((largest >= low) & (largest < end))
 
 
 def lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:

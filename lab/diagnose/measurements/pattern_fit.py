@@ -300,10 +300,7 @@ def _refined(
     picture, across, down = (
         canvas.picture(part * spectrum)[mask] for part in (below_nyquist(canvas), 2j * np.pi * fx, 2j * np.pi * fy)
     )
-    picture = (
-        picture
-        + np.sum([p.picture for parts in canvas.beyond(otf, study.camera.fill_factor) for p in parts], axis=0)[mask]
-    )
+    picture = picture + canvas.beyond_picture(otf, study.camera.fill_factor)[mask]
     terms = warp.basis(mask_points(mask, window))
     # with contrasts of their own: where cells are a whole number of pixels, a loss of contrast looks like a displacement
     bands = [canvas.picture(np.where(part, spectrum, 0.0))[mask] for *_, part in _band_masks(canvas)]

@@ -180,13 +180,14 @@ def test_a_warmer_frame_s_dark_current_is_free() -> None:
 def test_after_dummy_frames_image_lag_holds_nothing_of_the_capture_before() -> None:
     at = study(rendered(3))
     bright, dark = at.recordings.captures("flat", "left")[-1], at.recordings.captures("dark", "left")[0]
-    assert at.carried_e(bright, at.channels[0], (ImageLag(lag_percent=2.0),)) != 0.0
+    lag = (ImageLag(lag_percent=2.0),)
+    assert at.carried_e(lag)(bright, at.channels[0]) != 0.0
     manifest = at.recordings.manifest
     after = [c.model_copy(update={"dummy_frames": 2}) for c in manifest.captures]
     at.recordings.manifest = manifest.model_copy(update={"captures": tuple(after)})
     again = study(at.recordings)
     for capture in (bright, dark):
-        assert again.carried_e(capture, again.channels[0], (ImageLag(lag_percent=2.0),)) == 0.0
+        assert again.carried_e(lag)(capture, again.channels[0]) == 0.0
 
 
 def test_a_glow_that_brightens_darks_brightens_light_frames_as_much() -> None:
