@@ -21,8 +21,8 @@ from lab.formats.recording_set import Manifest, RecordingSet
 from lab.pipeline import session_recordings
 
 commands = typer.Typer()
-#: `--from` this: a CSV of channel means and variances, which becomes a fit.
-LEVEL_TABLE = "photon-transfer-table"
+#: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a fit.
+LEVEL_TABLE, MEAN_TABLE = "photon-transfer-table", "spectral-table"
 
 
 @commands.command("import")
@@ -31,7 +31,9 @@ def import_(
     kind: Annotated[
         str,
         typer.Option(
-            "--from", metavar="KIND", help="emva1288, raw-folder, fits, slanted-edge, colorchecker or dot-grid"
+            "--from",
+            metavar="KIND",
+            help="emva1288, raw-folder, fits, slanted-edge, colorchecker, dot-grid, photon-transfer-table or spectral-table",
         ),
     ],
     out_folder: Annotated[
@@ -82,8 +84,8 @@ def import_(
         white_patch=white_patch,
         tap=tap or None,
     )
-    if kind == LEVEL_TABLE:
-        _import_level_table(path, options, out_folder)
+    if kind in (LEVEL_TABLE, MEAN_TABLE):
+        _import_table(kind, path, options, out_folder)
         return
     recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
@@ -92,13 +94,14 @@ def import_(
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
-def _import_level_table(path: Path, options: ImportOptions, file: Path) -> None:
+def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> None:
     """A table holds no frames: its import is a fit."""
     from lab.fit.noise.level_table import fit_level_table
+    from lab.fit.spectral.mean_table import fit_mean_table
     from lab.formats.importers.images import read_camera_file
 
     if [name for name in options.stated() if name != "--camera"]:
-        raise InputError(f"--from {LEVEL_TABLE} takes --camera alone")
+        raise InputError(f"--from {kind} takes --camera alone")
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the table (CSV)")
     described = options.camera if options.camera is not None else path.parent / "camera.toml"
@@ -106,7 +109,7 @@ def _import_level_table(path: Path, options: ImportOptions, file: Path) -> None:
     if camera is None:
         raise InputError(f"{described}: describes no left camera; write the keys without a table")
     check_writable(file)
-    result = fit_level_table(path, camera)
+    result = (fit_level_table if kind == LEVEL_TABLE else fit_mean_table)(path, camera)
     write_json(result, file)
     print_fit(RecordingSet(Manifest(cameras={"left": camera}, captures=())), result)
 

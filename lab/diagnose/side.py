@@ -14,6 +14,7 @@ from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model
+from lab.diagnose.metadata import misstatements
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
@@ -98,10 +99,16 @@ def diagnose_side(
     that are drawn frame by frame for the threshold, each as long as summarising takes.
     """
     policy = policy or DecisionPolicy()
+    report("checking what is stated")
+    stated = recordings.camera(side)
+    recordings, misstated = misstatements(recordings, side)
+    wrong = tuple(one.told(side) for one in misstated)
+    if fit is not None and recordings.camera(side).cfa != stated.cfa:  # its planes were mixed
+        fit = fit.model_copy(update={"cameras": {s: c for s, c in fit.cameras.items() if s != side}})
     report("summarising the recordings")
     model, skipped = measurement_model(recordings, side, fit, baseline)
     if model is None:
-        return SideFindings(side, skipped)
+        return SideFindings(side, skipped, unexplained=wrong)
     rng = np.random.default_rng(SEED)
     least = 0.0
     if bootstrap:
@@ -115,6 +122,7 @@ def diagnose_side(
         recordings, side, fit, baseline, model, verdict.effects, verdict.discrepancies
     )
     left = (
+        *wrong,
         *unexplained(recordings, side, verdict, corrections, policy),
         *misstated_light(side, fit.cameras.get(side) if fit is not None else None),
     )

@@ -190,7 +190,9 @@ def render_report(
         "sheets": list(data_sheets(recordings, fit)),
         "linearity": {side: charts.linearity(noise) if noise else None for side, noise in noises.items()},
         "qe": {
-            side: charts.quantum_efficiency(camera.spectral, recordings, side) if camera.spectral else None
+            side: charts.quantum_efficiency(camera.spectral, recordings, side)
+            if camera.spectral and camera.spectral.quantum_efficiency
+            else None
             for side, camera in fit.cameras.items()
         },
         "mtf_explained": {

@@ -525,7 +525,7 @@ def residual_curve(curve: ResidualCurve) -> Figure:
         "layout": layout(
             330,
             xaxis=axis(curve.axis, anchor="y2", **_named_ticks(curve)),
-            yaxis=axis("measured", domain=[0.42, 1.0], range=_range(curve)),
+            yaxis=axis(curve.quantity or "measured", domain=[0.42, 1.0], range=_range(curve)),
             yaxis2=axis("residual, σ", domain=[0.0, 0.32], zeroline=True),
             shapes=[
                 {

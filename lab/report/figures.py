@@ -97,12 +97,20 @@ def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[
     if fit.noise is not None:
         yield from noise_figures(fit.noise, camera)
     if fit.spectral is not None:
-        for channel, curve in fit.spectral.quantum_efficiency.items():
+        quantity, curves, stds = (
+            "quantum efficiency",
+            fit.spectral.quantum_efficiency,
+            fit.spectral.quantum_efficiency_std,
+        )
+        if not curves:  # of lights and signals whose scale isn't known
+            quantity, curves = "relative sensitivity", fit.spectral.relative_sensitivity
+            stds = fit.spectral.relative_sensitivity_std
+        for channel, curve in curves.items():
             peak = max(range(len(curve)), key=lambda k: curve[k])
-            std = fit.spectral.quantum_efficiency_std.get(channel)
+            std = stds.get(channel)
             at = fit.spectral.wavelength_nm[peak]
             yield KeyFigure(
-                f"peak quantum efficiency {channel}", "1", curve[peak], std[peak] if std else None, note=f"at {at:g} nm"
+                f"peak {quantity} {channel}", "1", curve[peak], std[peak] if std else None, note=f"at {at:g} nm"
             )
     for channel in ("R", "G", "B", "Y"):
         if (span := mtf50_range(fit.mtf, channel)) is not None:

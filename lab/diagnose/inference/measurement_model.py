@@ -28,6 +28,8 @@ from sim.spectrum import FloatArray
 
 #: Limits of the caches: covariance entries (160 MB), and predictions.
 CACHED_ENTRIES, CACHED_PREDICTIONS = 2e7, 20000
+#: Prior standard deviations within which a nuisance parameter is what the camera may have.
+MOST_PRIOR_STD = 3.0
 #: Correlation of a law's error between two channels, and between two conditions, of one measurement.
 CORRELATION_BETWEEN_CHANNELS = CORRELATION_BETWEEN_CONDITIONS = 0.7
 
@@ -262,6 +264,17 @@ class MeasurementModel:
         found = self.nuisance_estimates(effects, discrepancies)
         moved = sum(found[name] * column for name, column in self.nuisance_jacobian(effects).items())
         return np.asarray(self.mean(effects) + moved + self.discrepancy_mean(effects, discrepancies or {}))
+
+    def stated_mean(self, found: Mapping[str, float]) -> FloatArray:
+        """Prediction of all numbers by the baseline alone, (n,), with the nuisance parameters `found` by a better model, within
+        `MOST_PRIOR_STD` of their first guesses.
+
+        The posterior means of a baseline that lacks physics are no camera's: nuisance parameters stand in for what is missing, some by
+        tens of their prior standard deviations.
+        """
+        columns = self.nuisance_jacobian()
+        near = {n: float(np.clip(v, -MOST_PRIOR_STD, MOST_PRIOR_STD)) for n, v in found.items() if n in columns}
+        return np.asarray(self.mean() + sum(value * columns[name] for name, value in near.items()))
 
     def held_out(
         self,

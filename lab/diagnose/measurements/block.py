@@ -36,6 +36,9 @@ class Measurement:
     axis: str  # quantity of `Label.x`
     unit: str  # of the axis
     make: Callable[[Study], Block]
+    quantity: str  # what the numbers are, with their unit: the ordinate of the report's curves
+    #: Whether the numbers are levels of frames, which lie between 0 and the white level.
+    is_level: bool = False
     #: Quantity that conditions are values of ("orientation"): slices and curves are by condition, too. "": none.
     conditions: str = ""
     #: Words before the conditions where the report lists them ("edges at"); "": `conditions`.

@@ -113,4 +113,5 @@ BOARD_COLOUR = Measurement(
     axis="field",
     unit="half diagonals",
     make=board_colour_block,
+    quantity="displacement from green, px",
 )

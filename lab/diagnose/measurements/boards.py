@@ -220,6 +220,7 @@ BOARDS = Measurement(
     axis="field",
     unit="half diagonals",
     make=board_block,
+    quantity="shift of corners, px",
     conditions="direction",
     conditions_words="corners",
 )

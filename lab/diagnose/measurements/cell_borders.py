@@ -46,5 +46,6 @@ CELL_BORDERS = Measurement(
     axis="level",
     unit="1",
     make=cell_border_block,
+    quantity="excess light at borders, share",
     places="borders",
 )

@@ -216,5 +216,13 @@ def patch_boxes(capture: ChartCapture) -> list[tuple[str, tuple[int, int], tuple
 
 
 CHART = Measurement(
-    "chart", title="patches of the chart", order=300, axis="level", unit="DN", make=chart_block, places="patches"
+    "chart",
+    title="patches of the chart",
+    order=300,
+    axis="level",
+    unit="DN",
+    make=chart_block,
+    quantity="mean level, DN",
+    is_level=True,
+    places="patches",
 )

@@ -320,5 +320,11 @@ def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
 
 
 CODE_DENSITY = Measurement(
-    "code_density", title="code-density test", order=240, axis="level", unit="DN", make=code_block
+    "code_density",
+    title="code-density test",
+    order=240,
+    axis="level",
+    unit="DN",
+    make=code_block,
+    quantity="step, DN, or excess variance of counts",
 )

@@ -81,5 +81,6 @@ DARK_FIELD = Measurement(
     axis="field",
     unit="of half the diagonal",
     make=dark_field_block,
+    quantity="dark signal less the frame's mean, DN",
     conditions="exposure and temperature",
 )

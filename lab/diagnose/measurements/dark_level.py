@@ -117,6 +117,8 @@ DARK = Measurement(
     axis="exposure",
     unit="s",
     make=dark_level_block,
+    quantity="mean level, DN",
+    is_level=True,
     conditions="exposure and temperature",
 )
 
@@ -128,4 +130,5 @@ BLACK_LEVEL = Measurement(
     axis="exposure",
     unit="s",
     make=black_level_block,
+    quantity="black level, DN",
 )

@@ -175,6 +175,7 @@ DARK_CORRELATION = Measurement(
     axis="spatial_frequency",
     unit="cy/px",
     make=correlation_block,
+    quantity="power over white noise, ln",
     conditions="direction",
 )
 ROW_NOISE = Measurement(
@@ -184,6 +185,7 @@ ROW_NOISE = Measurement(
     axis="spatial_frequency",
     unit="cy/px",
     make=partial(temporal_line_block, "rows"),
+    quantity="power over single pixels', ln",
 )
 COLUMN_NOISE = Measurement(
     "dark_column_noise",
@@ -192,6 +194,7 @@ COLUMN_NOISE = Measurement(
     axis="spatial_frequency",
     unit="cy/px",
     make=partial(temporal_line_block, "columns"),
+    quantity="power over single pixels', ln",
 )
 ROW_PATTERN = Measurement(
     "dark_row_pattern",
@@ -200,6 +203,7 @@ ROW_PATTERN = Measurement(
     axis="spatial_frequency",
     unit="cy/px",
     make=partial(fixed_line_block, "rows"),
+    quantity="power over single pixels', ln",
     conditions="pattern",
 )
 COLUMN_PATTERN = Measurement(
@@ -209,5 +213,6 @@ COLUMN_PATTERN = Measurement(
     axis="spatial_frequency",
     unit="cy/px",
     make=partial(fixed_line_block, "columns"),
+    quantity="power over single pixels', ln",
     conditions="pattern",
 )

@@ -110,5 +110,6 @@ DARK_NOISE = Measurement(
     axis="exposure",
     unit="s",
     make=dark_noise_block,
+    quantity="temporal variance, DN²",
     conditions="exposure and temperature",
 )

@@ -197,6 +197,7 @@ SCREEN = Measurement(
     axis="level",
     unit="DN",
     make=screen_block,
+    quantity="light beyond the dark screen's, DN",
     conditions="pattern",
     places="dark squares",
 )

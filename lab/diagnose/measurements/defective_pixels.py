@@ -261,6 +261,7 @@ DEFECTIVE_PIXELS = Measurement(
     axis="deviation",
     unit="standard deviations",
     make=defective_pixel_block,
+    quantity="number of pixels, 2 sqrt(n + 3/8)",
     conditions="exposure and temperature",
 )
 
@@ -272,4 +273,5 @@ FLICKERING_PIXELS = Measurement(
     axis="variance",
     unit="times their surroundings'",
     make=flickering_pixel_block,
+    quantity="number of pixels, 2 sqrt(n + 3/8)",
 )

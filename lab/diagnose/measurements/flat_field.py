@@ -219,5 +219,11 @@ def _cells(plane: FloatArray) -> FloatArray:
 
 
 FLAT_FIELD = Measurement(
-    "flat_field", title="shading of flat fields", order=270, axis="field", unit="mm", make=shading_block
+    "flat_field",
+    title="shading of flat fields",
+    order=270,
+    axis="field",
+    unit="mm",
+    make=shading_block,
+    quantity="signal over the mean",
 )

@@ -95,5 +95,11 @@ def _stripes(line: FloatArray, period: int, least: float) -> tuple[float, float]
 
 
 FLAT_LINES = Measurement(
-    "flat_lines", title="lines in flat fields", order=260, axis="field", unit="px", make=line_block
+    "flat_lines",
+    title="lines in flat fields",
+    order=260,
+    axis="field",
+    unit="px",
+    make=line_block,
+    quantity="step over the mean signal",
 )

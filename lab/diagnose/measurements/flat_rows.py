@@ -226,6 +226,7 @@ FLAT_ROWS = Measurement(
     axis="row_frequency",
     unit="cy/row",
     make=flicker_block,
+    quantity="power over noise, cube root",
     conditions="exposure",
     conditions_words="flats of",
 )

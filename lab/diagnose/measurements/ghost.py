@@ -30,5 +30,12 @@ def ghost_block(study: Study) -> Block:
 
 
 PATTERN_GHOST = Measurement(
-    "ghost", title="ghost of the pattern", order=430, axis="level", unit="1", make=ghost_block, places="ghosts"
+    "ghost",
+    title="ghost of the pattern",
+    order=430,
+    axis="level",
+    unit="1",
+    make=ghost_block,
+    quantity="ghost's share of the light",
+    places="ghosts",
 )

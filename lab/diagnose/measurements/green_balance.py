@@ -188,5 +188,11 @@ def _cell_means(plane: FloatArray) -> FloatArray:
 
 
 GREEN_BALANCE = Measurement(
-    "green_balance", title="balance of the two greens", order=250, axis="wavelength", unit="nm", make=green_block
+    "green_balance",
+    title="balance of the two greens",
+    order=250,
+    axis="wavelength",
+    unit="nm",
+    make=green_block,
+    quantity="green over green, less 1",
 )

@@ -96,5 +96,6 @@ LATERAL_COLOUR = Measurement(
     axis="field",
     unit="half diagonals",
     make=colour_block,
+    quantity="displacement from green, px",
     conditions="direction",
 )

@@ -116,4 +116,5 @@ LEVEL_REPEATS = Measurement(
     axis="exposure",
     unit="log s",
     make=level_repeats_block,
+    quantity="variance over noise, ln",
 )

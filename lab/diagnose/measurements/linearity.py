@@ -156,5 +156,12 @@ def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, 
 
 
 PHOTON_TRANSFER = Measurement(
-    "photon_transfer", title="linearity of flat fields", order=200, axis="level", unit="DN", make=linearity_block
+    "photon_transfer",
+    title="linearity of flat fields",
+    order=200,
+    axis="level",
+    unit="DN",
+    make=linearity_block,
+    quantity="mean level, DN",
+    is_level=True,
 )

@@ -165,5 +165,12 @@ def _sample_std(repeats: Iterable[Sequence[Spectrum]]) -> float:
 
 
 NARROWBAND = Measurement(
-    "narrowband", title="signal in narrowband light", order=280, axis="wavelength", unit="nm", make=narrowband_block
+    "narrowband",
+    title="signal in narrowband light",
+    order=280,
+    axis="wavelength",
+    unit="nm",
+    make=narrowband_block,
+    quantity="mean level, DN",
+    is_level=True,
 )

@@ -98,5 +98,11 @@ def coded_variance(dn: FloatArray, dn2: FloatArray, effects: Effects, study: Stu
 
 
 NOISE = Measurement(
-    "noise", title="temporal noise against signal", order=220, axis="level", unit="DN", make=variance_block
+    "noise",
+    title="temporal noise against signal",
+    order=220,
+    axis="level",
+    unit="DN",
+    make=variance_block,
+    quantity="temporal variance, DN²",
 )

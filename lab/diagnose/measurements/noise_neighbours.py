@@ -138,4 +138,5 @@ NOISE_NEIGHBOURS = Measurement(
     axis="level",
     unit="DN",
     make=neighbour_block,
+    quantity="correlation",
 )

@@ -135,6 +135,7 @@ BERNOULLI = Measurement(
     axis="spatial_frequency",
     unit="cy/px",
     make=contrast_block,
+    quantity="contrast over the baseline's",
     conditions="orientation",
     conditions_words="bands at",
 )

@@ -142,5 +142,11 @@ def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatA
 
 
 SCREEN_GRID = Measurement(
-    "screen_grid", title="pixel grid of the screen", order=450, axis="spatial_frequency", unit="cy/px", make=grid_block
+    "screen_grid",
+    title="pixel grid of the screen",
+    order=450,
+    axis="spatial_frequency",
+    unit="cy/px",
+    make=grid_block,
+    quantity="strength of the line, sigma",
 )

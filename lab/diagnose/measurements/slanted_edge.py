@@ -466,6 +466,7 @@ SLANTED_EDGE = Measurement(
     axis="spatial_frequency",
     unit="cy/px",
     make=edge_block,
+    quantity="transfer function",
     conditions="orientation",
     conditions_words="edges at",
 )

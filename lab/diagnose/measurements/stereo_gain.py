@@ -285,6 +285,7 @@ STEREO_GAIN = Measurement(
     axis="level",
     unit="1",
     make=scene_gain_block,
+    quantity="right over left, ln",
     conditions="scene",
     places="scenes",
 )

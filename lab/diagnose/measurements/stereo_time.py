@@ -113,5 +113,11 @@ def _gaps(
 
 
 STEREO_TIME = Measurement(
-    "stereo_time", title="capture times of the two cameras", order=610, axis="time", unit="px/s", make=time_block
+    "stereo_time",
+    title="capture times of the two cameras",
+    order=610,
+    axis="time",
+    unit="px/s",
+    make=time_block,
+    quantity="displacement, px",
 )

@@ -91,11 +91,15 @@ def held_out(verdict: Verdict) -> HeldOut | None:
 
 
 def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
-    """Every measurement by condition and channel, seen and held out: measured values and both predictions."""
+    """Every measurement by condition and channel, seen and held out: measured values and both predictions. The baseline is drawn as it is
+    stated, with the nuisance parameters of the model with what was found; its levels end at the white level, as a camera's do."""
     model = verdict.model
-    before, after = model.fitted_mean(), model.fitted_mean(verdict.effects, verdict.kernels)
+    before = model.stated_mean(model.nuisance_estimates(verdict.effects, verdict.kernels))
+    after = model.fitted_mean(verdict.effects, verdict.kernels)
+    white_dn = float(model.camera.white_level_dn)
     for block, at in zip(model.blocks, model.slices, strict=True):
         std = np.sqrt(np.diag(block.covariance))
+        stated = np.clip(before[at], 0.0, white_dn) if block.measurement.is_level else before[at]
         groups: dict[tuple[str, str, bool], list[int]] = {}
         for i, label in enumerate(block.labels):
             condition = label.condition if block.measurement.conditions else ""
@@ -109,11 +113,12 @@ def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
                 channel=channel,
                 axis=block.measurement.places
                 or f"{block.measurement.axis.replace('_', ' ')}, {block.measurement.unit}",
+                quantity=block.measurement.quantity,
                 names=tuple(block.labels[i].condition for i in order) if block.measurement.places else (),
                 x=tuple(block.labels[i].x for i in order),
                 measured=tuple(float(block.value[i]) for i in order),
                 measured_std=tuple(float(std[i]) for i in order),
-                before=tuple(float(before[at][i]) for i in order),
+                before=tuple(float(stated[i]) for i in order),
                 after=tuple(float(after[at][i]) for i in order),
                 held_out=is_held_out,
             )

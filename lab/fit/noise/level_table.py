@@ -7,14 +7,14 @@ pixels), `pixels` (of the channel, over which both were taken), `repeats` (frame
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Hashable
 from pathlib import Path
 
-from lab.errors import InputError, one_line
+from lab.errors import InputError
 from lab.fit.noise.level_statistics import MeasuredLevel, PlaneStatistics
 from lab.fit.noise.noise_fit import noise_fit
+from lab.fit.number_table import TableRow, table_rows
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, ChannelNoise, Emva1288, FitResult, NoiseFit, Skipped
 
@@ -35,15 +35,17 @@ def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
     where the levels don't determine the conversion gain.
     """
     groups: dict[Setting, dict[str, PlaneStatistics]] = {}
-    for number, row in _rows(file):
-        channel = row.get("channel") or ("Y" if camera.cfa == "MONO" else "")
+    for row in table_rows(file, NEEDED, KNOWN):
+        channel = row.cells.get("channel") or ("Y" if camera.cfa == "MONO" else "")
         if channel not in camera.channels:
             raise InputError(
-                f"{file}: row {number}: channel '{channel}' of a {camera.cfa} sensor; write {', '.join(camera.channels)}"
+                f"{file}: row {row.number}: channel '{channel}' of a {camera.cfa} sensor; write {', '.join(camera.channels)}"
             )
-        setting, plane = _level(file, number, row, camera)
+        setting, plane = _level(row, camera)
         if channel in groups.setdefault(setting, {}):
-            raise InputError(f"{file}: row {number}: channel {channel} of this level stands twice; take one row out")
+            raise InputError(
+                f"{file}: row {row.number}: channel {channel} of this level stands twice; take one row out"
+            )
         groups[setting][channel] = plane
     darks: list[MeasuredLevel] = []
     flats: list[MeasuredLevel] = []
@@ -64,52 +66,16 @@ def fit_level_table(file: Path, camera: DataSheet) -> FitResult:
     return FitResult(source=str(file), cameras={"left": CameraFit(noise=fitted)}, skipped=skipped)
 
 
-def _rows(file: Path) -> list[tuple[int, dict[str, str]]]:
-    try:
-        reader = csv.reader(file.read_text(encoding="utf-8-sig").splitlines())
-        header = [cell.strip() for cell in next(reader, [])]
-        rows = [
-            (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(cell.strip() for cell in row)
-        ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: can't be read ({one_line(error)}); give a CSV") from error
-    unknown = [name for name in header if name not in KNOWN]
-    missing = [name for name in NEEDED if name not in header]
-    if unknown or missing:
-        told = [f"missing: {', '.join(missing)}"] if missing else []
-        told += [f"unknown: {', '.join(unknown)}"] if unknown else []
-        raise InputError(f"{file}: columns {'; '.join(told)}; columns are {', '.join(KNOWN)}, in these units")
-    if not rows:
-        raise InputError(f"{file}: holds no levels; write one row a level and channel")
-    for number, row in rows:
-        if len(row) != len(header):
-            raise InputError(f"{file}: row {number}: {len(row)} cells under {len(header)} columns; correct it")
-    return [(number, dict(zip(header, row, strict=True))) for number, row in rows]
-
-
-def _level(file: Path, number: int, row: dict[str, str], camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
-    def value(name: str, least: float = 0.0) -> float:
-        try:
-            found = float(row[name])
-        except ValueError:
-            found = math.nan
-        if not (math.isfinite(found) and found >= least):
-            raise InputError(
-                f"{file}: row {number}: {name} = '{row[name]}' isn't a number of {least:g} or more; correct it"
-            )
-        return found
-
-    def known(name: str, least: float = 0.0) -> float | None:
-        return value(name, least) if row.get(name) else None
-
-    if row["kind"] not in ("dark", "flat"):
-        raise InputError(f"{file}: row {number}: kind '{row['kind']}'; write dark or flat")
-    mean, variance = value("mean_dn"), value("variance_dn2")
+def _level(row: TableRow, camera: DataSheet) -> tuple[Setting, PlaneStatistics]:
+    kind = row.cells["kind"]
+    if kind not in ("dark", "flat"):
+        raise InputError(f"{row.file}: row {row.number}: kind '{kind}'; write dark or flat")
+    mean, variance = row.value("mean_dn"), row.value("variance_dn2")
     if mean > camera.saturation_dn:
         raise InputError(
-            f"{file}: row {number}: mean_dn = {mean:g} is above the highest code {camera.saturation_dn:g}; correct one"
+            f"{row.file}: row {row.number}: mean_dn = {mean:g} is above the highest code {camera.saturation_dn:g}; correct one"
         )
-    pixels, repeats = int(value("pixels", 1.0)), int(value("repeats", 1.0))
+    pixels, repeats = int(row.value("pixels", 1.0)), int(row.value("repeats", 1.0))
     is_clipped = mean > camera.saturation_dn - CLIPPED_SIGMA * math.sqrt(variance) - 0.5
     std = variance * math.sqrt(2.0 / (max(repeats - 1, 1) * pixels))
     side = max(round(math.sqrt(pixels)), 2)
@@ -120,11 +86,11 @@ def _level(file: Path, number: int, row: dict[str, str], camera: DataSheet) -> t
         temporal_variance_of_all=variance,
     )  # fmt: skip
     setting = (
-        row["kind"],
-        value("exposure_s"),
-        known("photons_per_pixel"),
-        known("wavelength_nm"),
-        known("temperature_c", -273.15),
+        kind,
+        row.value("exposure_s"),
+        row.known("photons_per_pixel"),
+        row.known("wavelength_nm"),
+        row.known("temperature_c", -273.15),
     )
     return setting, plane
 

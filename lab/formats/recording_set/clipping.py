@@ -23,13 +23,18 @@ LADDER_LEVELS = 3
 WRONG_SHARE = 0.2
 #: Factor between the stated light of an unsaturated level and that which the others' median slope gives its mean, above which it contradicts them.
 WRONG_FACTOR = 1.5
+#: Scatter of a plane's pixels over the greatest of the dimmer levels, below which the response bends: noise, PRNU and shading grow with the signal
+#: until a full well or a bend of the response holds the pixels together.
+BENT_SCATTER = 0.8
+#: Relative difference of two lights below which they are one level: readings of a light scatter.
+SAME_LIGHT = 0.01
 #: Least share of the flat's signal that these levels must predict for it. Below 1, as lamps and sensors aren't exactly linear.
 LADDER_REACH = 0.85
 
 
 @dataclass(frozen=True)
 class ClippedLevel:
-    """Level of one flat: mean and clipped share of each channel."""
+    """Level of one flat: mean, clipped share, and standard deviation of the pixels within a plane, of each channel."""
 
     id: str
     where: str
@@ -38,6 +43,7 @@ class ClippedLevel:
     scale: str
     mean_dn: dict[str, float]
     clipped: dict[str, float]
+    scatter_dn: dict[str, float]
 
 
 def channel_planes(frame: Frame, camera: DataSheet) -> dict[str, list[Frame]]:
@@ -84,8 +90,9 @@ def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clippe
     light, scale = _light(recordings, flat)
     planes = channel_planes(frame, recordings.camera(flat.side))
     mean_dn = {name: float(np.mean([plane.mean() for plane in planes[name]])) for name in planes}
+    scatter_dn = {name: float(np.mean([plane.std() for plane in planes[name]])) for name in planes}
     where = f"{recordings.where(flat.frame)} (capture {flat.id})"
-    return ClippedLevel(flat.id, where, flat.gain_db, light, scale, mean_dn, clipped)
+    return ClippedLevel(flat.id, where, flat.gain_db, light, scale, mean_dn, clipped, scatter_dn)
 
 
 def _why_not_a_ladder(level: ClippedLevel, channel: str, levels: list[ClippedLevel], black: float) -> str | None:
@@ -99,7 +106,7 @@ def _why_not_a_ladder(level: ClippedLevel, channel: str, levels: list[ClippedLev
         for other in levels
         if (other.gain_db, other.scale) == (level.gain_db, level.scale) and other.clipped[channel] <= CLIPPED_LIMIT
     ]
-    wrong = set(map(id, contradicting_levels(unclipped, channel, black)))
+    wrong = {*map(id, contradicting_levels(unclipped, channel, black)), *_bent_levels(unclipped, channel)}
     unclipped = [other for other in unclipped if id(other) not in wrong]
     for other in unclipped:
         if other.light >= level.light and other.clipped[channel] < CLIPPED_LIMIT / 5:
@@ -118,11 +125,13 @@ def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: flo
 
     The median slope of signal against light tells which: it holds while fewer than half of the levels are wrong. None where more
     than `WRONG_SHARE` of the levels are off: then no majority says what the light is. `black`: DN; where it isn't known, the
-    offset of a line through the levels (Theil and Sen) stands for it.
+    offset of a line through the levels (Theil and Sen) stands for it. Levels at the full well, or where the response bends at its
+    top, say nothing about the slope, and having less signal than it says is no contradiction there.
     """
+    bent = _bent_levels(unclipped, channel)
     signals: dict[float, float] = {}
     for other in unclipped:
-        if other.light > 0:
+        if other.light > 0 and id(other) not in bent:
             signals.setdefault(other.light, other.mean_dn[channel])
     light, mean = np.array(list(signals)), np.array(list(signals.values()))
     if light.size < 1 / WRONG_SHARE:
@@ -137,10 +146,22 @@ def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: flo
         other
         for other in unclipped
         if other.light > 0
+        and not (id(other) in bent and other.mean_dn[channel] < offset + slope * other.light)
         and abs(other.mean_dn[channel] - offset - slope * other.light)
         > max((1.0 - 1.0 / WRONG_FACTOR) * max(slope * other.light, other.mean_dn[channel] - offset), 0.1 * span)
     ]
     return off if len({other.light for other in off}) <= WRONG_SHARE * light.size else []
+
+
+def _bent_levels(levels: list[ClippedLevel], channel: str) -> set[int]:
+    """Ids of the levels of one gain and light at or beyond the bend at the top of the response."""
+    found: set[int] = set()
+    greatest = 0.0
+    for level in sorted(levels, key=lambda level: level.mean_dn[channel]):
+        if level.scatter_dn[channel] < BENT_SCATTER * greatest:
+            found.add(id(level))
+        greatest = max(greatest, level.scatter_dn[channel])
+    return found
 
 
 def wrong_lights(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
@@ -150,21 +171,33 @@ def wrong_lights(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]
         for channel in own[0].clipped:
             unclipped = [level for level in own if level.clipped[channel] <= CLIPPED_LIMIT]
             off = contradicting_levels(unclipped, channel, camera.black_level_dn or 0.0)
-            for light in dict.fromkeys(level.light for level in off):
-                of = [level for level in off if level.light == light]
+            for of in _by_light(off):
                 yield (
-                    f"{of[0].where}: {len(of)} flats of a stated light of {light:.6g} ({of[0].scale}) have {of[0].mean_dn[channel]:.4g} DN, "
+                    f"{of[0].where}: {len(of)} flats of a stated light of {of[0].light:.6g} ({of[0].scale}) have {of[0].mean_dn[channel]:.4g} DN, "
                     "which contradicts the other levels; the fits judge that; correct the photon number or the exposure"
                 )
             if off:
                 break
     misplaced = list(_misplaced(levels, camera))
     forgiven = _forgiven(misplaced, levels)
-    for light, first in {level.light: level for level, *_ in reversed(misplaced) if id(level) in forgiven}.items():
+    for first, *_ in _by_light([level for level, *_ in misplaced if id(level) in forgiven]):
         yield (
-            f"{first.where}: saturated though its stated {light:.6g} photons are fewer than those of levels that aren't: left out by the "
+            f"{first.where}: saturated though its stated {first.light:.6g} photons are fewer than those of levels that aren't: left out by the "
             "fits; correct the photon number"
         )
+
+
+def _by_light(levels: list[ClippedLevel]) -> list[list[ClippedLevel]]:
+    """Levels of one light together, the first in the set first."""
+    found: list[list[ClippedLevel]] = []
+    for level in levels:
+        for of in found:
+            if abs(of[0].light - level.light) <= SAME_LIGHT * of[0].light:
+                of.append(level)
+                break
+        else:
+            found.append([level])
+    return found
 
 
 def saturated_flats(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:

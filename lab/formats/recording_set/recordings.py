@@ -106,12 +106,12 @@ class RecordingSet:
     def without(self, ids: Container[str]) -> RecordingSet:
         """The same set less the captures of these ids; frames, spectra and targets are shared."""
         kept = tuple(c for c in self.manifest.captures if c.id not in ids)
+        return self.under(self.manifest.model_copy(update={"captures": kept}))
+
+    def under(self, manifest: Manifest) -> RecordingSet:
+        """The same frames, spectra and targets as `manifest` describes them."""
         return RecordingSet(
-            self.manifest.model_copy(update={"captures": kept}),
-            source=self.source,
-            warnings=self.warnings,
-            files=self._files,
-            cache_bytes=self.cache_bytes,
+            manifest, source=self.source, warnings=self.warnings, files=self._files, cache_bytes=self.cache_bytes
         )
 
     def capture(self, id: str) -> Capture:

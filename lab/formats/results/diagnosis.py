@@ -123,13 +123,18 @@ class HeldOut(Frozen):
 
 
 class ResidualCurve(Frozen):
-    """One measurement as recorded and as predicted, before and after the named effects, for the report's figures."""
+    """One measurement as recorded and as predicted, before and after the named effects, for the report's figures.
+
+    `before` has the nuisance parameters that were found with the named effects, within three prior standard deviations of what is stated:
+    what a camera without these effects would show, and not a fit of the baseline to recordings that contradict it.
+    """
 
     side: Side
     measurement: str
     label: str
     channel: str
     axis: str
+    quantity: str = ""  # that `measured`, `before` and `after` are, with its unit
     x: tuple[float, ...]
     names: tuple[str, ...] = ()  # of the points, where x is only their number
     measured: tuple[float, ...]

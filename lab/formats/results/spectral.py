@@ -22,7 +22,8 @@ class MakerDeparture(Frozen):
 
 
 class SpectralFit(Frozen):
-    """Absolute quantum efficiency per channel, electrons per photon; the lens's stated transmittance is divided out."""
+    """Absolute quantum efficiency per channel, electrons per photon; the lens's stated transmittance is divided out. Empty where no scale is
+    known, as of a table of means: `relative_sensitivity` stands then."""
 
     wavelength_nm: tuple[float, ...]
     quantum_efficiency: dict[str, tuple[float, ...]]

@@ -35,7 +35,7 @@ def declared(name: str, axis: str, unit: str, *, conditions: str = "", places: s
     def make(study: Study) -> Block:
         raise NotImplementedError(f"{name}: a test makes its numbers")
 
-    return Measurement(name, name, 0, axis, unit, make, conditions=conditions, places=places)
+    return Measurement(name, name, 0, axis, unit, make, "made up", conditions=conditions, places=places)
 
 
 def former(

@@ -84,3 +84,63 @@ def test_clipped_channel_of_another_kind_is_only_remarked(folder: Path) -> None:
     np.save(folder / "frames/narrowband-012.npy", frame)
     (line,) = read(folder).warnings
     assert "1 narrowband captures of the left camera have a channel clipped" in line
+
+
+# --- full well below the converter's range, whose read noise spreads the pixels over codes ---------------------------------
+
+
+def ladder(
+    folder: Path, exposures_s: tuple[float, ...], full_well_dn: float, stated: dict[float, float] | None = None
+) -> None:
+    """Replaces the left camera's flats by three repeats of each exposure: 200 DN a ms, photon noise, a full well, 2 DN of read noise.
+
+    Red has twice the light of the others. The lamp's radiance is read anew, within 0.03 %, with each repeat.
+    `stated`: exposure that the manifest states for one of the exposures.
+    """
+    rng = np.random.default_rng(4)
+    lamp = (folder / "spectra/lamp.csv").read_text().splitlines()
+
+    def change(manifest: dict[str, Any]) -> None:
+        first = next(c for c in manifest["captures"] if c["kind"] == "flat" and c["side"] == "left")
+        manifest["captures"] = [c for c in manifest["captures"] if (c["kind"], c["side"]) != ("flat", "left")]
+        for level, exposure_s in enumerate(exposures_s):
+            for repeat in range(3):
+                signal = np.full((24, 32), 200e3 * exposure_s / 2)
+                signal[0::2, 0::2] *= 2
+                signal = np.minimum(rng.normal(signal, np.sqrt(0.3 * signal)), full_well_dn)
+                name = f"ladder-{level}-{repeat}"
+                np.save(
+                    folder / f"frames/{name}.npy",
+                    np.clip(rng.normal(64 + signal, 2.0), 0, 4095).round().astype(np.uint16),
+                )
+                rows = [f"{x},{float(y) * (1 + 3e-4 * repeat)}" for x, y in (row.split(",") for row in lamp[1:])]
+                (folder / f"spectra/lamp-{repeat}.csv").write_text("\n".join([lamp[0], *rows]))
+                manifest["captures"].append(
+                    first
+                    | {"id": name, "frame": f"frames/{name}.npy", "radiance": f"spectra/lamp-{repeat}.csv"}
+                    | {"exposure_s": (stated or {}).get(exposure_s, exposure_s)}
+                )
+
+    edit(folder, change)
+
+
+MS = (1e-3, 2e-3, 4e-3, 6e-3, 8e-3, 10e-3, 12e-3, 14e-3)
+
+
+def test_a_level_at_the_full_well_contradicts_no_stated_light(folder: Path) -> None:
+    # Red reaches 3000 DN at 15 ms: at 24 ms it has two thirds of what its light says
+    ladder(folder, (*MS, 24e-3), full_well_dn=3000.0)
+    assert read(folder).warnings == ()
+
+
+def test_a_stated_light_that_the_full_well_does_not_explain_is_one_line(folder: Path) -> None:
+    ladder(folder, MS, full_well_dn=3500.0, stated={14e-3: 28e-3})
+    (line,) = read(folder).warnings
+    assert "capture ladder-7-0" in line
+    assert "3 flats of a stated light" in line
+
+
+def test_the_full_well_with_too_little_light_stated(folder: Path) -> None:
+    ladder(folder, (*MS, 24e-3), full_well_dn=3000.0, stated={24e-3: 3e-3})
+    (line,) = read(folder).warnings
+    assert "capture ladder-8-0" in line

@@ -1,0 +1,32 @@
+"""What is stated of a camera or of captures, and its recordings contradict: found before any physics is looked for.
+
+A wrong statement makes physics out of nothing: exchanged colours, lights at other wavelengths. What is found here is told as metadata,
+with the value that the recordings fit, and the diagnosis goes on with that value.
+"""
+
+from __future__ import annotations
+
+from lab.diagnose.metadata.bit_depth import misstated_bit_depth
+from lab.diagnose.metadata.black_level import misstated_black_level
+from lab.diagnose.metadata.cell_size import misstated_cell_size
+from lab.diagnose.metadata.exchanged_lights import exchanged_lights
+from lab.diagnose.metadata.misstatement import Misstatement
+from lab.diagnose.metadata.mosaic_phase import misstated_mosaic_phase
+from lab.formats.recording_set import RecordingSet
+from sim.camera import Side
+
+__all__ = ["Misstatement", "misstatements"]
+
+#: In this order: what follows is judged with what was found before it.
+_CHECKS = (misstated_bit_depth, misstated_black_level, misstated_mosaic_phase, exchanged_lights, misstated_cell_size)
+
+
+def misstatements(recordings: RecordingSet, side: Side) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
+    """The recordings with the values that they fit in place of wrong statements, and these statements."""
+    found: list[Misstatement] = []
+    for check in _CHECKS:
+        one = check(recordings, side)
+        if one is not None:
+            found.append(one)
+            recordings = one.corrected
+    return recordings, tuple(found)

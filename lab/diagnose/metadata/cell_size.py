@@ -1,0 +1,75 @@
+"""A size of a screen's cells that isn't that in the pictures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lab.diagnose.measurements.pattern_contrast import BERNOULLI
+from lab.diagnose.metadata.misstatement import Misstatement
+from lab.errors import NotDetermined
+from lab.fit.psf.levelled_captures import ScreenPictures, screen_pictures
+from lab.fit.psf.screen_registration import register
+from lab.formats.recording_set import RecordingSet
+from sim.camera import Side
+
+TOLERANCE = 0.05  # of a cell: the stated size is nominal, and a tilted screen's cells differ over the frame
+
+
+def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | None:
+    """Where the checkerboard's corners have cells that are further than `TOLERANCE` off `cell_camera_px`, mean over the pattern.
+
+    The cell's size is a first guess of the registration, which finds its own.
+    """
+    try:
+        pictures = [one for one in screen_pictures(recordings, side) if one.first.screen.cell_camera_px is not None]
+    except NotDetermined:
+        return None
+    sizes: dict[float, float] = {}
+    for one in pictures:
+        stated = one.first.screen.cell_camera_px
+        if stated is not None and stated not in sizes:
+            measured = _cell_px(one, stated)
+            if measured is not None:
+                sizes[stated] = measured
+    off = {stated: size for stated, size in sizes.items() if abs(size / stated - 1.0) > TOLERANCE}
+    if not off:
+        return None
+
+    def restated(capture: Any) -> Any:
+        screen = getattr(capture, "screen", None)
+        if capture.side != side or screen is None or screen.cell_camera_px not in off:
+            return capture
+        size = {"cell_camera_px": round(off[screen.cell_camera_px], 4)}
+        return capture.model_copy(update={"screen": screen.model_copy(update=size)})
+
+    captures = tuple(restated(c) for c in recordings.manifest.captures)
+    changed = tuple(new.id for old, new in zip(recordings.manifest.captures, captures, strict=True) if new is not old)
+    told = ", ".join(f"{size:.3f} px and not {stated:g}" for stated, size in off.items())
+    return Misstatement(
+        measurement=BERNOULLI,
+        where="cells of the screen",
+        shape="the stated size of the screen's cells contradicts the checkerboard's corners",
+        check=f"The screen's cells are {told} in the pictures of the {side} camera: correct cell_camera_px.",
+        chi2_stated=float(sum((np.log(size / stated) / (TOLERANCE / 5.0)) ** 2 for stated, size in off.items())),
+        chi2_corrected=0.0,
+        n=len(off),
+        captures=changed,
+        corrected=recordings.under(recordings.manifest.model_copy(update={"captures": captures})),
+    )
+
+
+def _cell_px(pictures: ScreenPictures, stated: float) -> float | None:
+    """Side of a cell in camera px: the root of its mean area over the pattern; None where the pattern isn't found."""
+    try:
+        warp = register(
+            pictures.checkerboard, pictures.bernoulli, pictures.checkerboard_target, pictures.bernoulli_target, stated
+        )
+    except NotDetermined:
+        return None
+    rows, cols = np.nonzero(np.isfinite(pictures.checkerboard))
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    cells = warp.cells(corner + np.array([cols.mean(), rows.mean()]))
+    (ax, ay), (bx, by) = cells[1] - cells[0], cells[2] - cells[0]
+    return float(1.0 / np.sqrt(abs(ax * by - ay * bx)))

@@ -1,0 +1,51 @@
+"""One wrong statement, and what it is told as."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from lab.diagnose.measurements.block import Measurement
+from lab.formats.recording_set import RecordingSet
+from lab.formats.results import Unexplained
+from sim.camera import Side
+
+
+@dataclass(frozen=True)
+class Misstatement:
+    """A statement that recordings contradict. `chi2_stated`, `chi2_corrected`: of `n` numbers, with the value that is stated and with the one
+    that fits. `corrected`: the recordings with that value."""
+
+    measurement: Measurement  # that shows it
+    where: str
+    shape: str  # what contradicts what
+    check: str  # both values, as a sentence
+    chi2_stated: float
+    chi2_corrected: float
+    n: int
+    captures: tuple[str, ...]
+    corrected: RecordingSet
+
+    def told(self, side: Side) -> Unexplained:
+        """As results have it."""
+        return Unexplained(
+            side=side,
+            measurement=self.measurement.name,
+            axis=self.measurement.axis,
+            where=self.where,
+            shape=self.shape,
+            significance_sigma=round(max(self.chi2_stated - self.chi2_corrected, 0.0) ** 0.5, 2),
+            chi2_before=self.chi2_stated,
+            chi2_after=self.chi2_corrected,
+            n=self.n,
+            captures=self.captures,
+            correction="the value that fits is taken in its place",
+            check=self.check,
+        )
+
+
+def restated_camera(recordings: RecordingSet, side: Side, **values: Any) -> RecordingSet:
+    """The recordings with other values stated of the camera of `side`."""
+    manifest = recordings.manifest
+    camera = manifest.cameras[side].model_copy(update=values)
+    return recordings.under(manifest.model_copy(update={"cameras": {**manifest.cameras, side: camera}}))

@@ -1,0 +1,86 @@
+"""A mosaic whose colours lie elsewhere than stated: planes that answer lights as another channel's curve says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.diagnose.measurements.chart import CHART
+from lab.diagnose.measurements.narrowband import NARROWBAND
+from lab.diagnose.metadata.lit_planes import LitPlanes, chart_planes, narrowband_planes, predicted
+from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
+from lab.formats.recording_set import RecordingSet
+from lab.predict.camera_model import camera_model
+from sim.camera import Cfa, Side
+from sim.spectrum import FloatArray
+
+MOSAICS: tuple[Cfa, ...] = ("RGGB", "BGGR", "GRBG", "GBRG")
+FEWEST_LIGHTS = 3
+BRIGHT = 10.0  # times what the dark level leaves open: of dimmer lights nothing is said
+DIM = 0.05  # of a light's brightest plane: curves differ from the maker's by any factor where they are low
+LEAST_ERROR = 0.15  # in the logarithm, of the stated mosaic: curves and crosstalk leave less
+BETTER = 0.5  # error of another mosaic over that of the stated one, at most
+SURER = 0.75  # ... over that of the next best, at most
+MOST_GAIN = 0.7  # of a channel against the maker's curve, logarithm: nobody's curves are worse
+ROUNDS = 6
+
+
+def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement | None:
+    """Where the planes' rates, relative to each other in each light, fit another mosaic than the stated one.
+
+    r = ln(plane's rate) - ln(channel's predicted rate) less a level for each light and a gain for each channel, over narrowband lights and
+    patches of a chart; the mosaic with the least rms of r. Without stated curves typical ones stand for them: wrong colours are wrong by
+    factors.
+    """
+    stated = recordings.camera(side).cfa
+    if stated == "MONO":
+        return None
+    patches = [one for light in chart_planes(recordings, side) for one in light]
+    narrow = narrowband_planes(recordings, side)
+    seen = [one for one in (*narrow, *patches) if np.isfinite(one.rate).sum() > 1]
+    seen = [one for one in seen if np.nanmax(one.rate) > BRIGHT * one.offset]
+    if len(seen) < FEWEST_LIGHTS:
+        return None
+    camera = camera_model(recordings, side, maker_curves=True)
+    rates = predicted(recordings, camera, seen)
+    errors = {cfa: _error(seen, rates, cfa) for cfa in MOSAICS}
+    best, second = sorted(MOSAICS, key=lambda cfa: errors[cfa])[:2]
+    if best == stated or errors[stated] < LEAST_ERROR:
+        return None
+    if errors[best] > BETTER * errors[stated] or errors[best] > SURER * errors[second]:
+        return None
+    n = 4 * len(seen)
+    # the numbers' standard deviation is taken for what the better mosaic leaves, at least that of sound curves
+    std = max(errors[best], LEAST_ERROR / 3.0)
+    return Misstatement(
+        measurement=NARROWBAND if narrow else CHART,
+        where="all lights",
+        shape="the stated mosaic contradicts the colours that its planes see",
+        check=f"The planes of the {side} camera answer the lights as a mosaic {best} does (rms {100 * errors[best]:.0f} %), but cfa = {stated} is "
+        f"stated (rms {100 * errors[stated]:.0f} %): correct cfa to {best}, or crop or turn the frames by even numbers of pixels, and fit again.",
+        chi2_stated=n * (errors[stated] / std) ** 2,
+        chi2_corrected=n * (errors[best] / std) ** 2,
+        n=n,
+        captures=tuple(dict.fromkeys(name for one in seen for name in one.captures)),
+        corrected=restated_camera(recordings, side, cfa=best),
+    )
+
+
+def _error(seen: list[LitPlanes], rates: dict[str, FloatArray], cfa: Cfa) -> float:
+    """Rms of the planes' logarithmic departures from the channels of `cfa`."""
+    rate = np.array([one.rate for one in seen])  # NaN where clipped
+    expected = np.where(np.isfinite(rate), np.array([rates[channel] for channel in cfa]).T, np.nan)
+    expected = expected * (np.nansum(rate, axis=1) / np.maximum(np.nansum(expected, axis=1), 1e-300))[:, None]
+    dim = np.maximum(DIM * np.nanmax(rate, axis=1), [one.offset for one in seen])[:, None]
+    left = np.log(np.maximum(rate, 0.0) + dim) - np.log(expected + dim)
+    channels = np.array(list(cfa))
+    gain = dict.fromkeys(cfa, 0.0)
+    for _ in range(ROUNDS):
+        moved = left - np.array([gain[channel] for channel in cfa])
+        moved = moved - np.nanmedian(moved, axis=1, keepdims=True)
+        for channel in gain:
+            own = moved[:, channels == channel]
+            step = float(np.median(own[np.isfinite(own)])) if np.isfinite(own).any() else 0.0
+            gain[channel] = float(np.clip(gain[channel] + 0.5 * step, -MOST_GAIN, MOST_GAIN))
+    final = left - np.array([gain[channel] for channel in cfa])
+    final = final - np.nanmean(final, axis=1, keepdims=True)
+    return float(np.sqrt(np.nanmean(np.square(final))))

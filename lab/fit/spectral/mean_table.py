@@ -1,0 +1,210 @@
+"""The relative sensitivity from a table of channel means by wavelength, for recordings whose frames aren't at hand.
+
+One row a light and channel, CSV with a header. Columns: `kind` (dark, narrowband), `exposure_s`, `mean_dn`, `mean_std_dn` (of the mean: noise,
+and scatter of repeats); of narrowband light `wavelength_nm`, `bandwidth_nm` (full width at half maximum) and its power by a reference:
+`radiance_w_per_sr_m2`, or `photodiode_a` with `photodiode_a_per_w`; of a colour sensor `channel` (R, G, B).
+
+The power's common factor is unknown or cancels: the curves are relative to their highest value. The method is that of frames (`lab.fit.spectral`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lab.errors import InputError, NotDetermined
+from lab.fit.number_table import TableRow, table_rows
+from lab.fit.spectral.recordings import FINE_SHARE, OUTPUT_STEP_NM
+from lab.fit.spectral.sensitivity import (
+    COVERAGE_FACTOR,
+    MIN_SPECTRA,
+    RADIOMETER_RELATIVE_STD,
+    Sensitivity,
+    solved_sensitivity,
+    trapezoid_weights,
+)
+from lab.formats.recording_set import DataSheet
+from lab.formats.results import CameraFit, FitResult, Skipped, SpectralFit
+from sim.spectrum import FloatArray
+
+NEEDED = ("kind", "exposure_s", "mean_dn", "mean_std_dn", "wavelength_nm", "bandwidth_nm")
+RADIANCE = "radiance_w_per_sr_m2"
+PHOTODIODE, RESPONSIVITY = "photodiode_a", "photodiode_a_per_w"
+KNOWN = (*NEEDED, RADIANCE, PHOTODIODE, RESPONSIVITY, "channel")
+GRID_NM = 1.0  # on which lights and curves stand
+CLIPPED_SHARE = 0.95  # of the range above black: a mean above it may be of a clipped plane
+
+
+@dataclass(frozen=True)
+class _Light:
+    """One mean in narrowband light, DN/s above dark. `power`: proportional to the light's."""
+
+    channel: str
+    wavelength_nm: float
+    bandwidth_nm: float
+    power: float
+    rate: float
+    rate_std: float
+
+
+def fit_mean_table(file: Path, camera: DataSheet) -> FitResult:
+    """Relative sensitivities of all channels from the table `file`, of a camera whose `cfa`, `bit_depth` and levels `camera` states.
+
+    Raises InputError with one line where a column is missing or unknown (another unit, above all) or a cell is no number, and `NotDetermined`
+    where a channel has fewer than three lights.
+    """
+    rows = table_rows(file, NEEDED, KNOWN)
+    darks = [row for row in rows if row.cells["kind"] == "dark"]
+    lit = [row for row in rows if row.cells["kind"] == "narrowband"]
+    if len(darks) + len(lit) < len(rows):
+        row = next(row for row in rows if row.cells["kind"] not in ("dark", "narrowband"))
+        raise InputError(f"{file}: row {row.number}: kind '{row.cells['kind']}'; write dark or narrowband")
+    if camera.black_level_dn is None and not darks:
+        raise InputError(f"{file}: no row of kind dark; add the channels' means in the dark, or state black_level_dn")
+    lights, clipped = [], 0
+    for row in lit:
+        light = _light(row, darks, camera)
+        clipped += light is None
+        lights += [light] if light is not None else []
+    remarks = [
+        "of a table of means: the sensitivities are relative, as nothing says which share of the light reaches a pixel and how many DN an electron makes"
+    ]
+    if clipped:
+        remarks.append(f"{clipped} means near the highest code are left out")
+    if not darks:
+        remarks.append(f"no means in the dark: the stated black level of {camera.black_level_dn:g} DN is taken off")
+    spectral = _fitted(lights, camera.channels, remarks)
+    reason = "a table of channel means holds no frames"
+    skipped = tuple(Skipped(step=step, reason=reason, side="left") for step in ("noise", "mtf", "psf", "geometry"))
+    return FitResult(source=str(file), cameras={"left": CameraFit(spectral=spectral)}, skipped=skipped)
+
+
+def _channel(row: TableRow, camera: DataSheet) -> str:
+    channel = row.cells.get("channel") or ("Y" if camera.cfa == "MONO" else "")
+    if channel not in camera.channels:
+        raise InputError(
+            f"{row.file}: row {row.number}: channel '{channel}' of a {camera.cfa} sensor; write {', '.join(camera.channels)}"
+        )
+    return channel
+
+
+def _power(row: TableRow) -> float:
+    radiance, current = row.known(RADIANCE), row.known(PHOTODIODE)
+    if (radiance is None) == (current is None):
+        raise InputError(
+            f"{row.file}: row {row.number}: give the light's power once, as {RADIANCE} or as {PHOTODIODE} with {RESPONSIVITY}"
+        )
+    if radiance is not None:
+        return radiance
+    responsivity = row.known(RESPONSIVITY)
+    if not responsivity:
+        raise InputError(
+            f"{row.file}: row {row.number}: {PHOTODIODE} without {RESPONSIVITY}; give the photodiode's responsivity at this wavelength"
+        )
+    return (current or 0.0) / responsivity
+
+
+def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Light | None:
+    """The row's rate; None where its mean may be clipped."""
+    channel, power = _channel(row, camera), _power(row)
+    exposure_s, mean = row.value("exposure_s", 1e-9), row.value("mean_dn")
+    if power <= 0.0:
+        raise InputError(f"{row.file}: row {row.number}: no light; leave the row out, or write kind dark")
+    own = [dark for dark in darks if _channel(dark, camera) == channel]
+    if darks and not own:
+        raise InputError(f"{row.file}: channel {channel} has no row of kind dark; add its mean in the dark")
+    black, black_std = camera.black_level_dn or 0.0, 0.0
+    if own:
+        nearest = min(own, key=lambda dark: abs(dark.value("exposure_s") - exposure_s))
+        black, black_std = nearest.value("mean_dn"), nearest.value("mean_std_dn")
+    if mean > black + CLIPPED_SHARE * (camera.saturation_dn - black):
+        return None
+    return _Light(
+        channel,
+        row.value("wavelength_nm", 1.0),
+        row.value("bandwidth_nm", 0.1),
+        power,
+        (mean - black) / exposure_s,
+        float(np.hypot(row.value("mean_std_dn", 1e-9), black_std)) / exposure_s,
+    )
+
+
+def _fitted(lights: Sequence[_Light], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
+    by_channel = {c: [one for one in lights if one.channel == c] for c in channels}
+    for channel, own in by_channel.items():
+        if len({one.wavelength_nm for one in own}) < MIN_SPECTRA:
+            raise NotDetermined(
+                "spectral", f"channel {channel} has fewer than {MIN_SPECTRA} lights; add means at other wavelengths"
+            )
+    low = min(one.wavelength_nm - one.bandwidth_nm for one in lights)
+    high = max(one.wavelength_nm + one.bandwidth_nm for one in lights)
+    wave = np.arange(np.floor(low), np.ceil(high) + GRID_NM, GRID_NM)
+    unit = float(np.median([one.power * one.wavelength_nm for one in lights]))
+    solved = {}
+    for channel, own in by_channel.items():
+        value = np.array([one.rate for one in own])
+        noise = np.array([one.rate_std for one in own])
+        operator = np.array([_photons(one, wave) for one in own]) / unit * trapezoid_weights(wave)
+        scale = float(np.abs(value).max()) or 1.0
+        std = np.hypot(noise, RADIOMETER_RELATIVE_STD * value) / scale
+        solved[channel] = scale, solved_sensitivity(wave, operator, value / scale, std, None, FINE_SHARE)
+    centres = [one.wavelength_nm for one in lights]
+    out = (
+        np.arange(np.ceil(min(centres) / OUTPUT_STEP_NM), np.floor(max(centres) / OUTPUT_STEP_NM) + 1) * OUTPUT_STEP_NM
+    )
+    if out.size < 2:
+        raise NotDetermined(
+            "spectral", f"the lights within {min(centres):g}..{max(centres):g} nm don't span the spectrum"
+        )
+    at = np.stack([np.interp(out, wave, row) for row in np.eye(wave.size)], axis=1)
+    value = np.concatenate([scale * (at @ one.sensitivity) for scale, one in solved.values()])
+    joint = _joint_covariance(at, solved, by_channel)
+    peak = int(np.argmax(value))
+    ratio = value / value[peak]
+    variance = np.diag(joint) - 2.0 * ratio * joint[peak] + ratio**2 * joint[peak, peak]
+    relative = np.sqrt(np.clip(variance, 0.0, None)) / value[peak]
+    size = out.size
+
+    def told(array: FloatArray) -> dict[str, tuple[float, ...]]:
+        return {c: tuple(array[k * size : (k + 1) * size].tolist()) for k, c in enumerate(channels)}
+
+    return SpectralFit(
+        wavelength_nm=tuple(out.tolist()),
+        quantum_efficiency={},
+        quantum_efficiency_std={},
+        relative_sensitivity=told(ratio),
+        relative_sensitivity_std=told(relative),
+        coverage_factor=COVERAGE_FACTOR,
+        remarks=tuple(remarks),
+    )
+
+
+def _photons(light: _Light, wave: FloatArray) -> FloatArray:
+    """Photons per nm, up to a factor: a triangle of the light's bandwidth, as a monochromator with equal slits has."""
+    shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / light.bandwidth_nm, 0.0, None)
+    area = float(np.sum(shape * trapezoid_weights(wave)))
+    if area <= 0.0:  # narrower than the grid, and between its points
+        shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / GRID_NM, 0.0, None)
+        area = float(np.sum(shape * trapezoid_weights(wave)))
+    return np.asarray(shape * light.power * light.wavelength_nm / area)
+
+
+def _joint_covariance(
+    at: FloatArray, solved: dict[str, tuple[float, Sensitivity]], by_channel: dict[str, list[_Light]]
+) -> FloatArray:
+    """Covariance of the curves of all channels, channel after channel. Channels share the error of the reference's reading of each light."""
+    blocks = []
+    for c, (scale, one) in solved.items():
+        row = []
+        for d, (_, two) in solved.items():
+            if c == d:
+                row.append(scale**2 * at @ one.covariance @ at.T)
+                continue
+            same = np.array([[a.wavelength_nm == b.wavelength_nm for b in by_channel[d]] for a in by_channel[c]])
+            rates = np.outer([a.rate for a in by_channel[c]], [b.rate for b in by_channel[d]])
+            row.append(at @ one.gain @ (RADIOMETER_RELATIVE_STD**2 * same * rates) @ two.gain.T @ at.T)
+        blocks.append(row)
+    return np.block(blocks)

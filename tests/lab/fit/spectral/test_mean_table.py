@@ -1,0 +1,117 @@
+"""Tables of channel means by wavelength give the relative sensitivities of their camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.errors import InputError, NotDetermined
+from lab.fit.spectral.mean_table import fit_mean_table
+from lab.formats.recording_set import DataSheet
+from lab.formats.results import SpectralFit
+
+CAMERA = DataSheet(rows=200, cols=200, cfa="RGGB", bit_depth=12)
+BLACK_DN, EXPOSURE_S, STD_DN = 64.0, 0.1, 0.3
+CURVES = {"R": (600.0, 35.0, 0.9), "G": (540.0, 40.0, 1.0), "B": (460.0, 30.0, 0.8)}
+HEADER = "kind,channel,wavelength_nm,bandwidth_nm,exposure_s,mean_dn,mean_std_dn"
+
+
+def _truth(channel: str, wavelength_nm: np.ndarray) -> np.ndarray:
+    middle, width, height = CURVES[channel]
+    return np.asarray(height * np.exp(-0.5 * ((wavelength_nm - middle) / width) ** 2))
+
+
+def _table(path: Path, seed: int = 0, *, photodiode: bool = False, change: tuple[str, str] = ("", "")) -> Path:
+    """Lines of 10 nm every 10 nm through triangles of that width, whose power falls to the blue by half; DN a photon as `CURVES`."""
+    rng = np.random.default_rng(seed)
+    rows = [f"{HEADER},{'photodiode_a,photodiode_a_per_w' if photodiode else 'radiance_w_per_sr_m2'}"]
+    for channel in CURVES:
+        black = BLACK_DN + rng.normal(0.0, 0.02)
+        rows.append(f"dark,{channel},,,{EXPOSURE_S},{black:.4f},0.02,{',' if photodiode else ''}")
+    fine = np.arange(-10.0, 10.01, 0.25)
+    weight = 1.0 - np.abs(fine) / 10.0
+    for line_nm in np.arange(400.0, 701.0, 10.0):
+        power = 1e-3 * (0.5 + 0.5 * (line_nm - 400.0) / 300.0)
+        read = power * (1.0 + rng.normal(0.0, 0.003))
+        responsivity = 0.2 + 0.0005 * (line_nm - 400.0)
+        light = f"{read * responsivity:.8g},{responsivity:.6g}" if photodiode else f"{read:.8g}"
+        for channel in CURVES:
+            # the table's light is a triangle in photons: its mean wavelength is that of the line
+            mean = float(np.sum(weight * _truth(channel, line_nm + fine)) / weight.sum())
+            signal = 3.0e3 * (power / 1e-3) * (line_nm / 700.0) * mean
+            told = BLACK_DN + signal + rng.normal(0.0, STD_DN)
+            rows.append(f"narrowband,{channel},{line_nm:g},10,{EXPOSURE_S},{told:.4f},{STD_DN},{light}")
+    file = path / "table.csv"
+    text = "\n".join(rows) + "\n"
+    file.write_text(text.replace(*change) if change[0] else text)
+    return file
+
+
+def _spectral(file: Path) -> SpectralFit:
+    found = fit_mean_table(file, CAMERA).cameras["left"].spectral
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("photodiode", [False, True])
+def test_the_relative_sensitivities_of_the_table_s_camera(tmp_path: Path, photodiode: bool) -> None:
+    """The highest value of all channels is 1. Reading and noise leave some per mille at the peaks."""
+    found = _spectral(_table(tmp_path, photodiode=photodiode))
+    wave = np.array(found.wavelength_nm)
+    assert (wave[0], wave[-1]) == (400.0, 700.0)
+    peak = max(float(_truth(c, wave).max()) for c in CURVES)
+    for channel in CURVES:
+        value, std = (np.array(getattr(found, f"relative_sensitivity{part}")[channel]) for part in ("", "_std"))
+        truth = _truth(channel, wave) / peak
+        assert np.all(std < 0.02)
+        # beside its uncertainty, a regularised curve is off by structure that lights of 10 nm don't resolve
+        assert np.all(np.abs(value - truth) < 4.0 * np.hypot(std, 0.002))
+    assert found.quantum_efficiency == {}
+    assert any("relative" in remark for remark in found.remarks)
+
+
+@pytest.mark.slow
+def test_standard_deviations_of_relative_sensitivities_are_true(tmp_path: Path) -> None:
+    """20 draws, all values above a tenth of the peak: the mean square pull is within 1 +- 3 sqrt(2 / 20), as neighbours share their noise."""
+    pulls = []
+    for seed in range(20):
+        found = _spectral(_table(tmp_path, seed))
+        wave = np.array(found.wavelength_nm)
+        peak = max(float(_truth(c, wave).max()) for c in CURVES)
+        for channel in CURVES:
+            truth = _truth(channel, wave) / peak
+            value, std = (np.array(getattr(found, f"relative_sensitivity{part}")[channel]) for part in ("", "_std"))
+            high = (truth > 0.1) & (std > 1e-6)
+            pulls.append(np.mean(np.square((value - truth)[high] / std[high])))
+    assert 0.2 < np.mean(pulls) < 1.0 + 3.0 * np.sqrt(2.0 / 20)
+
+
+def test_means_near_the_highest_code_are_left_out(tmp_path: Path) -> None:
+    found = fit_mean_table(_table(tmp_path), CAMERA.model_copy(update={"white_level_dn": 2000.0}))
+    assert found.cameras["left"].spectral is not None
+    assert any("near the highest code are left out" in r for r in found.cameras["left"].spectral.remarks)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("bandwidth_nm", "fwhm_nm"), "missing: bandwidth_nm; unknown: fwhm_nm"),
+        (("narrowband,R,400", "flat,R,400"), "kind 'flat'; write dark or narrowband"),
+        (("narrowband,R,400", "narrowband,Y,400"), "channel 'Y' of a RGGB sensor"),
+        (("narrowband,R,400,10", "narrowband,R,400,wide"), "bandwidth_nm = 'wide' isn't a number"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(tmp_path: Path, change: tuple[str, str], words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        fit_mean_table(_table(tmp_path, change=change), CAMERA)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_channel_without_lights(tmp_path: Path) -> None:
+    file = _table(tmp_path)
+    file.write_text("\n".join(line for line in file.read_text().splitlines() if not line.startswith("narrowband,B")))
+    with pytest.raises(NotDetermined, match="channel B has fewer than 3 lights"):
+        fit_mean_table(file, CAMERA)
