@@ -21,6 +21,7 @@ from lab.diagnose.side import SideFindings, diagnose_side
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult
+from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 
 __all__ = ["DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
@@ -49,6 +50,7 @@ def diagnose(
     return examine(recordings, fit, progress, at_once=at_once).result
 
 
+@one_blas_thread
 def examine(
     recordings: RecordingSet,
     fit: FitResult | None = None,

@@ -12,6 +12,7 @@ from typing import TypeVar
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
+from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 
 #: Called with what was just done and the share of the work that is done, 0..1; from any thread, one call at a time.
@@ -45,6 +46,7 @@ class _Run:
         return result
 
 
+@one_blas_thread
 def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None) -> FitResult:
     """Run every fit on every side, and the stereo pair. What the recordings don't determine is in `skipped`, with the
     reason.
