@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from lab.formats.camera_file import CameraFile
     from lab.formats.recording_set import RecordingSet
     from lab.formats.results import DiagnosisResult, FitResult, NextCapture, Resolution, ValidationResult
+    from lab.workers import Workers
     from sim.camera import Side
 
 M = TypeVar("M", bound="BaseModel")
@@ -93,6 +94,7 @@ class PipelineRequest:
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart
     pictures : draw the residual pictures of the diagnosis
     bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
+    workers : where they are drawn; None: in this computer's processes of the diagnosis
     report_file : the page to write; None: `report.html` in the session's folder, with the results and cameras beside it
     """
 
@@ -108,6 +110,7 @@ class PipelineRequest:
     resolve: bool = False
     pictures: bool = True
     bootstrap: int = 0
+    workers: Workers | None = None
     report_file: Path | None = None
 
     def __post_init__(self) -> None:
@@ -417,6 +420,7 @@ class _Pipeline:
             baseline=self.request.models,
             pictures=self.request.pictures,
             bootstrap=self.request.bootstrap,
+            workers=self.request.workers,
         )
 
     def _resolve_step(self) -> None:

@@ -22,6 +22,7 @@ from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult
 from lab.one_blas_thread import one_blas_thread
+from lab.workers import Workers
 from sim.camera import Side
 
 __all__ = ["DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
@@ -60,6 +61,7 @@ def examine(
     at_once: bool = True,
     pictures: bool = False,
     bootstrap: int = 0,
+    workers: Workers | None = None,
     policy: DecisionPolicy | None = None,
 ) -> Diagnosis:
     """Diagnose every side.
@@ -71,6 +73,7 @@ def examine(
     at_once     several sides run at the same time, each in a process of its own; else one after the other in this one.
     pictures    draw residual pictures, for the report.
     bootstrap   healthy cameras like the baseline that are drawn frame by frame; the threshold is at least what their scores say.
+    workers     where these are drawn; None: in the side's process.
     policy      the rules of decision; None: `DecisionPolicy()`.
     """
     policy = policy or DecisionPolicy()
@@ -92,10 +95,13 @@ def examine(
             policy=policy,
             pictures=pictures,
             bootstrap=bootstrap,
+            workers=workers,
         )
 
     if at_once and len(shares) > 1:
-        found = in_processes(recordings, fit, cameras, report, policy=policy, pictures=pictures, bootstrap=bootstrap)
+        found = in_processes(
+            recordings, fit, cameras, report, policy=policy, pictures=pictures, bootstrap=bootstrap, workers=workers
+        )
     else:
         found = [alone(side) for side in recordings.sides]
     if progress is not None:

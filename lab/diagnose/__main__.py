@@ -24,10 +24,18 @@ def _serve() -> None:
             task = pickle.load(sys.stdin.buffer)
         except (EOFError, pickle.UnpicklingError):
             os._exit(1)  # the caller was interrupted before it had sent the task
-        recordings, side, fit, baseline, policy, pictures, bootstrap = task
+        recordings, side, fit, baseline, policy, pictures, bootstrap, workers = task
         try:
             found = diagnose_side(
-                recordings, side, fit, baseline, say, policy=policy, pictures=pictures, bootstrap=bootstrap
+                recordings,
+                side,
+                fit,
+                baseline,
+                say,
+                policy=policy,
+                pictures=pictures,
+                bootstrap=bootstrap,
+                workers=workers,
             )
             say(found)
         except BrokenPipeError:

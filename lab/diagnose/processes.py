@@ -25,6 +25,7 @@ from lab.errors import InputError
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
+from lab.workers import Workers
 from sim.camera import Side
 
 #: How often (s) a waiting main thread wakes to let Python run signal handlers.
@@ -42,6 +43,7 @@ def in_processes(
     policy: DecisionPolicy,
     pictures: bool = False,
     bootstrap: int = 0,
+    workers: Workers | None = None,
 ) -> list[SideFindings]:
     """The findings of every side, in the order of the sides. `report` is called in the caller's thread. An exception in
     it, or in a process, ends all processes. Raises InputError where a process was ended from outside."""
@@ -52,7 +54,7 @@ def in_processes(
         for side in recordings.sides:
             # registered before it starts: an interrupt in between must find it
             stack.enter_context(
-                _Process(side, (recordings, side, fit, baseline.get(side), policy, pictures, bootstrap), said)
+                _Process(side, (recordings, side, fit, baseline.get(side), policy, pictures, bootstrap, workers), said)
             ).start()
         while len(found) < len(recordings.sides):
             try:
