@@ -19,8 +19,8 @@ from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
 from lab.capture.store import Store
 from lab.errors import InputError
+from lab.formats.results import ReportFile
 from lab.jobs import JobInfo, JobRunner
-from lab.pipeline import ReportFile
 
 
 @dataclass(frozen=True)

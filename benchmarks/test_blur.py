@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.signal import fftconvolve
+from threadpoolctl import threadpool_limits
 
 from benchmarks.peers.iso12233 import iso12233_mtf
 from benchmarks.peers.mosleh import mosleh_kernel
+from benchmarks.table import Row, show
 from lab.capture_kinds.bernoulli import BernoulliCapture
 from lab.capture_kinds.screen import ScreenState
 from lab.fit.mtf import edge_mtf
@@ -39,9 +41,11 @@ from sim.scene.scenes import ScreenPattern
 from sim.sensor.electrons import FixedPattern, sample_from
 from sim.spectrum import Spectrum
 from tests.lab.fit.mtf.drawn_edges import edge, gaussian_mtf, gaussian_mtf50
-from tests.lab.fit.psf.drawn_targets import KERNELS, blurred_target, misplaced_target, misplacement, psnr_db
+from tests.lab.fit.psf.drawn_targets import KERNELS, blurred_target, gaussian, misplaced_target, misplacement, psnr_db
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
+EDGE_LIMIT_MS = 40.0
+KERNEL_LIMIT_S = {25: 1.5, 33: 3.0}  # by support, px
 DRAWS = int(os.environ.get("CALIBENCH_BENCH_DRAWS", "40"))
 SIZE, FULL_E, READ_E = 400, 10000.0, 2.0
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
@@ -120,6 +124,24 @@ def test_edges_beside_iso_12233() -> None:
         # a standard deviation of so many draws is known to 1 / sqrt(2 n): three of these
         assert sd <= 1.1 * bound * (1 + 3 / np.sqrt(2 * DRAWS))
         assert np.abs(excess).max() < 0.004
+
+
+def test_times_beside_their_limits() -> None:
+    """With the threads for linear algebra that a user has who set nothing: the entries of the numerics take one."""
+    rows = []
+    with threadpool_limits(os.cpu_count(), user_api="blas"):
+        for sigma in (0.3, 1.5):
+            frame = noisy(edge(SIZE, 5.0, sigma), np.random.default_rng(1))
+            edge_mtf(frame)
+            taken = 1e3 * float(np.median([cpu(lambda f=frame: edge_mtf(f)) for _ in range(20)]))
+            rows.append(Row(f"edge of {SIZE} x {SIZE} px, sigma {sigma} px", taken, EDGE_LIMIT_MS, "ms", "limit"))
+        for support, limit in KERNEL_LIMIT_S.items():
+            sharp, blurred = blurred_target(gaussian(support, support / 8, support / 8))
+            taken = float(
+                np.median([cpu(lambda s=sharp, b=blurred, n=support: estimate_kernel(s, b, n)) for _ in range(5)])
+            )
+            rows.append(Row(f"kernel of {support} x {support} px from 256 x 256", taken, limit, "s", "limit"))
+    show("CPU time", rows)
 
 
 def test_kernels_beside_mosleh() -> None:

@@ -33,6 +33,7 @@ from lab.pipeline import (
     run_pipeline,
     source_recordings,
 )
+from lab.workers import dask_client
 from sim.parameters import Frozen
 
 #: The least time (s) between two rows of progress.
@@ -194,28 +195,23 @@ class JobRunner:
 
         with self._starting:
             if self._client is None:
-                try:
-                    if self.scheduler is None:
-                        # Dask opens its HTTP servers to the whole network, even with no dashboard asked for, the
-                        # scheduler's at one fixed port: here they are on loopback, at any port, and answer nothing.
-                        quiet: dict[str, list[str]] = {
-                            f"distributed.{part}.http.routes": [] for part in ("scheduler", "worker")
-                        }
-                        with dask.config.set(quiet):
-                            self._client = Client(
-                                processes=False,
-                                n_workers=1,
-                                threads_per_worker=self.workers,
-                                dashboard_address="127.0.0.1:0",
-                                worker_dashboard_address="127.0.0.1:0",
-                                set_as_default=False,
-                            )
-                    else:
-                        self._client = Client(self.scheduler, timeout=self.connect_timeout_s, set_as_default=False)
-                except OSError as error:
-                    raise InputError(
-                        f"Dask scheduler {self.scheduler}: not reached ({error}); start it or unset CALIBENCH_SCHEDULER"
-                    ) from error
+                if self.scheduler is not None:
+                    self._client = dask_client(self.scheduler, self.connect_timeout_s)
+                    return self._client
+                # Dask opens its HTTP servers to the whole network, even with no dashboard asked for, the
+                # scheduler's at one fixed port: here they are on loopback, at any port, and answer nothing.
+                quiet: dict[str, list[str]] = {
+                    f"distributed.{part}.http.routes": [] for part in ("scheduler", "worker")
+                }
+                with dask.config.set(quiet):
+                    self._client = Client(
+                        processes=False,
+                        n_workers=1,
+                        threads_per_worker=self.workers,
+                        dashboard_address="127.0.0.1:0",
+                        worker_dashboard_address="127.0.0.1:0",
+                        set_as_default=False,
+                    )
             return self._client
 
     def submit(self, kind: Goal, source: str, *, resolve: bool = False, capturer: Capturer | None = None) -> str:

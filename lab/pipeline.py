@@ -16,16 +16,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from pydantic import BaseModel
-
 from lab.errors import Cancelled, InputError
-from lab.formats import recording_set
-from lab.formats.recording_set import RecordingError, RecordingSet
-from lab.formats.results import DiagnosisResult, FitResult, NextCapture, Resolution, ValidationResult
-from sim.camera import Side
-from sim.parameters import Frozen
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from lab.capture.plan import CapturePlan
     from lab.capture.session import Progress as CaptureProgress
     from lab.capture.station import Drivers, Station
@@ -34,8 +29,12 @@ if TYPE_CHECKING:
     from lab.diagnose.outcome.next_capture import Proposal
     from lab.diagnose.policy import DecisionPolicy
     from lab.formats.camera_file import CameraFile
+    from lab.formats.recording_set import RecordingSet
+    from lab.formats.results import DiagnosisResult, FitResult, NextCapture, Resolution, ValidationResult
+    from lab.workers import Workers
+    from sim.camera import Side
 
-M = TypeVar("M", bound=BaseModel)
+M = TypeVar("M", bound="BaseModel")
 Goal = Literal["capture", "fit", "validate", "diagnose", "report", "pipeline"]
 Step = Literal["capture", "fit", "validate", "diagnose", "resolve", "report"]
 
@@ -95,6 +94,7 @@ class PipelineRequest:
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart
     pictures : draw the residual pictures of the diagnosis
     bootstrap : healthy cameras that are drawn frame by frame for the threshold of the diagnosis
+    workers : where they are drawn; None: in this computer's processes of the diagnosis
     report_file : the page to write; None: `report.html` in the session's folder, with the results and cameras beside it
     """
 
@@ -110,6 +110,7 @@ class PipelineRequest:
     resolve: bool = False
     pictures: bool = True
     bootstrap: int = 0
+    workers: Workers | None = None
     report_file: Path | None = None
 
     def __post_init__(self) -> None:
@@ -146,13 +147,6 @@ Tell = Callable[[PipelineProgress], None]
 Capturer = Callable[[CaptureRequest, "Callable[[CaptureProgress], None]"], str]
 
 
-class ReportFile(Frozen):
-    """A report: its path, relative to the data folder if it lies there, and the ids of the results that it shows, by kind."""
-
-    path: str
-    results: dict[str, str] = {}
-
-
 @dataclass(frozen=True)
 class PipelineResult:
     """What a pipeline found; None for what its goal doesn't need."""
@@ -171,10 +165,12 @@ class PipelineResult:
 
 def session_recordings(store: Store, session_id: str) -> RecordingSet:
     """A stored session as a recording set, inspected as a folder would be. Raises InputError where it can't be used."""
+    from lab.formats.recording_set import RecordingError, inspect
+
     recordings = store.recording_set(session_id)
     if not recordings.captures():
         raise InputError(f"session {session_id}: nothing was captured yet; resume it with `calibench capture --resume`")
-    problems, warnings = recording_set.inspect(recordings)
+    problems, warnings = inspect(recordings)
     if problems:
         raise RecordingError(problems)
     recordings.warnings = tuple(warnings)
@@ -187,6 +183,8 @@ def source_recordings(source: str, open_store: Callable[[], Store | None]) -> Re
     The store is opened only where `source` isn't a path; `open_store` returns None where there is no data folder.
     """
     if Path(source).exists() or os.sep in source:
+        from lab.formats import recording_set
+
         return recording_set.read(source)
     store = open_store()
     if store is None or not store.has_session(source):
@@ -380,6 +378,7 @@ class _Pipeline:
 
     def _fit_step(self) -> None:
         from lab.fit import fit_recording_set
+        from lab.formats.results import FitResult
 
         if self._fit is None:
             self._fit = self._kept("fit", FitResult)
@@ -388,6 +387,7 @@ class _Pipeline:
             self._keep("fit", self._fit)
 
     def _validate_step(self) -> None:
+        from lab.formats.results import ValidationResult
         from lab.predict.validate import validate
 
         self._validation = self._kept("validate", ValidationResult)
@@ -401,6 +401,8 @@ class _Pipeline:
             self._keep("validate", self._validation)
 
     def _diagnose_step(self) -> None:
+        from lab.formats.results import DiagnosisResult
+
         self._diagnosis = self._kept("diagnose", DiagnosisResult)
         if self._diagnosis is None:
             self._examined = self._diagnosed(self.recordings, "diagnose")
@@ -418,6 +420,7 @@ class _Pipeline:
             baseline=self.request.models,
             pictures=self.request.pictures,
             bootstrap=self.request.bootstrap,
+            workers=self.request.workers,
         )
 
     def _resolve_step(self) -> None:
@@ -426,6 +429,7 @@ class _Pipeline:
         from dataclasses import replace
 
         from lab.diagnose.policy import DecisionPolicy
+        from lab.formats.results import Resolution
 
         assert self._examined is not None
         assert self.store is not None
@@ -455,6 +459,7 @@ class _Pipeline:
         self._say("resolve", "done", 1.0, remark=ties.verdict(examined.proposals))
 
     def _report_step(self) -> None:
+        from lab.formats.results import ReportFile
         from lab.report import provenance_of, write_report
 
         runs = self.store.runs(self._session) if self.store is not None and self._session is not None else []

@@ -17,20 +17,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from mocks.cornerstone260 import MockCornerstone260
-from mocks.cornerstone260b_serial import MockCornerstone260BSerial
-from mocks.cr300 import ColorimetryResearch
-from mocks.display import MockScreen, Page, browse
-from mocks.lamp import Lamp, LampClock
-from mocks.pr655 import DIALECTS, PhotoResearch
-from mocks.scpi_meter import MockScpiMeter
-from mocks.specbos1211 import MockSpecbos1211
-from mocks.stage import MockStage, Targets
 from mocks.wire import (
     AddressError,
     Endpoint,
@@ -47,6 +39,13 @@ from mocks.wire import (
 if TYPE_CHECKING:
     from mocks.bench import Bench
     from mocks.conceal import Concealed
+    from mocks.display import MockScreen
+    from mocks.lamp import Lamp
+    from mocks.stage import Targets
+
+    class Place(MeasuredLight, Targets, MockScreen, Protocol):
+        """All that the mocks here act on: a bench, or a lamp alone."""
+
 
 commands = typer.Typer()
 
@@ -58,22 +57,23 @@ CALIBRATION_DEPARTURE_PERCENT = 2.0
 WARMEST_C = 40.0
 
 
-class Place(MeasuredLight, Targets, MockScreen, Protocol):
-    """All that the mocks here act on: a bench, or a lamp alone."""
+def _mock(module: str, name: str, *identity: Any) -> Callable[[Place], Grammar]:
+    """Makes a mock of the class `name` in `mocks.MODULE`, which is imported only then: `calibench --help` names them all."""
+    return lambda place: getattr(import_module(f"mocks.{module}"), name)(place, *identity)
 
 
 INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
-    "cornerstone260": MockCornerstone260,
-    "cornerstone260b-serial": MockCornerstone260BSerial,
-    "specbos1211": MockSpecbos1211,
-    "specbos1201": lambda place: MockSpecbos1211(place, "1201427", "specbos 1201", (380.0, 780.0)),
-    "spectraval1501": lambda place: MockSpecbos1211(place, "1501427", "spectraval 1501", (380.0, 780.0)),
-    "pr655": lambda place: PhotoResearch(place, "PR-655"),
-    "pr670": lambda place: PhotoResearch(place, "PR-670", "67001234"),
-    "cr250": lambda place: ColorimetryResearch(place, "CR-250"),
-    "cr300": lambda place: ColorimetryResearch(place, "CR-300"),
-    "scpi-meter": MockScpiMeter,
-    "stage": MockStage,
+    "cornerstone260": _mock("cornerstone260", "MockCornerstone260"),
+    "cornerstone260b-serial": _mock("cornerstone260b_serial", "MockCornerstone260BSerial"),
+    "specbos1211": _mock("specbos1211", "MockSpecbos1211"),
+    "specbos1201": _mock("specbos1211", "MockSpecbos1211", "1201427", "specbos 1201", (380.0, 780.0)),
+    "spectraval1501": _mock("specbos1211", "MockSpecbos1211", "1501427", "spectraval 1501", (380.0, 780.0)),
+    "pr655": _mock("pr655", "PhotoResearch", "PR-655"),
+    "pr670": _mock("pr655", "PhotoResearch", "PR-670", "67001234"),
+    "cr250": _mock("cr300", "ColorimetryResearch", "CR-250"),
+    "cr300": _mock("cr300", "ColorimetryResearch", "CR-300"),
+    "scpi-meter": _mock("scpi_meter", "MockScpiMeter"),
+    "stage": _mock("stage", "MockStage"),
 }
 
 #: Exported over USB/IP (`mocks.usb`).
@@ -106,6 +106,10 @@ def mock(
     ] = None,
 ) -> None:
     """Serve one mock instrument on a pseudo-terminal, a TCP port or USB/IP; prints `ready ADDRESS` when it listens."""
+    from mocks.display import Page, browse
+    from mocks.lamp import Lamp, LampClock
+    from mocks.pr655 import DIALECTS, PhotoResearch
+
     with _one_line_errors():
         if name not in EVERY_INSTRUMENT:
             raise _Unusable(f"mock {name}: no such instrument; choose from {', '.join(EVERY_INSTRUMENT)}")
@@ -278,6 +282,10 @@ def _start_bench(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
     """Start everything; returns the addresses by instrument, and what a lab knows of this bench."""
     # The bench brings the whole forward model along: only this command pays for it.
+    from mocks.cornerstone260 import MockCornerstone260
+    from mocks.display import Page, browse
+    from mocks.specbos1211 import MockSpecbos1211
+    from mocks.stage import MockStage
     from mocks.targets import SCREEN_COLS, SCREEN_ROWS
     from mocks.usb import SERIAL_NUMBERS, serve_usbip, stereo_pair
 

@@ -22,9 +22,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from sim.spectrum import Spectrum
+if TYPE_CHECKING:
+    from sim.spectrum import Spectrum
 
 #: A host that has said nothing for so long has ended its line, whatever it ends lines with.
 QUIET_S = 0.15

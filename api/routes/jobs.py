@@ -15,9 +15,8 @@ from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
 from lab.capture.plan import full_plan
-from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
-from lab.pipeline import ReportFile
 
 router = APIRouter()
 

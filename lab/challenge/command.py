@@ -6,11 +6,14 @@ import os
 import random
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lab.errors import InputError
+
+if TYPE_CHECKING:
+    from lab.workers import Workers
 
 commands = typer.Typer(
     name="challenge",
@@ -20,6 +23,14 @@ commands = typer.Typer(
 )
 
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes (all cores)")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        envvar="CALIBENCH_SCHEDULER",
+        help="a Dask scheduler (tcp://HOST:PORT), in place of processes here; its workers have to see DIR under the same path",
+    ),
+]
 EXIT_CHECK = 4
 #: The list of scored seeds, in a checkout of the project; an installation has none.
 PROOF_PAGE = Path(__file__).resolve().parents[2] / "docs" / "proof.md"
@@ -28,6 +39,12 @@ PROOF_PAGE = Path(__file__).resolve().parents[2] / "docs" / "proof.md"
 def _say(text: str, share: float) -> None:
     if sys.stderr.isatty():
         print(f"\r{text} ({100 * share:.0f} %)", end="" if share < 1 else "\n", file=sys.stderr, flush=True)
+
+
+def _workers(jobs: int | None, scheduler: str | None) -> Workers:
+    from lab.workers import Workers
+
+    return Workers(jobs or os.cpu_count() or 1, scheduler)
 
 
 @commands.command("make")
@@ -47,6 +64,7 @@ def make_command(
         bool, typer.Option("--proof", help="a proof: its seed is scored once, and never tuned on")
     ] = False,
     jobs: Jobs = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Write sealed recording sets with concealed truths. An interrupted one goes on where it stopped."""
     from lab.challenge.make import make
@@ -68,7 +86,7 @@ def make_command(
     if proof:
         refuse_scored(seed, PROOF_PAGE)
     file = truths if truths is not None else out.parent / f"{out.resolve().name}.truths.json"
-    made = make(out, cases, seed, file, size, jobs or os.cpu_count() or 1, cfa=cfa, progress=_say)
+    made = make(out, cases, seed, file, size, _workers(jobs, scheduler), cfa=cfa, progress=_say)
     print(f"{out}: {len(made.truths)} cases, sealed in seals.json; the truths, seed among them, are in {file}")
 
 
@@ -83,6 +101,7 @@ def score_command(
         Path | None, typer.Option("--page", metavar="FILE.md", help="write tables and a picture into this page")
     ] = None,
     jobs: Jobs = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Diagnose what has no result yet, open the seals, and score. Exit code 4 where a goal is missed."""
     from lab.challenge.proof import table, write_page
@@ -92,7 +111,7 @@ def score_command(
 
     seals = load(Seals, folder / "seals.json")
     cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
-    runs = run_all(folder, cases, jobs or os.cpu_count() or 1, _say)
+    runs = run_all(folder, cases, _workers(jobs, scheduler), _say)
     opened = load(Truths, truths)  # only now that all diagnoses are written
     found = score(opened, seals, runs, broken_seals(folder, seals, opened))
     if page is not None:
@@ -112,6 +131,7 @@ def calibrate_command(
         list[str], typer.Option("--rule", metavar="NAME=VALUE", help="a rule of decision at another value; repeatable")
     ],
     jobs: Jobs = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Score tuning cases under other rules of decision, beside the default ones; results stay in DIR for the next time."""
     from lab.challenge.calibrate import changed_policy, comparison, refuse_proof
@@ -126,9 +146,7 @@ def calibrate_command(
     broken = broken_seals(folder, seals, opened)
     under = {"results": None, f"results {' '.join(sorted(rules))}": policy}
     scores = [
-        score(
-            opened, seals, run_all(folder, cases, jobs or os.cpu_count() or 1, _say, policy=one, results=where), broken
-        )
+        score(opened, seals, run_all(folder, cases, _workers(jobs, scheduler), _say, policy=one, results=where), broken)
         for where, one in under.items()
     ]
     print(comparison(*scores))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from lab.challenge.faults import FAULTS, spoilt
-from lab.challenge.noncentrality import noncentrality, summaries
+from lab.challenge.noncentrality import FairStrength, fair_strengths, library_changes, noncentrality, summaries
 from lab.challenge.recordings import recording_set
 from lab.challenge.truth import CaseTruth, Concealed, Kind
 from lab.diagnose.inference.measurement_model import MeasurementModel
@@ -77,23 +77,25 @@ def draw(
         return record(ConcealedCamera(camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw), plan)
 
     targets = [float(np.exp(rng.uniform(*np.log(WEAK if rng.random() < 0.5 else STRONG)))) for _ in laws]
-    chosen, sizes = laws, [0.0] * len(laws)
-    if sizing != "unmeasured":
-        aimed = sizing == "aimed"
-        chosen, sizes = _sized(take, laws, targets if aimed else [], (0, 1) if aimed else (0, 0))
-    session = take(tuple(chosen), 0)
+    accepted = {*(fault.accepts if fault else ()), *(a for one in laws for a in one.accepts)}
+    found = _Sized(laws, [0.0] * len(laws), [FairStrength(None, None, None) for _ in laws], None)
+    if sizing == "nominal":
+        found = _sized(take, laws, [], (0, 0), None)
+    elif sizing == "aimed":
+        found = _sized(take, laws, targets, (0, 1), (accepted, np.random.default_rng([seed, index, 1])))
+    session = take(tuple(found.laws), 0)
     if fault is not None:
         session = spoilt(session, fault, rng)
     concealed = tuple(
         Concealed(
             name=one.name, effect=one.effect, variant=one.variant, strength=one.strength, unit=one.unit,
-            parameters=one.library_parameters(), noncentrality=noncentrality_,
+            parameters=one.library_parameters(), noncentrality=size, conditional=fair.conditional, separability=fair.separability,
+            nearest_rival=fair.rival,
         )
-        for one, noncentrality_ in zip(chosen, sizes, strict=True)
+        for one, size, fair in zip(found.laws, found.noncentrality, found.fair, strict=True)
     )  # fmt: skip
-    accepts = sorted({*(fault.accepts if fault else ()), *(a for one in chosen for a in one.accepts)})
     truth = CaseTruth(
-        kind=what, concealed=concealed, fault=fault.name if fault else None, accepts=tuple(accepts), cfa=healthy.cfa, f_number=healthy.f_number,
+        kind=what, concealed=concealed, fault=fault.name if fault else None, accepts=tuple(sorted(accepted)), oracle_share=found.oracle_share, cfa=healthy.cfa, f_number=healthy.f_number,
         frames=len(session.manifest["captures"]), rows=rows, cols=cols,
     )  # fmt: skip
     return Case(recording_set(session), truth)
@@ -135,12 +137,27 @@ def _resized(law: Law, strength: float) -> Law:
     return type(law)(float(np.clip(strength, low, high)), law.variant, law.seed)
 
 
+@dataclass(frozen=True)
+class _Sized:
+    """Laws at their strengths, and how strongly and how distinctly each shows."""
+
+    laws: list[Law]
+    noncentrality: list[float]
+    fair: list[FairStrength]
+    oracle_share: float | None
+
+
 def _sized(
-    take: Callable[[tuple[Law, ...], int], DrawnSession], laws: list[Law], targets: list[float], draws: tuple[int, int]
-) -> tuple[list[Law], list[float]]:
-    """Laws at the strengths that come near the non-centralities aimed at, and the non-centralities reached."""
+    take: Callable[[tuple[Law, ...], int], DrawnSession],
+    laws: list[Law],
+    targets: list[float],
+    draws: tuple[int, int],
+    against: tuple[Collection[str], np.random.Generator] | None,
+) -> _Sized:
+    """Laws at the strengths that come near the non-centralities aimed at; of two, near the conditional ones. `against`: names that are no rivals, and
+    the noise of the oracle; None: only the non-centralities are measured."""
     if not laws:
-        return [], []
+        return _Sized([], [], [], None)
 
     @lru_cache(maxsize=4)
     def both(present: tuple[Law, ...]) -> list[MeasurementModel | None]:
@@ -158,6 +175,26 @@ def _sized(
                 break
             ratio = float(np.clip((target / size) ** (0.5 / laws[i].power), 0.1, 10.0))
             laws[i] = _resized(laws[i], laws[i].strength * ratio)
-    whole = both(tuple(laws))
-    without = [none] if len(laws) == 1 else [both(tuple(one for one in laws if one is not law)) for law in laws]
-    return laws, [shown(whole, absent) for absent in without]
+    whole, without = both(tuple(laws)), _without(both, laws)
+    fair, oracle = [FairStrength(None, None, None) for _ in laws], None
+    if against is not None:
+        accepts, rng = against
+        effects = [one.effect for one in laws]
+        library = library_changes(none[0])
+        fair, oracle = fair_strengths(whole, without, library, effects, accepts, rng)
+        ratios = [t / max(f.conditional or t, INVISIBLE) for t, f in zip(targets, fair, strict=True)]
+        if max(ratios) > SIZING_FACTOR:  # what one imitates of the other doesn't count
+            laws = [
+                _resized(one, one.strength * min(max(ratio, 1.0) ** (0.5 / one.power), 10.0))
+                for one, ratio in zip(laws, ratios, strict=True)
+            ]
+            whole, without = both(tuple(laws)), _without(both, laws)
+            fair, oracle = fair_strengths(whole, without, library, effects, accepts, rng)
+    return _Sized(laws, [shown(whole, absent) for absent in without], fair, oracle)
+
+
+def _without(
+    both: Callable[[tuple[Law, ...]], list[MeasurementModel | None]], laws: list[Law]
+) -> list[list[MeasurementModel | None]]:
+    """The summaries without each of the laws."""
+    return [both(tuple(one for one in laws if one is not law)) for law in laws]

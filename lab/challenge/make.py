@@ -5,21 +5,23 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 
 from lab.challenge.draw import SIZES, draw
 from lab.challenge.truth import CaseTruth, Seals, Truths, digest, load, purpose_of, salted, seal, store
 from lab.errors import InputError
 from lab.formats import recording_set
+from lab.one_blas_thread import one_blas_thread
+from lab.workers import Workers
 
 #: Modification time of all files of a challenge, s since 1970, so that times reveal nothing.
 FILE_TIME_S = 1_772_442_000
 
 
-def _write_case(folder: Path, seed: int, index: int, size: str, cfa: str | None) -> CaseTruth:
+@one_blas_thread
+def _write_case(index: int, out: Path, seed: int, size: str, cfa: str | None) -> CaseTruth:
     """Draw one case and write its recording set; the truth with the set's digest."""
+    folder = out / case_name(index)
     case = draw(seed, index, size, cfa=cfa)
     if folder.exists():  # of a run that was stopped between this set and its truth
         shutil.rmtree(folder)
@@ -34,7 +36,7 @@ def case_name(index: int) -> str:
 
 
 def make(
-    out: Path, cases: int, seed: int, truths_file: Path, size: str, jobs: int, *, cfa: str | None = None,
+    out: Path, cases: int, seed: int, truths_file: Path, size: str, workers: Workers, *, cfa: str | None = None,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> Truths:  # fmt: skip
     """Write the missing cases of a challenge.
@@ -60,7 +62,6 @@ def make(
     out.mkdir(parents=True, exist_ok=True)
     truths = dict(held.truths)
     missing = [i for i in range(1, cases + 1) if case_name(i) not in truths or not (out / case_name(i)).is_dir()]
-    arguments = {i: (out / case_name(i), seed, i, size, cfa) for i in missing}
 
     def keep(index: int, truth: CaseTruth) -> None:
         nonlocal held
@@ -70,12 +71,6 @@ def make(
         store(Seals(seals={name: seal(item) for name, item in held.truths.items()}), out / "seals.json")
         progress(f"{len(truths)} of {cases} cases", len(truths) / cases)
 
-    if jobs == 1:
-        for i in missing:
-            keep(i, _write_case(*arguments[i]))
-    elif missing:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            running = {pool.submit(_write_case, *arguments[i]): i for i in missing}
-            for done in as_completed(running):
-                keep(running[done], done.result())
+    for number, truth in workers.done(_write_case, missing, out, seed, size, cfa):
+        keep(missing[number], truth)
     return held

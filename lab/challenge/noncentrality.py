@@ -1,23 +1,31 @@
-"""How strongly a concealed law shows: the non-centrality of its change of the diagnosis's summaries.
+"""How strongly a concealed law shows: the non-centrality of its change of the diagnosis's summaries, and how well it could be told.
 
-The library of effects has no part in it. Recordings with and without the law are of the same camera with the same noise, so that their
-difference is the law's. The covariance is that of the recordings with it, nuisance parameters marginalised.
+The library of effects has no part in the non-centrality. Recordings with and without the law are of the same camera with the same noise, so that
+their difference is the law's. The covariance is that of the recordings with it, nuisance parameters marginalised. What else could look like
+it is what the library's effects change about the healthy camera (`lab.challenge.fair_strength`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Collection, Hashable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
+from lab.challenge.fair_strength import Directions, beyond, joined, oracle_share, separability, span, with_direction
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.library import measurements
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.predict.camera_model import camera_model
+from sim.effects.library import candidates
+from sim.spectrum import FloatArray
+
+#: Summaries with two draws of the noise.
+TwoDraws = Sequence[MeasurementModel | None]
 
 
 def summaries(recordings: RecordingSet) -> MeasurementModel | None:
@@ -68,3 +76,90 @@ def noncentrality(pairs: Sequence[tuple[MeasurementModel | None, MeasurementMode
     first, second = (np.array([d[key] for key, use in zip(keys, where, strict=True) if use]) for d in (one, two))
     covariance = present.gaussian(()).covariance[np.ix_(where, where)]
     return max(float(first @ cho_solve(cho_factor(covariance, lower=True), second)), 0.0)
+
+
+@dataclass(frozen=True)
+class FairStrength:
+    """How well one concealed law could be told. `conditional`: None where no other is concealed; `rival`: what comes nearest to it beside that."""
+
+    conditional: float | None
+    separability: float | None
+    rival: str | None
+
+
+@dataclass(frozen=True)
+class LibraryChanges:
+    """What the candidates of the library change about one camera: name and changes (n, prototypes) of each set of prototypes; `row` of each summary."""
+
+    row: dict[Hashable, int]
+    changes: tuple[tuple[str, FloatArray], ...]
+
+
+def library_changes(healthy: MeasurementModel | None) -> LibraryChanges:
+    """The changes by every candidate about the healthy camera; none where nothing can be summarised."""
+    if healthy is None:
+        return LibraryChanges({}, ())
+    base = healthy.mean()
+    found = [
+        (effect.name, np.stack([healthy.mean((one,)) - base for one in prototypes], axis=1))
+        for effect in candidates()
+        if healthy.affected(effect).any()
+        for prototypes in effect.prototypes(healthy.camera)
+    ]
+    return LibraryChanges({key: row for row, key in enumerate(_keys(healthy))}, tuple(found))
+
+
+def fair_strengths(
+    whole: TwoDraws,
+    without: Sequence[TwoDraws],
+    library: LibraryChanges,
+    effects: Sequence[str | None],
+    accepts: Collection[str],
+    rng: np.random.Generator,
+) -> tuple[list[FairStrength], float | None]:
+    """Conditional non-centrality and separability of each concealed law, and the oracle's share of right answers on the case.
+
+    `whole`: summaries of the recordings; `without`: of those without each law; `effects`: the laws' names in the list of effects. What
+    `accepts` names is no rival. Of an effect that is concealed, its law's own change is one direction. The share is None where a law isn't in
+    the list, or its effect changes no summary.
+    """
+    present, again = whole
+    absent = [(one, other) for one, other in without if one is not None and other is not None]
+    if present is None or again is None or len(absent) < len(without):
+        return [FairStrength(None, None, None) for _ in without], None
+    tables = [(_change(present, one), _change(again, other)) for one, other in absent]
+    keys = _keys(present)
+    where = np.array([key in library.row and all(key in d for pair in tables for d in pair) for key in keys])
+    if not where.any():
+        return [FairStrength(None, None, None) for _ in without], None
+    common = [key for key, use in zip(keys, where, strict=True) if use]
+    lower = cholesky(present.gaussian(()).covariance[np.ix_(where, where)], lower=True)
+
+    def white(table: FloatArray) -> FloatArray:
+        return np.asarray(solve_triangular(lower, table, lower=True))
+
+    first, second = (white(np.array([[pair[k][key] for pair in tables] for key in common])) for k in (0, 1))
+    own = 0.5 * (first + second)
+    rows = [library.row[key] for key in common]
+    listed: list[Directions] = []
+    for effect, changes in library.changes:
+        basis = span(white(changes[rows]))
+        for law, name in enumerate(effects):
+            if name == effect:
+                basis = with_direction(basis, own[:, law])
+        if basis.shape[1]:
+            listed.append(Directions(effect, basis))
+    found = []
+    for law, name in enumerate(effects):
+        others = [k for k in range(len(effects)) if k != law]
+        of_others = {effects[k] for k in others}
+        beside = joined(*(c.basis for c in listed if c.name in of_others), span(own[:, others]))
+        rivals = [c for c in listed if c.name not in {name, *of_others, *accepts}]
+        left, rival = separability(first[:, law], second[:, law], beside, rivals)
+        conditional = beyond(first[:, law], second[:, law], beside) if others else None
+        found.append(FairStrength(conditional, left, rival))
+    names = [name for name in effects if name is not None]
+    asked = [c for c in listed if c.name in names or c.name not in accepts]
+    if not names or len(names) < len(effects) or not {c.name for c in asked} >= set(names):
+        return found, None
+    return found, oracle_share(own.sum(axis=1), asked, names, rng)

@@ -7,6 +7,7 @@ from collections import Counter
 from html import escape
 from pathlib import Path
 
+from lab.challenge.power_curves import power_curves
 from lab.challenge.score import STRONG, CaseScore, ChallengeScore, Rate
 from lab.errors import InputError
 
@@ -27,13 +28,19 @@ def _rate(rate: Rate) -> str:
     return f"{rate.count} of {rate.of} ({100 * rate.low:.0f}..{100 * rate.high:.0f} %)"
 
 
+def _share(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.0f} %"
+
+
 def table(found: ChallengeScore) -> str:
     """The scores as Markdown tables; intervals are Clopper-Pearson's of 95 %."""
     verdict = {True: "met", False: "missed", None: "none to tell"}
-    lines = ["| goal | wanted | reached | |", "| --- | --- | --- | --- |"]
+    lines = ["| goal | wanted | reached | oracle | |", "| --- | --- | --- | --- | --- |"]
     for goal in found.goals:
         doubt = "" if goal.sure or goal.sure is None or goal.met is None else ", too few cases to be sure"
-        lines.append(f"| {goal.name} | {goal.wanted} | {goal.reached} | {verdict[goal.met]}{doubt} |")
+        lines.append(
+            f"| {goal.name} | {goal.wanted} | {goal.reached} | {_share(goal.oracle)} | {verdict[goal.met]}{doubt} |"
+        )
     lines += [
         "",
         "| single effects of non-centrality | first name right | it alone | nothing named |",
@@ -42,6 +49,12 @@ def table(found: ChallengeScore) -> str:
     lines += [
         f"| {s.noncentrality} | {_rate(s.top_1)} | {_rate(s.alone)} | {_rate(s.unnamed)} |" for s in found.singles
     ]
+    if any(f.right.of for f in found.fair):
+        lines += ["", "| separability | right | oracle | of the oracle |", "| --- | --- | --- | --- |"]
+        lines += [
+            f"| {f.kind}, {f.separability} | {_rate(f.right)} | {_share(f.oracle)} | {_share(f.of_oracle)} |"
+            for f in found.fair
+        ]
     lines += ["", "| also | |", "| --- | --- |"]
     for what, rate in (
         ("concealed effects above 25, every one named as such", found.families.right_effects),
@@ -85,6 +98,11 @@ def write_page(found: ChallengeScore, page: Path) -> None:
         f"Seed {found.seed}, {found.cases} cases, {found.size} frames; SHA-256 over all seals `{found.seals_sha256}`.\n\n"
         f"{table(found)}\n\n![What was said of what was concealed]({picture.name})"
     )
+    if any(s.oracle_share is not None for s in found.case_scores):
+        curves = page.with_name(f"{page.stem}-{found.purpose}-oracle.svg")
+        section += f"\n\n![Right answers over separability, of the diagnosis and of the oracle]({curves.name})"
+        page.parent.mkdir(parents=True, exist_ok=True)
+        curves.write_text(power_curves(found), encoding="utf-8")
     text = placed(text, found.purpose, section)
     row = f"| {found.purpose} | {found.seed} | {found.cases} | {found.size} | `{found.seals_sha256[:16]}` |"
     if row not in text:

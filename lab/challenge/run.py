@@ -8,13 +8,12 @@ import resource
 import time
 import traceback
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 
 from lab.challenge.truth import load, store
 from lab.diagnose.policy import DecisionPolicy
 from lab.formats.results import DiagnosisResult
+from lab.workers import Workers
 from sim.parameters import Frozen
 
 
@@ -61,7 +60,7 @@ def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
 def run_all(
     folder: Path,
     cases: tuple[str, ...],
-    jobs: int,
+    workers: Workers,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     *,
     policy: DecisionPolicy | None = None,
@@ -77,11 +76,7 @@ def run_all(
         runs[result.case] = result
         progress(f"{len(runs)} of {len(cases)} cases", len(runs) / len(cases))
 
-    if jobs == 1:
-        for case in missing:
-            keep(run_case(folder / case, policy))
-    elif missing:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            for done in as_completed([pool.submit(run_case, folder / case, policy) for case in missing]):
-                keep(done.result())
+    # workers elsewhere know the folder by its whole path
+    for _, result in workers.done(run_case, [folder.resolve() / case for case in missing], policy):
+        keep(result)
     return runs

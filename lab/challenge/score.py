@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from math import inf
 from pathlib import Path
 from statistics import fmean, median
 from typing import Literal
@@ -22,6 +23,8 @@ CONFIDENCE = 0.95
 #: Half width of a parameter's 95 % interval, standard deviations.
 INTERVAL_SIGMAS = 1.959964
 STRONG, SEEN = 50.0, 25.0
+#: Classes of separability: what it is called, above, at most.
+CLASSES = (("above 50", STRONG, inf), ("25 to 50", SEEN, STRONG), ("below 25", -1.0, SEEN))
 CPU_GOAL_S, MEMORY_GOAL_MIB = 120.0, 3072.0  # 60 s on two cores
 #: Smallest excess of held-out chi2 whose removal is scored, standard deviations of chi2.
 EXCESS_SIGMAS = 3.0
@@ -50,13 +53,14 @@ class Rate(Frozen):
 
 class Goal(Frozen):
     """A goal of the proof. `met`: None where no case applies. `sure`: whether the 95 % interval lies entirely on one
-    side of the limit."""
+    side of the limit. `oracle`: the share that the oracle reaches on the same cases, as far as it was asked; None: it wasn't."""
 
     name: str
     wanted: str
     reached: str
     met: bool | None
     sure: bool | None = None
+    oracle: float | None = None
 
 
 class CaseScore(Frozen):
@@ -67,6 +71,8 @@ class CaseScore(Frozen):
     truth: tuple[str, ...]
     variants: tuple[int, ...]
     noncentrality: tuple[float, ...]
+    separability: float | None  # the least of its concealed laws; None: not measured
+    oracle_share: float | None  # of draws of the noise in which the oracle answers rightly
     fault: str | None
     verdict: str
     named: tuple[str, ...]
@@ -93,6 +99,17 @@ class SinglesScore(Frozen):
     top_1: Rate
     alone: Rate
     unnamed: Rate
+
+
+class FairScore(Frozen):
+    """Cases of one class of separability (`lab.challenge.fair_strength`) for which the oracle was asked: the share of right answers, a single
+    effect's name first or both of a compound, and the mean of the oracle's. `of_oracle`: the one over the other."""
+
+    kind: Literal["single", "compound"]
+    separability: str
+    right: Rate
+    oracle: float | None
+    of_oracle: float | None
 
 
 class FamiliesScore(Frozen):
@@ -127,6 +144,7 @@ class ChallengeScore(Frozen):
     broken_seals: tuple[str, ...]
     failed: dict[str, str]
     singles: tuple[SinglesScore, ...]
+    fair: tuple[FairScore, ...]
     families: FamiliesScore
     effects: tuple[EffectScore, ...]
     compounds_both_named: Rate
@@ -219,6 +237,11 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     mean_removed = fmean(removed) if removed else None
     cpu, memory = max((r.cpu_s for r in ran), default=None), max((r.memory_mib for r in ran), default=None)
     families = _families(scored)
+    fair = tuple(
+        _fair(kind, what, [s for s in scored if s.kind == kind and above < (s.separability or 0.0) <= most])
+        for kind in ("single", "compound")
+        for what, above, most in CLASSES
+    )
     goals = (
         Goal(
             name="seals that hold",
@@ -234,10 +257,12 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
             met=len(ran) == len(cases),
             sure=True,
         ),
-        _at_least("top-1 of single effects above 50", classes[0].top_1, 0.95),
+        _at_least("top-1 of single effects above 50", classes[0].top_1, 0.95).model_copy(
+            update={"oracle": _oracle(s for s in singles if s.noncentrality[0] > STRONG)}
+        ),
         _at_least("right families above 25", families.right_families, 0.97),
         _at_most("names of a wrong family", families.wrong_families, 0.01),
-        _at_least("both members of a compound named", both, 0.80),
+        _at_least("both members of a compound named", both, 0.80).model_copy(update={"oracle": _oracle(compounds)}),
         _at_least("rival sets cover the truth", cover, 0.95),
         _limit("rivals in a set, mean", size, 1.5, ""),
         _at_most("false names on healthy cameras", names, 0.01),
@@ -254,7 +279,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     )
     return ChallengeScore(
         purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals), broken_seals=tuple(broken),
-        failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, families=families, effects=_by_effect(singles),
+        failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, fair=fair, families=families, effects=_by_effect(singles),
         compounds_both_named=both, compounds_one_named=one, compounds_strong_both_named=both_strong, rival_sets_cover=cover,
         rival_set_mean_size=size, false_alarms=alarms, false_names=names, outside_not_named=abstained, outside_located=located,
         parameters_covered=covered, excess_removed=mean_removed, excess_removed_median=median(removed) if removed else None,
@@ -283,13 +308,19 @@ def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
     }[truth.kind]
     return CaseScore(
         case=case, kind=truth.kind, truth=tuple(c.name for c in truth.concealed), variants=tuple(c.variant for c in truth.concealed),
-        noncentrality=tuple(c.noncentrality for c in truth.concealed), fault=truth.fault,
+        noncentrality=tuple(c.noncentrality for c in truth.concealed), separability=_least_separability(truth),
+        oracle_share=truth.oracle_share, fault=truth.fault,
         verdict=found.verdict if found is not None else "failed", named=named, rivals=rivals,
         unexplained=tuple(u.measurement for u in found.unexplained) if found is not None else (), right=right,
         effects=truth.names, true_families=tuple(tuple(sorted(one)) for one in true), families=tuple(told),
         right_family=bool(true) and all(set(told) & one for one in true), wrong_family=not set(told) <= accepted.union(*true),
         excess_removed=_removed(truth, found), cpu_s=run.cpu_s, memory_mib=run.memory_mib,
     )  # fmt: skip
+
+
+def _least_separability(truth: CaseTruth) -> float | None:
+    found = [c.separability for c in truth.concealed if c.separability is not None]
+    return min(found) if found and len(found) == len(truth.concealed) else None
 
 
 def families_of(concealed: Concealed) -> frozenset[str]:
@@ -332,6 +363,20 @@ def _singles(what: str, cases: Sequence[CaseScore]) -> SinglesScore:
         alone=Rate.over(s.named == s.truth for s in cases),
         unnamed=Rate.over(not s.named for s in cases),
     )
+
+
+def _oracle(cases: Iterable[CaseScore]) -> float | None:
+    """Mean of the oracle's shares, of the cases for which it was asked."""
+    shares = [s.oracle_share for s in cases if s.oracle_share is not None]
+    return fmean(shares) if shares else None
+
+
+def _fair(kind: Literal["single", "compound"], what: str, cases: Sequence[CaseScore]) -> FairScore:
+    asked = [s for s in cases if s.oracle_share is not None and s.separability is not None]
+    right, oracle = Rate.over(s.right for s in asked), _oracle(asked)
+    return FairScore(
+        kind=kind, separability=what, right=right, oracle=oracle, of_oracle=right.share / oracle if right.share is not None and oracle else None
+    )  # fmt: skip
 
 
 def _families(scored: Sequence[CaseScore]) -> FamiliesScore:

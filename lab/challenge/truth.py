@@ -28,7 +28,8 @@ class Concealed(Frozen):
 
     `effect`: its name in the list of effects, None outside it. `parameters`: true values of the library's parameters,
     where they have the same meaning. `noncentrality`: size of its change of the summaries, see
-    `lab.challenge.noncentrality`.
+    `lab.challenge.noncentrality`. `conditional`: what of it the other concealed law can't imitate; `separability`: what no rival beside that
+    can, and `nearest_rival` the one that can most (`lab.challenge.fair_strength`). None: not measured.
     """
 
     name: str
@@ -38,19 +39,24 @@ class Concealed(Frozen):
     unit: str = "1"
     parameters: dict[str, float] = {}
     noncentrality: float
+    conditional: float | None = None
+    separability: float | None = None
+    nearest_rival: str | None = None
 
 
 class CaseTruth(Frozen):
     """The truth of one case.
 
     `fault`: what is stated wrongly, or went wrong on the rig. `accepts`: effects that describe the case rightly
-    besides the concealed ones. `recordings_sha256`: over all files of the set, so that the seal fixes these, too.
+    besides the concealed ones. `oracle_share`: of draws of the noise in which the oracle that knows all laws answers rightly; None: not
+    measured. `recordings_sha256`: over all files of the set, so that the seal fixes these, too.
     """
 
     kind: Kind
     concealed: tuple[Concealed, ...] = ()
     fault: str | None = None
     accepts: tuple[str, ...] = ()
+    oracle_share: float | None = None
     cfa: str
     f_number: float
     frames: int
@@ -90,8 +96,14 @@ class Seals(Frozen):
 
 
 def canonical(truth: CaseTruth) -> str:
-    """JSON with sorted keys and no blanks, the same text for the same truth."""
-    return json.dumps(truth.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+    """JSON with sorted keys and no blanks, the same text for the same truth. What wasn't measured of its strengths is left out, so that seals
+    from before there were such keep."""
+    content = truth.model_dump(mode="json")
+    for part in (content, *content["concealed"]):
+        for name in ("oracle_share", "conditional", "separability", "nearest_rival"):
+            if part.get(name) is None:
+                part.pop(name, None)
+    return json.dumps(content, sort_keys=True, separators=(",", ":"))
 
 
 def seal(salted: SaltedTruth) -> str:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pydantic import BaseModel
 from rich.console import Console
 from rich.markup import escape
 
 from lab.errors import InputError
-from lab.formats.result_file import result_json, write_result
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 # In a file or a pipe, a table keeps its width.
 out = Console(soft_wrap=True, highlight=False, emoji=False, width=None if sys.stdout.isatty() else 200)
@@ -36,6 +38,8 @@ def write_json(result: BaseModel, file: Path | None) -> None:
     """Write a result as JSON, completely or not at all: to a file, to stdout ("-"), or nowhere (None)."""
     if file is None:
         return
+    from lab.formats.result_file import result_json, write_result
+
     if str(file) == "-":
         sys.stdout.write(result_json(result))
     else:

@@ -65,12 +65,22 @@ def diagnose(
             help=f"draw N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
         ),
     ] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            envvar="CALIBENCH_SCHEDULER",
+            help="a Dask scheduler (tcp://HOST:PORT) whose workers draw the cameras of --bootstrap; they have to see the recordings under the same path",
+        ),
+    ] = None,
 ) -> None:
     """Name the physics that the model left out, where the recordings show any. Exit code 2 where nothing could be judged."""
     if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
         raise InputError(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
         )
+    from lab.workers import Workers
+
     check_writable(json)
     recordings = recordings_of(source)
     if save is not None:
@@ -82,6 +92,7 @@ def diagnose(
         models=read_models(recordings, model),
         pictures=False,
         bootstrap=bootstrap,
+        workers=Workers(scheduler=scheduler),
     )
     found = run_here(request)
     assert found.diagnosis is not None

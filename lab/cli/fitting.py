@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -13,10 +13,11 @@ from lab.cli.exit_codes import EXIT_CHECK
 from lab.cli.sources import Json, Source, existing_store, recordings_of, run_here
 from lab.cli.tables import print_comparison, print_fit
 from lab.errors import NotDetermined
-from lab.formats.recording_set import RecordingSet
-from lab.formats.result_file import read_result
-from lab.formats.results import FitResult
 from lab.pipeline import PipelineRequest
+
+if TYPE_CHECKING:
+    from lab.formats.recording_set import RecordingSet
+    from lab.formats.results import FitResult
 
 commands = typer.Typer()
 
@@ -114,6 +115,9 @@ def compare(
 
 def _calibration(source: str) -> FitResult:
     """A fit from the file that `--json` wrote, from the registry of sessions, or made now from recordings."""
+    from lab.formats.result_file import read_result
+    from lab.formats.results import FitResult
+
     if Path(source).is_file():
         return read_result(FitResult, Path(source))
     if not Path(source).exists() and (store := existing_store()) is not None:

@@ -9,7 +9,6 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from lab.capture_kinds.base import CAPTURES
 from lab.cli.console import out
 from lab.cli.sources import recordings_of
 
@@ -23,6 +22,8 @@ def kinds(
     ] = "",
 ) -> None:
     """The kinds of capture: what stands before the camera, and which sequence takes them."""
+    from lab.capture_kinds.base import CAPTURES
+
     counted = Counter(capture.kind for capture in recordings_of(source).captures()) if source else None
     table = Table(box=None, pad_edge=False)
     for heading in (

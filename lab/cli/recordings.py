@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -15,10 +15,10 @@ from lab.cli.progress import progress_bar
 from lab.cli.sources import StoreFolder, open_store
 from lab.cli.tables import print_fit
 from lab.errors import InputError
-from lab.formats import recording_set as recording
-from lab.formats.importers.import_options import ImportOptions
-from lab.formats.recording_set import Manifest, RecordingSet
 from lab.pipeline import session_recordings
+
+if TYPE_CHECKING:
+    from lab.formats.importers.import_options import ImportOptions
 
 commands = typer.Typer()
 #: `--from` these: a CSV of channel means and variances by level, or of channel means by wavelength, which becomes a fit.
@@ -67,7 +67,9 @@ def import_(
     ] = None,
 ) -> None:
     """Turn another format into a recording set."""
+    from lab.formats import recording_set
     from lab.formats.importers import read_foreign
+    from lab.formats.importers.import_options import ImportOptions
 
     if transfer not in ("", "linear", "srgb"):
         raise InputError(f"--transfer {transfer}: give linear or srgb")
@@ -90,7 +92,7 @@ def import_(
     recordings = read_foreign(kind, path, options)
     warn(recordings.warnings)
     with progress_bar("import") as advance:
-        folder = recording.write(recordings, out_folder, progress=advance)
+        folder = recording_set.write(recordings, out_folder, progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")
 
 
@@ -99,6 +101,7 @@ def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> 
     from lab.fit.noise.level_table import fit_level_table
     from lab.fit.spectral.mean_table import fit_mean_table
     from lab.formats.importers.images import read_camera_file
+    from lab.formats.recording_set import Manifest, RecordingSet
 
     if [name for name in options.stated() if name != "--camera"]:
         raise InputError(f"--from {kind} takes --camera alone")
@@ -158,8 +161,10 @@ def export(
     data: StoreFolder = None,
 ) -> None:
     """Write a stored session as a recording set."""
+    from lab.formats import recording_set
+
     recordings = session_recordings(open_store(data), session)
     warn(recordings.warnings)
     with progress_bar("export") as advance:
-        folder = recording.write(recordings, to, progress=advance)
+        folder = recording_set.write(recordings, to, progress=advance)
     out.print(f"{folder}: {len(recordings.manifest.captures)} captures of {', '.join(recordings.sides)}")

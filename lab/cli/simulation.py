@@ -36,9 +36,18 @@ def lens(
     glass: Annotated[
         list[str] | None, typer.Option(metavar="NAME=OTHER", help="a glass for another: NAME=OTHER or NAME=nd,Vd")
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            envvar="CALIBENCH_SCHEDULER",
+            help="a Dask scheduler (tcp://HOST:PORT) whose workers trace the field points, in place of this computer",
+        ),
+    ] = None,
 ) -> None:
     """What a lens prescription amounts to: first-order quantities, illumination, distortion, MTF, PSF."""
     from lab.predict.lens import parse_glasses, trace_prescription
+    from lab.workers import Workers
 
     check_writable(json)
     if focus not in ("file", "best"):
@@ -50,6 +59,7 @@ def lens(
             maximum_field_deg=field_deg,
             glasses=parse_glasses(glass or []),
             progress=advance,
+            workers=Workers(scheduler=scheduler),
         )
     warn(traced.result.warnings)
     write_json(traced.result, json)

@@ -10,15 +10,14 @@ import typer
 from lab.cli.console import warn
 from lab.cli.progress import pipeline_bar
 from lab.errors import InputError
-from lab.formats.recording_set import RecordingSet
-from lab.formats.result_file import read_result
-from lab.formats.results import FitResult
 from lab.pipeline import Capturer, PipelineRequest, PipelineResult, run_pipeline, source_recordings
-from sim.camera import Side
 
 if TYPE_CHECKING:
     from lab.capture.store import Store
     from lab.formats.camera_file import CameraFile
+    from lab.formats.recording_set import RecordingSet
+    from lab.formats.results import FitResult
+    from sim.camera import Side
 
 Source = Annotated[str, typer.Argument(metavar="SOURCE", help="a recording set's folder, or a stored session's id")]
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="write the result as JSON ('-': to stdout)")]
@@ -63,7 +62,12 @@ def run_here(request: PipelineRequest, store: Store | None = None, capturer: Cap
 
 def read_fit(file: Path | None) -> FitResult | None:
     """The fit of `--fit FILE`; None without the option: the pipeline fits then."""
-    return None if file is None else read_result(FitResult, file)
+    if file is None:
+        return None
+    from lab.formats.result_file import read_result
+    from lab.formats.results import FitResult
+
+    return read_result(FitResult, file)
 
 
 def camera_path(recordings: RecordingSet, side: Side, path: Path) -> Path:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rich.markup import escape
 from rich.table import Table
 
 from lab.cli.console import out
-from lab.formats.recording_set import RecordingSet
-from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
+
+if TYPE_CHECKING:
+    from lab.formats.recording_set import RecordingSet
+    from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
 
 
 def print_skipped(skipped: tuple[Skipped, ...]) -> None:

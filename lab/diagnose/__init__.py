@@ -21,7 +21,9 @@ from lab.diagnose.side import diagnose_side
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, FitResult
+from lab.one_blas_thread import one_blas_thread
 from lab.side_processes import in_processes
+from lab.workers import Workers
 from sim.camera import Side
 
 __all__ = ["DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
@@ -50,6 +52,7 @@ def diagnose(
     return examine(recordings, fit, progress, at_once=at_once).result
 
 
+@one_blas_thread
 def examine(
     recordings: RecordingSet,
     fit: FitResult | None = None,
@@ -59,6 +62,7 @@ def examine(
     at_once: bool = True,
     pictures: bool = False,
     bootstrap: int = 0,
+    workers: Workers | None = None,
     policy: DecisionPolicy | None = None,
 ) -> Diagnosis:
     """Diagnose every side.
@@ -70,6 +74,7 @@ def examine(
     at_once     several sides run at the same time, each in a process of its own; else one after the other in this one.
     pictures    draw residual pictures, for the report.
     bootstrap   healthy cameras like the baseline that are drawn frame by frame; the threshold is at least what their scores say.
+    workers     where these are drawn; None: in the side's process.
     policy      the rules of decision; None: `DecisionPolicy()`.
     """
     policy = policy or DecisionPolicy()
@@ -91,6 +96,7 @@ def examine(
             policy=policy,
             pictures=pictures,
             bootstrap=bootstrap,
+            workers=workers,
         )
         for side in recordings.sides
     }

@@ -39,6 +39,7 @@ from lab.formats.results import (
     VetoedName,
     Visibility,
 )
+from lab.workers import Workers
 from sim.camera import Side
 
 #: Called with what is being done.
@@ -92,11 +93,12 @@ def diagnose_side(
     policy: DecisionPolicy | None = None,
     pictures: bool = False,
     bootstrap: int = 0,
+    workers: Workers | None = None,
 ) -> SideFindings:
     """Everything that is told of one side.
 
     `pictures`: draw residual pictures, which takes the forward model some seconds. `bootstrap`: healthy recording sets
-    that are drawn frame by frame for the threshold, each as long as summarising takes.
+    that are drawn frame by frame for the threshold, each as long as summarising takes; `workers`: where, None: in this process.
     """
     policy = policy or DecisionPolicy()
     report("checking what is stated")
@@ -113,7 +115,7 @@ def diagnose_side(
     least = 0.0
     if bootstrap:
         report(f"drawing {bootstrap} healthy cameras")
-        draws = healthy_draws(recordings, side, model, bootstrap, rng, fit, baseline)
+        draws = healthy_draws(recordings, side, model, bootstrap, rng, fit, baseline, workers)
         least = image_threshold(draws, policy.false_alarm_rate)
     report("scoring the effects")
     verdict = decide(model, rng, policy, report, least_threshold=least)

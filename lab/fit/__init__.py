@@ -14,6 +14,7 @@ from typing import TypeVar
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, Skipped, StereoFit
+from lab.one_blas_thread import one_blas_thread
 from lab.side_processes import in_processes
 from sim.camera import Side
 
@@ -33,6 +34,7 @@ class SideFit:
     skipped: tuple[Skipped, ...]
 
 
+@one_blas_thread
 def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None) -> FitResult:
     """Run every fit on every side, and the stereo pair. What the recordings don't determine is in `skipped`, with the
     reason.

@@ -51,6 +51,7 @@ from lab.fit.geometry.recordings import corner_errors
 from lab.fit.tuples import numbers, rows, triple, triples
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DepthUncertainty, GeometryFit, Rectification, Skipped, StereoFit
+from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]
@@ -71,6 +72,7 @@ class StereoPair:
     right: BoardView
 
 
+@one_blas_thread
 def fit_stereo(
     recordings: RecordingSet,
     left: GeometryFit,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from lab.errors import InputError
+from lab.workers import Workers
 from sim.optics.prescription import GlassName, Prescription, PrescriptionError
 from sim.optics.table import LensTable
 from sim.optics.zmx import read_zmx
@@ -134,8 +135,11 @@ def trace_prescription(
     maximum_field_deg: float | None = None,
     glasses: Mapping[str, GlassName] | None = None,
     progress: Progress | None = None,
+    workers: Workers | None = None,
 ) -> TracedPrescription:
     """Read and trace a prescription: results at 33 wavelengths and 21 field points.
+
+    `workers`: where the field points are traced, None: in this process.
 
     Raises InputError, in one line, for a file that can't be read or traced.
     """
@@ -154,8 +158,11 @@ def trace_prescription(
             spread = np.linspace(own[0], own[-1], 33) if len(own) > 1 else np.array(own)
             settings = settings.model_copy(update={"wavelength_nm": tuple(float(w) for w in spread)})
         work = OpticalTable(system, settings)
-        table = work.table(None if progress is None else lambda text, share: progress(text, share * (1 - _MTF_SHARE)))
-        fields = tuple(_field(system, table, f, progress) for f in range(len(table.field_deg)))
+        workers = workers or Workers()
+        table = work.table(
+            None if progress is None else lambda text, share: progress(text, share * (1 - _MTF_SHARE)), workers.done
+        )
+        fields = _fields(system, table, workers, progress)
     except PrescriptionError as error:
         message = str(error)
         raise InputError(message if str(file) in message else f"{file}: {message}") from error
@@ -183,16 +190,27 @@ def trace_prescription(
     return TracedPrescription(result, table, system)
 
 
-def _field(system: OpticalSystem, table: LensTable, f: int, progress: Progress | None) -> LensField:
-    angle = float(table.field_deg[f, 1])
-    tangent = math.tan(math.radians(angle))
-    height = float(table.chief_mm[f, 1])
-    ideal = system.ideal_height_mm(tangent)
-    axis = float(table.chief_mm[0, 1])
+def _fields(
+    system: OpticalSystem, table: LensTable, workers: Workers, progress: Progress | None
+) -> tuple[LensField, ...]:
     low, high = table.wavelength_nm[0], table.wavelength_nm[-1]
     wavelengths = sorted({system.reference_nm, *(w for w in MTF_WAVELENGTHS_NM if low <= w <= high)})
+    tangents = [math.tan(math.radians(float(angle))) for angle in table.field_deg[:, 1]]
+    curves: dict[int, tuple[LensMtf, ...]] = {}
+    for f, found in workers.done(_mtf_curves, tangents, system, wavelengths):
+        curves[f] = found
+        if progress is not None:
+            progress(
+                f"MTF of field {len(curves)} of {len(tangents)}",
+                1 - _MTF_SHARE + _MTF_SHARE * len(curves) / len(tangents),
+            )
+    return tuple(_field(system, table, f, curves[f]) for f in range(len(tangents)))
+
+
+def _mtf_curves(tangent: float, system: OpticalSystem, wavelengths_nm: Sequence[float]) -> tuple[LensMtf, ...]:
+    """MTF of a field point on the +y side at each wavelength."""
     curves = []
-    for w in wavelengths:
+    for w in wavelengths_nm:
         sagittal, tangential = system.mtf((0.0, tangent), w, MTF_LP_PER_MM)
         curves.append(
             LensMtf(
@@ -202,9 +220,15 @@ def _field(system: OpticalSystem, table: LensTable, f: int, progress: Progress |
                 tangential=tuple(tangential.tolist()),
             )
         )
-    if progress is not None:
-        count = len(table.field_deg)
-        progress(f"MTF of field {f + 1} of {count}", 1 - _MTF_SHARE + _MTF_SHARE * (f + 1) / count)
+    return tuple(curves)
+
+
+def _field(system: OpticalSystem, table: LensTable, f: int, curves: tuple[LensMtf, ...]) -> LensField:
+    angle = float(table.field_deg[f, 1])
+    tangent = math.tan(math.radians(angle))
+    height = float(table.chief_mm[f, 1])
+    ideal = system.ideal_height_mm(tangent)
+    axis = float(table.chief_mm[0, 1])
     return LensField(
         angle_deg=angle,
         height_mm=height,
@@ -220,5 +244,5 @@ def _field(system: OpticalSystem, table: LensTable, f: int, progress: Progress |
             )
             for i, w in enumerate(table.wavelength_nm)
         ),
-        mtf=tuple(curves),
+        mtf=curves,
     )

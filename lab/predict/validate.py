@@ -34,6 +34,7 @@ from lab.formats.results import (
     Skipped,
     ValidationResult,
 )
+from lab.one_blas_thread import one_blas_thread
 from lab.predict.camera_model import camera_model
 from sim.camera import CameraModel, Side
 from sim.effects.base import Effect
@@ -56,6 +57,7 @@ _Checking = Callable[
 ]
 
 
+@one_blas_thread
 def validate(
     recordings: RecordingSet,
     fit: FitResult,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,26 @@ _SOLID_ANGLE_TOLERANCE = 3e-4
 _STEEPEST = math.tan(math.radians(60.0))
 
 Progress = Callable[[str, float], None]
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TracedField:
+    """What is traced of one field point, by wavelength (w): `chief_mm` (2,) of the reference wavelength, middle of the windows `window_um` (2,) from there,
+    `solid_angle` (w,), `centroid_um` (w, 2), `psf` (w, samples, samples)."""
+
+    chief_mm: FloatArray
+    window_um: FloatArray
+    solid_angle: FloatArray
+    centroid_um: FloatArray
+    psf: FloatArray
+    warnings: tuple[str, ...]
+
+
+#: Does a piece of work for each item, wherever that is; gives each item's number and result, in any order.
+Each = Callable[
+    [Callable[[tuple[Point, Point]], TracedField], Sequence[tuple[Point, Point]]], Iterable[tuple[int, TracedField]]
+]
 
 
 class TableSettings(Frozen):
@@ -57,11 +78,14 @@ def content_hash(prescription: Prescription, settings: TableSettings) -> str:
 
 
 def lens_table(
-    prescription: Prescription, settings: TableSettings | None = None, progress: Progress | None = None
+    prescription: Prescription,
+    settings: TableSettings | None = None,
+    progress: Progress | None = None,
+    each: Each | None = None,
 ) -> LensTable:
-    """Trace a lens and compute its `LensTable`. PrescriptionError where it makes no image."""
+    """Trace a lens and compute its `LensTable`. `each`: see `OpticalTable.table`. PrescriptionError where it makes no image."""
     settings = settings or TableSettings()
-    return OpticalTable(OpticalSystem(prescription, settings.focus), settings).table(progress)
+    return OpticalTable(OpticalSystem(prescription, settings.focus), settings).table(progress, each)
 
 
 def cached_table(
@@ -159,36 +183,22 @@ class OpticalTable:
         finest = 0.5e-3 * self.wavelengths[0] * self.system.first_order.working_f_number
         return max(0.05 * math.floor(finest / 0.05), 0.05)
 
-    def table(self, progress: Progress | None = None) -> LensTable:
-        """Compute it."""
+    def table(self, progress: Progress | None = None, each: Each | None = None) -> LensTable:
+        """Compute it. `each` does the field points' work, None: one after the other, here."""
         system, settings = self.system, self.settings
         w_count, f_count, n = self.wavelengths.size, len(self.tangents), settings.samples
         chief, window = np.zeros((f_count, 2)), np.zeros((f_count, 2))
-        solid, energy = np.zeros((w_count, f_count)), np.zeros((w_count, f_count))
+        solid = np.zeros((w_count, f_count))
         psf = np.zeros((w_count, f_count, n, n))
         centroid = np.zeros((w_count, f_count, 2))
-        half_diagonal = 0.5e-3 * math.sqrt(2.0) * n * self.pitch_um
-        starts = self._starts()
-        for f, tangent in enumerate(self.tangents):
-            row = system.chief(tangent, system.reference_nm, starts[f])
-            assert row is not None
-            chief[f] = row[rt.X], row[rt.Y]
-            centre = self._centre(tangent, starts[f])
-            coarse = [self._pupil(tangent, w, centre, 0.0) for w in self.wavelengths]
-            for i, pupil in enumerate(coarse):
-                solid[i, f], energy[i, f] = pupil.solid_angle, pupil.energy
-                centroid[i, f] = (np.array(pupil.centroid_mm) - chief[f]) * 1e3
-            window[f] = 0.5 * (centroid[:, f].min(axis=0) + centroid[:, f].max(axis=0))
-            about = float(chief[f, 0] + 1e-3 * window[f, 0]), float(chief[f, 1] + 1e-3 * window[f, 1])
-            blur = max(float(np.max(np.hypot(p.x_mm - about[0], p.y_mm - about[1]))) for p in coarse)
-            # Of light that arrives four half diagonals away, next to nothing is diffracted into the window.
-            reach = min(blur, 4.0 * half_diagonal)
-            sine = max(0.5 * max(np.ptp(p.rim_cosine_x), np.ptp(p.rim_cosine_y)) for p in coarse)
-            span = coarse[0].wave_number_per_mm * float(sine) * (half_diagonal + reach)
-            for i, pupil in enumerate(self._pupils(tangent, centre, span, solid[:, f])):
-                psf[i, f] = point_spread(pupil, about, n, self.pitch_um, reach if reach < blur else math.inf)
+        points = list(zip(self.tangents, self._starts(), strict=True))
+        told: dict[int, tuple[str, ...]] = {}
+        found = each(self.traced_field, points) if each else ((f, self.traced_field(p)) for f, p in enumerate(points))
+        for f, point in found:
+            chief[f], window[f], solid[:, f] = point.chief_mm, point.window_um, point.solid_angle
+            centroid[:, f], psf[:, f], told[f] = point.centroid_um, point.psf, point.warnings
             if progress is not None:
-                progress(f"field {f + 1} of {f_count}", (f + 1) / f_count)
+                progress(f"field {len(told)} of {f_count}", len(told) / f_count)
         share = psf.sum(axis=(2, 3))
         w, f = divmod(int(np.argmin(share)), f_count)
         if share[w, f] < LEAST_SHARE:
@@ -216,9 +226,38 @@ class OpticalTable:
             sample_pitch_um=self.pitch_um,
             encircled_share=share,
             centroid_um=centroid,
-            warnings=tuple(dict.fromkeys([*system.warnings, *self.warnings])),
+            warnings=tuple(
+                dict.fromkeys([*system.warnings, *(w for f in sorted(told) for w in told[f]), *self.warnings])
+            ),
             content_hash=content_hash(system.prescription, settings),
         )
+
+    def traced_field(self, point: tuple[Point, Point]) -> TracedField:
+        """Trace a field point, given as its tangents and the pupil point of its chief ray."""
+        (tangent, start), system, n = point, self.system, self.settings.samples
+        before = len(system.warnings)
+        half_diagonal = 0.5e-3 * math.sqrt(2.0) * n * self.pitch_um
+        row = system.chief(tangent, system.reference_nm, start)
+        assert row is not None
+        chief = np.array([row[rt.X], row[rt.Y]])
+        centre = self._centre(tangent, start)
+        coarse = [self._pupil(tangent, w, centre, 0.0) for w in self.wavelengths]
+        solid = np.array([pupil.solid_angle for pupil in coarse])
+        centroid = np.array([(np.array(pupil.centroid_mm) - chief) * 1e3 for pupil in coarse])
+        window = 0.5 * (centroid.min(axis=0) + centroid.max(axis=0))
+        about = float(chief[0] + 1e-3 * window[0]), float(chief[1] + 1e-3 * window[1])
+        blur = max(float(np.max(np.hypot(p.x_mm - about[0], p.y_mm - about[1]))) for p in coarse)
+        # Of light that arrives four half diagonals away, next to nothing is diffracted into the window.
+        reach = min(blur, 4.0 * half_diagonal)
+        sine = max(0.5 * max(np.ptp(p.rim_cosine_x), np.ptp(p.rim_cosine_y)) for p in coarse)
+        span = coarse[0].wave_number_per_mm * float(sine) * (half_diagonal + reach)
+        psf = np.array(
+            [
+                point_spread(pupil, about, n, self.pitch_um, reach if reach < blur else math.inf)
+                for pupil in self._pupils(tangent, centre, span, solid)
+            ]
+        )
+        return TracedField(chief, window, solid, centroid, psf, tuple(system.warnings[before:]))
 
     def _axis_index(self) -> int:
         return int(np.argmin([math.hypot(*tangent) for tangent in self.tangents]))

@@ -22,7 +22,9 @@ from lab.diagnose.measurements.blocks import measurement_model
 from lab.formats.camera_file import CameraFile
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
+from lab.one_blas_thread import one_blas_thread
 from lab.predict.replay import Replay
+from lab.workers import Workers
 from sim.camera import CameraModel, Side
 from sim.effects.library import candidates
 from sim.spectrum import Spectrum
@@ -47,18 +49,32 @@ def healthy_draws(
     rng: np.random.Generator,
     fit: FitResult | None = None,
     baseline: CameraFile | None = None,
+    workers: Workers | None = None,
 ) -> list[HealthyDraw]:
     """`count` draws of the recordings by the baseline of `model`; measurements of captures that can't be replayed are
-    left out."""
+    left out. Each draw has a generator of its own, so that they are the same wherever `workers` do them (None: in this process)."""
+    workers = workers or Workers()
     camera = _at_recorded_levels(recordings, side, model.camera)
+    if workers.scheduler is not None:
+        recordings.let_go()  # every worker reads its own frames
+    draws = workers.in_order(_healthy_draw, rng.spawn(count), recordings, side, camera, fit, baseline)
+    return [draw for draw in draws if draw is not None]
+
+
+@one_blas_thread
+def _healthy_draw(
+    rng: np.random.Generator,
+    recordings: RecordingSet,
+    side: Side,
+    camera: CameraModel,
+    fit: FitResult | None,
+    baseline: CameraFile | None,
+) -> HealthyDraw | None:
+    """One draw; None where nothing of it can be summarised."""
     replay = Replay(recordings, side, camera)
     others = {c.id for c in recordings.captures(side=side)} - {c.id for c in replay.captures}
-    found = []
-    for _ in range(count):
-        again, _ = measurement_model(replay.drawn(rng).without(others), side, fit, baseline)
-        if again is not None:
-            found.append(_draw_of(again))
-    return found
+    again, _ = measurement_model(replay.drawn(rng).without(others), side, fit, baseline)
+    return None if again is None else _draw_of(again)
 
 
 def image_threshold(draws: Sequence[HealthyDraw], false_alarm_rate: float) -> float:

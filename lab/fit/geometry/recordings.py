@@ -30,6 +30,7 @@ from lab.formats.results import (
     Skipped,
     ViewResiduals,
 )
+from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 
 Array = NDArray[np.floating[Any]]
@@ -37,6 +38,7 @@ Array = NDArray[np.floating[Any]]
 LARGEST_WARP_STD = 0.5  # of the standard deviation of the prior; above it, the views don't determine a warp
 
 
+@one_blas_thread
 def fit_geometry(recordings: RecordingSet, side: Side) -> GeometryFit:
     """Camera matrix and distortion of `side` from its `charuco` captures (plain checkerboards: see `board_detection`).
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 EDGE_ORDER = 3  # degree of the polynomial
+ORDERS = np.arange(1.0, EDGE_ORDER + 1)  # of its terms beyond the constant
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,11 @@ class EdgeCurve:
         """Slope of the edge at its middle, px across per px along."""
         return float(self.poly[1]) / self.half_length
 
+    @property
+    def slope(self) -> Array:
+        """Coefficients (EDGE_ORDER,) of the slope of the edge, px across per px along."""
+        return self.poly[1:] * ORDERS / self.half_length
+
     def shifted(self, change: Array) -> EdgeCurve:
         """The edge with `change` (EDGE_ORDER + 1,) added to its coefficients."""
         return EdgeCurve(self.transposed, self.centre, self.half_length, self.poly + change, self.sign)
@@ -44,8 +49,8 @@ class EdgeCurve:
         `along` (n,) in half lengths and `across` (n,) in px. Returns (distance, foot, slope), each (n,): the foot in
         half lengths along, and the slope of the curve there. Two Newton steps; a straight line in closed form.
         """
-        first = polynomial.polyder(self.poly) / self.half_length
-        second = polynomial.polyder(first) / self.half_length
+        first = self.slope
+        second = first[1:] * ORDERS[:-1] / self.half_length
         foot = along
         if not self.poly[2:].any():  # a straight line: in closed form
             gap = across - polynomial_value(along, self.poly)

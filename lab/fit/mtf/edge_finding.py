@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -117,7 +116,7 @@ def refined_edge(samples: Samples, edge: EdgeCurve, widest: float) -> EdgeCurve:
         # Profile and edge have a shift in common: the edge is put where the profile is half way.
         grid = np.linspace(-limit, limit, 401)
         # The values are levelled: half way is 1/2. The outermost coefficients are of few samples and are no levels.
-        offset = half_way_px(grid, spline.design(grid) @ esf)
+        offset = half_way_px(grid, spline.values(esf, grid))
         change[0] = edge.sign * offset * tilt
         change = np.clip(change, -0.25 * limit, 0.25 * limit)
         edge = edge.shifted(np.concatenate([change, np.zeros(EDGE_ORDER - terms)]))
@@ -166,7 +165,7 @@ def usable_reach_px(planes: Sequence[Plane], edge: EdgeCurve) -> float:
     """
     every = max(1, min(planes[0].values.shape) // 64)
     samples = Samples.near(planes, edge, MOST_REACH_PX + 4.0 * planes[0].step, every)
-    slope = polynomial_value(samples.along, polynomial.polyder(edge.poly)) / edge.half_length
+    slope = polynomial_value(samples.along, edge.slope)
     distance = (samples.across - polynomial_value(samples.along, edge.poly)) / np.sqrt(1.0 + slope**2)
     width = 2.0 * samples.step
     bins = int(MOST_REACH_PX / width) + 1

@@ -181,7 +181,7 @@ def _blur_width_px(samples: Samples, distance: Array, reach: float) -> float:
     matrix = gram[:-1, :-1]
     coefficients = np.linalg.solve(matrix + spline.roughness(1e-3 * np.trace(matrix) / spline.size), gram[:-1, -1])
     fine = np.linspace(-reach, reach, 16 * count + 1)
-    esf = spline.design(fine) @ coefficients
+    esf = spline.values(coefficients, fine)
     low, high = fine[esf < 0.1], fine[esf > 0.9]
     first = low[low < 0].max(initial=-reach)
     last = high[high > 0].min(initial=reach)
@@ -212,7 +212,7 @@ def _refuse_unless_one_edge(residual: Array, tail: NDArray[np.bool_], std: float
 def _refuse_too_wide(spline: Spline, coefficients: Array, reach: float) -> None:
     """Raise `NotDetermined` where the profile hardly reaches its levels within the region."""
     at = np.linspace(-reach, reach, 201)
-    esf = spline.design(at) @ coefficients
+    esf = spline.values(coefficients, at)
     rise = float(np.count_nonzero((esf > 0.1) & (esf < 0.9)) * (at[1] - at[0]))
     if rise > WIDEST_RISE * reach:
         raise NotDetermined(

@@ -13,6 +13,7 @@ from lab.fit.mtf.edge_finding import first_line, refined_edge, usable_reach_px, 
 from lab.fit.mtf.edge_profile import Quantisation, measured_mtf
 from lab.fit.mtf.samples import Plane, Samples, refuse_unusable
 from lab.fit.mtf.transfer_function import EdgeMtf
+from lab.one_blas_thread import one_blas_thread
 
 Array = NDArray[np.floating[Any]]
 
@@ -36,6 +37,7 @@ def edge_mtf(
     return planes_mtf([Plane(values)], frequency_cy_per_px, noise_std)
 
 
+@one_blas_thread
 def planes_mtf(
     planes: Sequence[Plane],
     frequency_cy_per_px: ArrayLike | None = None,

@@ -148,7 +148,7 @@ def posterior(
     for at, weight in weights.items():
         root = _covariance_root(priors.at(at))
         inner = root.T @ information @ root
-        inner[np.diag_indices_from(inner)] += 1.0
+        inner.flat[:: masses + 1] += 1.0
         factor, _ = linalg.lapack.dpotrf(inner, lower=1)
         half, _ = linalg.lapack.dtrtrs(factor, root.T, lower=1)
         covariance = half.T @ half
@@ -180,9 +180,11 @@ def _prior_weights(
 
     def log_likelihood(at: PriorIndex) -> float:
         """Log marginal likelihood, up to a constant; minus infinity beside the grid."""
+        if at in tried:
+            return tried[at]
         if not all(0 <= i < count for i, count in zip(at, PRIOR_GRID, strict=True)):
-            return -np.inf
-        if at not in tried:
+            tried[at] = -np.inf
+        else:
             smoothness, length, strength, amplitude = at
             if (smoothness, length) not in near:
                 near[smoothness, length] = design @ priors.near(smoothness, length) @ design.T
@@ -191,8 +193,10 @@ def _prior_weights(
                 + TAIL_AMPLITUDES_PX[amplitude] ** 2 * far
                 + fixed
             )
-            covariance[np.diag_indices_from(covariance)] += 1.0
-            factor, _ = linalg.lapack.dpotrf(covariance, lower=1)
+            covariance.flat[:: len(covariance) + 1] += 1.0
+            factor, _ = linalg.lapack.dpotrf(
+                covariance.T, lower=1, overwrite_a=1
+            )  # symmetric: its transpose isn't copied
             white, _ = linalg.lapack.dtrtrs(factor, data, lower=1)
             tried[at] = float(-0.5 * white @ white - np.log(np.diag(factor)).sum())
         return tried[at]
@@ -218,17 +222,17 @@ def _prior_weights(
 
 def _neighbours(at: PriorIndex) -> list[PriorIndex]:
     """The eight neighbours on the grid of hyperparameters."""
-    smoothness, length, strength, amplitude = at
+    a, b, c, d = at
     return [
-        (smoothness + i, length + j, strength + k, amplitude + m)
-        for i, j, k, m in (*np.eye(4, dtype=int).tolist(), *(-np.eye(4, dtype=int)).tolist())
-    ]
+        (a + 1, b, c, d), (a, b + 1, c, d), (a, b, c + 1, d), (a, b, c, d + 1),
+        (a - 1, b, c, d), (a, b - 1, c, d), (a, b, c - 1, d), (a, b, c, d - 1),
+    ]  # fmt: skip
 
 
 def _covariance_root(covariance: Array) -> Array:
     """R with covariance = R R^T."""
     scale = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(scale, scale)
-    correlation[np.diag_indices_from(correlation)] += 1e-12
+    correlation.flat[:: len(correlation) + 1] += 1e-12
     factor, _ = linalg.lapack.dpotrf(correlation, lower=1, clean=1)
     return np.asarray(scale[:, None] * factor)

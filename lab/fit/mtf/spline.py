@@ -39,6 +39,11 @@ class Spline:
         inside = np.clip(distance_px, self.knot_px[0], self.knot_px[-1])
         return BSpline.design_matrix(inside, self._all_knots, 3)
 
+    def values(self, coefficients: Array, distance_px: Array) -> Array:
+        """Values (n,) at `distance_px` (n,): `design(distance_px) @ coefficients`, without the matrix."""
+        inside = np.clip(distance_px, self.knot_px[0], self.knot_px[-1])
+        return np.asarray(BSpline(self._all_knots, coefficients, 3)(inside))
+
     def derivative(self, coefficients: Array, distance_px: Array) -> Array:
         """First derivative (n,), per px, at `distance_px`; 0 beyond the ends."""
         value = BSpline(self._all_knots, coefficients, 3)(distance_px, nu=1, extrapolate=True)
@@ -52,12 +57,26 @@ class Spline:
         In each interval four basis functions differ from zero. `pieces[i, k, j]` is the coefficient of t^k, t = 0..1
         within interval i, of basis function i + j.
         """
-        t = np.array([0.0, 1.0, 2.0, 3.0]) / 3.0
-        at = self.knot_px[:-1, None] + t * np.diff(self.knot_px)[:, None]
-        values = BSpline(self._all_knots, np.eye(self.size), 3)(np.minimum(at, self.knot_px[-1]).ravel())
-        index = np.arange(len(at))[:, None, None] + np.arange(4)
-        local = values.reshape(len(at), 4, self.size)[np.arange(len(at))[:, None, None], np.arange(4)[:, None], index]
-        return np.asarray(np.linalg.inv(np.vander(t, increasing=True)) @ local)
+        knots, intervals = self._all_knots, len(self.knot_px) - 1
+        at = np.arange(intervals) + 3  # of the knot at the beginning of each interval
+        width = np.diff(self.knot_px)
+        lower = np.zeros((intervals, 4, 4))
+        lower[:, 0, 0] = 1.0
+        # The recursion of Cox and de Boor; basis function at - degree + j of each degree stands in column j
+        for degree in (1, 2, 3):
+            higher = np.zeros_like(lower)
+            for j in range(degree + 1):
+                i = at - degree + j
+                if j > 0:  # times (x - knots[i]) / (knots[i + degree] - knots[i]), x = knots[at] + width t
+                    share = lower[:, :, j - 1] / (knots[i + degree] - knots[i])[:, None]
+                    higher[:, :, j] += (knots[at] - knots[i])[:, None] * share
+                    higher[:, 1:, j] += width[:, None] * share[:, :-1]
+                if j < degree:  # times (knots[i + degree + 1] - x) / (knots[i + degree + 1] - knots[i + 1])
+                    share = lower[:, :, j] / (knots[i + degree + 1] - knots[i + 1])[:, None]
+                    higher[:, :, j] += (knots[i + degree + 1] - knots[at])[:, None] * share
+                    higher[:, 1:, j] -= width[:, None] * share[:, :-1]
+            lower = higher
+        return lower
 
     def roughness(self, strength: float) -> Array:
         """Penalty matrix (size, size), `strength` times the sum of squared third differences. It bridges knots without
@@ -73,7 +92,8 @@ class Spline:
         pi i f width t).
         """
         turn = -2j * np.pi * np.asarray(frequency_cy_per_px, dtype=float)[:, None]
-        moments = _exponential_moments(turn * np.diff(self.knot_px)) * np.exp(turn * self.knot_px[:-1])
+        width, which = np.unique(np.diff(self.knot_px), return_inverse=True)  # most intervals are of one width
+        moments = _exponential_moments(turn * width)[:, :, which] * np.exp(turn * self.knot_px[:-1])
         out = np.zeros((len(turn), self.size), dtype=complex)
         derivatives = self.pieces[:, 1:] * np.array([1.0, 2.0, 3.0])[:, None]
         for basis in range(4):
@@ -148,8 +168,12 @@ class SortedSamples:
     def derivatives(self, coefficients: Array) -> Array:
         """First derivatives (n,) at the samples, per px, in sorted order."""
         counts = np.diff(self.starts)
-        _, b, c, d = (np.repeat(k / np.diff(self.spline.knot_px), counts) for k in self._local(coefficients))
-        return np.asarray(b + 2.0 * c * self.powers[1] + 3.0 * d * self.powers[2])
+        _, b, c, d = self._local(coefficients) / np.diff(self.spline.knot_px)
+        value, t = np.repeat(3.0 * d, counts), self.powers[1]
+        for lower in (2.0 * c, b):
+            value *= t
+            value += np.repeat(lower, counts)
+        return value
 
     def gram(self, columns: Array, weight: Array | None = None) -> Array:
         """Gram matrix A^T W A, (size + g, size + g): A holds the basis functions, then `columns` (g, n), at the sorted
@@ -158,19 +182,21 @@ class SortedSamples:
         `weight` (n,) is the diagonal of W, the identity where it is None.
         """
         size, extra = self.spline.size, len(columns)
-        rows = np.concatenate([self.powers, columns])
-        weighted = rows if weight is None else rows * weight
-        bounds = zip(self.starts[:-1], self.starts[1:], strict=True)
-        parts = np.array([weighted[:, start:stop] @ rows[:, start:stop].T for start, stop in bounds])
+        parts = np.empty((len(self.starts) - 1, 4, 4 + extra))
+        # An interval at a time: its samples fit into the processor's cache
+        for part, start, stop in zip(parts, self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True):
+            powers = self.powers[:, start:stop]
+            weighted = powers if weight is None else powers * weight[start:stop]
+            part[:, :4], part[:, 4:] = weighted @ powers.T, weighted @ columns[:, start:stop].T
         pieces = self.spline.pieces
-        core = pieces.transpose(0, 2, 1) @ parts[:, :4, :4] @ pieces
-        cross = pieces.transpose(0, 2, 1) @ parts[:, :4, 4:]
+        core = pieces.transpose(0, 2, 1) @ parts[:, :, :4] @ pieces
+        cross = pieces.transpose(0, 2, 1) @ parts[:, :, 4:]
         out = np.zeros((size + extra,) * 2)
-        at = np.arange(len(parts))
+        bands = out.reshape(-1)
         for k in range(4):
-            out[at + k, size:] += cross[:, k]
-            for other in range(4):
-                out[at + k, at + other] += core[:, k, other]
+            out[k : k + len(parts), size:] += cross[:, k]
+            for other in range(4):  # the diagonal that begins at (k, other)
+                bands[k * len(out) + other :: len(out) + 1][: len(parts)] += core[:, k, other]
         out[size:, :size] = out[:size, size:].T
-        out[size:, size:] = parts[:, 4:, 4:].sum(axis=0)
+        out[size:, size:] = (columns if weight is None else columns * weight) @ columns.T
         return out

@@ -185,7 +185,7 @@ def edge_result(
         angle_deg=geometry.angle_deg,
         angle_deg_std=geometry.angle_deg_std,
         distance_px=distance,
-        esf=(spline.design(distance) @ esf - esf[0]) / step,
+        esf=(spline.values(esf, distance) - esf[0]) / step,
         lsf=spline.derivative(esf, distance) / step,
         dark_level=levels[0],
         light_level=levels[1],

@@ -13,12 +13,14 @@ from lab.fit.psf.normal_equations import normal_equations, normal_equations_righ
 from lab.fit.psf.regularised_kernel import ROUNDS, KernelEstimate, solve_kernel
 from lab.fit.psf.simplex import BRIEF_SOLVES, on_simplex
 from lab.fit.psf.target_displacement import displaced, displacement
+from lab.one_blas_thread import one_blas_thread
 
 Array = NDArray[np.floating[Any]]
 
 DISPLACEMENT_STEPS = 3
 
 
+@one_blas_thread
 def estimate_kernel(
     sharp: ArrayLike,
     blurred: ArrayLike,

@@ -40,11 +40,6 @@ class KernelPrior:
         power, vectors = np.linalg.eigh(np.exp(-0.5 * ((x[:, None] - x) / self.length) ** 2))
         return np.clip(np.kron(power, power), 0.0, None) + 1e-4, vectors
 
-    def root(self) -> Array:
-        """R (k, k) with covariance = R R^T."""
-        power, vectors = self._eigen()
-        return np.asarray(self.strength * self.envelope[:, None] * np.kron(vectors, vectors) * np.sqrt(power))
-
     def precision(self) -> Array:
         """Inverse of the covariance, (k, k)."""
         power, vectors = self._eigen()
@@ -53,7 +48,7 @@ class KernelPrior:
         return np.asarray(inverse / np.outer(envelope, envelope))
 
     def whitened(self, information: Array) -> Array:
-        """R^T information R, (k, k)."""
+        """R^T information R, (k, k), where covariance = R R^T."""
         power, vectors = self._eigen()
         envelope = self.strength * self.envelope
         inner = _both_axes(vectors, information * np.outer(envelope, envelope))
@@ -67,11 +62,14 @@ class KernelPrior:
 
     def posterior(self, information: Array) -> Array:
         """Covariance (k, k) of the kernel, given the data and that its sum is 1."""
-        inner = self.whitened(information)
-        inner[np.diag_indices_from(inner)] += 1.0
-        factor = linalg.cholesky(inner, lower=True, check_finite=False)
-        half = linalg.solve_triangular(factor, self.root().T, lower=True, check_finite=False)
-        covariance = half.T @ half
+        factor = _cholesky_of_one_more(self.whitened(information))
+        lower, failed = linalg.lapack.dpotri(factor, lower=1, overwrite_c=1)
+        if failed:
+            raise linalg.LinAlgError("the information of a kernel isn't positive definite")
+        inverse = np.tril(lower) + np.tril(lower, -1).T
+        power, vectors = self._eigen()
+        envelope = self.strength * self.envelope
+        covariance = _both_axes(vectors.T, inverse * np.sqrt(np.outer(power, power))) * np.outer(envelope, envelope)
         share = covariance.sum(axis=1)
         return np.asarray(covariance - np.outer(share, share) / share.sum())
 
@@ -80,19 +78,26 @@ def log_likelihood(inner: Array, right: Array) -> float:
     """Log marginal likelihood of the data under a prior, up to a constant, from R^T information R (overwritten) and
     R^T weighted.
     """
-    inner[np.diag_indices_from(inner)] += 1.0
-    factor = linalg.cholesky(inner, lower=True, overwrite_a=True, check_finite=False)
+    factor = _cholesky_of_one_more(inner)
     half = linalg.solve_triangular(factor, right, lower=True, check_finite=False)
     return float(0.5 * half @ half - np.log(np.diag(factor)).sum())
 
 
+def _cholesky_of_one_more(matrix: Array) -> Array:
+    """The lower triangular root of `matrix` + 1, (k, k) and symmetric, which is overwritten; above it stands anything."""
+    matrix.flat[:: len(matrix) + 1] += 1.0
+    # LAPACK's columns are the rows of a symmetric matrix: nothing is copied
+    factor, failed = linalg.lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
+    if failed:
+        raise linalg.LinAlgError("the information of a kernel isn't positive definite")
+    return np.asarray(factor)
+
+
 def _both_axes(vectors: Array, matrix: Array) -> Array:
-    """(W x W)^T matrix (W x W), x the Kronecker product."""
+    """(W x W)^T matrix (W x W) of a symmetric `matrix`, x the Kronecker product."""
     s = len(vectors)
-    out = np.tensordot(vectors, matrix.reshape(s, s, s * s), axes=(0, 0))  # (s', s, k)
-    out = np.tensordot(vectors, out, axes=(0, 1)).transpose(1, 0, 2).reshape(s * s, s, s)
-    out = np.tensordot(out, vectors, axes=(1, 0))  # (k', s, s')
-    return np.tensordot(out, vectors, axes=(1, 0)).reshape(s * s, s * s)
+    half = (vectors.T @ matrix.reshape(-1, s, s) @ vectors).reshape(matrix.shape)  # matrix (W x W)
+    return np.asarray((vectors.T @ half.T.reshape(-1, s, s) @ vectors).reshape(matrix.shape))
 
 
 def envelope_of(kernel: Array) -> Array:

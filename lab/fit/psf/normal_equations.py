@@ -32,43 +32,75 @@ def normal_equations(sharp: Array, blurred: Array, support: int) -> NormalEquati
     """Exact normal equations over the pixels for which the whole kernel (support, support) sees `sharp`; both pictures
     (rows, cols).
 
-    Each product of `sharp` with itself shifted is summed once over the part common to all windows, and by running sums
-    over the margins: O(support^2 pixels) instead of O(support^4 pixels).
+    The sums over the windows of all elements are those over the window of the last element, updated by the rows and columns that enter and
+    leave: O(support^2 pixels) instead of O(support^4 pixels).
     """
     s, h = support, support // 2
     rows, cols = sharp.shape
     tall, wide = rows - 2 * h, cols - 2 * h
     offset = float(sharp.mean())  # centred values: no digits are lost to the mean
     u = sharp - offset
-    index = np.arange(s)
-
-    def windows(product: Array) -> Array:
-        """Sums over all `tall` x `wide` windows that begin at rows and columns 0..support-1: (support, support)."""
-        by_row = np.empty((s, product.shape[1]))
-        by_row[0] = product[:tall].sum(axis=0)
-        by_row[1:] = by_row[0] + np.cumsum(product[tall : tall + s - 1] - product[: s - 1], axis=0)
-        total = np.empty((s, s))
-        total[:, 0] = by_row[:, :wide].sum(axis=1)
-        total[:, 1:] = total[:, :1] + np.cumsum(by_row[:, wide : wide + s - 1] - by_row[:, : s - 1], axis=1)
-        return total
-
-    # Kernel element (i, j) sees the window that begins at (2 h - i, 2 h - j)
+    padded = np.pad(u, ((s - 1, 0), (s - 1, s - 1)))
+    i, j = np.arange(s)[:, None, None], np.arange(s)[:, None]
     gram = np.zeros((s, s, s, s))
-    for di in range(s):
-        for dj in range(-(s - 1) if di else 0, s):
-            shifted = np.zeros_like(u)
-            source = u[: rows - di, max(0, -dj) : cols - max(0, dj)]
-            shifted[di:, max(0, dj) : cols - max(0, -dj)] = source
-            sums = windows(u * shifted)[::-1, ::-1]  # [i, j]: window of (i, j) with that of (i + di, j + dj)
-            ii, jj = np.ix_(index[: s - di], index[max(0, -dj) : s - max(0, dj)])
-            part = sums[ii, jj]
-            gram[ii, jj, ii + di, jj + dj] = part
-            gram[ii + di, jj + dj, ii, jj] = part
-    means = windows(u)[::-1, ::-1].ravel()
+    for down in range(s):
+        # Element (i, j) sees the window that begins at (2 h - i, 2 h - j), element (i + down, j') the one `down` rows above
+        sums = _lagged_sums(u, padded[s - 1 - down : s - 1 - down + rows], tall, wide)
+        part = sums[s - 1 - i[: s - down], s - 1 - j, s - 1 + j - j.T]
+        at = np.arange(s - down)
+        gram[at, :, at + down, :] = part
+        gram[at + down, :, at, :] = part.transpose(0, 2, 1)
+    means = _window_sums(u, tall, wide)[::-1, ::-1].ravel()
     # Back from the centred values: sharp = u + offset
     count = tall * wide
     full = gram.reshape(s * s, s * s) + offset * (means[:, None] + means) + offset**2 * count
     return NormalEquations(full, *normal_equations_right(sharp, blurred, support), count)
+
+
+def _window_sums(picture: Array, tall: int, wide: int) -> Array:
+    """Sums (s, s) of a picture (rows, cols) over all its windows of `tall` x `wide`, s = rows - tall + 1."""
+    cumulative = np.pad(picture.cumsum(axis=0), ((1, 0), (0, 0)))
+    by_row = np.pad((cumulative[tall:] - cumulative[: len(cumulative) - tall]).cumsum(axis=1), ((0, 0), (1, 0)))
+    return np.asarray(by_row[:, wide:] - by_row[:, : by_row.shape[1] - wide])
+
+
+def _lagged_sums(u: Array, other: Array, tall: int, wide: int) -> Array:
+    """Sums (s, s, 2 s - 1) of u[r, c] other[r, c + lag] over the windows of `tall` x `wide` that begin at (row, col).
+
+    `u` (rows, cols), `other` (rows, cols + 2 s - 2), s = cols - wide + 1. Over the first window by matrix products of blocks of columns, of
+    which the diagonals are the lags; over the others by what their rows and columns add and leave out.
+    """
+    cols = u.shape[1]
+    s = cols - wide + 1
+    lags = 2 * s - 1
+    by_column = np.empty((cols, lags))  # over the first `tall` rows
+    for first in range(0, cols, 2 * s):
+        last = min(first + 2 * s, cols)
+        products = u[:tall, first:last].T @ other[:tall, first : last + lags - 1]
+        row, item = products.strides
+        by_column[first:last] = np.lib.stride_tricks.as_strided(products, (last - first, lags), (row + item, item))
+    views = np.lib.stride_tricks.sliding_window_view(other, lags, axis=1)  # (rows, cols, lags)
+    enters, leaves = np.arange(tall, tall + s - 1), np.arange(s - 1)
+    # Down the rows: over the first `wide` columns together, and each column that a window further right leaves out or adds
+    within = np.empty((s, lags))
+    within[0] = by_column[:wide].sum(axis=0)
+    row_sums = _row_products(u[:, :wide], other[:, : wide + lags - 1], np.concatenate([enters, leaves]))
+    within[1:] = within[0] + np.cumsum(row_sums[: s - 1] - row_sums[s - 1 :], axis=0)
+    change = np.empty((s, s - 1, lags))  # of a window one further right
+    change[0] = by_column[wide:] - by_column[: s - 1]
+    right, left = slice(wide, None), slice(None, s - 1)
+    added = [u[rows, at, None] * views[rows, at] for rows in (enters, leaves) for at in (right, left)]
+    change[1:] = change[0] + np.cumsum(added[0] - added[1] - added[2] + added[3], axis=0)
+    out = np.empty((s, s, lags))
+    out[:, 0] = within
+    out[:, 1:] = within[:, None] + np.cumsum(change, axis=1)
+    return out
+
+
+def _row_products(u: Array, other: Array, rows: NDArray[np.int64]) -> Array:
+    """Sums (rows, lags) of u[r, c] other[r, c + lag] over the columns, for chosen `rows`."""
+    views = np.lib.stride_tricks.sliding_window_view(other, u.shape[1], axis=1)  # (rows, lags, cols)
+    return np.array([views[r] @ u[r] for r in rows]).reshape(len(rows), views.shape[1])
 
 
 def normal_equations_right(sharp: Array, blurred: Array, support: int) -> tuple[Array, float]:

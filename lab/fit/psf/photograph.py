@@ -16,6 +16,7 @@ from lab.fit.psf.drawn_pattern import DrawnPattern
 from lab.fit.psf.regularised_kernel import KernelEstimate, solve_kernel
 from lab.fit.psf.screen_kernel import screen_kernel
 from lab.fit.psf.screen_registration import LEAST_CORRELATION, ScreenWarp
+from lab.one_blas_thread import one_blas_thread
 
 Array = NDArray[np.floating[Any]]
 
@@ -43,6 +44,7 @@ class PhotographedKernel:
     samples: int
 
 
+@one_blas_thread
 def photographed_kernel(
     photo: ArrayLike,
     pattern: NDArray[np.uint8],

@@ -14,6 +14,7 @@ from lab.fit.psf.pixel_sampling import on_pixels, pixel_matrix
 from lab.fit.psf.regularised_kernel import KernelEstimate, solve_kernel
 from lab.fit.psf.screen_registration import register
 from lab.fit.psf.simplex import on_simplex
+from lab.one_blas_thread import one_blas_thread
 from sim.camera import Cfa
 from sim.sensor.mosaic import phases
 from sim.sensor.mosaic import step as period
@@ -68,6 +69,7 @@ class ScreenField:
     parts: tuple[ScreenKernel, ...]
 
 
+@one_blas_thread
 def measure_field(
     pictures: ScreenPictures, cfa: Cfa, support_px: int = 9, oversample: int = 2, patches: int = 3
 ) -> ScreenField:

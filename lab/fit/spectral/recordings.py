@@ -16,6 +16,7 @@ from lab.fit.spectral.maker_prior import solved_with_maker
 from lab.fit.spectral.sensitivity import COVERAGE_FACTOR, RADIOMETER_RELATIVE_STD, Sensitivity, solved_sensitivity
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
+from lab.one_blas_thread import one_blas_thread
 from sim.camera import Side
 from sim.spectrum import FloatArray
 
@@ -26,6 +27,7 @@ SEEN_SIGMA = 5.0  # standard deviations that one signal at least has to be above
 CENTROID_MARGIN_NM = 1.0  # beyond the centroids of the outer lights up to which the curve is stated
 
 
+@one_blas_thread
 def fit_spectral(recordings: RecordingSet, side: Side, noise: NoiseFit | None = None) -> SpectralFit:
     """Absolute quantum efficiency of every channel from the narrowband captures, electrons per photon at the pixel.
 

