@@ -48,7 +48,7 @@ def _station(service: Service, name: str) -> StationState:
     try:
         station = service.station(name)
     except InputError as error:
-        return StationState(name=name, title=name, problem=str(error))
+        return StationState(name=name, title=name, problem=service.public(str(error)))
     return StationState(
         name=name,
         title=station.name or name,
@@ -83,9 +83,8 @@ def state_now(info: SessionInfo, live: LiveSession | None) -> Any:
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     live = service.live.find(info.id)
     fields = info.model_dump(exclude={"packed"}) | {"state": state_now(info, live)}
-    return fields | (
-        {"error": None} if live is not None else {}
-    )  # the error of an earlier run doesn't concern this one
+    # The error of an earlier run doesn't concern this one.
+    return fields | {"error": None if live is not None else service.public.or_none(info.error)}
 
 
 def _session(service: Service, session_id: str) -> StoredSession:
@@ -130,7 +129,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
         **_fields(service, info),
         station=service.store.station(session_id).name,
         progress=service.progress(session_id) if info.closed is None else None,
-        runs=tuple(service.store.runs(session_id)),
+        runs=service.runs(session_id),
         captures=tuple(
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
@@ -192,7 +191,7 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
         return
     yield event("state", await asyncio.to_thread(look))
     async for progress in live.follow(stopping):
-        yield event("progress", progress)
+        yield event("progress", service.told(progress))
         if (progress.state, live.pausing) != seen:
             seen = (progress.state, live.pausing)
             yield event("state", await asyncio.to_thread(look))
