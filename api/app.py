@@ -25,7 +25,7 @@ from api.keys import LOOPBACK, stored_keys
 from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.public_text import PublicText
-from api.routes import jobs, knowledge, recordings, sessions
+from api.routes import calibrations, jobs, knowledge, recordings, sessions
 from api.schemas import Health, Login, Me
 from api.security import (
     COOKIE,
@@ -60,6 +60,7 @@ TAGS = [
     {"name": "captures", "description": "What was captured: pictures and raw frames."},
     {"name": "recordings", "description": "Recording sets that are sent in."},
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
+    {"name": "calibrations", "description": "Candidate, certified, superseded, expired; figures and their history."},
     {"name": "knowledge", "description": "What the models know."},
 ]
 #: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that is too large,
@@ -220,7 +221,7 @@ def create_app(
 
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
-    for part in (knowledge, sessions, recordings, jobs):
+    for part in (knowledge, sessions, recordings, jobs, calibrations):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -82,7 +82,8 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     session, which can be followed, paused and aborted as any other. 409 while another runs on the same instruments. The key's
     scope has to be `admin`, for this captures and computes."""
     station = service.station(start.station)
-    session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
+    plan = full_plan(station, start.quick, start.sequences)
+    session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
     return _accepted(service, job_id, response)
 

@@ -116,7 +116,8 @@ def list_sessions(
 def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
     """Start a session, which runs in the background. 409 while another session runs on the same instruments."""
     station = service.station(start.station)
-    session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
+    plan = full_plan(station, start.quick, start.sequences)
+    session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
     return _session(service, session_id)
 

@@ -36,6 +36,11 @@ ROUTES = [
     ("GET", "/sessions/{session_id}/captures/{capture_id}/frame.npy", "read"),
     ("POST", "/sessions/{session_id}/jobs", "calibrate"),
     ("POST", "/pipelines", "admin"),
+    ("GET", "/calibrations", "read"),
+    ("GET", "/calibrations/{calibration_id}", "read"),
+    ("POST", "/calibrations/{calibration_id}/certify", "calibrate"),
+    ("GET", "/figures", "read"),
+    ("GET", "/history", "read"),
     ("GET", "/recordings", "read"),
     ("POST", "/recordings", "calibrate"),
     ("GET", "/recordings/{recordings_id}", "read"),
@@ -51,6 +56,7 @@ BODIES: dict[str, Any] = {
     "/sessions": {"station": "nowhere"},
     "/pipelines": {"station": "nowhere"},
     "jobs": {"kind": "fit"},
+    "/calibrations/{calibration_id}/certify": {},
 }
 
 
@@ -64,7 +70,14 @@ def test_the_list_of_routes_is_complete(shared: Running) -> None:
 
 @pytest.mark.parametrize(("method", "path", "least"), ROUTES)
 def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path: str, least: str) -> None:
-    ids = {"session_id": "0", "capture_id": "1", "job_id": "0" * 16, "recordings_id": "0" * 16, "name": "nothing"}
+    ids = {
+        "session_id": "0",
+        "capture_id": "1",
+        "job_id": "0" * 16,
+        "recordings_id": "0" * 16,
+        "calibration_id": "0" * 16,
+        "name": "nothing",
+    }
     asked = "/api/v1" + re.sub(r"\{(\w+)\}", lambda found: ids[found[1]], path)
     body = BODIES.get(path, BODIES["jobs"] if path.endswith("/jobs") and method == "POST" else None)
     for scope, key in [(None, None), ("wrong", "calibench_" + "x" * 43), *shared.keys.items()]:
@@ -77,7 +90,11 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         elif Permission(scope).allows(Permission(least)):
             # What is asked for isn't there, or is an empty upload: the key was good enough to be told so.
             assert response.status_code == (
-                200 if "{" not in path and method == "GET" else 422 if path == "/recordings" else 404
+                422
+                if path in ("/recordings", "/history") and (method, path) != ("GET", "/recordings")
+                else 200
+                if "{" not in path and method == "GET"
+                else 404
             )
         else:
             assert response.status_code == 403
