@@ -215,14 +215,21 @@ def upgrade(engine: sa.Engine, folder: Path) -> None:
     """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry."""
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
-    newest = ScriptDirectory.from_config(config).get_current_head()
+    scripts = ScriptDirectory.from_config(config)
+    newest, known = scripts.get_current_head(), {script.revision for script in scripts.walk_revisions()}
     lock = Lock(folder / ".migration.lock")
     if not lock.acquire(patience_s=60.0):
         raise InputError(f"{folder}: its registry is being migrated by another process; try again when it is done")
     try:
         with engine.execution_options(writes=True).connect() as connection:
-            if MigrationContext.configure(connection).get_current_revision() == newest:
+            found = MigrationContext.configure(connection).get_current_revision()
+            if found == newest:
                 return
+            if found is not None and found not in known:
+                raise InputError(
+                    f"{folder}: its registry has the revision {found}, written by a newer calibench; install that version, or restore "
+                    "the backup of before the upgrade"
+                )
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
             connection.commit()
