@@ -51,6 +51,8 @@ PAGES = Path(__file__).parent / "pages"
 ASSETS = {
     "operator.css": "text/css",
     "operator.js": "text/javascript",
+    "page.js": "text/javascript",
+    "calibrations.js": "text/javascript",
     "docs.js": "text/javascript",
 }
 TAGS = [
