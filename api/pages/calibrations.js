@@ -2,7 +2,7 @@
 
 import { $, ask, element, post, show, time, told } from "./page.js";
 
-const SVG = "http://www.w3.org/2000/svg";
+const SVG = $("svg").content.firstElementChild.namespaceURI;
 const HEIGHT = 240;
 const LEFT = 76;
 const RIGHT = 14;

@@ -8,11 +8,11 @@ same cameras is certified, and **expired** when its time is over.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
 
-import numpy as np
 import sqlalchemy as sa
 from scipy import special
 
@@ -98,7 +98,10 @@ def rig_of(cameras: Mapping[Side, str]) -> str:
 
 def check_certified(store: Store, cameras: Mapping[Side, str]) -> None:
     """Raises InputError unless the rig of these cameras has a certified calibration that isn't expired."""
-    found = [one for one in calibrations(store) if one.cameras == dict(cameras)]
+    register(store)
+    with store.reading() as db:
+        asked = _asked().where(CalibrationRow.rig == rig_of(cameras)).order_by(CalibrationRow.created.desc())
+        found = [_calibration(row, name) for row, name in db.execute(asked)]
     if any(one.state == "certified" for one in found):
         return
     expired = [one for one in found if one.state == "expired"]
@@ -169,7 +172,7 @@ def _aware(at: datetime | None) -> datetime | None:
     return at.replace(tzinfo=UTC) if at is not None and at.tzinfo is None else at
 
 
-def _state(row: CalibrationRow, at: datetime) -> CalibrationState:
+def _state(row: Any, at: datetime) -> CalibrationState:
     if row.certified is None:
         return "candidate"
     if row.superseded is not None:
@@ -319,23 +322,24 @@ def history(
     default those of the camera's newest certificate. Raises InputError where the camera or the figure isn't known.
     """
     register(store)
-    asked = (
-        sa.select(FigureRow, CalibrationRow)
-        .join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
-        .where(FigureRow.camera == camera, FigureRow.name == figure, FigureRow.place == place)
-        .order_by(CalibrationRow.created, CalibrationRow.id)
-    )
+    of_figure = (FigureRow.camera == camera, FigureRow.name == figure, FigureRow.place == place)
+    columns = (FigureRow.calibration_id, FigureRow.side, FigureRow.value, FigureRow.std)
+    life = (CalibrationRow.created, CalibrationRow.certified, CalibrationRow.superseded, CalibrationRow.expires)
+    asked = sa.select(*columns, *life).join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
+    asked = asked.where(*of_figure).order_by(CalibrationRow.created, CalibrationRow.id)
+    certificates = sa.select(CalibrationRow.limits).join(FigureRow, CalibrationRow.id == FigureRow.calibration_id)
+    certificates = certificates.where(*of_figure, CalibrationRow.certified.is_not(None))
     with store.reading() as db:
         rows = db.execute(asked).all()
+        stated = None if limits else db.scalars(certificates.order_by(CalibrationRow.certified.desc()).limit(1)).first()
     if not rows:
         raise InputError(
             f"{camera}: no calibration of it has the figure {figure!r} {place}".rstrip()
             + "; list the figures for their names"
         )
-    if limits is None:
-        stated = [row.limits for _, row in rows if row.limits is not None]
-        limits = CalibrationLimits.model_validate(stated[-1]) if stated else None
-    one = Figure(name=figure, side=rows[-1][0].side, place=place, value=0.0, std=0.0)  # type: ignore[arg-type]
+    if stated is not None:
+        limits = CalibrationLimits.model_validate(stated)
+    one = Figure(name=figure, side=rows[-1].side, place=place, value=0.0, std=0.0)
     limit = next((found for found in (limits.limit if limits else ()) if found.concerns(one)), None)
     threshold = sigma_of_probability(sidak_part(false_alarm_rate, len(rows) - 1))
     return History(
@@ -345,38 +349,34 @@ def history(
         limit=limit,
         false_alarm_rate=false_alarm_rate,
         threshold_sigma=threshold,
-        points=tuple(_points(rows, limit, threshold)),
+        points=tuple(_points(rows, one, limit, threshold)),
     )
 
 
-def _points(rows: Sequence[Any], limit: Limit | None, threshold_sigma: float) -> list[HistoryPoint]:
-    found: list[HistoryPoint] = []
+def _points(rows: Sequence[Any], figure: Figure, limit: Limit | None, threshold_sigma: float) -> Iterator[HistoryPoint]:
+    """A point for each row, oldest first. The reference is the last one before that was ever certified, else the first."""
     at = now()
-    for number, (figure, row) in enumerate(rows):
-        created = _aware(row.created) or at
-        before = [other for other, of in rows[:number] if of.certified is not None]
-        reference = before[-1] if before else rows[0][0] if number else None
-        significance = None if reference is None else _significance(reference, figure)
-        measured = _figure(figure)
-        found.append(
-            HistoryPoint(
-                calibration_id=row.id,
-                created=created,
-                state=_state(row, at),
-                value=figure.value,
-                std=figure.std,
-                mark=None if limit is None else limit.judge(measured),
-                reference_id=None if reference is None else reference.calibration_id,
-                significance_sigma=significance,
-                drifted=significance is not None and significance > threshold_sigma,
-            )
+    reference = None
+    for row in rows:
+        significance = None if reference is None else _significance(reference, row)
+        yield HistoryPoint(
+            calibration_id=row.calibration_id,
+            created=_aware(row.created) or at,
+            state=_state(row, at),
+            value=row.value,
+            std=row.std,
+            mark=None if limit is None else limit.judge(figure.model_copy(update={"value": row.value, "std": row.std})),
+            reference_id=None if reference is None else reference.calibration_id,
+            significance_sigma=significance,
+            drifted=significance is not None and significance > threshold_sigma,
         )
-    return found
+        if reference is None or row.certified is not None:
+            reference = row
 
 
-def _significance(a: FigureRow, b: FigureRow) -> float:
+def _significance(a: Any, b: Any) -> float:
     """Of the difference of two figures in standard deviations, two-sided."""
-    std = float(np.hypot(a.std, b.std))
+    std = math.hypot(a.std, b.std)
     if std == 0.0:
         return 0.0 if a.value == b.value else sigma_of_probability(0.0)
     return sigma_of_probability(2.0 * float(special.ndtr(-abs(b.value - a.value) / std)))
