@@ -111,6 +111,7 @@ def test_the_example_names_fixtures_that_there_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # three benches, one after the other
 def test_the_example_fails_on_a_drifted_figure_and_only_then(tmp_path: Path) -> None:
     made = pytest_of_example(tmp_path, "--calibench-update")
     assert made.returncode == 0, made.stdout
