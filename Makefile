@@ -7,7 +7,7 @@ STAMP := $(VENV)/.ready
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: aravis soak setup run test serve bench proof proof-live slow lint clean
+.PHONY: aravis chromium soak setup run test serve bench proof proof-live slow lint clean
 
 setup: $(STAMP)
 
@@ -24,6 +24,10 @@ soak: $(STAMP)
 # The library for GigE cameras of any maker, from the distribution; tests that need it skip without it.
 aravis:
 	scripts/install-aravis
+
+# The browser in which the tests drive the operator's page, from the distribution.
+chromium:
+	scripts/install-chromium
 
 run: $(STAMP)
 	$(BIN)/calibench run --out calibench-data $(ARGS)

@@ -19,20 +19,22 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.middleware import Middleware
 
 from api import errors, schemas
-from api.errors import DefectMiddleware, Problem, answers
+from api.errors import DefectMiddleware, Problem, answers, problem
 from api.idempotency import PARAMETER, Idempotency
-from api.keys import LOOPBACK, holder, stored_keys
+from api.keys import LOOPBACK, stored_keys
 from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
-from api.routes import jobs, knowledge, recordings, sessions
+from api.public_text import PublicText
+from api.routes import calibrations, jobs, knowledge, recordings, sessions
 from api.schemas import Health, Login, Me
 from api.security import (
     COOKIE,
     Gate,
-    Patience,
     SafeHeaders,
     SameHost,
     SmallBodies,
+    TooManyFailures,
+    address_of,
     set_cookie,
 )
 from api.service import READ, Here, Limits, Service
@@ -49,6 +51,8 @@ PAGES = Path(__file__).parent / "pages"
 ASSETS = {
     "operator.css": "text/css",
     "operator.js": "text/javascript",
+    "page.js": "text/javascript",
+    "calibrations.js": "text/javascript",
     "docs.js": "text/javascript",
 }
 TAGS = [
@@ -58,6 +62,7 @@ TAGS = [
     {"name": "captures", "description": "What was captured: pictures and raw frames."},
     {"name": "recordings", "description": "Recording sets that are sent in."},
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
+    {"name": "calibrations", "description": "Candidate, certified, superseded, expired; figures and their history."},
     {"name": "knowledge", "description": "What the models know."},
 ]
 #: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that is too large,
@@ -100,10 +105,9 @@ def metrics(request: Request) -> Response:
 
 @open_to_all.post("/login", tags=["access"], responses=answers(401, 403, 413, 422, 429))
 async def login(service: Here, request: Request, asked: Login, response: Response) -> Me:
-    """Exchange a key for the page's cookie. A wrong key is answered after a pause."""
-    key = holder(asked.key.strip(), stored_keys(service.store))
+    """Exchange a key for the page's cookie. An address that sends too many wrong keys is answered 429 for a while."""
+    key = await asyncio.to_thread(service.gate.check, asked.key.strip(), address_of(request))
     if key is None:
-        await request.app.state.patience.after_failure()
         raise HTTPException(401, "this key isn't valid; `calibench key create NAME` makes one")
     set_cookie(response, service.gate.logins.open(key), secure=request.url.scheme == "https")
     return Me(name=key.name, scope=key.scope)
@@ -201,7 +205,7 @@ def create_app(
     gate = Gate(lambda: stored_keys(store))
     app.state.gate = gate
     app.state.metrics = counted
-    app.state.patience = Patience()
+    app.state.public = PublicText(store.root)
     app.state.service = Service(
         store=store,
         stations=folder,
@@ -209,11 +213,17 @@ def create_app(
         jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
         gate=gate,
+        public=app.state.public,
         limits=caps,
     )
     errors.install(app)
+
+    def too_many(request: Request, error: Exception) -> Response:
+        return problem(429, str(error), {"Retry-After": str(getattr(error, "wait_s", 60))})
+
+    app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
-    for part in (knowledge, sessions, recordings, jobs):
+    for part in (knowledge, sessions, recordings, jobs, calibrations):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
@@ -238,7 +248,9 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             for method, operation in operations.items():
                 if method == "post" and path.startswith(PREFIX) and path != f"{PREFIX}/recordings":
                     operation.setdefault("parameters", []).append(PARAMETER)
-                for status, response in answers(*(EVERYWHERE if method == "get" else EVERY_CHANGE)).items():
+                everywhere = EVERYWHERE if method == "get" else EVERY_CHANGE
+                keyed = (429,) if operation.get("security") else ()
+                for status, response in answers(*everywhere, *keyed).items():
                     operation["responses"].setdefault(str(status), response)
         known = made["components"]["schemas"]
         for model in (Problem, Progress, schemas.StoredSession, schemas.Job):

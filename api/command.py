@@ -76,8 +76,12 @@ def serve(
         list[str] | None, typer.Option(metavar="NAME", help="a name under which others reach it; may be repeated")
     ] = None,
     create_first_key: Annotated[
-        bool, typer.Option("--create-first-key", help="make and print an admin key if there is none, on any --host")
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--create-first-key/--no-first-key",
+            help="make and print an admin key if there is none; without either: only on loopback",
+        ),
+    ] = None,
     tls_certificate: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM; serves https")] = None,
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM, the certificate's private key")] = None,
     data: Folder = None,
@@ -91,7 +95,8 @@ def serve(
     from lab.capture.recovery import Recovery
 
     store = _store(data)
-    makes_key = (is_loopback(host) or create_first_key) and not stored_keys(store)
+    wanted = is_loopback(host) if create_first_key is None else create_first_key
+    makes_key = wanted and not stored_keys(store)
     if not makes_key:
         check_bind(host, stored_keys(store))
     with _listening(host, port) as line, contextlib.closing(Recovery(store)) as recovery:

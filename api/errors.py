@@ -62,7 +62,7 @@ _MEANINGS = {
     409: "conflicts with what is under way",
     413: "larger than allowed",
     422: "can't be used: what, where, remedy",
-    429: "too often",
+    429: "too many keys that aren't valid; `Retry-After` says when another is looked at",
     500: "a defect of calibench; its log says more",
     503: "an instrument or the data folder failed",
 }
@@ -86,16 +86,9 @@ def _one_line(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip()) or type(error).__name__
 
 
-def _public(request: Request, text: str) -> str:
-    """A text without the data folder's path: where the server keeps its files is nobody's business."""
-    return text.replace(f"{request.app.state.service.store.root}/", "").replace(
-        str(request.app.state.service.store.root), "the data folder"
-    )
-
-
 def _answer(status: int) -> Callable[[Request, Exception], Response]:
     def handler(request: Request, error: Exception) -> Response:
-        return problem(status, _public(request, _one_line(error)))
+        return problem(status, request.app.state.public(_one_line(error)))
 
     return handler
 
@@ -106,7 +99,7 @@ def _invalid(request: Request, error: Exception) -> Response:
     for one in error.errors():
         where = ".".join(str(part) for part in one["loc"] if part != "body") or "body"
         lines.append(f"{where}: {one['msg']}")
-    return problem(422, "; ".join(lines))
+    return problem(422, request.app.state.public("; ".join(lines)))
 
 
 def _refused(request: Request, error: Exception) -> Response:
@@ -123,7 +116,7 @@ def _refused(request: Request, error: Exception) -> Response:
         ]
         headers["allow"] = ", ".join(dict.fromkeys(methods)) or headers.get("allow", "GET")
         return problem(405, f"{request.method} isn't for this path; use {headers['allow']}", headers)
-    return problem(error.status_code, str(error.detail), headers)
+    return problem(error.status_code, request.app.state.public(str(error.detail)), headers)
 
 
 class DefectMiddleware:

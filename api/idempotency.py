@@ -18,6 +18,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.errors import problem
+from api.security import TooManyFailures
 from lab.capture.records import now
 from lab.capture.store import Store
 from lab.capture.tables import IdempotentRow
@@ -58,7 +59,10 @@ class Idempotency:
             said = f"{HEADER}: give 1 to 100 letters, digits and any of _ . : -"
             await problem(422, said)(scope, receive, send)
             return
-        holder = await asyncio.to_thread(scope["app"].state.gate.identify, request)
+        try:
+            holder = await asyncio.to_thread(scope["app"].state.gate.identify, request)
+        except TooManyFailures:
+            holder = None
         if holder is None:  # the route refuses it
             await self.app(scope, receive, send)
             return

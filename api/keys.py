@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 
 KEY_PREFIX = "calibench_"
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
-_KEYS = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{20,}")
+_HIDDEN = KEY_PREFIX + "***"
+#: A key, also percent-encoded as a URL may have it: each of its characters as such or as %XX.
+_KEYS = re.compile(
+    "".join(f"(?:{letter}|%{ord(letter):02x})" for letter in KEY_PREFIX) + r"(?:[A-Za-z0-9_-]|%[0-9a-f]{2}){16,}", re.I
+)
 
 
 class Permission(StrEnum):
@@ -82,17 +86,23 @@ def holder(key: str, stored: Iterable[StoredKey]) -> StoredKey | None:
 
 
 class HideKeys(logging.Filter):
-    """Removes keys from log lines: a client may have written one into a URL."""
+    """Removes keys from log lines and their tracebacks: a client may have written one into a URL."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Remove the keys from a record; no record is dropped."""
         text = record.getMessage()
-        hidden = _KEYS.sub(KEY_PREFIX + "***", text)
+        hidden = _KEYS.sub(_HIDDEN, text)
         if hidden != text and isinstance(record.args, tuple):
             # uvicorn's formatter unpacks the arguments, so they are kept, one by one.
-            record.args = tuple(_KEYS.sub(KEY_PREFIX + "***", a) if isinstance(a, str) else a for a in record.args)
+            record.args = tuple(_KEYS.sub(_HIDDEN, a) if isinstance(a, str) else a for a in record.args)
         if _KEYS.search(record.getMessage()):
             record.msg, record.args = hidden, ()
+        if record.exc_info and record.exc_info[0] is not None:
+            record.exc_text = record.exc_text or logging.Formatter().formatException(record.exc_info)
+        if record.exc_text:  # a formatter takes it as it is
+            record.exc_text = _KEYS.sub(_HIDDEN, record.exc_text)
+        if record.stack_info:
+            record.stack_info = _KEYS.sub(_HIDDEN, record.stack_info)
         return True
 
 

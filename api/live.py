@@ -130,7 +130,7 @@ class LiveSessions:
         live = self._live.get(session_id)
         return live if live is not None and not live.ended else None
 
-    def start(self, station: Station, plan: CapturePlan, name: str, notes: str) -> str:
+    def start(self, station: Station, plan: CapturePlan, name: str, notes: str, demands_certified: bool = False) -> str:
         """Register a session and run it; its id. Raises Conflict if one runs on an instrument of the station, InputError if
         the station lacks what the plan needs."""
         with self._lock:
@@ -142,6 +142,7 @@ class LiveSessions:
                 plan,
                 name=name,
                 notes=notes,
+                demands_certified=demands_certified,
                 on_progress=live.tell,
                 connect=self._connect,
             )
@@ -183,7 +184,7 @@ class LiveSessions:
             try:
                 if not session_id:
                     plan = request.plan or full_plan(station, request.quick)
-                    session_id = self.start(station, plan, request.name, request.notes)
+                    session_id = self.start(station, plan, request.name, request.notes, request.demands_certified)
                 elif self.find(session_id) is None and self._store.session(session_id).state != "finished":
                     self.resume(session_id, station)
             except Conflict as error:

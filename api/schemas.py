@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from api.keys import Permission
+from lab.calibration.limits import CalibrationLimits
 from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
@@ -102,6 +103,35 @@ class SessionStart(Schema):
     sequences: tuple[SequenceName, ...] | None = Field(
         default=None, min_length=1, description="only these; without it, all that the station can do"
     )
+    demands_certified: bool = Field(
+        default=False, description="end the run when it has connected, unless the cameras have a certified calibration"
+    )
+
+
+class Certify(Schema):
+    """Certifies a calibration."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "limits": {
+                    "valid_days": 90,
+                    "limit": [{"figure": "noise read_noise_e", "good": [0, 2.5], "warn": [0, 3]}],
+                }
+            }
+        }
+    )
+
+    limits: CalibrationLimits | None = Field(default=None, description="null: those of the data folder, `limits.toml`")
+    accept_warnings: bool = Field(default=False, description="certify with figures in the warning band")
+
+
+class FigureName(Schema):
+    """A figure of a camera, or of the pair, that has a history."""
+
+    camera: str
+    figure: str
+    place: str
 
 
 class SessionResume(Schema):
@@ -142,6 +172,9 @@ class StoredSession(Schema):
     error: str | None = Field(description="why it ended early, and the remedy")
     steps: int
     steps_done: int
+    demands_certified: bool = Field(
+        default=False, description="it runs only with a certified calibration of its cameras"
+    )
 
 
 class CaptureCount(Schema):

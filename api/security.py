@@ -1,4 +1,4 @@
-"""Access control: keys, the page's cookie, Host and Origin, security headers, limits of request bodies.
+"""Access control: keys and how often one may fail, the page's cookie, Host and Origin, security headers, limits of request bodies.
 
 A key is sent in the header `Authorization: Bearer KEY`, never in a URL. The operator's page exchanges it for a cookie that scripts
 can't read and other sites can't send.
@@ -6,7 +6,6 @@ can't read and other sites can't send.
 
 from __future__ import annotations
 
-import asyncio
 import secrets
 import threading
 import time
@@ -21,6 +20,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.errors import problem
+from api.failed_keys import FailedKeys
 from api.keys import Permission, StoredKey, digest, holder
 
 COOKIE = "calibench"
@@ -58,44 +58,60 @@ class Logins:
             self._tokens.pop(digest(token), None)
 
 
+class TooManyFailures(Exception):
+    """The key isn't compared: its address has sent too many that weren't valid. `wait_s`: when it may try again."""
+
+    def __init__(self, wait_s: int) -> None:
+        super().__init__(f"too many keys that aren't valid; try again in {wait_s} s")
+        self.wait_s = wait_s
+
+
 @dataclass
-class Patience:
-    """Slows down guessing of keys: failed logins are answered one after the other, each after a pause; at most `queue` wait."""
-
-    pause_s: float = 0.5
-    queue: int = 20
-    _waiting: int = 0
-    _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
-
-    async def after_failure(self) -> None:
-        """Wait for one's turn and for the pause. Raises 429 at once where `queue` others wait."""
-        if self._waiting >= self.queue:
-            raise HTTPException(429, "too many failed logins; try again in a minute", headers={"Retry-After": "60"})
-        self._waiting += 1
-        try:
-            async with self._turn:
-                await asyncio.sleep(self.pause_s)
-        finally:
-            self._waiting -= 1
-
-
-@dataclass(frozen=True)
 class Gate:
     """Identifies the key of a request; one per application."""
 
     keys: Callable[[], Iterable[StoredKey]]
     logins: Logins = field(default_factory=Logins)
+    failures: FailedKeys = field(default_factory=FailedKeys)
+    #: SHA-256 of keys that were valid once: these are compared whatever their address did.
+    _proven: set[str] = field(default_factory=set)
+
+    def check(self, key: str, address: str) -> StoredKey | None:
+        """The stored key that `key` is, or None. Raises TooManyFailures without comparing where the address has none left."""
+        mine = digest(key)
+        if mine not in self._proven and (wait_s := self.failures.wait_s(address)):
+            raise TooManyFailures(wait_s)
+        found = holder(key, self.keys())
+        if found is None:
+            self._proven.discard(mine)
+            self.failures.failed(address)
+        else:
+            self._proven.add(mine)
+        return found
 
     def identify(self, request: Request) -> StoredKey | None:
-        """The key of a request, from the Authorization header, else from the page's cookie; None without a valid one."""
+        """The key of a request, from the Authorization header, else from the page's cookie; None without a valid one. Raises
+        TooManyFailures. A request is identified once, however often it is asked."""
+        if not hasattr(request.state, "key"):
+            request.state.key = self._identify(request)
+        key: StoredKey | None = request.state.key
+        return key
+
+    def _identify(self, request: Request) -> StoredKey | None:
         header = request.headers.get("authorization", "")
         scheme, _, key = header.partition(" ")
         if header:
-            return holder(key.strip(), self.keys()) if scheme.lower() == "bearer" and key.strip() else None
+            usable = scheme.lower() == "bearer" and key.strip()
+            return self.check(key.strip(), address_of(request)) if usable else None
         token = request.cookies.get(COOKIE)
         login = self.logins.holder(token) if token else None
         # A key that was taken away takes its logins with it.
         return login if login is not None and login in self.keys() else None
+
+
+def address_of(request: Request) -> str:
+    """The address that a request came from; a proxy's where there is one."""
+    return request.client.host if request.client is not None else "unknown"
 
 
 _BEARER = HTTPBearer(

@@ -12,9 +12,10 @@ from fastapi import Path as PathParameter
 from api.errors import known
 from api.keys import Permission
 from api.live import LiveSessions
+from api.public_text import PublicText
 from api.security import Demand, Gate
 from api.upload import Inbox
-from lab.capture.records import SessionInfo
+from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
 from lab.capture.store import Store
@@ -44,6 +45,7 @@ class Service:
     inbox: Inbox
     gate: Gate
     limits: Limits
+    public: PublicText
 
     def station_files(self) -> dict[str, Path]:
         """The station files by name."""
@@ -84,7 +86,26 @@ class Service:
     def progress(self, session_id: str) -> Progress | None:
         """The latest progress of a session that this process runs, else None."""
         live = self.live.find(session_id)
-        return live.latest if live is not None else None
+        return self.told(live.latest) if live is not None and live.latest is not None else None
+
+    def told(self, progress: Progress) -> Progress:
+        """A session's progress as an answer may have it."""
+        texts = {"what": self.public(progress.what), "remark": self.public.or_none(progress.remark)}
+        return progress.model_copy(update=texts)
+
+    def runs(self, session_id: str) -> tuple[RunRecord, ...]:
+        """The provenance of a session. An address that is a folder of the server is only its name."""
+        return tuple(
+            run.model_copy(
+                update={
+                    "instruments": {
+                        name: {key: self.public(value) for key, value in identity.items()}
+                        for name, identity in run.instruments.items()
+                    }
+                }
+            )
+            for run in self.store.runs(session_id)
+        )
 
 
 def _service(request: Request) -> Service:

@@ -13,7 +13,9 @@ import secrets
 import threading
 import time
 from datetime import datetime
+from ipaddress import ip_address
 from typing import Any, cast
+from urllib.parse import urlsplit
 
 import sqlalchemy as sa
 from pydantic import ConfigDict
@@ -141,6 +143,21 @@ def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None
             row.progress, row.message = 1.0, ""
 
 
+def check_scheduler(address: str) -> None:
+    """Raises InputError for a scheduler that others could pose as: whoever is the scheduler runs code in this process. It is on
+    this computer, or speaks TLS with the certificates of Dask's own settings (`distributed.comm.tls`)."""
+    scheme, _, place = address.rpartition("://")
+    host = urlsplit(f"//{place}").hostname or ""
+    with contextlib.suppress(ValueError):
+        if ip_address(host).is_loopback:
+            return
+    if scheme not in ("tls", "inproc") and host != "localhost":
+        raise InputError(
+            f"Dask scheduler {address}: isn't on this computer and doesn't speak TLS; give tls://HOST:PORT, with the certificates in "
+            "Dask's settings (distributed.comm.tls)"
+        )
+
+
 # --- the runner ----------------------------------------------------------------------------------------------------------
 
 
@@ -157,6 +174,8 @@ class JobRunner:
         self.connect_timeout_s = connect_timeout_s
         self.store = store
         self.scheduler = scheduler or store.settings.scheduler
+        if self.scheduler is not None:
+            check_scheduler(self.scheduler)
         self.workers = workers
         self.id = secrets.token_hex(6)
         self._lock = self._lock_of(self.id)

@@ -68,6 +68,7 @@ class CaptureRequest:
     plan : the sequences of a new session; None: all that the station has the instruments and targets for
     quick : fewer exposures and repeats, where `plan` is None
     only : names of the sequences to take, where `plan` is None; empty: all
+    demands_certified : a new session runs only with cameras that have a certified calibration
     """
 
     session: str = ""
@@ -76,6 +77,7 @@ class CaptureRequest:
     only: tuple[str, ...] = ()
     name: str = ""
     notes: str = ""
+    demands_certified: bool = False
 
 
 @dataclass(frozen=True)
@@ -231,6 +233,7 @@ def capture_here(
             quick=request.quick,
             name=request.name,
             notes=request.notes,
+            demands_certified=request.demands_certified,
             on_progress=told,
             connect=drivers,
         )

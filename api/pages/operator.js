@@ -1,47 +1,15 @@
 // The operator's page: what runs now, the sessions, the jobs and their reports. No framework: a few functions over fetch.
 
-const $ = (id) => document.getElementById(id);
-const api = "/api/v1";
+import { showCalibrations } from "./calibrations.js";
+import { $, Problem, api, ask, element, post, show, time, told } from "./page.js";
+
 const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
 const PICTURES_AT_ONCE = 48;
 let atOnce = PICTURES_AT_ONCE;
 let selected = null; // the session whose captures are shown
 let live = null; // the id of the session that runs now
+let jobsDone = 0;
 let following = null; // the open event stream, with the session it follows
-
-class Problem extends Error {}
-
-async function ask(path, options = {}) {
-  const response = await fetch(api + path, {
-    headers: options.body ? { "Content-Type": "application/json" } : {},
-    ...options,
-  });
-  if (response.status === 401) {
-    showLogin();
-    throw new Problem("log in first");
-  }
-  const body = response.status === 204 ? null : await response.json();
-  if (!response.ok) throw new Problem(body.detail);
-  return body;
-}
-
-const post = (path, body) => ask(path, { method: "POST", body: body === undefined ? undefined : JSON.stringify(body) });
-
-function element(tag, properties = {}, ...children) {
-  const made = Object.assign(document.createElement(tag), properties);
-  made.append(...children);
-  return made;
-}
-
-// Replaces the rows only where something changed, so that a button doesn't vanish under the pointer.
-function show(place, items, row) {
-  const text = JSON.stringify(items);
-  if ($(place).dataset.shown === text) return;
-  $(place).dataset.shown = text;
-  $(place).replaceChildren(...items.map(row));
-}
-
-const time = (text) => (text ? text.replace("T", " ").slice(0, 19) : "");
 
 function duration(seconds) {
   if (seconds == null) return "";
@@ -54,27 +22,22 @@ function exposure(seconds) {
   return seconds < 1 ? ` · ${Number((seconds * 1e3).toPrecision(3))} ms` : ` · ${Number(seconds.toPrecision(3))} s`;
 }
 
-function guarded(place, action) {
-  return async (event) => {
-    event?.preventDefault();
-    $(place).textContent = "";
-    try {
-      await action(event);
-    } catch (error) {
-      $(place).textContent = error.message;
-    }
-    await refresh();
-  };
-}
+const guarded = (place, action) => async (event) => {
+  await told(place, action)(event);
+  await refresh();
+};
 
 // --- log in ---------------------------------------------------------------------------------------------------------
+
+document.addEventListener("logged-out", () => showLogin());
 
 function showLogin() {
   following?.stream.close();
   following = null;
   $("login").hidden = false;
-  $("desk").hidden = $("logout").hidden = true;
+  $("desk").hidden = $("logout").hidden = $("halt").hidden = true;
   $("who").textContent = "";
+  $("login-form").elements.key.focus();
 }
 
 async function enter() {
@@ -82,8 +45,10 @@ async function enter() {
   $("who").textContent = `${me.name} (${me.scope})`;
   $("login").hidden = true;
   $("desk").hidden = $("logout").hidden = false;
+  $("halt").hidden = !["operate", "admin"].includes(me.scope);
   await showStations();
   await refresh();
+  await showCalibrations();
 }
 
 async function showStations() {
@@ -163,7 +128,7 @@ $("start-form").addEventListener(
   "submit",
   guarded("live-problem", async (event) => {
     const fields = event.target.elements;
-    const session = await post("/sessions", { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked });
+    const session = await post("/sessions", { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked, demands_certified: fields.certified.checked });
     await select(session);
   }),
 );
@@ -176,6 +141,17 @@ for (const verb of ["pause", "resume", "abort"]) {
     }),
   );
 }
+
+// Ends every session that runs, without a question: shutters close, screens go dark, and each can be resumed.
+$("halt").addEventListener(
+  "click",
+  guarded("live-problem", async () => {
+    const running = (await ask("/sessions?limit=50")).filter((s) => LIVE.includes(s.state));
+    const answers = await Promise.allSettled(running.map((s) => post(`/sessions/${s.id}/abort`)));
+    const failed = answers.filter((one) => one.status === "rejected").map((one) => one.reason.message);
+    if (failed.length) throw new Problem(failed.join("; "));
+  }),
+);
 
 // A session that ended early goes on where its station is now: the file of that name may have other addresses.
 async function goOn(session) {
@@ -252,7 +228,7 @@ async function select(session) {
   $("session-problem").textContent = "";
   $("session-title").textContent = session.name || session.id;
   const buttons = ["fit", "validate", "diagnose", "report", "pipeline"].map((kind) => {
-    const button = element("button", { textContent: kind[0].toUpperCase() + kind.slice(1) });
+    const button = element("button", { textContent: kind[0].toUpperCase() + kind.slice(1), title: `${kind} this session` });
     button.addEventListener(
       "click",
       guarded("session-problem", () => post(`/sessions/${session.id}/jobs`, { kind })),
@@ -373,6 +349,9 @@ async function refresh() {
   $("no-sessions").hidden = sessions.length > 0;
   show("jobs", jobs.map((job) => ({ ...job, of: names.get(job.session_id) ?? job.session_id ?? `recordings ${job.recordings_id}` })), jobRow);
   $("no-jobs").hidden = jobs.length > 0;
+  const done = jobs.filter((job) => job.state === "done").length;
+  if (done !== jobsDone) await showCalibrations(); // a fit is a new candidate
+  jobsDone = done;
   if (live && live === selected) await showCaptures();
 }
 

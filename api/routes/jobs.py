@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
+
 from fastapi import APIRouter, HTTPException, Request, Response
-from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.responses import HTMLResponse
 from sse_starlette.sse import EventSourceResponse
 
 from api.errors import Conflict, answers, known
@@ -24,7 +26,9 @@ router = APIRouter()
 def _job(service: Service, info: JobInfo) -> Job:
     recordings_id = service.inbox.id_of(info.source)
     return Job(
-        **info.model_dump(exclude={"source", "options", "cancel_requested"}),
+        **info.model_dump(exclude={"source", "message", "error", "cancel_requested"}),
+        message=service.public(info.message),
+        error=service.public.or_none(info.error),
         session_id=info.source if recordings_id is None else None,
         recordings_id=recordings_id,
     )
@@ -77,7 +81,8 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     session, which can be followed, paused and aborted as any other. 409 while another runs on the same instruments. The key's
     scope has to be `admin`, for this captures and computes."""
     station = service.station(start.station)
-    session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
+    plan = full_plan(station, start.quick, start.sequences)
+    session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
     return _accepted(service, job_id, response)
 
@@ -169,18 +174,18 @@ REPORTS = ("report", "pipeline")
     response_model=FitResult | ValidationResult | DiagnosisResult | PipelineResults,
     responses=answers(401, 404, 409, 422),
 )
-def job_result(service: Here, job_id: HexId) -> JSONResponse:
+def job_result(service: Here, job_id: HexId) -> Response:
     """What `calibench fit`, `validate` or `diagnose` write with `--json`; of a pipeline, all three."""
     kind = _done(service, job_id).kind
     if kind == "report":
         raise HTTPException(404, f"job {job_id} made a report; GET /api/v1/jobs/{job_id}/report")
-    # As it was stored, byte for byte the schema: no second serialisation that could differ.
+    # As it was stored: no second serialisation that could differ.
     document = service.store.result(job_id).document
     if kind == "pipeline":
         kept = ReportFile.model_validate(document).results
         parts = {"fit": "fit", "validation": "validate", "diagnosis": "diagnose"}
         document = {part: service.store.result(kept[goal]).document for part, goal in parts.items()}
-    return JSONResponse(document)
+    return Response(service.public.within(json.dumps(document)), media_type="application/json")
 
 
 @router.get(
@@ -195,4 +200,4 @@ def job_report(service: Here, job_id: HexId) -> HTMLResponse:
     if _done(service, job_id).kind not in REPORTS:
         raise HTTPException(404, f"job {job_id} made no report; GET /api/v1/jobs/{job_id}/result")
     page = known(f"the report of job {job_id} is gone; start it again", lambda: service.report(job_id))
-    return HTMLResponse(page, headers={"Content-Security-Policy": REPORT_POLICY})
+    return HTMLResponse(service.public.within(page), headers={"Content-Security-Policy": REPORT_POLICY})

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 
 from fastapi import APIRouter, HTTPException, Request, Response
 
 from api.errors import answers
 from api.schemas import Recordings
 from api.service import CALIBRATE, READ, Here, HexId
-from api.upload import TooMuch, receive
+from api.upload import NoRoom, TooMuch, check_room, check_size, receive
 from lab.formats.recording_set import Manifest
 
 router = APIRouter()
@@ -32,7 +33,7 @@ def _recordings(id: str, manifest: Manifest, warnings: tuple[str, ...] = ()) -> 
     status_code=201,
     tags=["recordings"],
     dependencies=[CALIBRATE],
-    responses=answers(401, 403, 413, 422),
+    responses=answers(401, 403, 413, 422, 503),
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -46,9 +47,13 @@ async def send_recordings(service: Here, request: Request, response: Response) -
     if sent not in TYPES:
         raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the .zip itself as application/zip")
     limits = service.limits
+    stated = request.headers.get("content-length", "0")
     with service.inbox.receiving() as place:
         archive = place / "archive.zip"
         try:
+            stated_bytes = int(stated) if stated.isdecimal() else 0
+            check_size(stated_bytes, limits.upload_bytes)
+            check_room(place, stated_bytes)
             with archive.open("wb") as file:
                 await receive(request.stream(), file, limits.upload_bytes)
             id, found = await asyncio.to_thread(
@@ -56,8 +61,21 @@ async def send_recordings(service: Here, request: Request, response: Response) -
             )
         except TooMuch as error:
             raise HTTPException(413, str(error), headers={"Connection": "close"}) from None
+        except NoRoom as error:
+            raise HTTPException(503, str(error), headers={"Connection": "close"}) from None
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise HTTPException(503, "the data folder is full; make room", headers={"Connection": "close"}) from None
     response.headers["Location"] = f"/api/v1/recordings/{id}"
-    return _recordings(id, found.manifest, tuple(line.replace(f"{place}/set/", "") for line in found.warnings))
+    return _recordings(
+        id,
+        found.manifest,
+        tuple(
+            service.public(line.replace(f"{place}/set/", "").replace(f"{place}/set", "the archive"))
+            for line in found.warnings
+        ),
+    )
 
 
 @router.get("/recordings", tags=["recordings"], dependencies=[READ], responses=answers(401))

@@ -48,7 +48,7 @@ def _station(service: Service, name: str) -> StationState:
     try:
         station = service.station(name)
     except InputError as error:
-        return StationState(name=name, title=name, problem=str(error))
+        return StationState(name=name, title=name, problem=service.public(str(error)))
     return StationState(
         name=name,
         title=station.name or name,
@@ -83,9 +83,8 @@ def state_now(info: SessionInfo, live: LiveSession | None) -> Any:
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
     live = service.live.find(info.id)
     fields = info.model_dump(exclude={"packed"}) | {"state": state_now(info, live)}
-    return fields | (
-        {"error": None} if live is not None else {}
-    )  # the error of an earlier run doesn't concern this one
+    # The error of an earlier run doesn't concern this one.
+    return fields | {"error": None if live is not None else service.public.or_none(info.error)}
 
 
 def _session(service: Service, session_id: str) -> StoredSession:
@@ -117,7 +116,8 @@ def list_sessions(
 def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
     """Start a session, which runs in the background. 409 while another session runs on the same instruments."""
     station = service.station(start.station)
-    session_id = service.live.start(station, full_plan(station, start.quick, start.sequences), start.name, start.notes)
+    plan = full_plan(station, start.quick, start.sequences)
+    session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
     return _session(service, session_id)
 
@@ -130,7 +130,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
         **_fields(service, info),
         station=service.store.station(session_id).name,
         progress=service.progress(session_id) if info.closed is None else None,
-        runs=tuple(service.store.runs(session_id)),
+        runs=service.runs(session_id),
         captures=tuple(
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
@@ -192,7 +192,7 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
         return
     yield event("state", await asyncio.to_thread(look))
     async for progress in live.follow(stopping):
-        yield event("progress", progress)
+        yield event("progress", service.told(progress))
         if (progress.state, live.pausing) != seen:
             seen = (progress.state, live.pausing)
             yield event("state", await asyncio.to_thread(look))

@@ -32,6 +32,7 @@ class SessionInfo(_Record):
     state: SessionState
     error: str | None
     packed: bool
+    demands_certified: bool = False
     steps: int
     steps_done: int
 

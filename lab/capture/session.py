@@ -149,6 +149,7 @@ class CaptureSession:
         quick: bool = False,
         name: str = "",
         notes: str = "",
+        demands_certified: bool = False,
         on_progress: Callable[[Progress], None] | None = None,
         connect: Callable[[Station], Drivers] = drivers_of,
     ) -> CaptureSession:
@@ -167,6 +168,7 @@ class CaptureSession:
             patterns=chosen.patterns(station),
             name=name,
             notes=notes,
+            demands_certified=demands_certified,
         )
         return cls(store, session_id, on_progress=on_progress, connect=connect)
 
@@ -259,6 +261,12 @@ class CaptureSession:
         try:
             identities = instruments.connect()
             self._check_identities(identities)
+            if self.store.session(self.id).demands_certified:
+                from lab.calibration.life import cameras_of, check_certified
+
+                check_certified(
+                    self.store, cameras_of({name: vars(one) for name, one in identities.items()}, self.station)
+                )
             self.store.set_state(self.id, "running", run=_provenance(identities, self._done), station=self.station)
             self._drive(instruments)
         except BaseException as error:

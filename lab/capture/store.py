@@ -115,8 +115,10 @@ class Store:
         patterns: Mapping[str, NDArray[np.uint8]] | None = None,
         name: str = "",
         notes: str = "",
+        demands_certified: bool = False,
     ) -> str:
-        """Register a session with all its steps; nothing is captured yet. Returns its id."""
+        """Register a session with all its steps; nothing is captured yet. Returns its id. `demands_certified`: it runs only with
+        cameras that have a certified calibration."""
         created = now()
         session_id = f"{created:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         files: list[StoredFile] = []
@@ -144,6 +146,7 @@ class Store:
                     calibration=dict(plan or {}),
                     cameras=cameras,
                     runs=[],
+                    demands_certified=demands_certified,
                 )
             )
             db.flush()
@@ -183,6 +186,7 @@ class Store:
                     state=row.state,  # type: ignore[arg-type]
                     error=row.error,
                     packed=row.packed,
+                    demands_certified=row.demands_certified,
                     steps=steps,
                     steps_done=done,
                 )

@@ -38,6 +38,7 @@ class SessionRow(Base):
     cameras: Mapped[dict[str, Any]]
     runs: Mapped[list[Any]]
     packed: Mapped[bool] = mapped_column(default=False)
+    demands_certified: Mapped[bool] = mapped_column(default=False, server_default=sa.false())
 
 
 class StepRow(Base):
@@ -114,6 +115,41 @@ class ResultRow(Base):
     document: Mapped[dict[str, Any]]
 
 
+class CalibrationRow(Base):
+    """The life of a fit of a session; `id` is the fit's result. `rig`: its cameras, by side. Without `certified` it is a candidate."""
+
+    __tablename__ = "calibrations"
+
+    id: Mapped[str] = mapped_column(sa.ForeignKey("results.id", ondelete="CASCADE"), primary_key=True)
+    session_id: Mapped[str] = mapped_column(sa.String(40), index=True)
+    created: Mapped[datetime] = mapped_column(index=True)
+    rig: Mapped[str] = mapped_column(sa.Text, index=True)
+    cameras: Mapped[dict[str, Any]]
+    certified: Mapped[datetime | None]
+    certified_by: Mapped[str | None] = mapped_column(sa.String(100))
+    limits: Mapped[dict[str, Any] | None]
+    judgements: Mapped[list[Any] | None]
+    expires: Mapped[datetime | None]
+    superseded: Mapped[datetime | None]
+    superseded_by: Mapped[str | None] = mapped_column(sa.String(40))
+
+
+class FigureRow(Base):
+    """A figure of a calibration, so that a history needs no document. `camera`: its name, or the rig of a figure of the pair."""
+
+    __tablename__ = "figures"
+    __table_args__ = (sa.Index("ix_figures_history", "camera", "name", "place"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    calibration_id: Mapped[str] = mapped_column(sa.ForeignKey("calibrations.id", ondelete="CASCADE"), index=True)
+    camera: Mapped[str] = mapped_column(sa.Text)
+    side: Mapped[str | None] = mapped_column(sa.String(10))
+    name: Mapped[str] = mapped_column(sa.String(200))
+    place: Mapped[str] = mapped_column(sa.String(60))
+    value: Mapped[float]
+    std: Mapped[float]
+
+
 class KeyRow(Base):
     """An API key: only its hash (see `api.security`)."""
 
@@ -179,14 +215,21 @@ def upgrade(engine: sa.Engine, folder: Path) -> None:
     """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry."""
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
-    newest = ScriptDirectory.from_config(config).get_current_head()
+    scripts = ScriptDirectory.from_config(config)
+    newest, known = scripts.get_current_head(), {script.revision for script in scripts.walk_revisions()}
     lock = Lock(folder / ".migration.lock")
     if not lock.acquire(patience_s=60.0):
         raise InputError(f"{folder}: its registry is being migrated by another process; try again when it is done")
     try:
         with engine.execution_options(writes=True).connect() as connection:
-            if MigrationContext.configure(connection).get_current_revision() == newest:
+            found = MigrationContext.configure(connection).get_current_revision()
+            if found == newest:
                 return
+            if found is not None and found not in known:
+                raise InputError(
+                    f"{folder}: its registry has the revision {found}, written by a newer calibench; install that version, or restore "
+                    "the backup of before the upgrade"
+                )
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
             connection.commit()

@@ -36,6 +36,9 @@ Only = Annotated[
     list[str] | None,
     typer.Option(metavar="SEQUENCE", help="take this sequence only (dark, flat, ...); may be repeated"),
 ]
+Certified = Annotated[
+    bool, typer.Option("--certified", help="refuse cameras without a certified calibration that isn't expired")
+]
 Conceal = Annotated[
     list[str] | None,
     typer.Option(
@@ -53,12 +56,16 @@ def capture(
     name: Name = "",
     resume: Resume = "",
     only: Only = None,
+    certified: Certified = False,
     conceal: Conceal = None,
 ) -> None:
     """Run the sequences of a station and keep what was captured. Without a station file: on the mock bench."""
     store = open_store(out_folder)
     request = PipelineRequest(
-        "capture", capture=CaptureRequest(session=resume, quick=quick, only=tuple(only or ()), name=name)
+        "capture",
+        capture=CaptureRequest(
+            session=resume, quick=quick, only=tuple(only or ()), name=name, demands_certified=certified
+        ),
     )
     out.print(f"session: {run_here(request, store, _capturer(store, station, conceal)).session}")
 

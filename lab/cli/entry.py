@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from lab.challenge.command import commands as challenge
-from lab.cli import capturing, devices, diagnosis, effects, fitting, kinds, recordings, simulation
+from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, kinds, recordings, simulation
 from lab.cli.console import err
 from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
 from lab.errors import DeviceError, InputError
@@ -27,6 +27,7 @@ app = typer.Typer(
 for _group in (capturing, fitting, diagnosis, effects, recordings, kinds, simulation):
     app.registered_commands += _group.commands.registered_commands
 app.add_typer(challenge)
+app.add_typer(calibrations.calibrations)
 app.add_typer(devices.devices)
 app.add_typer(devices.station)
 

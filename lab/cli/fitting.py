@@ -92,15 +92,24 @@ def compare(
     b: Annotated[str, typer.Argument(metavar="B", help="the calibration to compare with it")],
     json: Json = None,
     check: Annotated[bool, typer.Option("--check", help="exit code 4 where anything changed")] = False,
+    fail_on: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[SIDE:]FIGURE[>AMOUNT[%]]",
+            help="exit code 4 where this figure changed, by more than AMOUNT; * stands for any text; may be repeated",
+        ),
+    ] = None,
     every: Annotated[bool, typer.Option("--all", help="list what didn't change, too")] = False,
     report_folder: Annotated[
         Path | None, typer.Option("--report", metavar="DIR", help="write DIR/compare.html, one page with pictures")
     ] = None,
 ) -> None:
     """Two calibrations: what changed beyond its uncertainty."""
+    from lab.fit.changes_that_fail import FailRule, failing
     from lab.fit.compare import compare as compared
 
     check_writable(json)
+    rules = [FailRule.parse(text) for text in fail_on or ()]
     result = compared(_calibration(a), _calibration(b))
     write_json(result, json)
     if report_folder is not None:
@@ -109,7 +118,10 @@ def compare(
         err.print(f"report: {escape(str(write_comparison(report_folder, result)))}")
     if str(json) != "-":
         print_comparison(result, every)
-    if check and result.changed:
+    failed = failing(result, rules)
+    for name in failed:
+        err.print(escape(f"--fail-on: {name} changed"))
+    if failed or (check and result.changed):
         raise typer.Exit(EXIT_CHECK)
 
 

@@ -47,7 +47,7 @@ AXES = ("wavelength_nm", "frequency_cy_per_px", "radius_px")
 
 
 @dataclass(frozen=True)
-class _Numbers:
+class Numbers:
     """Values and standard deviations under one name, along `axis` where there is one."""
 
     name: str
@@ -73,7 +73,7 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
             skipped.append(Skipped(step="camera", reason=f"only {only} has this side", side=side))
             continue
         one, two = a.cameras[side], b.cameras[side]
-        rows += _compared(dict(_numbers(one, "")), dict(_numbers(two, "")), side, skipped)
+        rows += _compared(dict(numbers_of(one, "")), dict(numbers_of(two, "")), side, skipped)
         if one.geometry is not None and two.geometry is not None:
             found = _projection(one.geometry, two.geometry, side)
             if isinstance(found, Skipped):
@@ -81,11 +81,11 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
             else:
                 projections.append(found)
     if a.stereo is not None and b.stereo is not None:
-        rows += _compared(dict(_numbers(a.stereo, "stereo ")), dict(_numbers(b.stereo, "stereo ")), None, skipped)
+        rows += _compared(dict(numbers_of(a.stereo, "stereo ")), dict(numbers_of(b.stereo, "stereo ")), None, skipped)
         rows += _rotation_changes(a.stereo, b.stereo)
     elif (a.stereo is None) != (b.stereo is None):
         skipped.append(Skipped(step="stereo", reason=f"only {'A' if a.stereo else 'B'} has it"))
-    threshold = _sigma(_sidak_part(false_alarm_rate, len(rows) + len(projections)))
+    threshold = sigma_of_probability(sidak_part(false_alarm_rate, len(rows) + len(projections)))
     return ComparisonResult(
         a=a.source,
         b=b.source,
@@ -102,12 +102,12 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
 # --- significance ----------------------------------------------------------------------------------------------------
 
 
-def _sigma(p_value: float) -> float:
+def sigma_of_probability(p_value: float) -> float:
     """A probability as standard deviations of a normal distribution, two-sided."""
     return -float(special.ndtri(max(p_value, 1e-300) / 2.0))
 
 
-def _sidak_part(rate: float, number: int) -> float:
+def sidak_part(rate: float, number: int) -> float:
     """Probability allowed for each of `number` tests, so that any of them has `rate` (Sidak)."""
     return float(-np.expm1(np.log1p(-rate) / max(number, 1)))
 
@@ -120,7 +120,7 @@ def _sidak_whole(p_value: float, number: int) -> float:
 # --- numbers, by their names -----------------------------------------------------------------------------------------
 
 
-def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
+def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
     """Every fitted number under `model`, by name. A model in a list is named by its text fields: capture, channel,
     board.
     """
@@ -132,10 +132,10 @@ def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
         value, std = getattr(model, field), getattr(model, f"{field}_std", None)
         name = f"{prefix}{field}"
         if isinstance(value, Frozen):
-            yield from _numbers(value, f"{name} ")
+            yield from numbers_of(value, f"{name} ")
         elif isinstance(value, tuple) and value and isinstance(value[0], Frozen):
             for item in value:
-                yield from _numbers(item, f"{name} {_identity(item)} ")
+                yield from numbers_of(item, f"{name} {_identity(item)} ")
         elif std is None or value is None or field in OF_THE_SET_UP:
             continue
         elif isinstance(value, dict):
@@ -145,10 +145,10 @@ def _numbers(model: Frozen, prefix: str) -> Iterator[tuple[str, _Numbers]]:
             yield _listed(name, value, std, axis_name, axis)
 
 
-def _listed(name: str, value: Any, std: Any, axis_name: str, axis: Array | None) -> tuple[str, _Numbers]:
+def _listed(name: str, value: Any, std: Any, axis_name: str, axis: Array | None) -> tuple[str, Numbers]:
     values, stds = np.atleast_1d(np.array(value, dtype=float)), np.atleast_1d(np.array(std, dtype=float))
     along = axis if axis is not None and values.shape == axis.shape else None
-    return name, _Numbers(name, values, stds, axis_name if along is not None else "", along)
+    return name, Numbers(name, values, stds, axis_name if along is not None else "", along)
 
 
 def _identity(model: Frozen) -> str:
@@ -157,7 +157,7 @@ def _identity(model: Frozen) -> str:
 
 
 def _compared(
-    a: dict[str, _Numbers], b: dict[str, _Numbers], side: Side | None, skipped: list[Skipped]
+    a: dict[str, Numbers], b: dict[str, Numbers], side: Side | None, skipped: list[Skipped]
 ) -> Iterator[Change]:
     alone = {"A": [name for name in a if name not in b], "B": [name for name in b if name not in a]}
     for which, names in alone.items():
@@ -173,19 +173,19 @@ def _compared(
                 yield from _rows(one, two, side)
 
 
-def _aligned(a: _Numbers, b: _Numbers) -> tuple[_Numbers, _Numbers]:
+def _aligned(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
     """Both on the axis of A, where that of B covers it."""
     if a.axis is None or b.axis is None or np.array_equal(a.axis, b.axis) or not len(b.axis):
         return a, b
     inside = (a.axis >= b.axis[0]) & (a.axis <= b.axis[-1])
     axis = a.axis[inside]
     return (
-        _Numbers(a.name, a.value[inside], a.std[inside], a.axis_name, axis),
-        _Numbers(b.name, np.interp(axis, b.axis, b.value), np.interp(axis, b.axis, b.std), a.axis_name, axis),
+        Numbers(a.name, a.value[inside], a.std[inside], a.axis_name, axis),
+        Numbers(b.name, np.interp(axis, b.axis, b.value), np.interp(axis, b.axis, b.std), a.axis_name, axis),
     )
 
 
-def _rows(a: _Numbers, b: _Numbers, side: Side | None) -> Iterator[Change]:
+def _rows(a: Numbers, b: Numbers, side: Side | None) -> Iterator[Change]:
     value_a, value_b, std_a, std_b = (np.ravel(part) for part in (a.value, b.value, a.std, b.std))
     std = np.hypot(std_a, std_b)
     # A normalised curve is 1 at frequency 0 by definition; its uncertainty and its difference there are rounding
@@ -204,7 +204,7 @@ def _rows(a: _Numbers, b: _Numbers, side: Side | None) -> Iterator[Change]:
         yield Change(
             name=a.name,
             side=side,
-            where=_where(a, k),
+            where=place_of(a, k),
             n=n,
             a=value_a[k],
             a_std=std_a[k],
@@ -212,12 +212,13 @@ def _rows(a: _Numbers, b: _Numbers, side: Side | None) -> Iterator[Change]:
             b_std=std_b[k],
             difference=value_b[k] - value_a[k],
             difference_std=std[k],
-            significance_sigma=_sigma(p_value),
+            significance_sigma=sigma_of_probability(p_value),
             changed=False,
         )
 
 
-def _where(numbers: _Numbers, at: int) -> str:
+def place_of(numbers: Numbers, at: int) -> str:
+    """Which of the numbers under one name the one at index `at` is: on the axis, by its symbol, or by its index."""
     if numbers.axis is not None:
         quantity, unit = numbers.axis_name.split("_", 1)
         return f"{quantity} {numbers.axis[at]:.4g} {unit.replace('_per_', '/')}"
@@ -315,6 +316,6 @@ def _rotation_changes(a: StereoFit, b: StereoFit) -> Iterator[Change]:
             b_std=std_b,
             difference=float(rotation_mrad[k]),
             difference_std=std,
-            significance_sigma=_sigma(2.0 * float(special.ndtr(-abs(rotation_mrad[k]) / std))),
+            significance_sigma=sigma_of_probability(2.0 * float(special.ndtr(-abs(rotation_mrad[k]) / std))),
             changed=False,
         )

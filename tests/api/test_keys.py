@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import sys
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 
@@ -90,20 +92,35 @@ def test_only_loopback_may_be_without_a_key(host: str, own: bool) -> None:
         ('%s - "%s %s" %d', ("127.0.0.1:1", "GET", "/x?key={}", 200)),
         ("refused {}", ()),
         ("%(key)s", ({"key": "{}"},)),
+        ('%s - "%s %s" %d', ("127.0.0.1:1", "GET", "/x?key=%63alibench%5F{tail}", 200)),
+        ("GET /x?key=%63alibench%5F{encoded}", ()),
         ("%s", (["{}"],)),
     ],
 )
 def test_a_key_in_a_log_line_is_hidden(message: str, args: tuple[object, ...]) -> None:
     secret = new_key()
+    tail = secret.removeprefix("calibench_")
 
     def filled(value: object) -> object:
         if isinstance(value, str):
-            return value.replace("{}", secret)
+            encoded = "".join(f"%{ord(letter):02X}" for letter in tail)
+            return value.replace("{}", secret).replace("{tail}", tail).replace("{encoded}", encoded)
         if isinstance(value, dict):
             return {name: filled(one) for name, one in value.items()}
         return [filled(one) for one in value] if isinstance(value, list) else value
 
     record = logging.LogRecord("x", logging.INFO, "", 1, str(filled(message)), tuple(filled(one) for one in args), None)
     assert HideKeys().filter(record)
-    assert secret not in record.getMessage()
+    assert tail not in unquote(record.getMessage())
     assert "calibench_***" in record.getMessage()
+
+
+def test_a_key_in_a_traceback_is_hidden() -> None:
+    secret = new_key()
+    try:
+        {}[f"/{secret}"]
+    except KeyError:
+        record = logging.LogRecord("x", logging.ERROR, "", 1, "a defect", (), sys.exc_info())
+    assert HideKeys().filter(record)
+    text = logging.Formatter().format(record)
+    assert secret not in text and "calibench_***" in text and "KeyError" in text

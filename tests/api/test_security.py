@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 import socket
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from fastapi import HTTPException
 
+from api.failed_keys import ADDRESSES, FailedKeys, network_of
 from api.keys import Permission, StoredKey, digest
-from api.security import COOKIE, COOKIE_LIFETIME_S, Logins, Patience
-from tests.api.conftest import Running
+from api.security import COOKIE, COOKIE_LIFETIME_S, Logins
+from lab.capture.tables import JobRow
+from lab.errors import InputError
+from tests.api.conftest import Running, until, until_state
 
 #: Every route under /api/v1 with the least scope that it needs.
 ROUTES = [
@@ -35,6 +36,11 @@ ROUTES = [
     ("GET", "/sessions/{session_id}/captures/{capture_id}/frame.npy", "read"),
     ("POST", "/sessions/{session_id}/jobs", "calibrate"),
     ("POST", "/pipelines", "admin"),
+    ("GET", "/calibrations", "read"),
+    ("GET", "/calibrations/{calibration_id}", "read"),
+    ("POST", "/calibrations/{calibration_id}/certify", "calibrate"),
+    ("GET", "/figures", "read"),
+    ("GET", "/history", "read"),
     ("GET", "/recordings", "read"),
     ("POST", "/recordings", "calibrate"),
     ("GET", "/recordings/{recordings_id}", "read"),
@@ -50,6 +56,7 @@ BODIES: dict[str, Any] = {
     "/sessions": {"station": "nowhere"},
     "/pipelines": {"station": "nowhere"},
     "jobs": {"kind": "fit"},
+    "/calibrations/{calibration_id}/certify": {},
 }
 
 
@@ -63,7 +70,14 @@ def test_the_list_of_routes_is_complete(shared: Running) -> None:
 
 @pytest.mark.parametrize(("method", "path", "least"), ROUTES)
 def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path: str, least: str) -> None:
-    ids = {"session_id": "0", "capture_id": "1", "job_id": "0" * 16, "recordings_id": "0" * 16, "name": "nothing"}
+    ids = {
+        "session_id": "0",
+        "capture_id": "1",
+        "job_id": "0" * 16,
+        "recordings_id": "0" * 16,
+        "calibration_id": "0" * 16,
+        "name": "nothing",
+    }
     asked = "/api/v1" + re.sub(r"\{(\w+)\}", lambda found: ids[found[1]], path)
     body = BODIES.get(path, BODIES["jobs"] if path.endswith("/jobs") and method == "POST" else None)
     for scope, key in [(None, None), ("wrong", "calibench_" + "x" * 43), *shared.keys.items()]:
@@ -76,7 +90,11 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         elif Permission(scope).allows(Permission(least)):
             # What is asked for isn't there, or is an empty upload: the key was good enough to be told so.
             assert response.status_code == (
-                200 if "{" not in path and method == "GET" else 422 if path == "/recordings" else 404
+                422
+                if path in ("/recordings", "/history") and (method, path) != ("GET", "/recordings")
+                else 200
+                if "{" not in path and method == "GET"
+                else 404
             )
         else:
             assert response.status_code == 403
@@ -130,18 +148,108 @@ def test_logins_end_after_twelve_hours() -> None:
     assert len(logins._tokens) == 1  # what has run out isn't kept
 
 
-def test_failed_logins_wait_in_line_and_only_so_many() -> None:
-    async def guess() -> tuple[float, list[Any]]:
-        patience = Patience(pause_s=0.02, queue=4)
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        answers = await asyncio.gather(*(patience.after_failure() for _ in range(7)), return_exceptions=True)
-        return loop.time() - began, answers
+def test_an_address_has_so_many_failures_and_gets_them_back() -> None:
+    clock = [0.0]
+    failed = FailedKeys(most=3, per_s=0.5, clock=lambda: clock[0])
+    for _ in range(3):
+        assert failed.wait_s("192.0.2.1") == 0
+        failed.failed("192.0.2.1")
+    assert failed.wait_s("192.0.2.1") == 2  # one comes back in 1 / 0.5 s
+    assert failed.wait_s("192.0.2.2") == 0
+    clock[0] = 2.0
+    assert failed.wait_s("192.0.2.1") == 0
+    clock[0] = 1000.0
+    for _ in range(3):
+        failed.failed("192.0.2.1")
+    assert failed.wait_s("192.0.2.1") == 2  # no more than three were saved up
 
-    took_s, answers = asyncio.run(guess())
-    refused = [answer for answer in answers if isinstance(answer, HTTPException)]
-    assert [answer.status_code for answer in refused] == [429] * 3
-    assert took_s >= 4 * 0.02
+
+def test_a_client_with_a_whole_network_is_one_address() -> None:
+    assert network_of("2001:db8::1") == network_of("2001:db8::ffff:1") != network_of("2001:db8:0:1::1")
+    assert network_of("::ffff:192.0.2.1") == "192.0.2.1"
+    failed = FailedKeys()
+    for number in range(ADDRESSES + 50):
+        failed.failed(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}")
+    assert len(failed._left) == ADDRESSES  # no amount of addresses takes more memory
+
+
+def test_guessing_is_slowed_down_and_those_who_work_are_not(running: Running) -> None:
+    running.app.state.gate.failures = FailedKeys(most=5, per_s=0.01)
+    with running.client("read") as client, running.client(None) as other:
+        assert client.get("/api/v1/me").status_code == 200
+
+        def guess(number: int) -> int:
+            key = {"Authorization": f"Bearer calibench_{number:043d}"}
+            if number % 3 == 0:
+                return other.post("/login", json={"key": f"calibench_{number:043d}"}).status_code
+            if number % 3 == 1:
+                return other.post("/api/v1/sessions", json={}, headers=key | {"Idempotency-Key": "x"}).status_code
+            return other.get("/metrics", headers=key).status_code
+
+        assert [guess(number) for number in range(9)] == [401] * 5 + [429] * 4
+        # Even the right key isn't looked at, so an answer tells nothing; one that was used before always is.
+        right = {"Authorization": f"Bearer {running.keys['admin']}"}
+        refused = other.get("/api/v1/me", headers=right)
+        assert refused.status_code == 429 and 1 <= int(refused.headers["retry-after"]) <= 100
+        assert client.get("/api/v1/me").status_code == 200
+        running.app.state.gate.failures = FailedKeys()
+        assert other.get("/api/v1/me", headers=right).status_code == 200
+
+
+def test_no_answer_names_a_path_of_the_server(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything that can go wrong with a path in its text, and every answer that would tell of it."""
+    root = str(running.store.root)
+    (running.store.root / "stations" / "broken.toml").write_text("name = [")
+    stations = running.store.root / "stations"
+    (stations / "lens.toml").write_text(
+        (stations / "fakes.toml").read_text().replace("bit_depth = 12", 'bit_depth = 12, lens_file = "/srv/lab/x.zmx"')
+    )
+
+    def failing(*_: object, **__: object) -> None:
+        raise OSError(13, "Permission denied", f"{root}/sessions/x/session.nxs")
+
+    def refused(*_: object, **__: object) -> None:
+        raise InputError(f"{root}/sessions/x/a.npy: damaged; see also /usr/lib/python3/thing.py and /dev/ttyUSB0")
+
+    answers: list[str] = []
+    with running.client() as client:
+        started = client.post("/api/v1/sessions", json={"station": "fakes", "quick": True, "sequences": ["dark"]})
+        path = started.headers["location"]
+        until_state(client, started.json()["id"], "finished")
+        for broken in (failing, refused):
+            monkeypatch.setattr("lab.fit.fit_recording_set", broken)
+            job = client.post(f"{path}/jobs", json={"kind": "fit"}).headers["location"]
+            until(client, job, lambda now: now["state"] == "failed")
+            answers += [client.get(job).text, client.get(f"{job}/result").text, client.get("/api/v1/jobs").text]
+        assert "/dev/ttyUSB0" in answers[-1] and "sessions/x/a.npy" in answers[-1]
+        running.store.add_result("fit", "x", {"source": f"{root}/recordings/0/set"}, job_id=job.rpartition("/")[2])
+        with running.store.transaction() as db:
+            db.get_one(JobRow, job.rpartition("/")[2]).state = "done"
+        answers.append(client.get(f"{job}/result").text)
+        assert "recordings/0/set" in answers[-1]
+        for file in (running.store.folder(started.json()["id"])).glob("*.nxs"):
+            file.write_bytes(b"damaged")
+        capture = client.get(f"{path}/captures").json()[0]
+        for asked in (capture["frame"], capture["preview"]):
+            response = client.get(asked)
+            assert response.status_code == 422
+            answers.append(response.text)
+        running.store.set_state(started.json()["id"], "failed", error=f"{root}/sessions/x: no space left")
+        paths = (
+            "/stations",
+            "/sessions",
+            path.removeprefix("/api/v1"),
+            "/recordings",
+            "/sessions?after=" + "/etc/x" * 9,
+        )
+        answers += [client.get(f"/api/v1{one}").text for one in paths]
+        for station in ("broken", "lens"):
+            answers.append(client.post("/api/v1/sessions", json={"station": station}).text)
+    for answer in answers:
+        found = re.findall(
+            r"(?<![\w/])/(?:srv|usr|tmp|home|root|work|var|etc)/[^\s\"]*", answer.replace(running.url, "")
+        )
+        assert root not in answer and not found, (found, answer[:400])
 
 
 # --- Host, Origin ------------------------------------------------------------------------------------------------------

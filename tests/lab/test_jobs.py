@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from lab.capture.store import Store
 from lab.capture.tables import JobRow
 from lab.capture_kinds.dark import DarkSequence
 from lab.errors import InputError, NotDetermined
-from lab.jobs import JobInfo, JobRunner
+from lab.jobs import JobInfo, JobRunner, check_scheduler
 from lab.pipeline import CaptureRequest, Goal, PipelineProgress, PipelineRequest, Tell, capture_here
 from tests.lab import fake_bench
 
@@ -218,3 +219,25 @@ def test_a_job_that_captures_runs_here_and_is_cancelled_in_good_order(store: Sto
 def test_only_a_pipeline_that_captures_resolves(store: Store, session: str, kind: Goal) -> None:
     with JobRunner(store) as runner, pytest.raises(InputError, match="leave resolve out"):
         runner.submit(kind, session, resolve=True)
+
+
+@pytest.mark.parametrize(
+    ("address", "good"),
+    [
+        ("tcp://127.0.0.1:8786", True),
+        ("127.0.0.1:8786", True),
+        ("tcp://[::1]:8786", True),
+        ("localhost:8786", True),
+        ("tls://192.0.2.1:8786", True),
+        ("tcp://192.0.2.1:8786", False),
+        ("scheduler:8786", False),
+        ("ws://lab.example:8786", False),
+    ],
+)
+def test_a_scheduler_is_on_this_computer_or_speaks_tls(tmp_path: Path, address: str, good: bool) -> None:
+    """Whoever is the scheduler runs code here."""
+    if good:
+        check_scheduler(address)
+        return
+    with contextlib.closing(Store(tmp_path)) as store, pytest.raises(InputError, match="tls://"):
+        JobRunner(store, scheduler=address)

@@ -55,14 +55,14 @@ def _load_npy(file: Path, dtype: type[np.unsignedinteger[Any]]) -> NDArray[Any]:
     return np.array(mapped, dtype=wanted, order="C")
 
 
-def _load_tif(file: Path) -> NDArray[Any]:
-    """A TIFF of one page, 16 bit, one sample a pixel."""
+def _load_tif(file: Path, wanted: tuple[int, int] | None = None) -> NDArray[Any]:
+    """A TIFF of one page, 16 bit, one sample a pixel. One of another shape than `wanted` isn't decoded: it may be far larger than its file."""
     frame = None
     try:
         with tifffile.TiffFile(file) as tif:
             pages, page = len(tif.pages), tif.pages[0]
             shape, dtype = tuple(page.shape), np.dtype(page.dtype)
-            if pages == 1 and dtype == np.uint16 and len(shape) == 2:
+            if pages == 1 and dtype == np.uint16 and len(shape) == 2 and wanted in (None, shape):
                 frame = np.ascontiguousarray(page.asarray())
     except Exception as error:
         raise InputError(f"damaged TIFF ({one_line(error)}); write it again or recapture") from error
@@ -70,6 +70,11 @@ def _load_tif(file: Path) -> NDArray[Any]:
         raise InputError(f"has {pages} pages, not 1; save one file a frame")
     if dtype != np.uint16:
         raise InputError(f"its samples are {dtype}, not uint16; save raw DN as 16 bit")
+    if frame is None and len(shape) == 2 and wanted is not None:
+        raise InputError(
+            f"{shape[0]} x {shape[1]} pixels (rows x cols), but the manifest says {wanted[0]} x {wanted[1]}; "
+            "recapture, or correct rows and cols"
+        )
     if frame is None:
         raise InputError(f"has the shape {shape}, not (rows, cols); save the mosaic, not colours")
     return frame
@@ -95,7 +100,7 @@ def load_frame(file: Path, shape: tuple[int, int] | None = None) -> Frame:
     if suffix == ".npy":
         return _load_npy(file, np.uint16)
     if suffix in (".tif", ".tiff"):
-        return _load_tif(file)
+        return _load_tif(file, shape)
     if suffix in RAWS:
         return _load_raw(file, shape)
     raise InputError(f"a frame can't be {suffix or 'without an ending'}; give .npy, .tif or .dng")

@@ -17,12 +17,15 @@ from lab.capture_kinds.base import CAPTURES, AnyCapture, Capture, Open
 from lab.errors import InputError, one_line
 from sim.camera import Cfa, Side
 
+#: Rows and columns of a frame, at most: no sensor has more, and a manifest can't ask for any amount of memory.
+MOST_PX = 1 << 15
+
 
 class DataSheet(Open):
     """What the manufacturer says of one camera. The fits test it. None: not known."""
 
-    rows: int = Field(gt=0)
-    cols: int = Field(gt=0)
+    rows: int = Field(gt=0, le=MOST_PX)
+    cols: int = Field(gt=0, le=MOST_PX)
     pixel_pitch_um: float | None = Field(default=None, gt=0)
     fill_factor: float | None = Field(default=None, gt=0, le=1)
     cfa: Cfa

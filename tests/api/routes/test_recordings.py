@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import copy
+import errno
 import io
+import json
+import os
+import shutil
+import socket
 import stat
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
+import numpy as np
 import pytest
+import tifffile
 
 import lab.fit
 from api.service import Limits
+from api.upload import RESERVE_BYTES, TooMuch, unpack
+from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import FitResult
@@ -151,6 +162,162 @@ def test_a_damaged_archive_is_refused_wherever_it_is_damaged(running: Running, f
             spoilt[at] ^= 0xFF
             assert send(client, bytes(spoilt)).status_code in (201, 422)  # some bytes say nothing, a date for one
     assert not [name for name in kept(running) if name.startswith(".")]
+
+
+def written_below(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files that unpacking opens for writing; filled while it runs."""
+    written: list[str] = []
+    opened = Path.open
+
+    def watched(self: Path, mode: str = "r", *more: Any, **options: Any) -> Any:
+        if self.is_relative_to(folder) and mode == "xb":
+            written.append(self.name)
+        return opened(self, mode, *more, **options)
+
+    monkeypatch.setattr(Path, "open", watched)
+    return written
+
+
+def compressed(method: int) -> Change:
+    return lambda archive: archive.writestr("x.bin", b"x" * 5000, compress_type=method)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "said"),
+    [
+        (lambda archive: archive.writestr("bomb.bin", b"\0" * 3_000_000), TooMuch, "1000000 at most"),
+        (lambda archive: [archive.writestr(f"{n}", "") for n in range(60)] and None, TooMuch, "50 at most"),
+        (lambda archive: archive.writestr("../evil.txt", "x"), InputError, "evil"),
+        (link, InputError, "link"),
+        (compressed(zipfile.ZIP_LZMA), InputError, "deflated"),
+        (compressed(zipfile.ZIP_BZIP2), InputError, "deflated"),
+    ],
+)
+def test_an_archive_is_checked_before_a_byte_of_it_is_written(
+    tmp_path: Path, folder: Path, change: Change, error: type[Exception], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The offending member comes last, and none of those before it lands on the disk."""
+    archive = tmp_path / "archive.zip"
+    archive.write_bytes(packed(folder, change=change))
+    written = written_below(tmp_path / "out", monkeypatch)
+    with pytest.raises(error, match=said):
+        unpack(archive, tmp_path / "out", 1_000_000, 50)
+    assert written == [] and not (tmp_path / "out").exists()
+    archive.write_bytes(packed(folder))
+    unpack(archive, tmp_path / "out", 1_000_000, 50)
+    assert written  # the check itself sees what is written
+
+
+def test_an_archive_that_states_less_than_it_holds_is_refused(tmp_path: Path) -> None:
+    """The size is stated twice, in the list and before the data; neither lets more out than the list says."""
+    archive = tmp_path / "archive.zip"
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as made:
+        made.writestr("a.bin", b"\0" * 3_000_000)
+    lying = archive.read_bytes().replace((3_000_000).to_bytes(4, "little"), (1000).to_bytes(4, "little"))
+    assert lying != archive.read_bytes()
+    archive.write_bytes(lying)
+    with pytest.raises(InputError, match="unpacked"):
+        unpack(archive, tmp_path / "out", 1_000_000, 50)
+    assert sum(file.stat().st_size for file in (tmp_path / "out").rglob("*")) <= 1000
+
+
+def test_a_list_of_files_that_fills_the_memory_isnt_read(tmp_path: Path) -> None:
+    archive = tmp_path / "archive.zip"
+    with zipfile.ZipFile(archive, "w") as made:
+        for number in range(300):
+            made.writestr(f"{number:0200d}" * 30, "")  # 300 names of 6,000 bytes
+    with pytest.raises(TooMuch, match="list of files"):
+        unpack(archive, tmp_path / "out", 1_000_000, 50)
+
+
+def test_members_that_share_their_bytes_count_each(tmp_path: Path) -> None:
+    """The bomb of overlapping members: one compressed block, listed many times under other names."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as made:
+        made.writestr("000.bin", b"\0" * 400_000)
+        first = made.infolist()[0]
+        for number in range(1, 40):
+            again = copy.copy(first)
+            again.filename = f"{number:03d}.bin"
+            made.filelist.append(again)
+            made.NameToInfo[again.filename] = again
+        made._didModify = True  # type: ignore[attr-defined]
+    archive = tmp_path / "archive.zip"
+    archive.write_bytes(buffer.getvalue())
+    assert archive.stat().st_size < 10_000
+    with pytest.raises(TooMuch, match="16000000 bytes unpacked"):
+        unpack(archive, tmp_path / "out", 1_000_000, 50)
+
+
+def test_a_stated_size_beyond_the_cap_is_refused_before_it_is_sent(tmp_path: Path, folder: Path) -> None:
+    with serving(tmp_path / "data", limits=Limits(upload_bytes=20_000)) as running:
+        address = urlsplit(running.url)
+        with socket.create_connection((address.hostname, address.port), timeout=10) as line:
+            line.sendall(
+                f"POST /api/v1/recordings HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/zip\r\nContent-Length: 30000\r\n"
+                f"Authorization: Bearer {running.keys['calibrate']}\r\n\r\nPK".encode()
+            )
+            assert line.recv(1000).startswith(b"HTTP/1.1 413")  # after two bytes of 30,000
+        assert kept(running) == []
+
+
+def test_a_full_disk_is_said_and_captures_keep_their_room(
+    running: Running, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(folder)
+    with running.client("calibrate") as client:
+        monkeypatch.setattr("api.upload.shutil.disk_usage", lambda _: usage._replace(free=RESERVE_BYTES + 100))
+        response = send(client, packed(folder))
+        assert response.status_code == 503 and "make room" in response.json()["detail"]
+        monkeypatch.undo()
+
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr("api.upload.recording.read", full)
+        response = send(client, packed(folder))
+        assert response.status_code == 503 and "full" in response.json()["detail"]
+        monkeypatch.undo()
+        assert kept(running) == []
+        left = running.store.root / "recordings" / ".incoming-left"
+        left.mkdir()
+        os.utime(left, (0, 0))
+        assert send(client, packed(folder)).status_code == 201 and not left.exists()
+
+
+@pytest.mark.parametrize("path", ["../../registry.sqlite", "/etc/passwd", "frames/../../x", "C:/x", "..\\x"])
+@pytest.mark.parametrize("key", ["frame", "lens_file", "quantum_efficiency"])
+def test_a_manifest_names_files_of_its_own_folder_only(
+    shared: Running, folder: Path, tmp_path: Path, key: str, path: str
+) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    if key == "frame":
+        manifest["captures"][0]["frame"] = path
+    else:
+        manifest["cameras"]["left"][key] = path if key == "lens_file" else {"Y": path}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with shared.client("calibrate") as client:
+        response = send(client, packed(folder))
+    detail = response.json()["detail"]
+    assert response.status_code == 422 and ("folder" in detail or "rename" in detail)
+    assert "root:" not in detail and str(shared.store.root) not in detail and "/etc" not in detail.replace(path, "")
+
+
+def test_a_picture_that_is_larger_than_the_data_sheet_says_isnt_decoded(
+    shared: Running, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tifffile.imwrite(folder / "frames" / "0.tif", np.zeros((4000, 4000), np.uint16), compression="zlib")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["captures"][0]["frame"] = "frames/0.tif"
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    monkeypatch.setattr(tifffile.TiffPage, "asarray", lambda *_: pytest.fail("decoded"))
+    with shared.client("calibrate") as client:
+        response = send(client, packed(folder))
+        assert response.status_code == 422 and "4000 x 4000" in response.json()["detail"]
+        manifest["cameras"]["left"] |= {"rows": 60_000, "cols": 60_000}
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+        response = send(client, packed(folder))
+        assert response.status_code == 422 and "32768" in response.json()["detail"]
 
 
 def test_caps_hold(tmp_path: Path, folder: Path) -> None:

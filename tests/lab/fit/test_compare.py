@@ -210,3 +210,32 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert "compare.html" in said.err and (tmp_path / "page" / "compare.html").stat().st_size > 10_000
     assert main(["compare", str(files[0]), str(tmp_path / "out.json")]) == 2
     assert main(["compare", str(files[0]), str(tmp_path / "nothing")]) == 2
+
+
+@pytest.mark.parametrize(
+    ("rule", "code"),
+    [
+        ("noise read_noise_e", 4),
+        ("*", 4),
+        ("left:noise *", 4),
+        ("noise read_noise_e>0.05", 4),
+        ("noise read_noise_e > 0.2", 0),
+        ("noise read_noise_e>3%", 4),
+        ("noise read_noise_e>6%", 0),
+        ("noise conversion_gain_dn_per_e", 0),
+        ("noise read_nose_e", 2),
+        ("right:noise read_noise_e", 2),
+        ("noise read_noise_e>much", 2),
+        ("noise read_noise_e>-1", 2),
+        (">1", 2),
+    ],
+)
+def test_a_check_fails_on_the_named_figures_only(
+    tmp_path: Path, rule: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A read noise of 2.3 e became 2.4 e: by 0.1 or 4.3 %, 35 sigma. A rule that concerns no figure is an error, not a pass."""
+    for name, fit in (("a", made(1)), ("b", made(2, read_noise_e=2.4))):
+        (tmp_path / name).write_text(fit.model_dump_json())
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--fail-on", rule]) == code
+    error = capsys.readouterr().err
+    assert ("left noise read_noise_e changed" in error) == (code == 4) and ("--fail-on" in error) == (code != 0)

@@ -1,0 +1,269 @@
+"""A client of the REST service, typed with the service's own schemas.
+
+    with ServiceClient("http://127.0.0.1:8000", key) as client:
+        session = client.capture("bench", quick=True, sequences=("dark", "flat"))
+        fit = client.fit(session.id)
+
+Needs httpx: `pip install 'calibench[test]'`.
+"""
+
+from __future__ import annotations
+
+import io
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, TypeAdapter
+
+from api.schemas import (
+    Certify,
+    Health,
+    Job,
+    JobKind,
+    JobStart,
+    Me,
+    PipelineResults,
+    PipelineStart,
+    Recordings,
+    SessionDetail,
+    SessionStart,
+    StationState,
+    StoredCapture,
+    StoredSession,
+)
+from lab.calibration.life import CalibrationRecord, History
+from lab.calibration.limits import CalibrationLimits
+from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+
+M = TypeVar("M", bound=BaseModel)
+#: How often (s) a client that waits looks, and how long it waits unless it is told.
+LOOK_S, PATIENCE_S = 0.2, 600.0
+
+
+class ServiceProblem(Exception):
+    """The service refused a request: its status and its one line."""
+
+    def __init__(self, status: int, detail: str) -> None:
+        super().__init__(f"{status}: {detail}")
+        self.status, self.detail = status, detail
+
+
+class ServiceClient:
+    """The service at `url`, with a key. Every method raises ServiceProblem where the service refuses, httpx.TransportError where it isn't
+    reached, and those that wait TimeoutError."""
+
+    def __init__(self, url: str, key: str, timeout_s: float = 30.0) -> None:
+        self.url = url
+        headers = {"Authorization": f"Bearer {key}"}
+        self.http = httpx.Client(base_url=f"{url}/api/v1", headers=headers, timeout=timeout_s, trust_env=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self.http.close()
+
+    # --- requests --------------------------------------------------------------------------------------------------------
+
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Any request below `/api/v1`; a POST has a key, so that it is carried out once."""
+        if method == "POST":
+            options["headers"] = {"Idempotency-Key": secrets.token_hex(16)} | dict(options.get("headers") or {})
+        response = self.http.request(method, path, **options)
+        if response.is_error:
+            try:
+                detail = str(response.json()["detail"])
+            except (ValueError, KeyError, TypeError):
+                detail = response.text[:200]
+            raise ServiceProblem(response.status_code, detail)
+        return response
+
+    def _get(self, model: type[M], path: str, **params: Any) -> M:
+        return model.model_validate_json(self.request("GET", path, params=params).content)
+
+    def _post(self, model: type[M], path: str, body: BaseModel | None = None) -> M:
+        content = {} if body is None else {"json": body.model_dump(mode="json")}
+        return model.model_validate_json(self.request("POST", path, **content).content)
+
+    def _pages(self, model: type[M], path: str, **params: Any) -> Iterator[M]:
+        """All items of a list, page by page."""
+        items = TypeAdapter(list[model])  # type: ignore[valid-type]
+        response = self.request("GET", path, params=params)
+        while True:
+            yield from items.validate_json(response.content)
+            following = response.links.get("next", {}).get("url")
+            if following is None:
+                return
+            response = self.request("GET", f"{self.url}{following}")
+
+    def _wait(self, look: Callable[[], M], over: Callable[[M], bool], patience_s: float) -> M:
+        until = time.monotonic() + patience_s
+        while not over(found := look()):
+            if time.monotonic() > until:
+                raise TimeoutError(f"after {patience_s:g} s: {found!r}")
+            time.sleep(LOOK_S)
+        return found
+
+    def health(self) -> Health:
+        """Whether the service is up, and its version."""
+        return Health.model_validate_json(self.http.get(f"{self.url}/health").raise_for_status().content)
+
+    def me(self) -> Me:
+        """Name and scope of the key."""
+        return self._get(Me, "/me")
+
+    # --- stations and sessions -------------------------------------------------------------------------------------------
+
+    def stations(self) -> list[StationState]:
+        """The stations that the service knows."""
+        return list(self._pages(StationState, "/stations"))
+
+    def sessions(self) -> Iterator[StoredSession]:
+        """All sessions, the newest first."""
+        return self._pages(StoredSession, "/sessions")
+
+    def session(self, session_id: str) -> SessionDetail:
+        """One session, with its provenance."""
+        return self._get(SessionDetail, f"/sessions/{session_id}")
+
+    def start_session(self, start: SessionStart) -> StoredSession:
+        """Start a session, which runs in the background."""
+        return self._post(StoredSession, "/sessions", start)
+
+    def pause(self, session_id: str) -> StoredSession:
+        """Pause a session at the end of its step."""
+        return self._post(StoredSession, f"/sessions/{session_id}/pause")
+
+    def resume(self, session_id: str) -> StoredSession:
+        """Continue a session."""
+        return self._post(StoredSession, f"/sessions/{session_id}/resume")
+
+    def abort(self, session_id: str) -> StoredSession:
+        """End a session's run now."""
+        return self._post(StoredSession, f"/sessions/{session_id}/abort")
+
+    def wait_session(self, session_id: str, patience_s: float = PATIENCE_S) -> SessionDetail:
+        """Wait until a session's run is over. Raises ServiceProblem unless it finished."""
+        over = ("interrupted", "failed", "finished")
+        found = self._wait(lambda: self.session(session_id), lambda now: now.state in over, patience_s)
+        if found.state != "finished":
+            raise ServiceProblem(409, f"session {session_id} is {found.state}: {found.error}")
+        return found
+
+    def capture(
+        self,
+        station: str,
+        *,
+        quick: bool = False,
+        sequences: tuple[str, ...] | None = None,
+        name: str = "",
+        demands_certified: bool = False,
+        patience_s: float = PATIENCE_S,
+    ) -> SessionDetail:
+        """Start a session and wait for its end."""
+        start = SessionStart(
+            station=station, quick=quick, sequences=sequences, name=name, demands_certified=demands_certified
+        )
+        return self.wait_session(self.start_session(start).id, patience_s)
+
+    def captures(self, session_id: str, **only: str) -> Iterator[StoredCapture]:
+        """The captures of a session; `only`: of a `kind`, a `side`."""
+        return self._pages(StoredCapture, f"/sessions/{session_id}/captures", **only)
+
+    def frame(self, capture: StoredCapture) -> NDArray[np.uint16]:
+        """The raw frame of a capture: uint16 (rows, cols)."""
+        content = self.request("GET", f"{self.url}{capture.frame}").content
+        frame: NDArray[np.uint16] = np.load(io.BytesIO(content), allow_pickle=False)
+        return frame
+
+    # --- recordings and jobs ---------------------------------------------------------------------------------------------
+
+    def send_recordings(self, archive: Path) -> Recordings:
+        """Send in a recording set, a .zip."""
+        with archive.open("rb") as file:
+            response = self.request(
+                "POST", "/recordings", content=file.read(), headers={"Content-Type": "application/zip"}
+            )
+        return Recordings.model_validate_json(response.content)
+
+    def start_job(self, kind: JobKind, session_id: str) -> Job:
+        """Start work on a finished session."""
+        return self._post(Job, f"/sessions/{session_id}/jobs", JobStart(kind=kind))
+
+    def start_pipeline(self, start: PipelineStart) -> Job:
+        """Start a session and the whole pipeline on it."""
+        return self._post(Job, "/pipelines", start)
+
+    def job(self, job_id: str) -> Job:
+        """One job."""
+        return self._get(Job, f"/jobs/{job_id}")
+
+    def jobs(self) -> Iterator[Job]:
+        """All jobs, the newest first."""
+        return self._pages(Job, "/jobs")
+
+    def cancel(self, job_id: str) -> Job:
+        """Ask a job to end."""
+        return self._post(Job, f"/jobs/{job_id}/cancel")
+
+    def wait_job(self, job_id: str, patience_s: float = PATIENCE_S) -> Job:
+        """Wait until a job is over. Raises ServiceProblem unless it is done."""
+        over = ("done", "failed", "cancelled")
+        found = self._wait(lambda: self.job(job_id), lambda now: now.state in over, patience_s)
+        if found.state != "done":
+            raise ServiceProblem(409, f"job {job_id} is {found.state}: {found.error}")
+        return found
+
+    def _made(self, model: type[M], kind: JobKind, session_id: str, patience_s: float) -> M:
+        job = self.wait_job(self.start_job(kind, session_id).id, patience_s)
+        return self._get(model, f"/jobs/{job.id}/result")
+
+    def fit(self, session_id: str, patience_s: float = PATIENCE_S) -> FitResult:
+        """Fit a finished session."""
+        return self._made(FitResult, "fit", session_id, patience_s)
+
+    def validate(self, session_id: str, patience_s: float = PATIENCE_S) -> ValidationResult:
+        """Validate a finished session's fit."""
+        return self._made(ValidationResult, "validate", session_id, patience_s)
+
+    def diagnose(self, session_id: str, patience_s: float = PATIENCE_S) -> DiagnosisResult:
+        """Diagnose a finished session."""
+        return self._made(DiagnosisResult, "diagnose", session_id, patience_s)
+
+    def pipeline_results(self, job_id: str) -> PipelineResults:
+        """What a pipeline found."""
+        return self._get(PipelineResults, f"/jobs/{job_id}/result")
+
+    def report(self, job_id: str) -> str:
+        """The page of a job of the kind `report` or `pipeline`."""
+        return self.request("GET", f"/jobs/{job_id}/report").text
+
+    # --- calibrations ----------------------------------------------------------------------------------------------------
+
+    def calibrations(self) -> Iterator[CalibrationRecord]:
+        """All calibrations, the newest first."""
+        return self._pages(CalibrationRecord, "/calibrations")
+
+    def certify(
+        self, calibration_id: str, limits: CalibrationLimits | None = None, *, accept_warnings: bool = False
+    ) -> CalibrationRecord:
+        """Certify a candidate, against `limits` or those of the service's data folder."""
+        asked = Certify(limits=limits, accept_warnings=accept_warnings)
+        return self._post(CalibrationRecord, f"/calibrations/{calibration_id}/certify", asked)
+
+    def history(self, camera: str, figure: str, place: str = "") -> History:
+        """A figure of a camera over its calibrations."""
+        return self._get(History, "/history", camera=camera, figure=figure, place=place)

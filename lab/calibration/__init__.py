@@ -1,0 +1,1 @@
+"""A calibration's life: candidate, certified, superseded, expired; its figures and their history."""

@@ -1,0 +1,150 @@
+"""CalibrationLimits that a laboratory sets on figures of a calibration: a good and a warning band each.
+
+A figure is judged by its value and its uncertainty, as ISO 14253-1 decides conformity: `good` where the whole interval of value
++- 2 standard deviations lies in the good band, `warn` where it lies in the warning band, else `bad`. A figure without a stated
+uncertainty is judged by its value alone. A limit whose figure the calibration doesn't have is `missing`.
+
+    valid_days = 90
+    [[limit]]
+    figure = "noise read_noise_e"     # as `calibench compare` names it; * stands for any text
+    side = "left"                     # or left out: both cameras
+    good = [0.0, 2.5]
+    warn = [0.0, 3.0]
+"""
+
+from __future__ import annotations
+
+import math
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from lab.calibration.figures import Figure
+from lab.errors import InputError
+from lab.formats.toml_file import read_toml
+from sim.camera import Side
+from sim.parameters import Frozen
+
+Mark = Literal["good", "warn", "bad", "missing"]
+#: Standard deviations on each side of a value that have to lie in a band: 95 % of a normal distribution.
+COVERAGE_FACTOR = 2.0
+
+
+class Limit(Frozen):
+    """The bands of one figure. `place`: of a figure of several numbers (`fx`), which; empty: all. None as an end: no limit there."""
+
+    figure: str = Field(min_length=1, max_length=200)
+    side: Side | None = None
+    place: str = Field(default="", max_length=60)
+    good: tuple[float | None, float | None]
+    warn: tuple[float | None, float | None] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.good == (None, None):
+            raise ValueError("good: has no end; give one at least")
+        for name, band in (("good", self.good), ("warn", self.warn or self.good)):
+            low, high = _ends(band)
+            if not low < high:
+                raise ValueError(f"{name}: {low:g} isn't below {high:g}")
+        (low, high), (outer_low, outer_high) = _ends(self.good), _ends(self.warn or self.good)
+        if low < outer_low or high > outer_high:
+            raise ValueError("warn: doesn't hold the whole good band")
+        return self
+
+    def concerns(self, figure: Figure) -> bool:
+        """Whether this limit is one of that figure."""
+        return (
+            fnmatchcase(figure.name, self.figure)
+            and self.side in (None, figure.side)
+            and self.place in ("", figure.place)
+        )
+
+    @property
+    def good_text(self) -> str:
+        """The good band, as a person reads it."""
+        low, high = self.good
+        return f"<= {high:g}" if low is None else f">= {low:g}" if high is None else f"{low:g} .. {high:g}"
+
+    def judge(self, figure: Figure) -> Mark:
+        """In which band the figure lies, with its uncertainty."""
+        half = COVERAGE_FACTOR * figure.std
+        for mark, band in (("good", self.good), ("warn", self.warn or self.good)):
+            low, high = _ends(band)
+            if low <= figure.value - half and figure.value + half <= high:
+                return "good" if mark == "good" else "warn"
+        return "bad"
+
+
+def _ends(band: tuple[float | None, float | None]) -> tuple[float, float]:
+    low, high = band
+    return (-math.inf if low is None else low), (math.inf if high is None else high)
+
+
+class CalibrationLimits(Frozen):
+    """CalibrationLimits of a laboratory. `valid_days`: how long a calibration that was certified against them may be used; None: until it is superseded."""
+
+    valid_days: float | None = Field(default=None, gt=0.0, le=36_500.0)
+    limit: tuple[Limit, ...] = Field(min_length=1, max_length=500)
+
+
+class Judgement(Frozen):
+    """One figure against one limit. `value` None: the calibration doesn't have it."""
+
+    figure: str
+    side: Side | None
+    place: str
+    value: float | None
+    std: float | None
+    limit: Limit
+    mark: Mark
+
+
+def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judgement, ...]:
+    """Every figure that a limit concerns, in the order of the limits."""
+    found: list[Judgement] = []
+    for limit in limits.limit:
+        concerned = [figure for figure in figures if limit.concerns(figure)]
+        found += [
+            Judgement(
+                figure=figure.name,
+                side=figure.side,
+                place=figure.place,
+                value=figure.value,
+                std=figure.std,
+                limit=limit,
+                mark=limit.judge(figure),
+            )
+            for figure in concerned
+        ]
+        if not concerned:
+            found.append(
+                Judgement(
+                    figure=limit.figure,
+                    side=limit.side,
+                    place=limit.place,
+                    value=None,
+                    std=None,
+                    limit=limit,
+                    mark="missing",
+                )
+            )
+    return tuple(found)
+
+
+def standing_limits(folder: Path) -> CalibrationLimits | None:
+    """The limits of a data folder, `limits.toml`; None where it has none. Raises InputError where they can't be used."""
+    file = folder / "limits.toml"
+    return read_limits(file) if file.exists() else None
+
+
+def read_limits(file: Path) -> CalibrationLimits:
+    """The limits of a TOML file. Raises InputError, one line for each problem."""
+    table = read_toml(file, "give a file of limits")
+    try:
+        return CalibrationLimits.model_validate(table)
+    except ValidationError as error:
+        lines = [f"{file}: {'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
+        raise InputError("\n".join(lines)) from error

@@ -1,0 +1,163 @@
+"""`calibench calibrations`: what each calibration is, certifying one, and how its figures drift."""
+
+from __future__ import annotations
+
+import getpass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from lab.cli.console import check_writable, out, write_json
+from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.sources import Json, StoreFolder, open_store
+from lab.errors import InputError
+
+if TYPE_CHECKING:
+    from lab.calibration.limits import CalibrationLimits
+    from lab.capture.store import Store
+
+calibrations = typer.Typer(
+    name="calibrations", no_args_is_help=True, help="A calibration's life: candidate, certified, superseded, expired."
+)
+Id = Annotated[str, typer.Argument(metavar="ID", help="a calibration's id, or its session's: the newest of it")]
+LimitsFile = Annotated[
+    Path | None,
+    typer.Option("--limits", metavar="FILE", help="the limits, TOML; without it limits.toml in the data folder"),
+]
+
+
+def _limits(store: Store, file: Path | None) -> CalibrationLimits:
+    from lab.calibration.limits import read_limits
+
+    return read_limits(file or store.root / "limits.toml")
+
+
+def _standing(store: Store, file: Path | None) -> CalibrationLimits | None:
+    """The limits that are given, or those of the data folder where it has some."""
+    from lab.calibration.limits import standing_limits
+
+    return standing_limits(store.root) if file is None else _limits(store, file)
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading)
+    return table
+
+
+@calibrations.command("list")
+def list_calibrations(data: StoreFolder = None) -> None:
+    """All calibrations, the newest first."""
+    from lab.calibration.life import calibrations as known
+
+    table = _table("id", "of", "begun (UTC)", "state", "by", "until", "cameras")
+    for one in known(open_store(data)):
+        until = f"{one.expires:%Y-%m-%d}" if one.expires else ""
+        begun, cameras = f"{one.created:%Y-%m-%d %H:%M}", ", ".join(one.cameras.values())
+        table.add_row(
+            one.id, escape(one.name), begun, one.state, escape(one.certified_by or ""), until, escape(cameras)
+        )
+    out.print(table)
+
+
+@calibrations.command()
+def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder = None) -> None:
+    """One calibration: its state, and its figures by the limits. Exit code 4 where a figure is bad or missing."""
+    from lab.calibration.life import calibration, figures
+    from lab.calibration.limits import judged
+
+    check_writable(json)
+    store = open_store(data)
+    found = calibration(store, id)
+    chosen = found.limits if limits is None and found.limits is not None else _standing(store, limits)
+    by_limit = judged(figures(store, found.id), chosen) if chosen is not None else ()
+    write_json(found.model_copy(update={"limits": chosen, "judgements": by_limit}), json)
+    if str(json) != "-":
+        who = f" by {found.certified_by} at {found.certified:%Y-%m-%d %H:%M}" if found.certified else ""
+        out.print(escape(f"{found.id} of {found.name}: {found.state}{who}"))
+        table = _table("figure", "side", "", "value", "std", "good", "mark")
+        for one in by_limit:
+            value, std = (
+                ("" if one.value is None else f"{one.value:.6g}"),
+                ("" if one.std is None else f"{one.std:.2g}"),
+            )
+            table.add_row(
+                escape(one.figure), one.side or "", escape(one.place), value, std, one.limit.good_text, one.mark
+            )
+        if table.row_count:
+            out.print(table)
+    if any(one.mark in ("bad", "missing") for one in by_limit):
+        raise typer.Exit(EXIT_CHECK)
+
+
+@calibrations.command()
+def certify(
+    id: Id,
+    limits: LimitsFile = None,
+    by: Annotated[str, typer.Option(metavar="NAME", help="who certifies; without it the user of this computer")] = "",
+    accept_warnings: Annotated[
+        bool, typer.Option("--accept-warnings", help="certify with figures in the warning band")
+    ] = False,
+    data: StoreFolder = None,
+) -> None:
+    """Certify a candidate against limits; the same cameras' earlier calibration is superseded."""
+    from lab.calibration import life
+
+    store = open_store(data)
+    found = life.certify(store, id, by or _user(), _limits(store, limits), accept_warnings=accept_warnings)
+    until = f"until {found.expires:%Y-%m-%d}" if found.expires else "until it is superseded"
+    out.print(
+        escape(f"{found.id}: certified by {found.certified_by}, {len(found.judgements)} figures within limits, {until}")
+    )
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError) as error:
+        raise InputError("--by: this user has no name; say who certifies") from error
+
+
+@calibrations.command()
+def history(
+    camera: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="a camera's name; without FIGURE its figures are listed")
+    ] = "",
+    figure: Annotated[str, typer.Argument(metavar="FIGURE", help="a figure, as `compare` names it")] = "",
+    place: Annotated[str, typer.Option(help="of a figure of several numbers (fx, cx): which")] = "",
+    limits: LimitsFile = None,
+    json: Json = None,
+    data: StoreFolder = None,
+) -> None:
+    """A figure of a camera over all its calibrations: bands and drift. Exit code 4 where the newest is bad or drifted."""
+    from lab.calibration.life import figure_names
+    from lab.calibration.life import history as looked_up
+
+    check_writable(json)
+    store = open_store(data)
+    if not figure:
+        for name, one, where in figure_names(store):
+            if camera in ("", name):
+                out.print(escape("  ".join(part for part in (name, one, where) if part)))
+        return
+    found = looked_up(store, camera, figure, place, _standing(store, limits))
+    write_json(found, json)
+    if str(json) != "-":
+        table = _table("calibration", "begun (UTC)", "state", "value", "std", "mark", "sigma", "drift")
+        for point in found.points:
+            sigma = "" if point.significance_sigma is None else f"{point.significance_sigma:.1f}"
+            values = (
+                f"{point.value:.6g}",
+                f"{point.std:.2g}",
+                point.mark or "",
+                sigma,
+                "yes" if point.drifted else "no",
+            )
+            table.add_row(point.calibration_id, f"{point.created:%Y-%m-%d %H:%M}", point.state, *values)
+        out.print(table)
+    if found.points[-1].mark == "bad" or found.points[-1].drifted:
+        raise typer.Exit(EXIT_CHECK)

@@ -1,0 +1,122 @@
+"""The typed client, and the pytest plugin that hands it out."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lab.fit
+from api.client import ServiceClient, ServiceProblem
+from api.pytest_plugin import FitReference
+from lab.formats.results import FitResult
+from tests.api.conftest import Running
+from tests.lab.calibration.test_life import fitted, limits
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "docs" / "examples" / "ci"
+
+
+def test_a_session_is_captured_fitted_and_certified(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lab.fit, "fit_recording_set", lambda *_: fitted(2.0))
+    with ServiceClient(running.url, running.keys["admin"]) as client:
+        assert client.health().status == "ok" and client.me().scope == "admin"
+        assert [station.name for station in client.stations()] == ["fakes"]
+        session = client.capture("fakes", quick=True, sequences=("dark",), name="nightly")
+        assert session.state == "finished" and session.name == "nightly"
+        captures = list(client.captures(session.id, side="left"))
+        assert captures and {one.side for one in captures} == {"left"}
+        np.testing.assert_array_equal(client.frame(captures[0]), running.store.frame(captures[0].id))
+        assert client.fit(session.id) == fitted(2.0)
+        (calibration,) = client.calibrations()
+        done = client.certify(calibration.id, limits())
+        assert done.state == "certified" and done.certified_by == "admin"
+        history = client.history(calibration.cameras["left"], "noise read_noise_e")
+        assert [point.value for point in history.points] == [2.0]
+        assert [one.id for one in client.sessions()] == [session.id] and len(list(client.jobs())) == 1
+
+
+def test_pages_are_followed(shared: Running) -> None:
+    with ServiceClient(shared.url, shared.keys["read"]) as client:
+        session = next(client.sessions())
+        every = [one.id for one in client.captures(session.id)]
+        assert len(every) > 4
+        assert [one.id for one in client.captures(session.id, limit="3")] == every
+
+
+def test_what_is_refused_is_an_exception_with_the_services_line(shared: Running) -> None:
+    with ServiceClient(shared.url, shared.keys["read"]) as client:
+        with pytest.raises(ServiceProblem, match="no session 'none'") as missing:
+            client.session("none")
+        assert missing.value.status == 404
+        with pytest.raises(ServiceProblem, match="needs 'operate'"):
+            client.capture("fakes")
+    with (
+        ServiceClient(shared.url, "calibench_wrong") as client,
+        pytest.raises(ServiceProblem, match="401: no valid key"),
+    ):
+        client.me()
+
+
+# --- the plugin --------------------------------------------------------------------------------------------------------
+
+
+def test_a_reference_is_written_kept_and_compared(tmp_path: Path) -> None:
+    with pytest.raises(pytest.fail.Exception, match="--calibench-update"):
+        FitReference(tmp_path, update=False).check(fitted(2.0))
+    FitReference(tmp_path, update=True).check(fitted(2.0))
+    kept = FitReference(tmp_path, update=False)
+    kept.check(fitted(2.01))
+    with pytest.raises(pytest.fail.Exception, match="left noise read_noise_e") as drifted:
+        kept.check(fitted(2.2))
+    assert "2 +- 0.01 -> 2.2 +- 0.01" in str(drifted.value)
+    kept.check(fitted(2.2), fail_on=["noise read_noise_e>20%"])
+    assert FitResult.model_validate_json((tmp_path / "reference.json").read_text()) == fitted(2.0)
+
+
+def test_the_installed_plugin_is_this_one_and_loads_nothing_heavy() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["entry-points"]["pytest11"] == {"calibench": "api.pytest_plugin"}
+    needed = {line.split(">")[0] for line in project["optional-dependencies"]["test"]}
+    assert needed == {"pytest", "httpx"}
+    code = "import sys, api.pytest_plugin; print(sorted({'numpy', 'httpx', 'fastapi', 'pydantic'} & set(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert loaded.stdout.strip() == "[]"
+
+
+def pytest_of_example(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    (folder / "pytest.ini").touch()
+    (folder / "test_calibration.py").write_text((EXAMPLE / "test_calibration.py").read_text())
+    installed = {found.name for found in entry_points(group="pytest11")}
+    plugin = [] if "calibench" in installed else ["-p", "api.pytest_plugin"]  # an environment made before it was there
+    plugin += ["-p", "no:cacheprovider", "-p", "no:schemathesis"]
+    command = [
+        sys.executable,
+        "-c",
+        f"import sys; sys.path.insert(0, {str(ROOT)!r}); import pytest; sys.exit(pytest.main(sys.argv[1:]))",
+    ]
+    return subprocess.run([*command, "-q", *plugin, *options], capture_output=True, text=True, cwd=folder, check=False)
+
+
+def test_the_example_names_fixtures_that_there_are(tmp_path: Path) -> None:
+    listed = pytest_of_example(tmp_path, "--setup-plan")
+    assert listed.returncode == 0, listed.stdout + listed.stderr
+    for fixture in ("calibench_bench", "calibench_client", "calibench_station", "calibench_reference"):
+        assert f"{fixture}" in listed.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # three benches, one after the other
+def test_the_example_fails_on_a_drifted_figure_and_only_then(tmp_path: Path) -> None:
+    made = pytest_of_example(tmp_path, "--calibench-update")
+    assert made.returncode == 0, made.stdout
+    again = pytest_of_example(tmp_path)
+    assert again.returncode == 0, again.stdout
+    drifted = pytest_of_example(tmp_path, "--calibench-conceal", "left:row_noise:noise_e=3")
+    assert drifted.returncode == 1 and "left noise read_noise_e" in drifted.stdout, drifted.stdout
+    assert "right" not in drifted.stdout.split("drifted against")[1]

@@ -1,0 +1,233 @@
+"""The operator's page in a real Chromium: axe, light and dark, a phone's width, the keyboard, the halt button, a calibration certified.
+
+`make chromium` installs the browser. Without one these tests are skipped on a desk, and fail in CI.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.api.conftest import Running, serving, until_state
+from tests.lab.calibration.test_life import fitted
+
+PHONE, DESK = {"width": 420, "height": 860}, {"width": 1280, "height": 860}
+READ_NOISE_E = (2.0, 2.01, 2.15)
+LIMITS = 'valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [1.9, 2.05]\nwarn = [1.8, 2.2]\n'
+PATIENCE_MS = 30_000.0
+FINISHED = "#sessions tr:first-child .state.finished"
+
+
+def chromium() -> str:
+    """The browser's program. In CI there has to be one."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        if found := shutil.which(name):
+            return found
+    if os.environ.get("CI"):
+        pytest.fail("no Chromium in CI: `make chromium` installs it")
+    pytest.skip("no Chromium; `make chromium` installs it")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    program = chromium()
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A service with a finished session that was calibrated three times; the last one drifted."""
+    with serving(tmp_path_factory.mktemp("data")) as running, running.client() as client:
+        (running.store.root / "limits.toml").write_text(LIMITS)
+        started = client.post(
+            "/api/v1/sessions", json={"station": "fakes", "quick": True, "sequences": ["dark"], "name": "nightly"}
+        ).json()
+        until_state(client, started["id"], "finished")
+        for value in READ_NOISE_E:
+            running.store.add_result("fit", started["id"], fitted(value).model_dump(mode="json"))
+        yield running
+
+
+class Watched:
+    """A page of its own, logged in; what its console complains of and where it sends requests is kept."""
+
+    def __init__(self, browser: Any, running: Running, scheme: str = "light", viewport: dict[str, int] = DESK) -> None:
+        self.context = browser.new_context(color_scheme=scheme, viewport=viewport)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.complaints: list[str] = []
+        self.elsewhere: list[str] = []
+        self.page.on("console", lambda told: told.type == "error" and self.complaints.append(told.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda asked: asked.url.startswith(running.url) or self.elsewhere.append(asked.url))
+        self.page.goto(f"{running.url}/")
+        self.page.wait_for_selector("#login-form")
+
+    def log_in(self, running: Running, scope: str = "admin") -> None:
+        self.page.fill("input[name=key]", running.keys[scope])
+        self.page.press("input[name=key]", "Enter")
+        self.page.wait_for_selector("#history svg")
+
+    def open_session(self) -> None:
+        self.page.click("#sessions tr:last-child button:has-text('Open')")
+        self.page.wait_for_selector("#captures img")
+
+    def serious(self) -> list[str]:
+        """What axe finds that is serious or critical."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        found = Axe().run(self.page).response["violations"]
+        return [
+            f"{one['id']} {node['target']}: {node['failureSummary']}"
+            for one in found
+            if one["impact"] in ("serious", "critical")
+            for node in one["nodes"]
+        ]
+
+    def sideways_px(self) -> int:
+        """By how much the page is wider than the window."""
+        wider = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+        found: int = self.page.evaluate(wider)
+        return found
+
+    def focused(self) -> dict[str, str]:
+        """What has the keyboard's focus, and whether one sees that."""
+        code = """() => { const on = document.activeElement, style = getComputedStyle(on);
+            return {tag: on.tagName, text: on.textContent.trim().slice(0, 40), name: on.name ?? "",
+                    outline: style.outlineStyle + " " + style.outlineWidth} }"""
+        found: dict[str, str] = self.page.evaluate(code)
+        return found
+
+    def tab_to(self, wanted: str) -> None:
+        """Go on with Tab until the element of that text or name is reached; what is passed shows that it has the focus."""
+        for _ in range(60):
+            self.page.keyboard.press("Tab")
+            on = self.focused()
+            if on["tag"] == "BODY":
+                continue
+            assert on["outline"] not in ("none 0px", "none 3px"), on
+            if wanted in (on["text"], on["name"]):
+                return
+        pytest.fail(f"{wanted!r} can't be reached by the keyboard")
+
+    def can_halt(self) -> bool:
+        """Whether a click in the middle of the halt button reaches it."""
+        code = """() => { const button = document.getElementById("halt"), box = button.getBoundingClientRect();
+            return document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button }"""
+        found: bool = self.page.evaluate(code)
+        return found
+
+    def close(self) -> None:
+        self.context.close()
+        assert self.elsewhere == []  # a laboratory has no network
+        # The page asks whether it is logged in before it is: the browser notes the 401.
+        assert [line for line in self.complaints if "401" not in line] == []
+
+
+@pytest.mark.parametrize(("scheme", "viewport"), [("light", PHONE), ("dark", DESK)])
+def test_everyone_can_read_and_use_it(browser: Any, lab: Running, scheme: str, viewport: dict[str, int]) -> None:
+    """axe finds nothing serious in the log-in, the desk with all it can show, and the certificate; nothing runs off the screen."""
+    watched = Watched(browser, lab, scheme, viewport)
+    assert watched.serious() == [] and watched.sideways_px() == 0
+    watched.log_in(lab)
+    watched.open_session()
+    watched.page.click("#history-words")
+    watched.page.eval_on_selector("#live", "live => { live.hidden = false }")
+    watched.page.eval_on_selector("#live-problem", "one => { one.textContent = 'instrument: doesn\\'t answer' }")
+    assert watched.serious() == [] and watched.sideways_px() == 0
+    watched.page.click("#calibrations button")
+    watched.page.wait_for_selector("#certify[open] .mark")
+    assert watched.serious() == [] and watched.sideways_px() == 0
+    assert watched.can_halt()  # wherever the page is scrolled to, and whatever is open
+    watched.page.goto(f"{lab.url}/docs")
+    watched.page.wait_for_selector("details")
+    assert watched.sideways_px() == 0
+    background = watched.page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (sum(int(part) for part in background[4:-1].split(",")) > 3 * 128) == (scheme == "light")
+    watched.close()
+
+
+def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    keyboard = watched.page.keyboard
+    assert watched.focused()["name"] == "key"
+    keyboard.type(lab.keys["admin"])
+    keyboard.press("Enter")
+    watched.page.wait_for_selector("#history svg")
+    watched.tab_to("name")
+    keyboard.type("by keyboard")
+    watched.tab_to("quick")
+    keyboard.press("Space")
+    lab.bench.delay_s = 0.02
+    watched.tab_to("Start a session")
+    keyboard.press("Enter")
+    watched.page.wait_for_selector("#sessions tr:first-child td:has-text('by keyboard')")
+    watched.tab_to("Open")
+    # The list is drawn anew while the session goes on; the focus stays where it was.
+    steps = watched.page.inner_text("#sessions tr:first-child .number")
+    watched.page.wait_for_function(
+        "seen => document.querySelector('#sessions tr:first-child .number').textContent !== seen", arg=steps
+    )
+    assert watched.focused()["text"] == "Open"
+    keyboard.press("Enter")
+    watched.page.wait_for_selector("#captures img")
+    watched.page.focus("#halt")
+    keyboard.press("Enter")
+    watched.page.wait_for_selector("#sessions tr:first-child .state.interrupted")
+    lab.bench.delay_s = 0.0
+    assert not lab.bench.opened  # the shutter
+    watched.close()
+
+
+def test_a_calibration_is_certified_and_a_drift_is_seen(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    assert page.input_value("#history-form select[name=figure]") == '["noise read_noise_e",""]'
+    assert len(page.query_selector_all("#history .point")) == 3 and len(page.query_selector_all("#history .band")) == 2
+    assert len(page.query_selector_all("#history path")) == 1  # the drift has a shape of its own
+    assert "1 drifted" in page.inner_text("#history-words")
+    page.click("#calibrations tr:first-child button")  # 2.15 e: warn
+    page.wait_for_selector("#certify[open] .mark.warn")
+    page.click("#certify-go")
+    page.wait_for_selector("#certify-problem:not(:empty)")
+    assert "is warn" in page.inner_text("#certify-problem")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#certify", state="hidden")
+    page.click("#calibrations tr:last-child button")
+    page.wait_for_selector("#certify[open] .mark.good")
+    page.click("#certify-go")
+    page.wait_for_selector("#calibrations tr:last-child .state.certified")
+    assert "admin, " in page.inner_text("#calibrations tr:last-child")
+    page.wait_for_selector("#history .ring")
+    assert lab.store is not None
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
+    watched.close()
+
+
+def test_who_may_only_read_is_offered_no_halt(browser: Any, lab: Running) -> None:
+    watched = Watched(browser, lab)
+    watched.log_in(lab, "read")
+    assert not watched.page.is_visible("#halt")
+    watched.page.click("#logout")
+    watched.page.wait_for_selector("#login-form")
+    watched.close()
+
+
+def test_a_missing_browser_fails_in_ci_and_is_skipped_on_a_desk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("CI", "true")
+    with pytest.raises(pytest.fail.Exception, match="make chromium"):
+        chromium()
+    monkeypatch.delenv("CI")
+    with pytest.raises(pytest.skip.Exception):
+        chromium()

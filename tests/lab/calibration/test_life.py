@@ -1,0 +1,271 @@
+"""A calibration's life: candidate, certified, superseded, expired; bands, drift, and sessions that demand a certified one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+from pydantic import ValidationError
+
+from lab.calibration import life
+from lab.calibration.figures import Figure, figures_of
+from lab.calibration.limits import CalibrationLimits, Limit, judged, read_limits
+from lab.capture.plan import CapturePlan
+from lab.capture.records import RunRecord, now
+from lab.capture.session import CaptureSession
+from lab.capture.store import Store
+from lab.capture.tables import Base, CalibrationRow
+from lab.capture_kinds.dark import DarkSequence
+from lab.cli import main
+from lab.errors import InputError
+from lab.fit.compare import FALSE_ALARM_RATE
+from lab.formats.results import CameraFit, FitResult, MtfCurve, NoiseFit
+from tests.lab import fake_bench
+
+DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
+STATION = fake_bench.station()
+SERIALS = {"left": "L1", "right": "R1"}
+STD = 0.01
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = Store(tmp_path)
+    yield opened
+    opened.close()
+
+
+def fitted(read_noise_e: float, std: float = STD) -> FitResult:
+    noise = NoiseFit(
+        read_noise_e=read_noise_e,
+        read_noise_e_std=std,
+        conversion_gain_dn_per_e=0.4,
+        conversion_gain_dn_per_e_std=0.001,
+    )
+    curve = MtfCurve(
+        capture="edge-1", channel="G", frequency_cy_per_px=tuple(np.linspace(0, 0.5, 20)), mtf=(0.5,) * 20,
+        mtf_std=(0.01,) * 20, mtf50_cy_per_px=0.25, mtf50_cy_per_px_std=0.002,
+        angle_deg=5.0, angle_deg_std=0.01,
+    )  # fmt: skip
+    return FitResult(
+        source="s", cameras={"left": CameraFit(noise=noise, mtf=(curve,)), "right": CameraFit(noise=noise)}
+    )
+
+
+def calibrated(store: Store, read_noise_e: float, serials: dict[str, str] = SERIALS, std: float = STD) -> str:
+    """A fitted session of the rig of these serial numbers; the calibration's id."""
+    session = store.create_session(STATION, DARKS.steps(STATION))
+    identities = {
+        f"camera {side}": {"maker": "m", "model": "c", "serial_number": serial, "firmware": ""}
+        for side, serial in serials.items()
+    }
+    store.set_state(session, "finished", run=RunRecord(started=now(), instruments=identities, versions={}))
+    return store.add_result("fit", session, fitted(read_noise_e, std).model_dump(mode="json"))
+
+
+def limits(valid_days: float | None = None, good: tuple[float | None, float | None] = (None, 2.5)) -> CalibrationLimits:
+    return CalibrationLimits(
+        valid_days=valid_days, limit=(Limit(figure="noise read_noise_e", good=good, warn=(None, 3.0)),)
+    )
+
+
+def test_figures_are_all_numbers_with_an_uncertainty_but_curves() -> None:
+    found = {(figure.side, figure.name): figure for figure in figures_of(fitted(2.0))}
+    assert found["left", "noise read_noise_e"].value == 2.0 and found["left", "noise read_noise_e"].std == STD
+    assert found["left", "mtf edge-1 G mtf50_cy_per_px"].value == 0.25
+    assert not any(name.endswith(" mtf") for _, name in found)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "mark"),
+    [
+        (2.0, 0.01, "good"),
+        (2.5, 0.0, "good"),
+        (2.49, 0.01, "warn"),  # 2.49 + 2 x 0.01 > 2.5: not proven to be within the good band
+        (2.47, 0.01, "good"),
+        (2.7, 0.1, "warn"),
+        (2.99, 0.01, "bad"),
+        (3.1, 0.0, "bad"),
+        (0.5, 0.0, "bad"),
+    ],
+)
+def test_a_figure_is_judged_with_its_uncertainty(value: float, std: float, mark: str) -> None:
+    limit = Limit(figure="noise *", side="left", good=(1.0, 2.5), warn=(0.9, 3.0))
+    figure = Figure(name="noise read_noise_e", side="left", value=value, std=std)
+    assert [one.mark for one in judged((figure,), CalibrationLimits(limit=(limit,)))] == [mark]
+    other = figure.model_copy(update={"side": "right"})
+    assert [one.mark for one in judged((other,), CalibrationLimits(limit=(limit,)))] == ["missing"]
+
+
+@pytest.mark.parametrize(
+    ("good", "warn", "said"),
+    [
+        ((2.0, 1.0), None, "below"),
+        ((1.0, 2.0), (1.5, 3.0), "hold"),
+        ((None, None), None, "no end"),
+        ((0.0, 1.0), (2.0, 1.0), "below"),
+    ],
+)
+def test_bands_that_contradict_themselves_are_refused(
+    good: tuple[float, float], warn: tuple[float, float], said: str
+) -> None:
+    with pytest.raises(ValidationError, match=said):
+        Limit(figure="x", good=good, warn=warn)
+
+
+def test_a_life(store: Store) -> None:
+    first, second, other = (
+        calibrated(store, 2.0),
+        calibrated(store, 2.01),
+        calibrated(store, 2.0, {"left": "L9", "right": "R1"}),
+    )
+    assert [one.state for one in life.calibrations(store)] == ["candidate"] * 3
+    assert life.calibration(store, first).cameras == {"left": "m c L1", "right": "m c R1"}
+    done = life.certify(store, first, "ada", limits(valid_days=30))
+    assert (done.state, done.certified_by, len(done.judgements)) == ("certified", "ada", 2)
+    assert (
+        done.expires is not None and done.certified is not None and done.expires - done.certified == timedelta(days=30)
+    )
+    with pytest.raises(InputError, match="is certified"):
+        life.certify(store, first, "bob", limits())
+    life.certify(store, other, "bob", limits())
+    assert life.calibration(store, first).state == "certified"  # another rig supersedes nothing
+    life.certify(store, second, "bob", limits())
+    again = life.calibration(store, first)
+    assert (again.state, again.superseded_by) == ("superseded", second)
+    with store.transaction() as db:
+        db.execute(sa.update(CalibrationRow).values(expires=now() - timedelta(seconds=1)))
+    assert [life.calibration(store, id).state for id in (first, second)] == ["superseded", "expired"]
+    assert len(life.calibrations(store, limit=2)) == 2 and life.count_calibrations(store) == 3
+    assert [one.id for one in life.calibrations(store, after=other)] == [second, first]
+
+
+def test_what_is_outside_its_limits_isnt_certified(store: Store) -> None:
+    bad, near = calibrated(store, 3.5), calibrated(store, 2.6)
+    with pytest.raises(
+        InputError, match=r"left noise read_noise_e = 3\.5 \+- 0\.01 is bad.*can't be accepted"
+    ) as refused:
+        life.certify(store, bad, "ada", limits(), accept_warnings=True)
+    assert len(str(refused.value).splitlines()) == 2  # a line for each side
+    with pytest.raises(InputError, match="is warn"):
+        life.certify(store, near, "ada", limits())
+    assert life.certify(store, near, "ada", limits(), accept_warnings=True).state == "certified"
+    lacking = CalibrationLimits(limit=(Limit(figure="geometry rms_px", good=(None, 0.2)),))
+    with pytest.raises(InputError, match="doesn't have it"):
+        life.certify(store, bad, "ada", lacking)
+    with pytest.raises(InputError, match="isn't known"):
+        life.certify(store, "0" * 16, "ada", limits())
+
+
+def test_drift_is_told_as_compare_tells_it(store: Store) -> None:
+    values = [2.0, 2.01, 1.99, 2.2]
+    ids = [calibrated(store, value) for value in values]
+    found = life.history(store, "m c L1", "noise read_noise_e")
+    assert [point.calibration_id for point in found.points] == ids and found.limit is None
+    assert [point.drifted for point in found.points] == [False, False, False, True]
+    # 0.2 over sqrt(2) x 0.01
+    assert found.points[3].significance_sigma == pytest.approx(0.2 / (np.sqrt(2) * STD), rel=1e-6)
+    # Certified, the third is the reference; its limits mark the history.
+    life.certify(store, ids[2], "ada", limits(good=(None, 2.05)))
+    found = life.history(store, "m c L1", "noise read_noise_e")
+    assert [point.mark for point in found.points] == ["good", "good", "good", "warn"]
+    assert found.points[3].reference_id == ids[2] and found.points[1].reference_id == ids[0]
+    assert life.history(store, "m c L1", "noise read_noise_e", limits=limits(good=(None, 2.1))).points[3].mark == "warn"
+    for camera, figure in (("m c L2", "noise read_noise_e"), ("m c L1", "noise x")):
+        with pytest.raises(InputError, match="no calibration of it"):
+            life.history(store, camera, figure)
+    assert ("m c L1", "noise read_noise_e", "") in life.figure_names(store)
+
+
+def test_an_unchanged_camera_rarely_drifts(store: Store) -> None:
+    """Over a history of 20, an alarm in one of a hundred cameras. 400 cameras of the binomial law: 4 +- 2 expected, 3 sigma = 10."""
+    rng = np.random.default_rng(5)
+    alarms = 0
+    threshold = life.sigma_of_probability(life.sidak_part(FALSE_ALARM_RATE, 19))
+    kept = {"calibration_id": "x", "created": now(), "certified": None, "superseded": None, "expires": None, "std": STD}
+    figure = Figure(name="n", value=0.0, std=STD)
+    for _ in range(400):
+        rows = [SimpleNamespace(value=value, **kept) for value in 2.0 + STD * rng.standard_normal(20)]
+        alarms += any(point.drifted for point in life._points(rows, figure, None, threshold))
+    assert alarms <= 10
+
+
+def test_a_session_that_demands_a_certified_calibration_runs_only_with_one(store: Store) -> None:
+    bench = fake_bench.Bench()
+
+    def session() -> CaptureSession:
+        return CaptureSession.start(store, STATION, DARKS, demands_certified=True, connect=bench.drivers)
+
+    first = session()
+    with pytest.raises(InputError, match="demands a certified calibration, and 0 calibrations"):
+        first.run()
+    assert store.session(first.id).state == "failed" and not bench.opened
+    free = CaptureSession.start(store, STATION, DARKS, connect=bench.drivers)
+    assert free.run().state == "finished"
+    of_it = store.add_result("fit", free.id, fitted(2.0).model_dump(mode="json"))
+    with pytest.raises(InputError, match="1 calibrations of it are known, none is certified"):
+        session().run()
+    life.certify(store, of_it, "ada", limits(valid_days=30))
+    assert session().run().state == "finished"
+    assert (
+        CaptureSession(store, first.id, connect=bench.drivers).run().state == "finished"
+    )  # a resumed one is looked at anew
+    with store.transaction() as db:
+        db.execute(sa.update(CalibrationRow).values(expires=now() - timedelta(days=1)))
+    with pytest.raises(InputError, match="expired on"):
+        session().run()
+
+
+def test_an_older_store_gets_its_calibrations(tmp_path: Path) -> None:
+    """A registry of the revision before: its sessions stay, and its fits become candidates."""
+    from alembic import command
+    from alembic.config import Config
+
+    import lab.capture.tables
+
+    store = Store(tmp_path)
+    kept = calibrated(store, 2.0)
+    config = Config()
+    config.set_main_option("script_location", str(Path(lab.capture.tables.__file__).parent / "migrations"))
+    with store.transaction() as db:
+        config.attributes["connection"] = db.connection()
+        command.downgrade(config, "0002")
+    store.close()
+    again = Store(tmp_path)
+    assert [one.id for one in life.calibrations(again)] == [kept] and not again.sessions()[0].demands_certified
+    with again.transaction() as db:
+        assert compare_metadata(MigrationContext.configure(db.connection()), Base.metadata) == []
+    again.close()
+
+
+def test_from_the_command_line(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CALIBENCH_DATA", str(tmp_path))
+    first, second = calibrated(store, 2.0), calibrated(store, 2.3)
+
+    def said(*arguments: str, code: int = 0) -> str:
+        assert main(["calibrations", *arguments]) == code
+        found = capsys.readouterr()
+        return found.out + found.err
+
+    assert "limits" in said("certify", first, "--by", "ada", code=2)
+    file = tmp_path / "limits.toml"
+    file.write_text('valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [0.0, 2.1]\nwarn = [0.0, 2.5]\n')
+    assert read_limits(file).valid_days == 90
+    assert f"{first}: certified by ada, 2 figures within limits, until" in said("certify", first, "--by", "ada")
+    assert "accept warnings" in said("certify", second, code=2)
+    listed = said("list")
+    assert "candidate" in listed and "certified" in listed
+    assert "warn" in said("show", second) and '"mark": "warn"' in said("show", second, "--json", "-")
+    assert "m c L1  noise read_noise_e" in said("history")
+    assert "yes" in said("history", "m c L1", "noise read_noise_e", code=4)  # the newest drifted
+    file.write_text('[[limit]]\nfigure = "x"\ngood = [2.0, 1.0]\n')
+    assert "limits.toml: limit.0" in said("show", second, code=2)
