@@ -15,6 +15,7 @@ from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.outcome.detectability import detectability
+from lab.diagnose.outcome.effect_sets import side_models
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
@@ -33,6 +34,7 @@ from lab.formats.results import (
     Mismatch,
     ResidualCurve,
     ResidualPicture,
+    SideModels,
     Skipped,
     Unexplained,
     VetoedName,
@@ -70,6 +72,7 @@ class SideFindings:
     abstained: tuple[Candidate, ...] = ()
     unexplained: tuple[Unexplained, ...] = ()
     vetoed: tuple[VetoedName, ...] = ()
+    models: SideModels | None = None
     held_out: HeldOut | None = None
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
@@ -131,6 +134,7 @@ def diagnose_side(
         abstained=verdict.abstained,
         unexplained=left,
         vetoed=tuple(vetoed_names(side, verdict)),
+        models=side_models(side, verdict.models, policy),
         held_out=held_out(verdict),
         curves=tuple(residual_curves(side, verdict)),
         improved=improved,

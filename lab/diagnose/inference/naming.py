@@ -19,7 +19,7 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
 
     One at a time: the weakest member that is too weak for any name; then the member for which a rival is likelier; then
     members that one discrepancy replaces, or whose name doesn't hold. After each change the rest is fitted and weighed
-    again.
+    again. What was given up and explains nothing isn't told.
     """
     model, policy = search.model, search.policy
     current = best
@@ -65,10 +65,10 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
         failing = sorted((c for c in members if not holds(c, policy)), key=lambda c: c.log_odds)
         lost = [members[i] for i in replaceable] or failing[:1]
         if not lost:
-            return members, given_up
+            return members, [c for c in given_up if c.explained_share > 0.0]
         given_up += lost
         current = search.fitted(tuple(c.effect for c in members if c not in lost), converged=True)
-    return [], given_up
+    return [], [c for c in given_up if c.explained_share > 0.0]
 
 
 def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
