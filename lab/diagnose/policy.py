@@ -240,7 +240,7 @@ class DecisionPolicy(Frozen):
         Rule(
             "name",
             "1",
-            "share of a stronger effect's size below which an effect beside it counts as that one's law's error",
+            "share of a stronger effect's size below which an effect beside it counts as that one's law's error, unless nothing departs with it and something without it",
             TUNED,
         ),
     ] = 0.03

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
+from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate, explained, weigh
@@ -90,6 +91,7 @@ def _too_weak(search: Search, fit: Fit) -> tuple[int, bool] | None:
     log_odds = [fit.log_posterior - search.without(fit, i).log_posterior for i in range(len(fit.effects))]
     members = [Candidate(e, s, 0.0, (), odds) for e, s, odds in zip(fit.effects, fit.std, log_odds, strict=True)]
     companions = [c for c in members if _is_companion(c, members, search)]
+    companions = [c for c in companions if not _settles(search, fit, members.index(c))]
 
     def needed(candidate: Candidate) -> float:
         factor = policy.added_threshold_factor if _is_beside_stronger(candidate, members, search) else 1.0
@@ -99,6 +101,16 @@ def _too_weak(search: Search, fit: Fit) -> tuple[int, bool] | None:
     if not weak:
         return None
     return members.index(min(weak, key=lambda c: c.log_odds)), bool(companions)
+
+
+def _settles(search: Search, fit: Fit, index: int) -> bool:
+    """Whether nothing departs from the set, within its laws' tolerances, and something does without one member: that is no error of the
+    others' laws."""
+    model, policy = search.model, search.policy
+    without = search.without(fit, index)
+    return not mismatches(model, model.gaussian(fit.effects), policy) and bool(
+        mismatches(model, model.gaussian(without.effects), policy)
+    )
 
 
 def _is_beside_stronger(candidate: Candidate, members: Sequence[Candidate], search: Search) -> bool:
