@@ -311,7 +311,7 @@ class DecisionPolicy(Frozen):
         Rule(
             "budget of the search",
             "s",
-            "CPU time of one side after which no further set is refitted, and no rival; these are listed",
+            "CPU time of one side's search after which no further set is refitted, and no rival; these are listed",
             "chosen: the challenge's limit for a whole diagnosis",
         ),
     ] = 120.0

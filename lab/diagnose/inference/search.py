@@ -150,6 +150,8 @@ class Search:
         for fit in sorted(self._listed(), key=self.promised_log_odds, reverse=True):
             if self.promised_log_odds(fit) <= self.log_odds(best or current) + self.policy.exchange_log_odds:
                 break
+            if self.is_spent and best is not None:
+                break
             whole = self.fitted(fit.effects, converged=True)
             gain = self.log_odds(whole) - self.log_odds(current)
             is_better = best is None or self.log_odds(whole) > self.log_odds(best)

@@ -170,6 +170,9 @@ def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, st
         return -np.inf, ""
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     starts = [(*rest, OtherFNumber(ratio=ratio)) for ratio in F_NUMBER_RATIOS]
+    if search.is_spent and not search.is_known(starts[0]):
+        search.leave(starts[0])
+        return -np.inf, ""
     tried = search.fitted(max(starts, key=lambda s: log_likelihood(model, s)), beside=fit)
     if tried.log_posterior < fit.log_posterior - policy.hopeless_log_odds:
         return -np.inf, ""
