@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from lab.diagnose.inference.search import ModelSet
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.results import EffectSet, IncludedEffect, NamedEffect, SideModels
+from lab.formats.results import EffectSet, IncludedEffect, NamedEffect, SideModels, Unexplained
 from sim.camera import Side
 
 #: Sets that a sentence lists.
@@ -25,13 +25,18 @@ def side_models(side: Side, found: ModelSet, policy: DecisionPolicy) -> SideMode
 
 
 def set_sentences(
-    models: Sequence[SideModels], effects: Sequence[NamedEffect], policy: DecisionPolicy
+    models: Sequence[SideModels],
+    effects: Sequence[NamedEffect],
+    unexplained: Sequence[Unexplained],
+    policy: DecisionPolicy,
 ) -> Iterator[str]:
-    """What the sets say beyond the names: effects that are neither named nor among the rivals of a name; and what the budget left."""
+    """What the sets say beyond the names: effects that are neither named nor among the rivals of a name, where the names explain
+    everything, as sets of listed effects fit an unlisted cause badly; and what the budget left."""
     for one in models:
         named = [e for e in effects if one.side in e.sides]
         told = {n for e in named for n in (e.name, *e.alternatives)}
-        if named and any(name not in told for s in one.sets for name in s.effects):
+        is_whole = named and all(u.side != one.side for u in unexplained)
+        if is_whole and any(name not in told for s in one.sets for name in s.effects):
             sets = ", ".join(f"{_words(s.effects)} ({100 * s.probability:.0f} %)" for s in one.sets[:LISTED_SETS])
             more = f" and {len(one.sets) - LISTED_SETS} more" if len(one.sets) > LISTED_SETS else ""
             yield (

@@ -224,7 +224,7 @@ def _summary(
     ]
     lines += dict.fromkeys(u.check for u in unexplained if u.check)
     lines += [v.statement for v in vetoed]
-    lines += set_sentences(models, effects, policy)
+    lines += set_sentences(models, effects, unexplained, policy)
     if held_out is not None and held_out.chi2_after != held_out.chi2_before:
         way = "falls" if held_out.chi2_after < held_out.chi2_before else "rises"
         lines.append(

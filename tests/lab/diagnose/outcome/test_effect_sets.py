@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from lab.diagnose.inference.search import Model, ModelSet
 from lab.diagnose.outcome.effect_sets import set_sentences, side_models
 from lab.diagnose.policy import DecisionPolicy
-from lab.formats.results import NamedEffect, Rival, SideModels
+from lab.formats.results import NamedEffect, Rival, SideModels, Unexplained
 
 POLICY = DecisionPolicy()
 
@@ -24,8 +24,8 @@ def _models(*sets: tuple[Sequence[str], float], left: Sequence[tuple[str, ...]] 
     return side_models("left", found, POLICY)
 
 
-def _told(models: SideModels, *effects: NamedEffect) -> str:
-    return " ".join(set_sentences([models], effects, POLICY))
+def _told(models: SideModels, *effects: NamedEffect, left: Sequence[Unexplained] = ()) -> str:
+    return " ".join(set_sentences([models], effects, left, POLICY))
 
 
 def test_sets_are_told_where_they_hold_what_no_name_does() -> None:
@@ -34,6 +34,11 @@ def test_sets_are_told_where_they_hold_what_no_name_does() -> None:
     assert _told(_models((["defocus"], 0.97)), _named("defocus")) == ""
     rivals = _models((["defocus"], 0.67), (["coma"], 0.3))
     assert _told(rivals, _named("defocus", "coma")) == ""  # said of the name already
+    left = Unexplained(
+        side="left", measurement="slanted_edge", axis="spatial_frequency", where="all", shape="irregular", significance_sigma=9.0,
+        chi2_before=300.0, chi2_after=290.0, n=60,
+    )  # fmt: skip
+    assert _told(both, _named("defocus"), left=[left]) == ""  # an unlisted cause is there
     assert _told(both) == ""  # nothing is named: what else it is was weighed, too
 
 
