@@ -302,7 +302,7 @@ class DecisionPolicy(Frozen):
         Rule(
             "budget of the search",
             "1",
-            "share of a name's gain that an effect promises in closed form, from which on it is fitted in its place",
+            "share of a name's gain that an effect promises in closed form, from which on it is fitted in its place; and of the best score beside a set, from which on an effect is added",
             "a refit of a large effect may gain two and a half times what its small signature promises; " + TUNED,
         ),
     ] = 0.4

@@ -197,9 +197,9 @@ class Search:
         return list(found.values())[: self.policy.refitted_pairs if wide else self.policy.refitted_sets]
 
     def _extensions(self, current: Fit) -> list[_Proposal]:
-        """One effect more."""
+        """One effect more: those that promise a share of what the best does. The others are scored again about the set with that one."""
         seen = self._seen_sets(current, 1)
-        least = 0.0 if current.effects or not seen else self.policy.promised_share * seen[0].score
+        least = self.policy.promised_share * seen[0].score if seen else 0.0
         return [self._proposal(current, one) for one in seen if one.score > least]
 
     def _wide_extensions(self, current: Fit) -> list[_Proposal]:
