@@ -240,7 +240,7 @@ class DecisionPolicy(Frozen):
         Rule(
             "name",
             "1",
-            "share of a stronger effect's size below which an effect beside it counts as that one's law's error",
+            "share of a stronger effect's size below which an effect beside it counts as that one's law's error, unless nothing departs with it and something without it",
             TUNED,
         ),
     ] = 0.03
@@ -279,41 +279,42 @@ class DecisionPolicy(Frozen):
     most_effects: Annotated[
         int, Rule("budget of the search", "1", "effects in one set", "chosen: twice what the proof's compounds have")
     ] = 4
-    screened_effects: Annotated[int, Rule("budget of the search", "1", "candidates refitted for one set", TUNED)] = 8
-    screened_pairs: Annotated[int, Rule("budget of the search", "1", "pairs refitted at the start", TUNED)] = 4
-    beam_width: Annotated[
-        int, Rule("budget of the search", "1", "sets of one size from which the search goes on", TUNED)
-    ] = 2
-    beam_log_odds: Annotated[
-        float,
+    refitted_sets: Annotated[
+        int,
         Rule(
             "budget of the search",
-            "log odds",
-            "distance from the best set within which the search goes on from a set",
-            TUNED,
+            "1",
+            "sets refitted in one step, and rivals of one name, the best in closed form",
+            "chosen: all sets of that size are compared in closed form before",
         ),
-    ] = 25.0
-    least_score_share: Annotated[
+    ] = 10
+    refitted_pairs: Annotated[
+        int,
+        Rule(
+            "budget of the search",
+            "1",
+            "pairs refitted in the place of one effect, or beside a set, where no single effect betters it",
+            "chosen: half of `refitted_sets`, as they come last",
+        ),
+    ] = 5
+    promised_share: Annotated[
         float,
         Rule(
             "budget of the search",
             "1",
-            "share of the best score below which a candidate isn't refitted",
-            "its refit would have to gain ten times what its signature promises",
+            "share of a name's gain that an effect promises in closed form, from which on it is fitted in its place; and of the best score beside a set, from which on an effect is added",
+            "a refit of a large effect may gain two and a half times what its small signature promises; " + TUNED,
         ),
-    ] = 0.1
-    rival_score_factor: Annotated[
+    ] = 0.4
+    search_cpu_s: Annotated[
         float,
         Rule(
             "budget of the search",
-            "score / log odds",
-            "score, over a name's gain, from which on any effect is fitted in its place (2: promises as much)",
-            TUNED,
+            "s",
+            "CPU time of one side's search after which no further set is refitted, and no rival; these are listed",
+            "chosen: the challenge's limit for a whole diagnosis",
         ),
-    ] = 1.2
-    near_rival_score_factor: Annotated[
-        float, Rule("budget of the search", "score / log odds", "the same of rivals", TUNED)
-    ] = 0.6
+    ] = 120.0
     rival_cosine: Annotated[
         float,
         Rule(
@@ -351,24 +352,12 @@ class DecisionPolicy(Frozen):
             "a probability of exp(-30) changes no decision",
         ),
     ] = 30.0
-    rough_fit_share: Annotated[
-        float,
-        Rule(
-            "budget of the search",
-            "1",
-            "share of a name's gain that a rival may lie behind after a rough fit and still be fitted to convergence",
-            TUNED,
-        ),
-    ] = 0.05
-    rough_fit_log_odds: Annotated[
-        float, Rule("budget of the search", "log odds", "upper limit of that distance, beside `rough_fit_steps`", TUNED)
-    ] = 100.0
     rough_fit_steps: Annotated[
         float,
         Rule(
             "budget of the search",
             "1",
-            "what is added to that limit, in gains that the rival's next Newton step promises",
+            "gain that a rough fit may still make, in gains that its next Newton step promises",
             TUNED,
         ),
     ] = 10.0
@@ -427,6 +416,15 @@ class DecisionPolicy(Frozen):
             "half of `false_alarm_rate`; rival sets' coverage: `calibench challenge score`",
         ),
     ] = 0.005
+    model_set_share: Annotated[
+        float,
+        Rule(
+            "report",
+            "1",
+            "probability that the listed sets of effects hold together",
+            "chosen; tests on linear problems: such sets hold the truth as often",
+        ),
+    ] = 0.95
     next_capture_share: Annotated[
         float,
         Rule(

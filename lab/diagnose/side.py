@@ -16,6 +16,7 @@ from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.metadata import misstatements
 from lab.diagnose.outcome.detectability import detectability
+from lab.diagnose.outcome.effect_sets import side_models
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
@@ -34,6 +35,7 @@ from lab.formats.results import (
     Mismatch,
     ResidualCurve,
     ResidualPicture,
+    SideModels,
     Skipped,
     Unexplained,
     VetoedName,
@@ -72,6 +74,7 @@ class SideFindings:
     abstained: tuple[Candidate, ...] = ()
     unexplained: tuple[Unexplained, ...] = ()
     vetoed: tuple[VetoedName, ...] = ()
+    models: SideModels | None = None
     held_out: HeldOut | None = None
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
@@ -141,6 +144,7 @@ def diagnose_side(
         abstained=verdict.abstained,
         unexplained=left,
         vetoed=tuple(vetoed_names(side, verdict)),
+        models=side_models(side, verdict.models, policy),
         held_out=held_out(verdict),
         curves=tuple(residual_curves(side, verdict)),
         improved=improved,

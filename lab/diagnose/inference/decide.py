@@ -20,8 +20,8 @@ from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import named_members
 from lab.diagnose.inference.outlying import OutlyingLevel, outlying_levels
 from lab.diagnose.inference.refit import log_likelihood
-from lab.diagnose.inference.score import signatures
-from lab.diagnose.inference.search import Search
+from lab.diagnose.inference.score import prototype_changes, signatures_of
+from lab.diagnose.inference.search import ModelSet, Search
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
@@ -37,6 +37,7 @@ class Verdict:
     `abstained`: candidates that weren't named. `discrepancies`: of the blocks that have a mismatch left. `held_out`: measurements whose
     held-out numbers contradict the model with the named effects, of those that have no other mismatch. `vetoed`: names that held-out
     numbers contradict. `outlying`: captures whose levels aren't those of what is stated, by the block that they alone disturb.
+    `models`: sets of effects with their probabilities.
     """
 
     model: MeasurementModel
@@ -50,6 +51,7 @@ class Verdict:
     held_out: tuple[Slice, ...] = ()
     vetoed: tuple[VetoedCandidate, ...] = ()
     outlying: Mapping[int, tuple[OutlyingLevel, ...]] = field(default_factory=dict)
+    models: ModelSet = field(default_factory=ModelSet)
 
     @property
     def kernels(self) -> dict[int, FloatArray]:
@@ -73,12 +75,13 @@ def decide(
     """The whole chain on one side's measurement model; deterministic for a given generator. `least_threshold` of the
     scores: from drawn healthy cameras, where there are any (`bootstrap.py`)."""
     known = candidates()
-    first = signatures(model, model.camera, (), known)
+    changes = prototype_changes(model, model.camera, (), known)
+    first = signatures_of(model, (), changes)
     threshold = max(first.threshold(rng, 1.0 - policy.false_alarm_rate, policy.threshold_draws), least_threshold)
     scores = first.scores()
     top = scores[0].value if scores else 0.0
     before = mismatches(model, model.gaussian(), policy)
-    search = Search(model, known, threshold, policy)
+    search = Search(model, known, changes, threshold, policy)
     named, abstained = named_members(search, search.best(report), report)
     if top > threshold + policy.lone_score_margin and not named and not before and not abstained:
         abstained.append(Candidate(scores[0].start, {}, 0.0, ((UNKNOWN, 1.0),), 0.5 * top))
@@ -110,9 +113,8 @@ def decide(
             continue
         if not parts:
             told = tuple(_with_either_sign(model, tied_family(c, policy), effects, policy) for c in named)
-            return _verdict(
-                Verdict(model, threshold, top, before, told, tuple(abstained), after, ()), left, refused, policy
-            )
+            plain = Verdict(model, threshold, top, before, told, tuple(abstained), after, (), models=search.models())
+            return _verdict(plain, left, refused, policy)
         # the weakest goes first: without it, what is left may be within the other laws' tolerances
         abstained.append(parts[-1])
         named = _refitted(search, named, parts[-1])

@@ -86,11 +86,14 @@ class Gaussian:
         return (split @ v[:, counts]) / s, s
 
     def _whiten_blocks(self, table: FloatArray) -> FloatArray:
-        """D^-1/2 times vectors; blocks in which all of them are zero are skipped."""
+        """D^-1/2 times vectors; of each block those that are zero there are skipped."""
         out = np.zeros_like(table)
         for block, at in zip(self.blocks, self.slices, strict=True):
-            if table[at].any():
+            use = table[at].any(axis=0)
+            if np.all(use):
                 out[at] = solve_triangular(block.lower, table[at], lower=True, check_finite=False)
+            elif np.any(use):
+                out[at, use] = solve_triangular(block.lower, table[at][:, use], lower=True, check_finite=False)
         return out
 
     def whiten(self, table: FloatArray) -> FloatArray:

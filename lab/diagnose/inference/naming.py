@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
+from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate, explained, weigh
@@ -19,7 +20,7 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
 
     One at a time: the weakest member that is too weak for any name; then the member for which a rival is likelier; then
     members that one discrepancy replaces, or whose name doesn't hold. After each change the rest is fitted and weighed
-    again.
+    again. What was given up and explains nothing isn't told.
     """
     model, policy = search.model, search.policy
     current = best
@@ -65,10 +66,10 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
         failing = sorted((c for c in members if not holds(c, policy)), key=lambda c: c.log_odds)
         lost = [members[i] for i in replaceable] or failing[:1]
         if not lost:
-            return members, given_up
+            return members, [c for c in given_up if c.explained_share > 0.0]
         given_up += lost
         current = search.fitted(tuple(c.effect for c in members if c not in lost), converged=True)
-    return [], given_up
+    return [], [c for c in given_up if c.explained_share > 0.0]
 
 
 def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
@@ -90,6 +91,7 @@ def _too_weak(search: Search, fit: Fit) -> tuple[int, bool] | None:
     log_odds = [fit.log_posterior - search.without(fit, i).log_posterior for i in range(len(fit.effects))]
     members = [Candidate(e, s, 0.0, (), odds) for e, s, odds in zip(fit.effects, fit.std, log_odds, strict=True)]
     companions = [c for c in members if _is_companion(c, members, search)]
+    companions = [c for c in companions if not _settles(search, fit, members.index(c))]
 
     def needed(candidate: Candidate) -> float:
         factor = policy.added_threshold_factor if _is_beside_stronger(candidate, members, search) else 1.0
@@ -99,6 +101,16 @@ def _too_weak(search: Search, fit: Fit) -> tuple[int, bool] | None:
     if not weak:
         return None
     return members.index(min(weak, key=lambda c: c.log_odds)), bool(companions)
+
+
+def _settles(search: Search, fit: Fit, index: int) -> bool:
+    """Whether nothing departs from the set, within its laws' tolerances, and something does without one member: that is no error of the
+    others' laws."""
+    model, policy = search.model, search.policy
+    without = search.without(fit, index)
+    return not mismatches(model, model.gaussian(fit.effects), policy) and bool(
+        mismatches(model, model.gaussian(without.effects), policy)
+    )
 
 
 def _is_beside_stronger(candidate: Candidate, members: Sequence[Candidate], search: Search) -> bool:

@@ -7,14 +7,14 @@ the covariance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import combinations
 
 import numpy as np
 from scipy.optimize import nnls
 
+from lab.diagnose.inference.closed_form import LinearProblem, LinearSet
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.block import Effects
 from sim.camera import CameraModel
@@ -45,14 +45,6 @@ class Score:
     def start(self) -> Effect:
         """The instance from which a refit starts."""
         return self.begin()
-
-
-@dataclass(frozen=True)
-class Pair:
-    """The same statistic of two effects together."""
-
-    value: float
-    starts: tuple[Effect, Effect]
 
 
 @dataclass(frozen=True)
@@ -94,29 +86,21 @@ class Signatures:
         """|r|^2 - |r - g|^2 of an effect as it stands; negative where it only adds."""
         return float(2.0 * signature @ self.white - signature @ signature)
 
-    def pairs(self, count: int) -> list[Pair]:
-        """The best pairs of two effects by their common score, highest first. Of two effects that act on the same
-        numbers, neither may be the best alone. Computed in the span of the signatures, which is of low dimension."""
-        best: dict[str, tuple[float, tuple[Effect, ...], FloatArray]] = {}
-        for effect, prototypes, table in self.columns:
-            value, _ = _cone_score(table, self.white)
-            if effect.name not in best or value > best[effect.name][0]:
-                best[effect.name] = value, prototypes, table
-        if len(best) < 2:
-            return []
-        basis = _span(np.concatenate([table for _, _, table in best.values()], axis=1))
-        white = basis.T @ self.white
-        members = [(prototypes, basis.T @ table) for _, prototypes, table in best.values()]
+    def problem(self, cost: Mapping[str, float]) -> LinearProblem:
+        """The linear problem of all sets of candidates; `cost`: log odds that each has to earn, by name."""
+        return LinearProblem.of(self.white, [t for _, _, t in self.columns], [e.name for e, _, _ in self.columns], cost)
+
+    def starts(self, one: LinearSet) -> tuple[Effect, ...]:
+        """Where a refit of a set of this problem starts: its members scaled by their shares; a single one as `Score.start`."""
         found = []
-        for (first, one), (second, two) in combinations(members, 2):
-            value, share = _cone_score(np.concatenate([one, two], axis=1), white)
-            found.append((value, first, share[: len(first)], second, share[len(first) :]))
-        found.sort(key=lambda pair: -pair[0])
-        return [
-            Pair(value, (_combined(type(first[0]), first, mine), _combined(type(second[0]), second, other)))
-            for value, first, mine, second, other in found[:count]
-            if mine.any() and other.any()
-        ]
+        for member, share in zip(one.members, one.share, strict=True):
+            effect, prototypes, _ = self.columns[member]
+            found.append(_combined(effect, prototypes, share))
+        if len(found) == 1:
+            name = found[0].name
+            single = [(self._chi2_taken(t[:, 0]), p[0]) for e, p, t in self.columns if e.name == name and len(p) == 1]
+            return (self._nearest(found[0], single),)
+        return tuple(found)
 
     def threshold(self, rng: np.random.Generator, quantile: float, draws: int) -> float:
         """The quantile of the largest score over draws of white noise, projected on the span of the signatures.
@@ -141,6 +125,25 @@ class Signatures:
         return float(np.quantile(top, quantile))
 
 
+#: Of every candidate and each of its alternative sets of prototypes: the prototypes, and their changes of the seen numbers
+#: (n, prototypes).
+Changes = Sequence[tuple[type[Effect], tuple[Effect, ...], FloatArray]]
+
+
+def prototype_changes(
+    model: MeasurementModel, camera: CameraModel, current: Effects, candidates: Iterable[type[Effect]]
+) -> Changes:
+    """What all prototypes of the candidates change beside a set of `current` effects. Candidates that change nothing that was measured
+    are left out."""
+    base = model.mean(current)
+    return [
+        (effect, prototypes, np.stack([model.mean((*current, e)) - base for e in prototypes], axis=1)[model.seen])
+        for effect in candidates
+        if model.affected(effect).any()
+        for prototypes in effect.prototypes(camera)
+    ]
+
+
 def signatures(
     model: MeasurementModel,
     camera: CameraModel,
@@ -149,27 +152,35 @@ def signatures(
     jacobian: FloatArray | None = None,
 ) -> Signatures:
     """Residual and signatures about a set of `current` effects. `jacobian` (n, p) by the parameters of these is
-    projected out. Candidates that change nothing that was measured are left out."""
-    seen = model.seen
+    projected out."""
+    return signatures_of(model, current, prototype_changes(model, camera, current, candidates), jacobian)
+
+
+def signatures_of(
+    model: MeasurementModel, current: Effects, changes: Changes, jacobian: FloatArray | None = None
+) -> Signatures:
+    """The same of changes that are known, by the covariance that `current` effects give. Those beside a smaller set stand for those
+    beside `current`: an effect's change depends little on what it stands beside."""
     gaussian = model.seen_gaussian(current)
-    base = model.mean(current)
     white = gaussian.whiten(model.seen_value - gaussian.mean)
     out = np.zeros((len(white), 0))
     if jacobian is not None and jacobian.size:
-        out = _span(gaussian.whiten(jacobian[seen]))
+        out = _span(gaussian.whiten(jacobian[model.seen]))
         white = white - out @ (out.T @ white)
 
-    def whitened_changes(effects: Sequence[Effect]) -> FloatArray:
-        raw = np.stack([model.mean((*current, e)) - base for e in effects], axis=1)[seen]
+    def whitened(raw: FloatArray) -> FloatArray:
         table = gaussian.whiten(raw)
         return np.asarray(table - out @ (out.T @ table))
 
+    def whitened_changes(effects: Sequence[Effect]) -> FloatArray:
+        base = model.mean(current)
+        return whitened(np.stack([model.mean((*current, e)) - base for e in effects], axis=1)[model.seen])
+
     columns = []
-    for effect in candidates:
-        if not model.affected(effect).any():
-            continue
-        for prototypes in effect.prototypes(camera):
-            table = whitened_changes(prototypes)
+    if changes:
+        stacked = whitened(np.concatenate([raw for _, _, raw in changes], axis=1))
+        tables = np.split(stacked, np.cumsum([raw.shape[1] for _, _, raw in changes])[:-1], axis=1)
+        for (effect, prototypes, _), table in zip(changes, tables, strict=True):
             # smaller ones are rounding: scaled to unit length, they would count in the threshold as any other
             if np.linalg.norm(table, axis=0).max(initial=0.0) > LEAST_SIGNATURE:
                 columns.append((effect, prototypes, table))

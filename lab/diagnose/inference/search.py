@@ -1,79 +1,113 @@
-"""Which set of effects explains the seen numbers best: a beam search over sets, starting from single effects and
-pairs."""
+"""Which sets of effects explain the seen numbers: all small sets are compared in closed form about the sets fitted so far, the best
+few are refitted in full, until none is better."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain, zip_longest
 
+from lab.diagnose.inference.closed_form import LinearProblem, LinearSet, posterior, smallest_set
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import Fit, refit
+from lab.diagnose.inference.refit import Fit, log_likelihood, refit
 from lab.diagnose.inference.rivals import session_rivals
-from lab.diagnose.inference.score import signatures
+from lab.diagnose.inference.score import Changes, Signatures, signatures_of
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
+
+#: Largest number of effects that one step adds to a set.
+LARGEST_STEP = 3
+#: Steps of the search: each adds an effect or exchanges one, at least.
+MOST_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Model:
+    """A set of effects by name, with its posterior probability among all sets of listed effects."""
+
+    effects: tuple[str, ...]
+    probability: float
+
+
+@dataclass(frozen=True)
+class ModelSet:
+    """What the search says: the smallest set of models that holds `policy.model_set_share`, likeliest first; every effect's probability
+    of being a part, likeliest first; and what the budget left, sets of effects by name."""
+
+    models: tuple[Model, ...] = ()
+    inclusion: tuple[tuple[str, float], ...] = ()
+    not_weighed: tuple[tuple[str, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Proposal:
+    """A set to be refitted: where that starts, and the set whose Jacobian it reuses."""
+
+    start: tuple[Effect, ...]
+    beside: Fit
+
+    @property
+    def key(self) -> frozenset[str]:
+        return frozenset(e.name for e in self.start)
 
 
 @dataclass
 class Search:
     """The sets that were fitted so far, by their effects' names, and the search over further ones.
 
-    `threshold` is that of the scores: twice the log odds that every effect has to earn. `refitted_again` holds the
-    names of sets that were fitted from a second start.
+    `threshold` is that of the scores: twice the log odds that every effect has to earn. `changes`: of the candidates' prototypes, beside
+    no effect. `refitted_again` holds the names of sets that were fitted from a second start. `clock` gives the CPU time (s) that the
+    budget is counted in, from the search's beginning. `not_weighed`: what the budget left.
     """
 
     model: MeasurementModel
     candidates: tuple[type[Effect], ...]
+    changes: Changes
     threshold: float
     policy: DecisionPolicy = field(default_factory=DecisionPolicy)
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
     refitted_again: set[frozenset[str]] = field(default_factory=set)
+    clock: Callable[[], float] = time.process_time
+    not_weighed: dict[frozenset[str], tuple[str, ...]] = field(default_factory=dict)
+    _signatures: dict[tuple[Effect, ...], Signatures] = field(default_factory=dict)
+    _problems: dict[tuple[Effect, ...], LinearProblem] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._begin = self.clock()
 
     @cached_property
     def rivals(self) -> Mapping[str, frozenset[str]]:
         """Effects whose signatures in these recordings are alike, by name; a symmetric relation."""
         return session_rivals(self.model, self.candidates, self.policy.rival_cosine)
 
+    @property
+    def is_spent(self) -> bool:
+        """Whether the budget is."""
+        return self.clock() - self._begin > self.policy.search_cpu_s
+
+    def signatures(self, fit: Fit) -> Signatures:
+        """Residual and signatures about a fitted set, its parameters projected out, of the candidates that aren't in it."""
+        if fit.effects not in self._signatures:
+            others = [c for c in self.changes if c[0].name not in fit.names]
+            self._signatures[fit.effects] = signatures_of(self.model, fit.effects, others, fit.jacobian)
+        return self._signatures[fit.effects]
+
+    # --- log odds ----------------------------------------------------------------------------------------------------
+
     def log_odds(self, fit: Fit) -> float:
         """Log posterior of a set, less half the threshold for every effect: one healthy camera in a hundred reaches
         that."""
         return fit.log_posterior - 0.5 * self.threshold * len(fit.effects)
 
-    def best(self, report: Callable[[str], None] = lambda _: None) -> Fit:
-        """Grow sets effect by effect; then leave out and exchange members while the log odds rise."""
-        current = self.fitted((), converged=True)
-        beam = [current]
-        for count in range(self.policy.most_effects):
-            report(f"looking for {'another' if count else 'an'} effect")
-            grown = [fit for state in beam for fit in self._grown(state)]
-            grown = sorted({frozenset(f.names): f for f in grown}.values(), key=self.log_odds, reverse=True)
-            kept = self._without_exchanges(grown)[: self.policy.beam_width]
-            beam = [self.fitted(f.effects, converged=True) for f in kept]
-            beam = sorted(beam, key=self.log_odds, reverse=True)
-            if not beam or self.log_odds(beam[0]) < self.log_odds(current) - self.policy.beam_log_odds:
-                break
-            if self.log_odds(beam[0]) <= self.log_odds(current) and count:
-                break
-            beam = [f for f in beam if self.log_odds(f) > self.log_odds(beam[0]) - self.policy.beam_log_odds]
-            if self.log_odds(beam[0]) > self.log_odds(current) + self._added_cost(beam[0], current):
-                current = beam[0]
-        return self._improved(current)
-
-    def _without_exchanges(self, sets: Sequence[Fit]) -> list[Fit]:
-        """Sets, best first, without those that are a better one with a member exchanged for its rival: they would grow
-        alike, and the exchange is tried in the end (`_exchanged`)."""
-        kept: list[Fit] = []
-        for one in sets:
-            if not any(self._is_exchange(one, better) for better in kept):
-                kept.append(one)
-        return kept
-
-    def _is_exchange(self, one: Fit, other: Fit) -> bool:
-        mine = [e for e in one.effects if e.name not in other.names]
-        theirs = [e for e in other.effects if e.name not in one.names]
-        return len(mine) == len(theirs) == 1 and mine[0].name in self.rivals[theirs[0].name]
+    @cached_property
+    def _cost(self) -> dict[str, float]:
+        """Log odds that each effect has to earn."""
+        kinds = {e.name: [q for q in e.quantities().values() if not q.dispensable] for e in self.candidates}
+        return {n: 0.5 * self.threshold + self.policy.parameter_log_odds * len(q) for n, q in kinds.items()}
 
     def _added_cost(self, fit: Fit, grown_from: Fit) -> float:
         """Log odds that an added effect has to earn beyond its own, where it shows most in a block on which an earlier
@@ -86,47 +120,154 @@ class Search:
         overlap = any(block.touched_by(e) for block in strongest for e in old)
         return 0.5 * (self.policy.added_threshold_factor - 1.0) * self.threshold if overlap else 0.0
 
-    def _grown(self, state: Fit) -> list[Fit]:
-        """Rough fits of the set with one more effect, the best by score; from no effect, also of the best pairs."""
-        policy = self.policy
-        found = signatures(
-            self.model,
-            self.model.camera,
-            state.effects,
-            [e for e in self.candidates if e.name not in state.names],
-            state.jacobian,
+    # --- search ------------------------------------------------------------------------------------------------------
+
+    def best(self, report: Callable[[str], None] = lambda _: None) -> Fit:
+        """From no effect on: the likeliest of the sets with one effect more, one exchanged or one less, until the log odds don't rise;
+        then of the sets with one effect exchanged for two, or two or three more that by themselves aren't seen. Of each kind the best in
+        closed form are refitted, about the current set, or about it without the member that is exchanged."""
+        current = self.fitted((), converged=True)
+        for step in range(MOST_STEPS):
+            report(f"looking for {'another' if step else 'an'} effect")
+            better = self._refitted(current, wide=False) or self._refitted(current, wide=True)
+            if better is None:
+                break
+            current = better
+        return current
+
+    def _refitted(self, current: Fit, *, wide: bool) -> Fit | None:
+        """The likeliest of the sets about the current one, refitted as far as the budget goes; None where it is no better."""
+        for proposal in self._proposals(current, wide=wide):
+            if self.is_spent:
+                self.leave(proposal.start)
+            else:
+                self.fitted(proposal.start, beside=proposal.beside)
+        return self._better(current)
+
+    def _better(self, current: Fit) -> Fit | None:
+        """The likeliest set that was fitted, to convergence, if it is likelier than the current one by what counts."""
+        best: Fit | None = None
+        for fit in sorted(self._listed(), key=self.promised_log_odds, reverse=True):
+            if self.promised_log_odds(fit) <= self.log_odds(best or current) + self.policy.exchange_log_odds:
+                break
+            if self.is_spent and best is not None:
+                break
+            whole = self.fitted(fit.effects, converged=True)
+            gain = self.log_odds(whole) - self.log_odds(current)
+            is_better = best is None or self.log_odds(whole) > self.log_odds(best)
+            if is_better and gain > self.policy.exchange_log_odds and gain > self._added_cost(whole, current):
+                best = whole
+        return best
+
+    def _listed(self) -> list[Fit]:
+        """The sets that hold nothing but effects of the library."""
+        return [f for f in self.fits.values() if self._is_listed(f)]
+
+    def _is_listed(self, fit: Fit) -> bool:
+        return all(e.is_candidate for e in fit.effects)
+
+    def promised_log_odds(self, fit: Fit) -> float:
+        """Log odds that a fit may reach when it has converged: by further steps, and without dispensable parameters."""
+        if fit.converged:
+            return self.log_odds(fit)
+        dispensable = sum(q.dispensable for e in fit.effects for q in type(e).quantities().values())
+        further = self.policy.rough_fit_steps * fit.promised_gain + self.policy.parameter_log_odds * dispensable
+        return self.log_odds(fit) + further
+
+    def is_known(self, effects: Effects) -> bool:
+        """Whether these effects were fitted together."""
+        return frozenset(e.name for e in effects) in self.fits
+
+    def leave(self, effects: Effects) -> None:
+        """Note a set that the budget leaves without a refit."""
+        if not self.is_known(effects):
+            self.not_weighed[frozenset(e.name for e in effects)] = tuple(e.name for e in effects)
+
+    def _proposals(self, current: Fit, *, wide: bool) -> list[_Proposal]:
+        """The sets to be refitted next, of every kind the best in turn, as a linear problem compares sets about one fit better than about
+        several."""
+        extended, exchanged = (
+            (self._wide_extensions, self._wide_exchanges) if wide else (self._extensions, self._exchanges)
         )
-        every = found.scores()
-        least = max(self.threshold, policy.least_score_share * every[0].value) if every else self.threshold
-        scores = [s for s in every if s.value > least][: policy.screened_effects]
-        starts: list[Effects] = [(*state.effects, s.start) for s in scores]
-        if not state.effects:
-            single = every[0].value if every else self.threshold
-            pairs = found.pairs(policy.screened_pairs)
-            starts += [pair.starts for pair in pairs if pair.value > single + self.threshold]
-        return [self.fitted(start, beside=state) for start in starts]
+        kinds = [extended(current), *(exchanged(current, i) for i in range(len(current.effects)))]
+        found: dict[frozenset[str], _Proposal] = {}
+        for one in chain.from_iterable(zip_longest(*kinds)):
+            if one is not None and one.key not in self.fits:
+                found.setdefault(one.key, one)
+        return list(found.values())[: self.policy.refitted_pairs if wide else self.policy.refitted_sets]
 
-    def _improved(self, fit: Fit) -> Fit:
-        """The set with members left out, or exchanged for a rival, while the log odds rise."""
-        while fit.effects:
-            others = [tuple(e for e in fit.effects if e is not gone) for gone in fit.effects]
-            tried = [self.fitted(rest, converged=True) for rest in others]
-            if len(fit.effects) > 1:
-                tried += [f for i, rest in enumerate(tuple(tried)) for f in self._exchanged(fit, i, rest)]
-            better = max(tried, key=self.log_odds)
-            if self.log_odds(better) <= self.log_odds(fit) + self.policy.exchange_log_odds:
-                return fit
-            fit = self.fitted(better.effects, converged=True)
-        return fit
+    def _extensions(self, current: Fit) -> list[_Proposal]:
+        """One effect more: those that promise a share of what the best does. The others are scored again about the set with that one."""
+        seen = self._seen_sets(current, 1)
+        least = self.policy.promised_share * seen[0].score if seen else 0.0
+        return [self._proposal(current, one) for one in seen if one.score > least]
 
-    def _exchanged(self, fit: Fit, index: int, without: Fit) -> list[Fit]:
-        """Rough fits with a rival in the place of one member; `without`: the fit without that member."""
-        rest = (*fit.effects[:index], *fit.effects[index + 1 :])
-        rivals = self.rivals[fit.effects[index].name]
-        kinds = [e for e in self.candidates if e.name in rivals and e.name not in fit.names]
-        scores = signatures(self.model, self.model.camera, rest, kinds).scores()
-        least = self.policy.rival_score_factor * (fit.log_posterior - without.log_posterior)
-        return [self.fitted((*rest, s.start), beside=without) for s in scores if s.value > least]
+    def _wide_extensions(self, current: Fit) -> list[_Proposal]:
+        """Two effects more, or three, where fewer aren't seen. What hides a pair is fitted first and exchanged for it then, as sets are
+        compared better about a fit that is nearer."""
+        seen: list[LinearSet] = []
+        for size in range(1, LARGEST_STEP + 1):
+            seen = seen or self._seen_sets(current, size)
+        return [self._proposal(current, one) for one in seen if len(one.members) > 1]
+
+    def _exchanges(self, current: Fit, index: int) -> list[_Proposal]:
+        """One effect in the place of a member: it has to promise a share of what that one gains."""
+        origin, gone = self._less(current, index), current.effects[index].name
+        least = 2.0 * self.policy.promised_share * (current.log_posterior - origin.log_posterior)
+        names = self.problem(origin).owners
+        seen = [one for one in self._seen_sets(origin, 1) if one.score > least and names[one.members[0]] != gone]
+        return [self._proposal(origin, one) for one in seen]
+
+    def _wide_exchanges(self, current: Fit, index: int) -> list[_Proposal]:
+        """Two effects in the place of a member. Where one of them was fitted in its place, the other is scored about that fit, which has
+        to promise more than the current set has. Of other pairs, the score has to be above the member's by what an effect has to earn."""
+        origin, gone = self._less(current, index), current.effects[index].name
+        problem, rest = self.problem(origin), frozenset(origin.names)
+        halves = [f for key, f in self.fits.items() if rest < key and len(key) == len(rest) + 1 and gone not in key]
+        found: list[tuple[float, _Proposal]] = []
+        for half in (f for f in halves if self._is_listed(f)):
+            names = self.problem(half).owners
+            for one in self._seen_sets(half, 1):
+                promised = self.promised_log_odds(half) + one.log_odds
+                if names[one.members[0]] != gone and promised > self.log_odds(current):
+                    found.append((promised, self._proposal(half, one)))
+        fitted = {gone, *(name for half in halves for name in half.names if name not in rest)}
+        own = problem.singles[gone].score if gone in problem.singles else 0.0
+        for one in self._seen_sets(origin, 2):
+            if one.score > own + self.threshold and fitted.isdisjoint(problem.owners[m] for m in one.members):
+                found.append((self.log_odds(origin) + one.log_odds, self._proposal(origin, one)))
+        return [proposal for _, proposal in sorted(found, key=lambda item: -item[0])]
+
+    def _less(self, fit: Fit, index: int) -> Fit:
+        """The set without one of its members."""
+        return self.fitted((*fit.effects[:index], *fit.effects[index + 1 :]), converged=True)
+
+    def _seen_sets(self, origin: Fit, size: int) -> list[LinearSet]:
+        """The sets of `size` effects beside `origin` in which every member is above the threshold, best first."""
+        if len(origin.effects) + size > self.policy.most_effects:
+            return []
+        sets = self.problem(origin).best(size)
+        return [one for one in sets if one.score > self.threshold * size]
+
+    def problem(self, fit: Fit) -> LinearProblem:
+        """The linear problem about a fitted set."""
+        if fit.effects not in self._problems:
+            self._problems[fit.effects] = self.signatures(fit).problem(self._cost)
+        return self._problems[fit.effects]
+
+    def _proposal(self, origin: Fit, one: LinearSet) -> _Proposal:
+        return _Proposal(self._start(origin, self.signatures(origin).starts(one)), origin)
+
+    def _start(self, origin: Fit, linear: Effects) -> tuple[Effect, ...]:
+        """Where the refit of a set starts: at the linear problem's coefficients, or where its members stood when each was fitted by
+        itself, as a large effect isn't linear: whichever is likelier."""
+        alone = [self.fits.get(frozenset((e.name,))) for e in linear]
+        if origin.effects or len(linear) < 2 or not any(alone):
+            return (*origin.effects, *linear)
+        mixed = tuple(e if fit is None else fit.effects[0] for e, fit in zip(linear, alone, strict=True))
+        return max((tuple(linear), mixed), key=lambda start: log_likelihood(self.model, start))
+
+    # --- fits --------------------------------------------------------------------------------------------------------
 
     def fitted(self, start: Effects, *, converged: bool = False, again: bool = False, beside: Fit | None = None) -> Fit:
         """The fit of a set of effects, made once: rough, which is enough to rank sets, or to convergence.
@@ -145,6 +286,7 @@ class Search:
         made = refit(self.model, begin, self.policy, rough=not converged, beside=None if converged else beside)
         if known is None or known.converged < converged or made.log_posterior > known.log_posterior:
             self.fits[key] = made
+        self.not_weighed.pop(key, None)
         return self.fits[key]
 
     def without(self, fit: Fit, index: int) -> Fit:
@@ -154,3 +296,26 @@ class Search:
         if rest and fit.log_posterior - without.log_posterior < self.policy.refit_again_log_odds:
             without = self.fitted(rest, converged=True, again=True)
         return without
+
+    # --- what it says ------------------------------------------------------------------------------------------------
+
+    def models(self) -> ModelSet:
+        """Every set that was fitted, with its probability by the log odds: rough fits that may reach a share are fitted to convergence."""
+        top = max(self.log_odds(f) for f in self._listed())
+        for fit in self._listed():
+            is_near = self.promised_log_odds(fit) > top + math.log(self.policy.least_rival_probability)
+            if not fit.converged and is_near and not self.is_spent:
+                self.fitted(fit.effects, converged=True)
+        fits = sorted(self._listed(), key=self.log_odds, reverse=True)
+        probability = posterior([self.log_odds(f) for f in fits])
+        kept = smallest_set(probability.tolist(), self.policy.model_set_share)
+        inclusion: dict[str, float] = {}
+        for fit, p in zip(fits, probability, strict=True):
+            for name in fit.names:
+                inclusion[name] = inclusion.get(name, 0.0) + float(p)
+        likely = [(n, min(p, 1.0)) for n, p in inclusion.items() if p >= self.policy.least_rival_probability]
+        return ModelSet(
+            tuple(Model(fits[i].names, float(probability[i])) for i in kept),
+            tuple(sorted(likely, key=lambda one: -one[1])),
+            tuple(self.not_weighed.values()),
+        )

@@ -12,7 +12,6 @@ from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.gaussian import Gaussian
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit, log_likelihood
-from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.search import Search
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
@@ -145,26 +144,19 @@ def _among_listed(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]
 
 
 def _rival_fits(search: Search, fit: Fit, index: int, without: Fit) -> dict[str, Fit]:
-    """The set with each likely effect in the place of a member: fitted roughly, and to convergence where it isn't far
-    behind."""
-    model, policy, name = search.model, search.policy, fit.effects[index].name
+    """The set with each effect in the place of a member that promises enough in closed form: fitted roughly, and to convergence
+    where it isn't far behind. What the budget leaves is noted."""
+    policy = search.policy
     log_odds = fit.log_posterior - without.log_posterior
-    others = [e for e in search.candidates if e.name not in fit.names]
-    scores = signatures(model, model.camera, without.effects, others, without.jacobian).scores()
-
-    def is_likely(rival: str, score: float) -> bool:
-        is_rival = rival in search.rivals[name]
-        return score > (policy.near_rival_score_factor if is_rival else policy.rival_score_factor) * log_odds
-
+    scores = [s for s in search.signatures(without).scores() if s.effect.name not in fit.names]
     found = {}
-    for score in [s for s in scores if is_likely(s.effect.name, s.value)][: policy.screened_effects]:
+    for score in [s for s in scores if 0.5 * s.value > policy.promised_share * log_odds][: policy.refitted_sets]:
         start = (*fit.effects[:index], score.start, *fit.effects[index + 1 :])
+        if search.is_spent and not search.is_known(start):
+            search.leave(start)
+            continue
         rough = search.fitted(start, beside=fit)
-        behind = min(
-            policy.rough_fit_share * log_odds,
-            policy.rough_fit_log_odds + policy.rough_fit_steps * rough.promised_gain,
-        )
-        is_near = rough.log_posterior > fit.log_posterior - policy.hopeless_log_odds - behind
+        is_near = search.promised_log_odds(rough) > search.log_odds(fit) - policy.hopeless_log_odds
         found[score.effect.name] = search.fitted(start, converged=True) if is_near else rough
     return found
 
@@ -178,6 +170,9 @@ def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, st
         return -np.inf, ""
     rest = (*fit.effects[:index], *fit.effects[index + 1 :])
     starts = [(*rest, OtherFNumber(ratio=ratio)) for ratio in F_NUMBER_RATIOS]
+    if search.is_spent and not search.is_known(starts[0]):
+        search.leave(starts[0])
+        return -np.inf, ""
     tried = search.fitted(max(starts, key=lambda s: log_likelihood(model, s)), beside=fit)
     if tried.log_posterior < fit.log_posterior - policy.hopeless_log_odds:
         return -np.inf, ""

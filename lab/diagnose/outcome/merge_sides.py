@@ -8,6 +8,7 @@ import numpy as np
 
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.library import measurement_title
+from lab.diagnose.outcome.effect_sets import set_sentences
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
@@ -20,6 +21,7 @@ from lab.formats.results import (
     NamedEffect,
     ParameterValue,
     Rival,
+    SideModels,
     Unexplained,
     VetoedName,
 )
@@ -47,6 +49,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
     elif effects:
         is_whole = not unexplained and not any(e.members and e.law == "inexact" for e in effects)
         verdict = "explained" if is_whole else "partly_explained"
+    models = tuple(f.models for f in found if f.models is not None)
     held_out = _held_out(found)
     offered = tuple(proposal.capture for f in found for proposal in f.proposals)
     return DiagnosisResult(
@@ -56,6 +59,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         effects=effects,
         unexplained=unexplained,
         vetoed=vetoed,
+        models=models,
         held_out=held_out,
         next_capture=LEAST_CAPTURES
         if verdict == "nothing_judged"
@@ -71,7 +75,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
         skipped=tuple(  # parts of one measurement give the same reason
             dict.fromkeys(s for f in found for s in f.skipped)
         ),
-        summary=tuple(_summary(verdict, mismatches, effects, unexplained, vetoed, held_out, policy)),
+        summary=tuple(_summary(verdict, mismatches, effects, unexplained, vetoed, models, held_out, policy)),
         policy=policy.told(),
     )
 
@@ -196,6 +200,7 @@ def _summary(
     effects: Sequence[NamedEffect],
     unexplained: Sequence[Unexplained],
     vetoed: Sequence[VetoedName],
+    models: Sequence[SideModels],
     held_out: HeldOut | None,
     policy: DecisionPolicy,
 ) -> list[str]:
@@ -219,6 +224,7 @@ def _summary(
     ]
     lines += dict.fromkeys(u.check for u in unexplained if u.check)
     lines += [v.statement for v in vetoed]
+    lines += set_sentences(models, effects, unexplained, policy)
     if held_out is not None and held_out.chi2_after != held_out.chi2_before:
         way = "falls" if held_out.chi2_after < held_out.chi2_before else "rises"
         lines.append(

@@ -144,6 +144,34 @@ class ResidualCurve(Frozen):
     held_out: bool
 
 
+class EffectSet(Frozen):
+    """A set of effects that may act together, with its posterior probability; the empty set is the baseline."""
+
+    effects: tuple[str, ...]
+    probability: float
+
+
+class IncludedEffect(Frozen):
+    """An effect, with the probability that it is a part of what acts: the sum over the sets that hold it."""
+
+    name: str
+    probability: float
+
+
+class SideModels(Frozen):
+    """What the search says of one side, if every cause is a listed effect.
+
+    `sets`: the fewest sets of effects that together hold `share` of the probability, likeliest first. `inclusion`: of all sets that were
+    fitted, likeliest first. `not_weighed`: sets that promised enough and that the budget of CPU time left without a refit.
+    """
+
+    side: Side
+    share: float
+    sets: tuple[EffectSet, ...]
+    inclusion: tuple[IncludedEffect, ...]
+    not_weighed: tuple[tuple[str, ...], ...] = ()
+
+
 class NextCapture(Frozen):
     """A capture that could be taken to tell rivals apart.
 
@@ -248,6 +276,7 @@ class DiagnosisResult(Frozen):
     effects: tuple[NamedEffect, ...] = ()
     unexplained: tuple[Unexplained, ...] = ()
     vetoed: tuple[VetoedName, ...] = ()
+    models: tuple[SideModels, ...] = ()
     held_out: HeldOut | None = None
     next_capture: str | None = None
     next_captures: tuple[NextCapture, ...] = ()  # best first, for each side

@@ -1,0 +1,56 @@
+"""The sets of effects that the search leaves, as a result and in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from lab.diagnose.inference.search import ModelSet
+from lab.diagnose.policy import DecisionPolicy
+from lab.formats.results import EffectSet, IncludedEffect, NamedEffect, SideModels, Unexplained
+from sim.camera import Side
+
+#: Sets that a sentence lists.
+LISTED_SETS = 5
+
+
+def side_models(side: Side, found: ModelSet, policy: DecisionPolicy) -> SideModels:
+    """What the search says of one side."""
+    return SideModels(
+        side=side,
+        share=policy.model_set_share,
+        sets=tuple(EffectSet(effects=m.effects, probability=m.probability) for m in found.models),
+        inclusion=tuple(IncludedEffect(name=n, probability=p) for n, p in found.inclusion),
+        not_weighed=found.not_weighed,
+    )
+
+
+def set_sentences(
+    models: Sequence[SideModels],
+    effects: Sequence[NamedEffect],
+    unexplained: Sequence[Unexplained],
+    policy: DecisionPolicy,
+) -> Iterator[str]:
+    """What the sets say beyond the names: effects that are neither named nor among the rivals of a name, where the names explain
+    everything, as sets of listed effects fit an unlisted cause badly; and what the budget left."""
+    for one in models:
+        named = [e for e in effects if one.side in e.sides]
+        told = {n for e in named for n in (e.name, *e.alternatives)}
+        is_whole = named and all(u.side != one.side for u in unexplained)
+        if is_whole and any(name not in told for s in one.sets for name in s.effects):
+            sets = ", ".join(f"{_words(s.effects)} ({100 * s.probability:.0f} %)" for s in one.sets[:LISTED_SETS])
+            more = f" and {len(one.sets) - LISTED_SETS} more" if len(one.sets) > LISTED_SETS else ""
+            yield (
+                f"For the {one.side} camera, if every cause is a listed effect, these sets of effects hold {100 * one.share:.0f} % together: "
+                f"{sets}{more}."
+            )
+        if one.not_weighed:
+            sets = "; ".join(_words(s) for s in one.not_weighed[:LISTED_SETS])
+            more = f"; and {len(one.not_weighed) - LISTED_SETS} more" if len(one.not_weighed) > LISTED_SETS else ""
+            yield (
+                f"The search for the {one.side} camera ended when its {policy.search_cpu_s:g} s of CPU time were spent. Not weighed: {sets}{more}; "
+                "a name may have rivals among these."
+            )
+
+
+def _words(effects: Sequence[str]) -> str:
+    return " with ".join(effects) if effects else "none"
