@@ -41,6 +41,9 @@ TRANSFER_AT = TRANSFER | {"image.shift"}
 #: 1e-4 of a 1 nm sum.
 OTF_WAVELENGTHS = 10
 
+#: Sum of the magnitudes of a sight's shares beyond which the nodes don't stand for its light: it lies beside them.
+MOST_SHARES = 2.0
+
 #: Wavelengths that land as near to each other as this are one image.
 TOGETHER_PX = 1e-9
 
@@ -244,16 +247,27 @@ def common_wavelengths(
     """Wavelengths (nm), at most `count`, that serve several sights (channel, light) at once, and how much each counts for each
     of them, (sights, wavelengths): sum 1 over a sight.
 
-    Gauss's nodes for the sights' mean spectral weight; the shares integrate the polynomial through the nodes, so that they may be
-    below 0. Transfers of broad and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's
+    Gauss's nodes for the sights' mean spectral weight without effects, so that transfers at the nodes are the same whatever effects do to
+    the light's colours; with effects where these put light beside the nodes or let wavelengths land apart; the shares integrate the polynomial through the nodes, so
+    that they may be below 0. Transfers of broad and narrow lights come out as by a sight's own nodes (2e-8 at 10 nodes; near a lens's
     cutoff, which is no polynomial in the wavelength, 5e-4).
     """
     found = _seen_light(camera, sights, effects, kind)
-    # sights have most of their wavelengths in common: each once
-    position, which = np.unique(np.concatenate([at for at, _ in found]), return_inverse=True)
-    pooled = np.bincount(which, np.concatenate([part for _, part in found])) / len(found)
-    nodes, _ = gauss_rule(position, pooled, count)
+    # what lets wavelengths land apart turns fast with the wavelength: at nodes of another light, ten are too few
+    if effects and not image_of(camera, effects).moves:
+        nodes = _pooled_nodes(_seen_light(camera, sights, (), kind), count)
+        shares = np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
+        if np.abs(shares).sum(axis=1).max() < MOST_SHARES:
+            return nodes, shares
+    nodes = _pooled_nodes(found, count)
     return nodes, np.concatenate([lagrange_shares(at, part[None], nodes) for at, part in found])
+
+
+def _pooled_nodes(seen: Sequence[tuple[FloatArray, FloatArray]], count: int) -> FloatArray:
+    """Gauss's nodes for the mean weight of several sights; these have most of their wavelengths in common: each once."""
+    position, which = np.unique(np.concatenate([at for at, _ in seen]), return_inverse=True)
+    pooled = np.bincount(which, np.concatenate([part for _, part in seen])) / len(seen)
+    return gauss_rule(position, pooled, count)[0]
 
 
 def wavelength_shares(

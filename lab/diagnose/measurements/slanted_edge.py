@@ -37,6 +37,7 @@ from sim.effects.base import Effect
 from sim.frame import charge_response
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.point import (
+    MOST_SHARES,
     TRANSFER_AT,
     common_wavelengths,
     detected_transfer,
@@ -136,7 +137,7 @@ class _Edges:
         #: cy/px of the numbers, real parts and then imaginary ones.
         self.frequencies = np.concatenate([REAL_AT, IMAGINARY_AT]) * top
         self._at = departure_shapes(self._quadrature, top)
-        self._spectral: dict[_Key, tuple[FloatArray, FloatArray, ComplexArray]] = {}
+        self._spectral: dict[tuple[_Key, bool], tuple[FloatArray, FloatArray, ComplexArray]] = {}
         self._blurred: dict[tuple[_Key, _Key, tuple[float, float]], ComplexArray] = {}
         self._changes: dict[_Key, FloatArray | None] = {}
         self._numbers_of: dict[_Key, FloatArray] = {}
@@ -265,7 +266,7 @@ class _Edges:
     def _sights_otf(self, effects: tuple[Effect, ...], place_um: tuple[float, float]) -> ComplexArray:
         """(sights, directions, nodes) at a place."""
         spectral = acting(effects, SPECTRAL)
-        nodes, shares, kink = self._wavelengths(spectral)
+        nodes, shares, kink = self._wavelengths(spectral, bool(acting(effects, frozenset({"image.shift"}))))
         fx, fy = self._frequencies
         moving = acting(effects, KERNELS) if self._camera.cfa != "MONO" else ()
         optical = acting(tuple(e for e in effects if e not in moving), TRANSFER_AT)
@@ -282,18 +283,30 @@ class _Edges:
         turn = np.deg2rad(self._turns)
         return np.outer(np.cos(turn), self._quadrature.frequency), np.outer(np.sin(turn), self._quadrature.frequency)
 
-    def _wavelengths(self, spectral: tuple[Effect, ...]) -> tuple[FloatArray, FloatArray, ComplexArray]:
-        """A few wavelengths (w,), their shares (sights, w), and what these few miss of the perfect lens's transfer."""
+    def _wavelengths(
+        self, spectral: tuple[Effect, ...], dispersed: bool
+    ) -> tuple[FloatArray, FloatArray, ComplexArray]:
+        """A few wavelengths (w,), their shares (sights, w), and what these few miss of the perfect lens's transfer. Of light that is
+        `dispersed` the transfer turns fast with the wavelength: the nodes are its own."""
 
         def worked_out() -> tuple[FloatArray, FloatArray, ComplexArray]:
             grid, perfect = self._perfect
             fine = wavelength_shares(self._camera, self._lit, grid, spectral)
-            few, _ = gauss_rule(grid, fine.mean(axis=0), WAVELENGTHS)
+            few = self._few
             share = lagrange_shares(grid, fine, few)
+            if dispersed or np.abs(share).sum(axis=1).max() > MOST_SHARES:
+                few, _ = gauss_rule(grid, fine.mean(axis=0), WAVELENGTHS)
+                share = lagrange_shares(grid, fine, few)
             missed = fine - np.array([linear_shares(few, own, grid) for own in share])
             return few, share, np.tensordot(missed, perfect, 1)
 
-        return _kept(self._spectral, spectral, worked_out)
+        return _kept(self._spectral, (spectral, dispersed), worked_out)
+
+    @cached_property
+    def _few(self) -> FloatArray:
+        """Wavelengths (w,), nm, that serve whatever effects do to the light's colours: transfers at them are kept."""
+        grid, _ = self._perfect
+        return gauss_rule(grid, wavelength_shares(self._camera, self._lit, grid).mean(axis=0), WAVELENGTHS)[0]
 
     @cached_property
     def _perfect(self) -> tuple[FloatArray, ComplexArray]:
