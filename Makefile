@@ -33,7 +33,7 @@ run: $(STAMP)
 	$(BIN)/calibench run --out calibench-data $(ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow" $(ARGS)
 
 serve: $(STAMP)
 	$(BIN)/calibench serve $(ARGS)

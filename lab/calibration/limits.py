@@ -1,4 +1,4 @@
-"""CalibrationLimits that a laboratory sets on figures of a calibration: a good and a warning band each.
+"""Limits that a laboratory sets on figures of a calibration: a good and a warning band each.
 
 A figure is judged by its value and its uncertainty, as ISO 14253-1 decides conformity: `good` where the whole interval of value
 +- 2 standard deviations lies in the good band, `warn` where it lies in the warning band, else `bad`. A figure without a stated
@@ -84,7 +84,7 @@ def _ends(band: tuple[float | None, float | None]) -> tuple[float, float]:
 
 
 class CalibrationLimits(Frozen):
-    """CalibrationLimits of a laboratory. `valid_days`: how long a calibration that was certified against them may be used; None: until it is superseded."""
+    """Limits of a laboratory. `valid_days`: how long a calibration that was certified against them may be used; None: until it is superseded."""
 
     valid_days: float | None = Field(default=None, gt=0.0, le=36_500.0)
     limit: tuple[Limit, ...] = Field(min_length=1, max_length=500)

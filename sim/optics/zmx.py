@@ -5,10 +5,13 @@ What changes the optics and isn't understood is an error or a warning that names
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from pydantic import ValidationError
 
 from sim.optics.prescription import (
     ASPHERE_TERMS,
@@ -143,6 +146,17 @@ def _number(text: str, keyword: str, meaning: str, where: str, position: int = 0
     return value
 
 
+@contextlib.contextmanager
+def _within_bounds(where: str) -> Iterator[None]:
+    """A value that a prescription can't have is an error of the file in one line."""
+    try:
+        yield
+    except ValidationError as refused:
+        first = refused.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise PrescriptionError(f"{where}: {name} {str(first['input'])[:40]}: {first['msg']}; correct it") from None
+
+
 def _optional(text: str, position: int, default: float = 0.0) -> float:
     parts = text.split()
     try:
@@ -181,25 +195,26 @@ class _Reader:
             raise PrescriptionError("header: FTYP 1 (object height) with an object at infinity; give angles (FTYP 0)")
         wavelengths, primary = self._wavelengths()
         name = (self._header("NAME") or "").strip('" ') or self.fallback_name
-        return Prescription(
-            name=name,
-            surfaces=tuple(surfaces[1:]),
-            stop=stops[0] - 1,
-            object_distance_mm=object_mm,
-            aperture_kind=aperture_kind,
-            aperture_value=surfaces[stops[0]].semi_diameter_mm
-            if aperture_kind == "stop_semi_diameter"
-            else aperture_value,
-            field_kind=field_kind,
-            field_points=points,
-            wavelength_nm=wavelengths,
-            primary_wavelength_nm=primary,
-            catalogues=tuple((self._header("GCAT") or "").upper().split()),
-            paraxial_stop=int(_optional(self._header("RAIM") or "", 1)) == 1,
-            stated_focal_length_mm=self._stated_focal_length(),
-            stated_stop_mm=self._stated_stop(self.blocks[stops[0]]),
-            warnings=tuple(dict.fromkeys(self.warnings)),
-        )
+        with _within_bounds("header"):
+            return Prescription(
+                name=name,
+                surfaces=tuple(surfaces[1:]),
+                stop=stops[0] - 1,
+                object_distance_mm=object_mm,
+                aperture_kind=aperture_kind,
+                aperture_value=surfaces[stops[0]].semi_diameter_mm
+                if aperture_kind == "stop_semi_diameter"
+                else aperture_value,
+                field_kind=field_kind,
+                field_points=points,
+                wavelength_nm=wavelengths,
+                primary_wavelength_nm=primary,
+                catalogues=tuple((self._header("GCAT") or "").upper().split()),
+                paraxial_stop=int(_optional(self._header("RAIM") or "", 1)) == 1,
+                stated_focal_length_mm=self._stated_focal_length(),
+                stated_stop_mm=self._stated_stop(self.blocks[stops[0]]),
+                warnings=tuple(dict.fromkeys(self.warnings)),
+            )
 
     # --- header -------------------------------------------------------------------------------------------------------
 
@@ -377,23 +392,24 @@ class _Reader:
             raise PrescriptionError(f"{where}: a coordinate break has neither curvature nor glass; correct it")
         self._check_keywords(block, where)
         semi_diameter = _optional(block.last("DIAM") or "", 0) * self.scale
-        return Surface(
-            kind=kind,
-            curvature_per_mm=curvature,
-            conic=_number(block.last("CONI") or "0", "CONI", "constant", where),
-            coefficients_mm=coefficients,
-            thickness_mm=thickness,
-            glass=glass,
-            semi_diameter_mm=semi_diameter,
-            aperture=None if is_object else self._surface_aperture(block, semi_diameter, where),
-            decentre_mm=(parameters.get(1, 0.0) * self.scale, parameters.get(2, 0.0) * self.scale)
-            if kind == "coordinate_break"
-            else (0.0, 0.0),
-            tilt_deg=(parameters.get(3, 0.0), parameters.get(4, 0.0), parameters.get(5, 0.0))
-            if kind == "coordinate_break"
-            else (0.0, 0.0, 0.0),
-            tilt_first=kind == "coordinate_break" and parameters.get(6, 0.0) != 0.0,
-        )
+        with _within_bounds(where):
+            return Surface(
+                kind=kind,
+                curvature_per_mm=curvature,
+                conic=_number(block.last("CONI") or "0", "CONI", "constant", where),
+                coefficients_mm=coefficients,
+                thickness_mm=thickness,
+                glass=glass,
+                semi_diameter_mm=semi_diameter,
+                aperture=None if is_object else self._surface_aperture(block, semi_diameter, where),
+                decentre_mm=(parameters.get(1, 0.0) * self.scale, parameters.get(2, 0.0) * self.scale)
+                if kind == "coordinate_break"
+                else (0.0, 0.0),
+                tilt_deg=(parameters.get(3, 0.0), parameters.get(4, 0.0), parameters.get(5, 0.0))
+                if kind == "coordinate_break"
+                else (0.0, 0.0, 0.0),
+                tilt_first=kind == "coordinate_break" and parameters.get(6, 0.0) != 0.0,
+            )
 
     def _length(self, block: _Block, keyword: str, meaning: str, where: str) -> float:
         stated = block.last(keyword)

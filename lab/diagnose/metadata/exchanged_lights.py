@@ -21,7 +21,7 @@ from sim.spectrum import FloatArray
 
 
 @dataclass(frozen=True)
-class Rule:
+class ExchangeRule:
     """When two lights count as exchanged. `out_of_line`: their error over the median one of all lights, at least; `better`: that after
     the exchange over that before, at most. `of_each`: of the two errors the smaller one before and the larger one after count, else both."""
 
@@ -35,8 +35,10 @@ DIM = 0.02  # of a light's brightest channel: curves differ from the maker's by 
 LEAST_ERROR = 0.005  # in the logarithm: no light's captures fit better
 SURER = 0.7  # ... over that of the next best exchange, at most
 UNKNOWN_LEVELS = 0.1  # median error from which on the lights' levels are taken for unknown: relative spectra
-CURVES = Rule(out_of_line=5.0, better=0.25, of_each=True)
-PATCHES = Rule(out_of_line=1.5, better=0.5, of_each=False)  # whose print and light leave some per cent, at any light
+CURVES = ExchangeRule(out_of_line=5.0, better=0.25, of_each=True)
+PATCHES = ExchangeRule(
+    out_of_line=1.5, better=0.5, of_each=False
+)  # whose print and light leave some per cent, at any light
 CHART_COLUMNS = 6  # of patches, row by row
 CURVE_ORDER = 2  # in the wavelength, of a channel's departure from the maker's curve
 
@@ -162,7 +164,7 @@ def _told(
     seen: Sequence[LitPlanes],
     errors: FloatArray,
     measurement: Measurement,
-    rule: Rule,
+    rule: ExchangeRule,
 ) -> Misstatement | None:
     """The exchange that brings two lights in line. `errors` (n, n): of the captures of light i with the statement of light j."""
     typical = max(float(np.median(np.diag(errors))), LEAST_ERROR)

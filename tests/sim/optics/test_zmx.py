@@ -132,6 +132,11 @@ def test_damage_anywhere_is_one_line_or_a_lens(start: int, length: int, put: str
     _read(TEXT[:start] + put + TEXT[start + length :])
 
 
+def test_a_curvature_that_is_no_number_a_lens_can_have_is_named() -> None:
+    with pytest.raises(PrescriptionError, match=r"surface 0: curvature_per_mm inf: .*; correct it"):
+        parse_zmx(TEXT.replace("CURV", "CURV 1E999", 2))
+
+
 @settings(max_examples=60)
 @given(st.binary(max_size=400))
 def test_any_bytes_are_one_line(data: bytes) -> None:
