@@ -49,12 +49,12 @@ STEPS: dict[Goal, tuple[Step, ...]] = {
 }
 #: Duration (s) of each step in a quick stereo session on the mock bench, two cores; their ratios give the share of the work that is done.
 TYPICAL_S: dict[Step, float] = {
-    "capture": 48.0,
-    "fit": 49.0,
-    "validate": 4.0,
-    "diagnose": 84.0,
-    "resolve": 90.0,
-    "report": 15.0,
+    "capture": 36.0,
+    "fit": 15.0,
+    "validate": 7.0,
+    "diagnose": 58.0,
+    "resolve": 70.0,
+    "report": 3.0,
 }
 
 

