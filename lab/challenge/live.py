@@ -112,10 +112,11 @@ FIRST_SESSION = ("dark", "flat", "screen")
 #: By how much the sensors get warmer (C) where the effect needs that.
 WARM_UP_C = {"dark_current_temperature": 6.0}
 
-#: Effects that a diagnosis doesn't look for: it is right with no name, or with the name of what does the same.
+#: Effects that a diagnosis doesn't look for: it is right with no name, or with the name of what does the same. The discrepancy's typical
+#: instance is a transfer that falls with the frequency alike in all directions: that family's name is right.
 NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
     "cover_glass": frozenset({"spherical_aberration"}),
-    "model_discrepancy": frozenset(),
+    "model_discrepancy": frozenset({"isotropic_contrast_loss"}),
     "other_f_number": frozenset(),
 }
 
