@@ -43,6 +43,7 @@ from lab.calibration.limits import CalibrationLimits
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 
 M = TypeVar("M", bound=BaseModel)
+W = TypeVar("W", SessionDetail, Job)
 #: How often (s) a client that waits looks, and how long it waits unless it is told.
 LOOK_S, PATIENCE_S = 0.2, 600.0
 
@@ -109,12 +110,15 @@ class ServiceClient:
                 return
             response = self.request("GET", f"{self.url}{following}")
 
-    def _wait(self, look: Callable[[], M], over: Callable[[M], bool], patience_s: float) -> M:
+    def _ended(self, what: str, look: Callable[[], W], ends: tuple[str, ...], patience_s: float) -> W:
+        """What `look` finds once its state is one of `ends`. Raises ServiceProblem unless that is the first of them, the good one."""
         until = time.monotonic() + patience_s
-        while not over(found := look()):
+        while (found := look()).state not in ends:
             if time.monotonic() > until:
                 raise TimeoutError(f"after {patience_s:g} s: {found!r}")
             time.sleep(LOOK_S)
+        if found.state != ends[0]:
+            raise ServiceProblem(409, f"{what} is {found.state}: {found.error}")
         return found
 
     def health(self) -> Health:
@@ -157,11 +161,8 @@ class ServiceClient:
 
     def wait_session(self, session_id: str, patience_s: float = PATIENCE_S) -> SessionDetail:
         """Wait until a session's run is over. Raises ServiceProblem unless it finished."""
-        over = ("interrupted", "failed", "finished")
-        found = self._wait(lambda: self.session(session_id), lambda now: now.state in over, patience_s)
-        if found.state != "finished":
-            raise ServiceProblem(409, f"session {session_id} is {found.state}: {found.error}")
-        return found
+        ends = ("finished", "interrupted", "failed")
+        return self._ended(f"session {session_id}", lambda: self.session(session_id), ends, patience_s)
 
     def capture(
         self,
@@ -193,10 +194,9 @@ class ServiceClient:
 
     def send_recordings(self, archive: Path) -> Recordings:
         """Send in a recording set, a .zip."""
-        with archive.open("rb") as file:
-            response = self.request(
-                "POST", "/recordings", content=file.read(), headers={"Content-Type": "application/zip"}
-            )
+        headers = {"Content-Type": "application/zip", "Content-Length": str(archive.stat().st_size)}
+        with archive.open("rb") as file:  # sent piece by piece: a set may be larger than the memory
+            response = self.request("POST", "/recordings", content=file, headers=headers)
         return Recordings.model_validate_json(response.content)
 
     def start_job(self, kind: JobKind, session_id: str) -> Job:
@@ -221,11 +221,7 @@ class ServiceClient:
 
     def wait_job(self, job_id: str, patience_s: float = PATIENCE_S) -> Job:
         """Wait until a job is over. Raises ServiceProblem unless it is done."""
-        over = ("done", "failed", "cancelled")
-        found = self._wait(lambda: self.job(job_id), lambda now: now.state in over, patience_s)
-        if found.state != "done":
-            raise ServiceProblem(409, f"job {job_id} is {found.state}: {found.error}")
-        return found
+        return self._ended(f"job {job_id}", lambda: self.job(job_id), ("done", "failed", "cancelled"), patience_s)
 
     def _made(self, model: type[M], kind: JobKind, session_id: str, patience_s: float) -> M:
         job = self.wait_job(self.start_job(kind, session_id).id, patience_s)

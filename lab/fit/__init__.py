@@ -22,7 +22,7 @@ from sim.camera import Side
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
 STEPS = ("noise", "spectral", "mtf", "psf", "geometry")
-#: Pixels of all frames from which on a process a side is worth its start, which takes 1.5 s: as long as the fits of so many.
+#: Pixels of all frames from which on a process a side is worth its start, which takes 1.5 s: the fits of so many take some 6 s.
 WORTH_PROCESSES_PX = 2e7
 
 

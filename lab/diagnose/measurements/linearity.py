@@ -65,7 +65,7 @@ def linearity_block(study: Study) -> Block:
     lights = [of[c.id] for c in levels.captures]
     baseline = {c: np.array([rate.get((one.lamp, c), 0.0) for one in lights]) for c in study.channels}
     of_lamp = {(lamp, channel): np.array([k == (lamp, channel) for k in key]) for lamp, channel in rate}
-    of_reading = _of_readings(study, [of[c.id] for c, *_ in points], [channel for _, channel, *_ in points])
+    of_reading = _of_readings(study, readings, [of[c.id] for c, *_ in points], [channel for _, channel, *_ in points])
 
     def predict(effects: Effects) -> Prediction:
         changed = _changed(study, readings, relative, effects)
@@ -101,11 +101,12 @@ def _changed(
     return changed
 
 
-def _of_readings(study: Study, lights: list[FlatLight], channels: list[str]) -> dict[str, tuple[float, np.ndarray]]:
+def _of_readings(
+    study: Study, readings: list[FlatLight], lights: list[FlatLight], channels: list[str]
+) -> dict[str, tuple[float, np.ndarray]]:
     """Relative standard deviations of the lamps' readings, and of each in every channel, by the name of their nuisance parameter, with
     masks (n,) of the means that they move. Nothing where every lamp was read once: that is in its rate."""
     found: dict[str, tuple[float, np.ndarray]] = {}
-    readings = list({one.name: one for one in lights}.values())
     if len(readings) == len({one.lamp for one in readings}):
         return found
     for one in readings:
