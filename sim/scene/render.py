@@ -171,15 +171,15 @@ def cell_means(
         return out
     # Through a distorting lens pattern points are splines' values, with one more all round for the squares' sides.
     fine = step / divide
-    mapper = warp.mapper((row[0] - step, row[-1] + step), (col[0] - step, col[-1] + step))
     offset = (np.arange(divide) + 0.5) * fine - 0.5 * step
     across = (col[:, None] + offset).ravel()
     across = np.concatenate([[across[0] - fine], across, [across[-1] + fine]])
+    mapper = warp.mapper((row[0] - step, row[-1] + step), across)
     strips = max(1, (row.size * divide * across.size) // 100_000)  # strips that stay in the processor's cache
     for part in np.array_split(np.arange(row.size), min(strips, row.size)):
         down = (row[part, None] + offset).ravel()
         down = np.concatenate([[down[0] - fine], down, [down[-1] + fine]])
-        u, v = mapper(down, across)
+        u, v = mapper(down)
         mapped_means(pattern, u, v, divide, lit, surround, out[part[0] : part[-1] + 1])
     return out
 

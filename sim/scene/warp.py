@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import BSpline, make_interp_spline
 
 from sim.camera import Geometry
 from sim.spectrum import FloatArray
@@ -78,25 +78,45 @@ class Warp:
 
     def grid_to_pattern(self, row: FloatArray, col: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pattern (u, v), each (len(row), len(col)), of the grid of ascending `row` and `col`; see `mapper`."""
-        return self.mapper((row[0], row[-1]), (col[0], col[-1]))(row, col)
+        return self.mapper((row[0], row[-1]), col)(row)
 
     def mapper(
-        self, rows: tuple[float, float], cols: tuple[float, float]
-    ) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-        """A function from ascending camera `row` and `col` (px, within `rows` and `cols`) to pattern (u, v) on their
-        grid.
+        self, rows: tuple[float, float], col: FloatArray
+    ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+        """A function from ascending camera `row` (px, within `rows`) to pattern (u, v) on their grid with ascending `col`.
 
         The lens's distortion is smooth: it is inverted on nodes some 8 px apart and interpolated by cubic splines
         (1e-5 px).
         """
         back = np.linalg.inv(np.asarray(self.homography))
         if self.straight:
-            return lambda row, col: _project(back, col[None, :], row[:, None])
+            return lambda row: _project(back, col[None, :], row[:, None])
         assert self.geometry is not None
-        y0, x0 = (np.linspace(low, high, max(8, int((high - low) / 8) + 2)) for low, high in (rows, cols))
+        y0, x0 = (np.linspace(low, high, max(8, int((high - low) / 8) + 2)) for low, high in (rows, (col[0], col[-1])))
         straight_x, straight_y = undistort(*np.meshgrid(x0, y0), self.geometry)
-        x, y = RectBivariateSpline(y0, x0, straight_x), RectBivariateSpline(y0, x0, straight_y)
-        return lambda row, col: _project(back, x(row, col), y(row, col))
+        x, y = _RowSpline.through(y0, x0, straight_x, col), _RowSpline.through(y0, x0, straight_y, col)
+        return lambda row: _project(back, x(row), y(row))
+
+
+@dataclass(frozen=True)
+class _RowSpline:
+    """A cubic spline of two variables at given columns, as a spline down the rows: value = B(row) C, B the B-splines of `knots`."""
+
+    knots: FloatArray
+    coefficients: FloatArray
+
+    @classmethod
+    def through(cls, row_nodes: FloatArray, col_nodes: FloatArray, values: FloatArray, col: FloatArray) -> Self:
+        """The spline that takes `values`, (rows, cols), at the nodes, at the columns `col` within them."""
+        across = make_interp_spline(col_nodes, values, k=3, axis=1)(col)
+        down = make_interp_spline(row_nodes, across, k=3, axis=0)
+        return cls(down.t, np.ascontiguousarray(down.c))
+
+    def __call__(self, row: FloatArray) -> FloatArray:
+        """Values (len(row), cols) at ascending rows within the nodes."""
+        basis = BSpline.design_matrix(np.clip(row, self.knots[0], self.knots[-1]), self.knots, 3)
+        used = slice(int(basis.indices.min()), int(basis.indices.max()) + 1)  # in a strip of rows, few differ from 0
+        return np.asarray(basis[:, used].toarray() @ self.coefficients[used])
 
 
 def _project(homography: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
