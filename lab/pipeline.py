@@ -90,7 +90,8 @@ class PipelineRequest:
     source : the session or folder that the results belong to; empty: the session of `capture`, else none
     keep : keep the results of `source` in the registry
     job_id : the job for which the goal's result is kept
-    reuse : take the kept results of a finished session in place of computing the goal's inputs again
+    reuse : take the kept results of a finished session in place of computing the goal's inputs again. Without it a diagnosis is given
+        only the fits that it rests on, and these aren't kept
     fit : a fit to rest on in place of a new one
     models : camera files that replace the fitted cameras, by side, in validation and diagnosis
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart
@@ -258,7 +259,10 @@ def run_pipeline(
     `store` keeps the results, under the request's source; without one nothing is kept. `capturer` is needed for a request that
     captures or resolves. Raises InputError, DeviceError, NotDetermined, and what `tell` raises.
     """
-    return _Pipeline(request, tell, store, capturer).run()
+    from lab.side_processes import kept_processes
+
+    with kept_processes():
+        return _Pipeline(request, tell, store, capturer).run()
 
 
 class _Pipeline:
@@ -380,14 +384,20 @@ class _Pipeline:
         return self.capturer(request, told)
 
     def _fit_step(self) -> None:
-        from lab.fit import fit_recording_set
+        from lab.fit import FOR_DIAGNOSIS, STEPS, fit_recording_set
         from lab.formats.results import FitResult
 
         if self._fit is None:
             self._fit = self._kept("fit", FitResult)
         if self._fit is None:
-            self._fit = fit_recording_set(self.recordings, lambda what, share: self._say("fit", what, share))
-            self._keep("fit", self._fit)
+            whole = self.request.goal != "diagnose" or self.request.reuse
+            self._fit = fit_recording_set(
+                self.recordings,
+                lambda what, share: self._say("fit", what, share),
+                STEPS if whole else FOR_DIAGNOSIS,
+            )
+            if whole:
+                self._keep("fit", self._fit)
 
     def _validate_step(self) -> None:
         from lab.formats.results import ValidationResult

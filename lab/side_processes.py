@@ -1,9 +1,9 @@
 """The sides of a recording set at the same time, each in an OS process of its own, as Python computes in one thread at
 a time.
 
-A process is `python -m lab.side_processes`. It receives its task on standard input, and sends progress and findings as
-pickles on standard output. Unlike a pool's worker it needs nothing of the caller's main module, may be started by a
-pool's worker, and ends with the process that started it.
+A process is `python -m lab.side_processes`. It receives tasks on standard input, one after the other, and sends progress and
+findings as pickles on standard output. Unlike a pool's worker it needs nothing of the caller's main module, may be started by
+a pool's worker, and ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Generic, TypeVar
@@ -43,6 +44,23 @@ class _Found(Generic[F]):
     findings: F
 
 
+#: Processes that wait for a task; None where none is kept.
+_waiting: ContextVar[list[_Process] | None] = ContextVar("_waiting", default=None)
+
+
+@contextlib.contextmanager
+def kept_processes() -> Iterator[None]:
+    """Within it, and in its thread, a process that has carried out a task waits for the next one: a start takes about 1.5 s."""
+    waiting: list[_Process] = []
+    before = _waiting.set(waiting)
+    try:
+        yield
+    finally:
+        _waiting.reset(before)
+        for process in waiting:
+            process.end()
+
+
 def in_processes(
     recordings: RecordingSet, tasks: Mapping[Side, Task[F]], report: Callable[[Side, Any], None], doing: str
 ) -> dict[Side, F]:
@@ -57,7 +75,7 @@ def in_processes(
     with contextlib.ExitStack() as stack:
         for side, task in tasks.items():
             # registered before it starts: an interrupt in between must find it
-            stack.enter_context(_Process(side, task, said, doing)).start()
+            stack.enter_context(_Work(side, task, said, doing)).start()
         while len(found) < len(tasks):
             try:
                 side, what = said.get(timeout=WAKE_S)
@@ -73,18 +91,9 @@ def in_processes(
 
 
 class _Process:
-    """One side's process, and a thread that reads its output. Leaving the context ends both."""
+    """A process that carries out tasks."""
 
-    def __init__(self, side: Side, task: Task[Any], said: queue.SimpleQueue[tuple[Side, Any]], doing: str) -> None:
-        self._side, self._task, self._said, self._doing = side, task, said, doing
-
-        self._process: subprocess.Popen[bytes] | None = None
-        self._listener = threading.Thread(target=self._listen, name=f"{doing}-{side}", daemon=True)
-
-    def __enter__(self) -> _Process:
-        return self
-
-    def start(self) -> None:
+    def __init__(self) -> None:
         # Of its own session: Ctrl-C is for the caller, who ends this process.
         self._process = subprocess.Popen(
             [sys.executable, "-m", "lab.side_processes"],
@@ -93,45 +102,91 @@ class _Process:
             env=os.environ | ONE_THREAD,
             start_new_session=True,
         )
+
+    def carry_out(self, task: Task[Any], say: Callable[[Any], None]) -> None:
+        """Send the task, and pass on what the process says, its findings last. Raises EOFError, with how it ended, where the process
+        ends before."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            pickle.dump(task, self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            self._process.stdin.flush()
+        try:
+            while True:
+                what = pickle.load(self._process.stdout)
+                say(what)
+                if isinstance(what, _Found | BaseException):
+                    return
+        except (EOFError, pickle.UnpicklingError):
+            ended = self._process.wait()
+            raise EOFError(f"signal {-ended}" if ended < 0 else f"exit code {ended}") from None
+
+    @property
+    def lives(self) -> bool:
+        return self._process.poll() is None
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def end(self) -> None:
+        """Let it end, as it does when it can't hear of a task any more, and wait for that."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        self._process.wait()
+        self._process.stdout.close()
+
+
+class _Work:
+    """One side's task in a process, and a thread that reads what the process says. Leaving the context ends the thread, and the process
+    where it isn't kept."""
+
+    def __init__(self, side: Side, task: Task[Any], said: queue.SimpleQueue[tuple[Side, Any]], doing: str) -> None:
+        self._side, self._task, self._said, self._doing = side, task, said, doing
+        self._process: _Process | None = None
+        self._listener = threading.Thread(target=self._listen, name=f"{doing}-{side}", daemon=True)
+
+    def __enter__(self) -> _Work:
+        return self
+
+    def start(self) -> None:
+        waiting = _waiting.get()
+        while waiting and not waiting[-1].lives:
+            waiting.pop().end()
+        self._process = waiting.pop() if waiting else _Process()
         self._listener.start()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if self._process is None:
             return
+        waiting = _waiting.get()
         if kind is not None:
             self._process.kill()
-        self._process.wait()
         if self._listener.is_alive():
             self._listener.join()
+        if kind is None and waiting is not None:
+            waiting.append(self._process)
+        else:
+            self._process.end()
 
     def _listen(self) -> None:
-        """Send the task; put what the process sends into the queue until its findings have come."""
+        """Put what the process sends into the queue until its findings have come."""
         assert self._process is not None
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError), self._process.stdin as to:
-            pickle.dump(self._task, to, pickle.HIGHEST_PROTOCOL)
-        with self._process.stdout as heard:
-            try:
-                while True:
-                    what = pickle.load(heard)
-                    self._said.put((self._side, what))
-                    if isinstance(what, _Found | BaseException):
-                        return
-            except (EOFError, pickle.UnpicklingError):
-                ended = self._process.wait()
-                by = f"signal {-ended}" if ended < 0 else f"exit code {ended}"
-                self._said.put((self._side, InputError(
-                    f"{self._doing}: the process for the {self._side} side ended with {by}; where memory was short, free about 1 GB a side "
-                    "and start again"
-                )))  # fmt: skip
+        try:
+            self._process.carry_out(self._task, lambda what: self._said.put((self._side, what)))
+        except EOFError as ended:
+            self._said.put((self._side, InputError(
+                f"{self._doing}: the process for the {self._side} side ended with {ended}; where memory was short, free about 1 GB a side "
+                "and start again"
+            )))  # fmt: skip
 
 
 # --- the process ---------------------------------------------------------------------------------------------------------
 
 
 def serve() -> None:
-    """Read a task from standard input, carry it out, and write progress and findings as pickles to standard output."""
+    """Read tasks from standard input until it ends, carry them out, and write progress and findings as pickles to standard output."""
     with os.fdopen(os.dup(1), "wb") as to:
         os.dup2(2, 1)  # what a library prints goes to standard error
 
@@ -139,17 +194,26 @@ def serve() -> None:
             to.write(pickle.dumps(what, pickle.HIGHEST_PROTOCOL))
             to.flush()
 
-        try:
-            task = pickle.load(sys.stdin.buffer)
-        except (EOFError, pickle.UnpicklingError):
-            os._exit(1)  # the caller was interrupted before it had sent the task
-        try:
-            say(_Found(task(say)))
-        except BrokenPipeError:
-            os._exit(1)  # the caller is gone
-        except Exception as error:
-            error.add_note(traceback.format_exc())
-            say(_sendable(error))
+        while _carried_out(say):
+            pass
+
+
+def _carried_out(say: Callable[[Any], None]) -> bool:
+    """Carry out the next task; False where there is none. Nothing of it is held afterwards."""
+    try:
+        task = pickle.load(sys.stdin.buffer)
+    except EOFError:
+        return False
+    except pickle.UnpicklingError:
+        os._exit(1)  # the caller was interrupted while it sent the task
+    try:
+        say(_Found(task(say)))
+    except BrokenPipeError:
+        os._exit(1)  # the caller is gone
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        say(_sendable(error))
+    return True
 
 
 def _sendable(error: Exception) -> Exception:

@@ -5,11 +5,11 @@ them.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import Literal, TypeVar, get_args
 
 from lab.errors import NotDetermined
 from lab.formats.recording_set import RecordingSet
@@ -21,7 +21,11 @@ from sim.camera import Side
 #: Called with what was just done and the share of the work that is done, 0..1; from any thread, one call at a time.
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
-STEPS = ("noise", "spectral", "mtf", "psf", "geometry")
+#: What is fitted of a side, in the order of a result, and of the pair.
+Step = Literal["noise", "spectral", "mtf", "psf", "geometry", "stereo"]
+STEPS: tuple[Step, ...] = get_args(Step)
+#: What a diagnosis rests on: it looks at edges and screens itself.
+FOR_DIAGNOSIS: tuple[Step, ...] = ("noise", "spectral", "geometry")
 #: Pixels of all frames from which on a process a side is worth its start, which takes 1.5 s: the fits of so many take some 6 s.
 WORTH_PROCESSES_PX = 2e7
 
@@ -35,19 +39,22 @@ class SideFit:
 
 
 @one_blas_thread
-def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None) -> FitResult:
-    """Run every fit on every side, and the stereo pair. What the recordings don't determine is in `skipped`, with the
-    reason.
+def fit_recording_set(
+    recordings: RecordingSet, progress: Progress | None = None, steps: Collection[Step] = STEPS
+) -> FitResult:
+    """Run the fits of `steps`, by default all, on every side and on the stereo pair. What the recordings don't determine is in
+    `skipped`, with the reason.
 
     Several sides with many frames are fitted at the same time, each in a process of its own. `progress` is called after each step.
     """
     from lab.fit.stereo import fit_stereo
 
     sides = recordings.sides
-    total, done = len(STEPS) * len(sides) + 1, 0
+    paired = "stereo" in steps
+    total, done = len(set(steps) - {"stereo"}) * len(sides) + paired, 0
     lock = threading.Lock()
 
-    def told(side: Side | None, step: str) -> None:
+    def told(side: Side | None, step: Step) -> None:
         nonlocal done
         with lock:
             done += 1
@@ -55,10 +62,10 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
                 progress(f"{step} of the {side} camera" if side else step, done / total)
 
     if len(sides) > 1 and _pixels(recordings) > WORTH_PROCESSES_PX:
-        tasks = {side: partial(fit_side, recordings, side) for side in sides}
+        tasks = {side: partial(fit_side, recordings, side, steps) for side in sides}
         fitted = in_processes(recordings, tasks, told, "fit")
     else:
-        fitted = {side: fit_side(recordings, side, partial(told, side)) for side in sides}
+        fitted = {side: fit_side(recordings, side, steps, partial(told, side)) for side in sides}
     cameras = {side: one.camera for side, one in fitted.items()}
 
     def pair() -> StereoFit:
@@ -68,8 +75,9 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
             raise NotDetermined("stereo", f"no geometry of the {missing} side; capture charuco poses with both cameras")
         return fit_stereo(recordings, both["left"], both["right"])
 
-    found, refused = _step(pair, None)
-    told(None, "stereo")
+    found, refused = _step(pair, None) if paired else (None, ())
+    if paired:
+        told(None, "stereo")
     return FitResult(
         source=recordings.source,
         cameras=cameras,
@@ -78,8 +86,9 @@ def fit_recording_set(recordings: RecordingSet, progress: Progress | None = None
     )
 
 
-def fit_side(recordings: RecordingSet, side: Side, told: Callable[[str], None]) -> SideFit:
-    """Every fit of one side; geometry beside radiometry, in a thread of its own. `told` is called with each step that was done."""
+def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told: Callable[[Step], None]) -> SideFit:
+    """The fits of `steps` of one side; geometry beside radiometry, in a thread of its own. `told` is called with each step that was
+    done."""
     from lab.fit.geometry.recordings import fit_geometry
     from lab.fit.mtf.recordings import fit_mtf
     from lab.fit.noise.recordings import fit_noise
@@ -88,7 +97,9 @@ def fit_side(recordings: RecordingSet, side: Side, told: Callable[[str], None]) 
 
     skipped: list[Skipped] = []
 
-    def step(name: str, work: Callable[[], T]) -> T | None:
+    def step(name: Step, work: Callable[[], T]) -> T | None:
+        if name not in steps:
+            return None
         result, refused = _step(work, side)
         skipped.extend(refused)
         told(name)
@@ -111,7 +122,7 @@ def fit_side(recordings: RecordingSet, side: Side, told: Callable[[str], None]) 
             geometry=geometry.result(),
         )
     # independent of the order of the threads; a fit may name a part of its step
-    order = {name: number for number, name in enumerate(STEPS)}
+    order: dict[str, int] = {name: number for number, name in enumerate(STEPS)}
     return SideFit(camera, tuple(sorted(skipped, key=lambda item: order.get(item.step, len(order)))))
 
 

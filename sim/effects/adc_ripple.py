@@ -64,8 +64,13 @@ class AdcRipple(Effect):
         if self.sine_dn == 0.0 and self.cosine_dn == 0.0:
             return codes
 
+        amplitude_dn, phase = np.hypot(self.sine_dn, self.cosine_dn), np.arctan2(self.cosine_dn, self.sine_dn)
+
         def converted(dn: FloatArray) -> FloatArray:
-            turn = 2.0 * np.pi * dn / self.period_dn
-            return np.asarray(dn + self.sine_dn * np.sin(turn) + self.cosine_dn * np.cos(turn))
+            ripple = np.multiply(dn, 2.0 * np.pi / self.period_dn)
+            ripple += phase
+            np.sin(ripple, out=ripple)
+            ripple *= amplitude_dn
+            return np.asarray(dn + ripple)
 
         return codes.adding(codes=converted)

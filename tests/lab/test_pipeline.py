@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The steps that were taken, in their order; each is a stand-in that costs nothing."""
     taken: list[str] = []
 
-    def fit(recordings: RecordingSet, tell: Callable[[str, float], None]) -> FitResult:
+    def fit(recordings: RecordingSet, tell: Callable[[str, float], None], parts: Collection[str]) -> FitResult:
         taken.append("fit")
         tell("half of it", 0.5)
         return FitResult(source=recordings.source, cameras={})
@@ -100,7 +100,7 @@ def test_a_goal_takes_what_leads_to_it_and_keeps_it_for_the_job(
     goal: Goal, small_set: Callable[..., RecordingSet], store: Store, steps: list[str]
 ) -> None:
     page = store.root / "reports" / "j.html"
-    request = PipelineRequest(goal, recordings=small_set(), source="a folder", job_id=None, report_file=page)
+    request = PipelineRequest(goal, recordings=small_set(), source="a folder", reuse=True, report_file=page)
     found = run_pipeline(request, store=store)
     assert steps == list(STEPS[goal])
     assert [kept.kind for kept in reversed(store.results("a folder"))] == steps
@@ -124,6 +124,22 @@ def test_a_finished_sessions_results_are_reused_and_its_goal_is_made_anew(store:
     for _ in range(2):
         run_pipeline(PipelineRequest("diagnose", recordings=recordings, source="folder", reuse=True), store=store)
     assert steps[5:] == ["fit", "diagnose"] * 2
+
+
+def test_a_diagnosis_that_nothing_is_reused_of_takes_the_fits_it_rests_on_alone(
+    small_set: Callable[..., RecordingSet], store: Store, monkeypatch: pytest.MonkeyPatch, steps: list[str]
+) -> None:
+    asked: list[tuple[str, ...]] = []
+
+    def fit(recordings: RecordingSet, tell: Callable[[str, float], None], parts: Collection[str]) -> FitResult:
+        asked.append(tuple(parts))
+        return FitResult(source=recordings.source, cameras={})
+
+    monkeypatch.setattr(lab.fit, "fit_recording_set", fit)
+    for goal in ("diagnose", "fit"):
+        run_pipeline(PipelineRequest(goal, recordings=small_set(), source="a folder"), store=store)
+    assert asked == [lab.fit.FOR_DIAGNOSIS, lab.fit.STEPS]
+    assert sorted(kept.kind for kept in store.results("a folder")) == ["diagnose", "fit"]  # the whole fit alone is kept
 
 
 def test_a_given_fit_is_not_made_again_and_nothing_is_kept_without_leave(

@@ -17,6 +17,7 @@ import pytest
 from lab.diagnose import diagnose
 from lab.errors import InputError
 from lab.formats.recording_set import Manifest, RecordingSet, read, write
+from lab.side_processes import kept_processes
 
 ROWS, COLS, BLACK_DN = 40, 48, 64.0
 
@@ -88,6 +89,22 @@ def test_a_process_that_was_killed_is_told_in_one_line() -> None:
 
     with pytest.raises(InputError, match="ended with signal 9; where memory was short"):
         diagnose(_darks(), progress=kill)
+    assert not _children()
+
+
+def test_kept_processes_take_the_next_task_and_a_dead_one_is_replaced() -> None:
+    recordings = _darks()
+    with kept_processes():
+        first = diagnose(recordings)
+        kept = _children()
+        assert len(kept) == 2
+        assert diagnose(recordings) == first
+        assert _children() == kept
+        os.kill(kept[0], signal.SIGKILL)
+        os.waitid(os.P_PID, kept[0], os.WEXITED | os.WNOWAIT)
+        assert diagnose(recordings) == first
+        assert len(_children()) == 2
+        assert kept[0] not in _children()
     assert not _children()
 
 
