@@ -52,6 +52,10 @@ class DiffractionLimited(Frozen):
         """(2 / pi) (arccos s - s sqrt(1 - s^2)), s = f wavelength f_number; frequencies broadcast."""
         if aberration.terms:
             return pupil_otf(fx_cy_per_um, fy_cy_per_um, wavelength_nm, f_number, aberration)
+        if np.ndim(fx_cy_per_um) == 2 and np.ndim(fy_cy_per_um) == 2 and np.shape(fy_cy_per_um)[1] == 1:
+            # the frequencies of a picture's transform: rows of fy and -fy are alike
+            fy, row = np.unique(np.abs(fy_cy_per_um[:, 0]), return_inverse=True)
+            return diffraction_otf(np.hypot(fx_cy_per_um, fy[:, None]), wavelength_nm, f_number)[row]
         return diffraction_otf(np.hypot(fx_cy_per_um, fy_cy_per_um), wavelength_nm, f_number)
 
     def cutoff_cy_per_um(self, wavelength_nm: float, f_number: float) -> float:
