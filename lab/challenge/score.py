@@ -86,6 +86,9 @@ class CaseScore(Frozen):
     families: tuple[str, ...]  # of all that was named
     right_family: bool  # of everything that was concealed, the family or the effect is named
     wrong_family: bool  # something of another family is named
+    set_holds: (
+        bool | None
+    )  # the sets of models that hold 95 % have what is concealed; None: no set of listed effects is the truth
     excess_removed: float | None
     cpu_s: float
     memory_mib: float
@@ -152,6 +155,8 @@ class ChallengeScore(Frozen):
     compounds_strong_both_named: Rate
     rival_sets_cover: Rate
     rival_set_mean_size: float | None
+    model_sets_hold: Rate
+    model_sets_mean_size: float | None
     false_alarms: Rate
     false_names: Rate
     outside_not_named: Rate
@@ -225,6 +230,8 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
     both_strong = Rate.over(set(s.truth) <= set(s.named) for s in strong)
     cover = Rate.over(truth in names for truth, names in sets)
     size = fmean(len(names) for _, names in sets) if sets else None
+    weighed = [s for s in scored if s.set_holds is not None]
+    model_sizes = [len(_model_sets(diagnoses[s.case])) for s in weighed]
     alarms = Rate.over(s.verdict not in {"no_mismatch", "nothing_judged", "failed"} for s in healthy)
     names = Rate.over(bool(s.named) for s in healthy)
     abstained = Rate.over(s.right for s in outside)
@@ -265,6 +272,7 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
         _at_least("both members of a compound named", both, 0.80).model_copy(update={"oracle": _oracle(compounds)}),
         _at_least("rival sets cover the truth", cover, 0.95),
         _limit("rivals in a set, mean", size, 1.5, ""),
+        _at_least("95 % sets of models hold the truth", Rate.over(bool(s.set_holds) for s in weighed), 0.95),
         _at_most("false names on healthy cameras", names, 0.01),
         _at_least("outside the library, no cause named", abstained, 0.90),
         _between("95 % intervals of parameters hold", covered, 0.90, 0.98),
@@ -281,7 +289,8 @@ def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequen
         purpose=truths.purpose, seed=truths.seed, size=truths.size, cases=len(cases), seals_sha256=seals_sha256(seals), broken_seals=tuple(broken),
         failed={case: run.error for case, _, run in cases if run.error is not None}, singles=classes, fair=fair, families=families, effects=_by_effect(singles),
         compounds_both_named=both, compounds_one_named=one, compounds_strong_both_named=both_strong, rival_sets_cover=cover,
-        rival_set_mean_size=size, false_alarms=alarms, false_names=names, outside_not_named=abstained, outside_located=located,
+        rival_set_mean_size=size, model_sets_hold=Rate.over(bool(s.set_holds) for s in weighed),
+        model_sets_mean_size=fmean(model_sizes) if model_sizes else None, false_alarms=alarms, false_names=names, outside_not_named=abstained, outside_located=located,
         parameters_covered=covered, excess_removed=mean_removed, excess_removed_median=median(removed) if removed else None,
         outside_excess_removed_median=median(outside_removed) if outside_removed else None,
         wall_median_s=median(r.wall_s for r in ran) if ran else None, cpu_median_s=median(r.cpu_s for r in ran) if ran else None,
@@ -314,8 +323,22 @@ def _case_score(case: str, truth: CaseTruth, run: CaseRun) -> CaseScore:
         unexplained=tuple(u.measurement for u in found.unexplained) if found is not None else (), right=right,
         effects=truth.names, true_families=tuple(tuple(sorted(one)) for one in true), families=tuple(told),
         right_family=bool(true) and all(set(told) & one for one in true), wrong_family=not set(told) <= accepted.union(*true),
+        set_holds=frozenset(truth.names) in _model_sets(found) if _is_listed(truth) else None,
         excess_removed=_removed(truth, found), cpu_s=run.cpu_s, memory_mib=run.memory_mib,
     )  # fmt: skip
+
+
+def _is_listed(truth: CaseTruth) -> bool:
+    """Whether a set of listed effects is the truth."""
+    return truth.kind != "outside" and all(c.effect is not None for c in truth.concealed)
+
+
+def _model_sets(found: DiagnosisResult | None) -> set[frozenset[str]]:
+    """The sets of effects that the smallest set of models has; that of no effect alone where there was nothing to search for."""
+    if found is None:
+        return set()
+    sets = {frozenset(one.effects) for models in found.models for one in models.sets}
+    return sets or {frozenset[str]()}
 
 
 def _least_separability(truth: CaseTruth) -> float | None:

@@ -10,7 +10,16 @@ from lab.challenge.proof import confusion, table, write_page
 from lab.challenge.run import CaseRun
 from lab.challenge.score import ChallengeScore, Rate, score
 from lab.challenge.truth import CaseTruth, Concealed, Kind, Seals, Truths, canonical, salted, seal
-from lab.formats.results import DiagnosisResult, HeldOut, Member, NamedEffect, ParameterValue, Rival
+from lab.formats.results import (
+    DiagnosisResult,
+    EffectSet,
+    HeldOut,
+    Member,
+    NamedEffect,
+    ParameterValue,
+    Rival,
+    SideModels,
+)
 from mocks.former import OUTSIDE
 from sim.effects.families import Family
 from sim.effects.library import effects as library
@@ -31,7 +40,7 @@ def truth(kind: Kind, *hidden: tuple[str, float], fault: str | None = None, acce
 def named(
     *names: str, rivals: tuple[str, ...] = (), value: float = 2.0, held: tuple[float, float, int] | None = None
 ) -> DiagnosisResult:
-    """Names with probabilities that fall from the first on; the first has the rivals."""
+    """Names with probabilities that fall from the first on; the first has the rivals. All names are the one set of models."""
     effects = tuple(
         NamedEffect(
             name=name, family=library()[name].family.value, law="exact", probability=0.99 - 0.1 * i, sides=("left",), statement="",
@@ -41,8 +50,13 @@ def named(
         for i, name in enumerate(names)
     )  # fmt: skip
     held_out = HeldOut(captures=(), chi2_before=held[0], chi2_after=held[1], n=held[2]) if held else None
+    models = SideModels(side="left", share=0.95, sets=(EffectSet(effects=names, probability=0.97),), inclusion=())
     return DiagnosisResult(
-        source="", verdict="explained" if effects else "unexplained", effects=effects, held_out=held_out
+        source="",
+        verdict="explained" if effects else "unexplained",
+        effects=effects,
+        held_out=held_out,
+        models=(models,) if names else (),
     )
 
 
@@ -128,6 +142,9 @@ def test_every_figure_is_what_a_hand_counts() -> None:
     # sets of the named singles: {defocus, crosstalk}, {defocus, crosstalk}, {defocus}, {defocus}
     assert counts(found.rival_sets_cover) == (4, 4)
     assert found.rival_set_mean_size == pytest.approx(1.5)
+    # healthy cameras without a name three, singles the first and the last, compounds the first; of the failed case there is none
+    assert counts(found.model_sets_hold) == (6, 12)
+    assert found.model_sets_mean_size == pytest.approx(11 / 12)
     assert counts(found.false_alarms) == (2, 4)
     assert counts(found.false_names) == (1, 4)
     assert counts(found.outside_not_named) == (3, 4)
