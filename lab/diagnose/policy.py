@@ -107,6 +107,15 @@ class DecisionPolicy(Frozen):
             "BIC, 0.5 ln n: 2.5 for n = 150 independent numbers, 2.9 for 300",
         ),
     ] = 2.5
+    included_log_odds: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "log odds",
+            "against a listed effect being there, in the probabilities of sets of effects; names have to earn more",
+            "ln 45: one of the library's effects a camera",
+        ),
+    ] = 3.8
     dispensable_log_odds: Annotated[
         float,
         Rule(

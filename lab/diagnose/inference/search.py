@@ -27,10 +27,12 @@ MOST_STEPS = 12
 
 @dataclass(frozen=True)
 class Model:
-    """A set of effects by name, with its posterior probability among all sets of listed effects."""
+    """A set of effects by name, with its posterior probability among all sets of listed effects. `refitted`: False where that is of the
+    linear problem about another set."""
 
     effects: tuple[str, ...]
     probability: float
+    refitted: bool = True
 
 
 @dataclass(frozen=True)
@@ -300,22 +302,49 @@ class Search:
     # --- what it says ------------------------------------------------------------------------------------------------
 
     def models(self) -> ModelSet:
-        """Every set that was fitted, with its probability by the log odds: rough fits that may reach a share are fitted to convergence."""
+        """Every set that was fitted, and those with one or two effects beside a likely one, in closed form, with their probabilities. Rough
+        fits that may reach a share are fitted to convergence."""
         top = max(self.log_odds(f) for f in self._listed())
         for fit in self._listed():
             is_near = self.promised_log_odds(fit) > top + math.log(self.policy.least_rival_probability)
             if not fit.converged and is_near and not self.is_spent:
                 self.fitted(fit.effects, converged=True)
-        fits = sorted(self._listed(), key=self.log_odds, reverse=True)
-        probability = posterior([self.log_odds(f) for f in fits])
+        weighed = self.weighed()
+        sets = sorted(weighed, key=lambda names: -weighed[names])
+        probability = posterior([weighed[names] for names in sets])
         kept = smallest_set(probability.tolist(), self.policy.model_set_share)
         inclusion: dict[str, float] = {}
-        for fit, p in zip(fits, probability, strict=True):
-            for name in fit.names:
+        for names, p in zip(sets, probability, strict=True):
+            for name in names:
                 inclusion[name] = inclusion.get(name, 0.0) + float(p)
         likely = [(n, min(p, 1.0)) for n, p in inclusion.items() if p >= self.policy.least_rival_probability]
         return ModelSet(
-            tuple(Model(fits[i].names, float(probability[i])) for i in kept),
+            tuple(Model(self._in_order(sets[i]), float(probability[i]), sets[i] in self.fits) for i in kept),
             tuple(sorted(likely, key=lambda one: -one[1])),
             tuple(self.not_weighed.values()),
         )
+
+    def weighed(self) -> dict[frozenset[str], float]:
+        """Log posterior of sets of listed effects, by name. A set's prior is `policy.included_log_odds` for each effect, how often effects
+        occur; a name has to earn more, for its false alarms are limited. Of sets that weren't fitted, by the linear problem about a
+        fitted set that isn't far below the likeliest."""
+        costs = {e.name: sum(not q.dispensable for q in e.quantities().values()) for e in self.candidates}
+        prior = self.policy.included_log_odds
+        found = {frozenset(f.names): f.log_posterior - prior * len(f.effects) for f in self._listed()}
+        least = max(found.values()) + math.log(self.policy.least_rival_probability)
+        near = [f for f in self._listed() if found[frozenset(f.names)] > least and f.effects in self._problems]
+        beside: dict[frozenset[str], float] = {}
+        for fit in near:
+            problem = self._problems[fit.effects]
+            for one in (*problem.singles.values(), *problem.best(2)):
+                owners = [problem.owners[m] for m in one.members]
+                key = frozenset((*fit.names, *owners))
+                earned = 0.5 * one.score - sum(self.policy.parameter_log_odds * costs[n] + prior for n in owners)
+                if key not in found and len(key) <= self.policy.most_effects:
+                    beside[key] = max(beside.get(key, -math.inf), found[frozenset(fit.names)] + earned)
+        return found | beside
+
+    def _in_order(self, names: frozenset[str]) -> tuple[str, ...]:
+        """As the set was fitted, else as the candidates stand."""
+        fit = self.fits.get(names)
+        return fit.names if fit is not None else tuple(e.name for e in self.candidates if e.name in names)

@@ -18,7 +18,7 @@ def side_models(side: Side, found: ModelSet, policy: DecisionPolicy) -> SideMode
     return SideModels(
         side=side,
         share=policy.model_set_share,
-        sets=tuple(EffectSet(effects=m.effects, probability=m.probability) for m in found.models),
+        sets=tuple(EffectSet(effects=m.effects, probability=m.probability, refitted=m.refitted) for m in found.models),
         inclusion=tuple(IncludedEffect(name=n, probability=p) for n, p in found.inclusion),
         not_weighed=found.not_weighed,
     )

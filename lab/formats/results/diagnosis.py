@@ -145,10 +145,12 @@ class ResidualCurve(Frozen):
 
 
 class EffectSet(Frozen):
-    """A set of effects that may act together, with its posterior probability; the empty set is the baseline."""
+    """A set of effects that may act together, with its posterior probability; the empty set is the baseline. `refitted`: its parameters
+    were fitted; otherwise the probability is of the linear problem about a likely set."""
 
     effects: tuple[str, ...]
     probability: float
+    refitted: bool = True
 
 
 class IncludedEffect(Frozen):
