@@ -30,13 +30,14 @@ def set_sentences(
     unexplained: Sequence[Unexplained],
     policy: DecisionPolicy,
 ) -> Iterator[str]:
-    """What the sets say beyond the names: effects that are neither named nor among the rivals of a name, where the names explain
-    everything, as sets of listed effects fit an unlisted cause badly; and what the budget left."""
+    """What the sets say beyond the names: effects that are neither named nor among the rivals of a name and that may well be a part, where
+    the names explain everything, as sets of listed effects fit an unlisted cause badly; and what the budget left."""
     for one in models:
         named = [e for e in effects if one.side in e.sides]
         told = {n for e in named for n in (e.name, *e.alternatives)}
         is_whole = named and all(u.side != one.side for u in unexplained)
-        if is_whole and any(name not in told for s in one.sets for name in s.effects):
+        untold = {n for s in one.sets for n in s.effects} - told
+        if is_whole and any(sum(s.probability for s in one.sets if n in s.effects) > 1.0 - one.share for n in untold):
             sets = ", ".join(f"{_words(s.effects)} ({100 * s.probability:.0f} %)" for s in one.sets[:LISTED_SETS])
             more = f" and {len(one.sets) - LISTED_SETS} more" if len(one.sets) > LISTED_SETS else ""
             yield (

@@ -34,6 +34,8 @@ def test_sets_are_told_where_they_hold_what_no_name_does() -> None:
     assert _told(_models((["defocus"], 0.97)), _named("defocus")) == ""
     rivals = _models((["defocus"], 0.67), (["coma"], 0.3))
     assert _told(rivals, _named("defocus", "coma")) == ""  # said of the name already
+    unlikely = _models((["defocus"], 0.91), (["defocus", "coma"], 0.03), (["defocus", "ghost"], 0.02))
+    assert _told(unlikely, _named("defocus")) == ""
     left = Unexplained(
         side="left", measurement="slanted_edge", axis="spatial_frequency", where="all", shape="irregular", significance_sigma=9.0,
         chi2_before=300.0, chi2_after=290.0, n=60,
