@@ -94,7 +94,10 @@ def mock(
     ] = "",
     fault: Annotated[
         str,
-        typer.Option(help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug."),
+        typer.Option(
+            help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug, "
+            "a camera's frames also torn repeated missed."
+        ),
     ] = "",
     real_time: Annotated[float, typer.Option(help="Real seconds for each of the instrument's (0: no waiting).")] = 0.0,
     dialect: Annotated[
@@ -121,7 +124,7 @@ def mock(
             raise _Unusable(f"mock {name}: no calibration file comes with it; leave --calibration out")
         if link is not None and tcp:
             raise _Unusable("mock: --link and --tcp exclude one another; give one of them")
-        faults = parse_faults(fault)
+        faults = parse_faults(fault, frames=name.startswith("u3v"))
         lamp = Lamp(clock=LampClock(max(0.0, real_time)))
         stop = threading.Event()
         with _ended_by_signals(stop):
@@ -441,7 +444,7 @@ def _bench_faults(specs: list[str]) -> dict[str, tuple[Fault, ...]]:
         instrument, separator, what = spec.partition(":")
         if not separator or instrument not in instruments:
             raise _Unusable(f"--fault {spec}: write INSTRUMENT:SPEC with one of {', '.join(instruments)}")
-        faults[instrument] = faults.get(instrument, ()) + parse_faults(what)
+        faults[instrument] = faults.get(instrument, ()) + parse_faults(what, frames=instrument.startswith("cameras."))
     return faults
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+import itertools
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -123,8 +124,25 @@ def _stuck(
     return shortened < 0.9 and levels[side] / before[1][side] > np.sqrt(shortened)
 
 
-def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> Plan[Taken]:
-    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id.
+def repeats_of(step: Step, following: Iterable[Step]) -> int:
+    """How many of the steps that follow at once only repeat a step's exposure."""
+    same = itertools.takewhile(
+        lambda other: (
+            bool(step.captures and other.captures)
+            and other.radiance is None
+            and other.setting == step.setting
+            and other.exposure == step.exposure
+        ),
+        following,
+    )
+    return sum(1 for _ in same)
+
+
+def take(
+    step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]], repeats: int = 0
+) -> Plan[Taken]:
+    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`:
+    `repeats_of` the step.
 
     A step with captures whose light the spectroradiometer refuses to measure is left out, with the reason in its result. In a step
     without captures the refusal is a DeviceError, as later steps use the spectrum.
@@ -155,14 +173,20 @@ def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str
             _exposures(step, instruments, results),
             instruments.limits.gain_db,
             {capture.side: capture.frame for capture in step.captures},
+            repeats,
         )
         dummies = 0 if cameras.in_series or not step.captures else DUMMY_FRAMES
-        for _ in range(dummies):
-            yield from _shoot(instruments, Shot(shot.exposure_s, shot.gain_db, {}))
+        retaken: list[str] = []
+        for left in range(dummies, 0, -1):
+            yield from _shoot(instruments, Shot(shot.exposure_s, shot.gain_db, {}, repeats + left))
+            retaken += cameras.retaken
         yield from _shoot(instruments, shot)
+        retaken += cameras.retaken
         files += cameras.stored.values()
         captures = _completed(step, instruments, dummies)
         result |= {"level": dict(cameras.levels)}
+        if retaken:
+            result["retaken"] = retaken
     yield from bps.create(name=step.sequence)
     for device in instruments.devices:
         yield from bps.read(device)
