@@ -64,18 +64,19 @@ class ReadyFrames:
         self.clock: MockClock = WallClock()
 
     @classmethod
-    def of_folder(cls, folder: Path) -> ReadyFrames:
-        """The frames `*-left.npy` and `*-right.npy` of a folder (a session's `frames`), by name. Raises ValueError."""
-        found: dict[Side, list[UInt16Array]] = {"left": [], "right": []}
-        for side, some in found.items():
+    def of_folder(cls, folder: Path, sides: Sequence[Side]) -> ReadyFrames:
+        """The frames `*-left.npy` and `*-right.npy` of a folder (a session's `frames`), by name. Raises ValueError, one line."""
+        found: dict[Side, list[UInt16Array]] = {}
+        for side in sides:
+            found[side] = []
             for file in sorted(folder.glob(f"*-{side}.npy")):
                 try:
-                    some.append(np.load(file, mmap_mode="r", allow_pickle=False))
+                    found[side].append(np.load(file, mmap_mode="r", allow_pickle=False))
                 except (OSError, ValueError) as error:
                     raise ValueError(f"{file}: can't be read ({error}); name a folder of raw frames") from error
-        if not any(found.values()):
-            raise ValueError(f"{folder}: holds no *-left.npy or *-right.npy; name a session's folder `frames`")
-        return cls({side: some for side, some in found.items() if some})
+            if not found[side]:
+                raise ValueError(f"{folder}: holds no *-{side}.npy; name a session's folder `frames`")
+        return cls(found)
 
     def sensor(self, side: Side) -> tuple[int, int, float]:
         rows, cols = self._shapes[side]
