@@ -44,7 +44,8 @@ _INSTRUMENTS = ("monochromator", "spectroradiometer", "display", "stage")
 # --- stations ----------------------------------------------------------------------------------------------------------
 
 
-def _station(service: Service, name: str) -> StationState:
+def station_state(service: Service, name: str) -> StationState:
+    """What a station file says, or why it can't be used."""
     try:
         station = service.station(name)
     except InputError as error:
@@ -65,7 +66,7 @@ def _station(service: Service, name: str) -> StationState:
 @router.get("/stations", tags=["stations"], dependencies=[READ], responses=answers(401))
 def list_stations(service: Here) -> list[StationState]:
     """The station files in the folder `stations` of the data folder. They are written there, not sent: they name devices."""
-    return [_station(service, name) for name in service.station_files()]
+    return [station_state(service, name) for name in service.station_files()]
 
 
 # --- sessions ----------------------------------------------------------------------------------------------------------

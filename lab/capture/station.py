@@ -107,9 +107,22 @@ class Station(Frozen):
         return self
 
     @property
+    def addresses(self) -> frozenset[str]:
+        """The addresses of its instruments; one without an address (a person at a prompt) is nobody else's."""
+        entries = [*(getattr(self, family) for family in _FAMILIES), *self.cameras.values()]
+        return frozenset(entry.address for entry in entries if entry is not None and entry.address)
+
+    @property
     def sides(self) -> tuple[Side, ...]:
         """The sides that have a camera, left first."""
         return tuple(sorted(self.cameras))
+
+    @property
+    def devices(self) -> dict[str, Address]:
+        """Its instruments by the name of their table: `monochromator`, `cameras.left`."""
+        found: dict[str, Address | None] = {family: getattr(self, family) for family in _FAMILIES}
+        found |= {f"cameras.{side}": self.cameras[side] for side in self.sides}
+        return {name: entry for name, entry in found.items() if entry is not None}
 
     def having(self, kind: type[TargetT]) -> dict[str, TargetT]:
         """Targets of one kind by name, in the station file's order."""

@@ -37,5 +37,5 @@ def test_frames_that_no_camera_here_has(tmp_path: Path, shape: tuple[int, int], 
     with pytest.raises(ValueError, match=r"holds no \*-right.npy"):
         ReadyFrames.of_folder(tmp_path, ("right",))
     (tmp_path / "1-right.npy").write_bytes(b"no array")
-    with pytest.raises(ValueError, match="1-right.npy: can't be read"):
+    with pytest.raises(ValueError, match=r"1-right\.npy: can't be read"):
         ReadyFrames.of_folder(tmp_path, ("right",))
