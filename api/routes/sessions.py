@@ -38,7 +38,6 @@ router = APIRouter()
 OVER = frozenset({"created", "interrupted", "failed", "finished"})
 #: A capture never changes, and its path has its session's random id in it.
 FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
-_INSTRUMENTS = ("monochromator", "spectroradiometer", "display", "stage")
 
 
 # --- stations ----------------------------------------------------------------------------------------------------------
@@ -54,9 +53,7 @@ def station_state(service: Service, name: str) -> StationState:
         name=name,
         title=station.name or name,
         cameras=station.sides,
-        instruments={
-            family: entry.driver for family in _INSTRUMENTS if (entry := getattr(station, family)) is not None
-        },
+        instruments={name: entry.driver for name, entry in station.devices.items() if not name.startswith("cameras.")},
         targets=tuple(station.targets),
         sequences=full_plan(station).names,
         busy_with=service.live.busy(station),

@@ -19,6 +19,14 @@ from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused, Repeated
 
 #: Triggers in a row that may fail before a series ends with the last failure.
 MOST_LOST = 3
+_LAST_OF_16_BIT = 0xFFFF
+
+
+def frames_between(before: int, now: int) -> int:
+    """How many frames were numbered between two; below 0 for one that comes out of order. GigE Vision's 16-bit numbers go from 65535 to 1."""
+    if now < before <= _LAST_OF_16_BIT and before - now > _LAST_OF_16_BIT // 2:
+        now += _LAST_OF_16_BIT
+    return now - before - 1
 
 
 @dataclass
@@ -187,7 +195,7 @@ class FrameStream:
                 side.frame_id += 1
             return
         assert frame is not None
-        skipped = 0 if side.frame_id is None else frame.frame_id - side.frame_id - 1
+        skipped = 0 if side.frame_id is None else frames_between(side.frame_id, frame.frame_id)
         if skipped < 0:
             raise NoAnswer(f"{side.name}: frame {frame.frame_id} came after frame {side.frame_id}; it is started anew")
         side.trigger, side.frame_id, side.frame = side.trigger + 1, frame.frame_id, frame

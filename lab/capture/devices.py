@@ -20,6 +20,7 @@ from drivers.camera.stream import MOST_LOST, FrameStream
 from drivers.display.base import Display
 from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
 from drivers.monochromator.base import Monochromator
+from drivers.photodiode.base import IrradianceMeasurement, Photodiode
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
 from lab.capture.blocking_calls import STOP_S, Status, bounded
@@ -221,6 +222,39 @@ class RadiometerDevice(Device):
 
     def readings(self) -> dict[str, float | str]:
         return {"radiance": self.stored.path if self.stored else ""}
+
+
+class PhotodiodeDevice(Device):
+    """The reference photodiode. Prepared with the wavelength (nm) of the light, and triggered to measure its irradiance; prepared with
+    None, its dark current."""
+
+    def __init__(self, photodiode: Photodiode) -> None:
+        super().__init__("photodiode")
+        self.photodiode = photodiode
+        self.wavelength_nm: float | None = None
+        self.dark_a: float | None = None  # None: not measured yet
+        self.measured: IrradianceMeasurement | None = None
+
+    def prepare(self, wavelength_nm: float | None) -> Status:
+        self.wavelength_nm, self.measured = wavelength_nm, None
+        return Status("photodiode", lambda: None, STOP_S)
+
+    def trigger(self) -> Status:
+        def measure() -> None:
+            if self.wavelength_nm is None:
+                self.dark_a = self.photodiode.measure_dark()
+            else:
+                self.measured = self.photodiode.measure(self.wavelength_nm)
+
+        return Status("photodiode", measure, MEASURE_S)
+
+    def readings(self) -> dict[str, float | str]:
+        found = self.measured
+        return {
+            "irradiance_w_m2": found.irradiance_w_m2 if found else 0.0,
+            "sd_irradiance_w_m2": found.sd_irradiance_w_m2 if found else 0.0,
+            "photodiode_dark_a": self.dark_a or 0.0,
+        }
 
 
 @dataclass(frozen=True)

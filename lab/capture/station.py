@@ -18,6 +18,7 @@ from drivers.display.base import Display
 from drivers.errors import InstrumentError
 from drivers.instrument import Instrument
 from drivers.monochromator.base import Monochromator
+from drivers.photodiode.base import Photodiode
 from drivers.registry import driver
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
@@ -32,7 +33,7 @@ from sim.spectrum import Spectrum
 
 T = TypeVar("T")
 
-_FAMILIES = ("monochromator", "spectroradiometer", "display", "stage")
+_FAMILIES = ("monochromator", "spectroradiometer", "photodiode", "display", "stage")
 
 
 class Address(BaseModel):
@@ -85,6 +86,7 @@ class Station(Frozen):
     resume_automatically: bool = False
     monochromator: Address | None = None
     spectroradiometer: Address | None = None
+    photodiode: Address | None = None
     display: Address | None = None
     stage: Address | None = None
     cameras: dict[Side, StationCamera] = Field(min_length=1)
@@ -186,6 +188,7 @@ class Drivers:
     monochromator: Monochromator | None = None
     spectroradiometer: Spectroradiometer | None = None
     display: Display | None = None
+    photodiode: Photodiode | None = None
 
     @property
     def all(self) -> dict[str, Instrument]:
@@ -195,6 +198,7 @@ class Drivers:
             "stage": self.stage,
             "display": self.display,
             "spectroradiometer": self.spectroradiometer,
+            "photodiode": self.photodiode,
         }
         named |= {f"camera {side}": camera for side, camera in self.cameras.items()}
         return {name: found for name, found in named.items() if found is not None}
@@ -230,4 +234,5 @@ def drivers_of(station: Station) -> Drivers:
         monochromator=made("monochromator", station.monochromator),
         spectroradiometer=made("spectroradiometer", station.spectroradiometer),
         display=made("display", station.display),
+        photodiode=made("photodiode", station.photodiode),
     )

@@ -11,7 +11,7 @@ import bluesky.plan_stubs as bps
 import numpy as np
 from bluesky.utils import Msg
 
-from lab.capture.devices import LightSetting, Shot, ShownPattern
+from lab.capture.devices import LightSetting, PhotodiodeDevice, Shot, ShownPattern
 from lab.capture.instruments import Instruments
 from lab.capture.records import StoredFile
 from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
@@ -147,6 +147,11 @@ def take(
     A step with captures whose light the spectroradiometer refuses to measure is left out, with the reason in its result. In a step
     without captures the refusal is a DeviceError, as later steps use the spectrum.
     """
+    wavelength_nm = step.setting.wavelength_nm or 0.0
+    # One responsivity: light of one wavelength.
+    photodiode = instruments.photodiode if step.radiance and step.captures and wavelength_nm > 0.0 else None
+    if photodiode is not None and photodiode.dark_a is None:
+        yield from _dark_current(instruments)
     yield from arrange(step, instruments)
     files: list[StoredFile] = []
     result: dict[str, Any] = {}
@@ -164,6 +169,8 @@ def take(
             return Taken({"skipped": reason})
         files.append(radiometer.stored)
         result["radiance"] = step.radiance
+    if photodiode is not None:
+        yield from _measure_irradiance(photodiode, wavelength_nm)
     captures: tuple[Capture, ...] = ()
     if isinstance(step.exposure, FindExposure):
         exposure_s, levels = yield from find_exposure(step.exposure, instruments, _start(instruments, results))
@@ -192,6 +199,21 @@ def take(
         yield from bps.read(device)
     yield from bps.save()
     return Taken(result, tuple(files), captures)
+
+
+def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | None) -> Plan[None]:
+    """Irradiance of light of a wavelength; of None, the dark current."""
+    yield Msg("prepare", photodiode, wavelength_nm, group="irradiance")
+    yield from bps.trigger(photodiode, group="irradiance")
+    yield from bps.wait(group="irradiance")
+
+
+def _dark_current(instruments: Instruments) -> Plan[None]:
+    """The photodiode's dark current, with the shutter closed."""
+    assert instruments.photodiode is not None
+    if instruments.shutter is not None and instruments.shutter.value is not False:
+        yield from bps.abs_set(instruments.shutter, False, wait=True)
+    yield from _measure_irradiance(instruments.photodiode, None)
 
 
 def _start(instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:

@@ -13,7 +13,7 @@ import usb.core
 
 from drivers.camera.base import capture_together
 from drivers.camera.basler import BaslerCamera
-from drivers.camera.stream import MOST_LOST, FrameStream
+from drivers.camera.stream import MOST_LOST, FrameStream, frames_between
 from drivers.camera.u3v import U3vCamera
 from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
 from mocks.peers import EmulatedBasler
@@ -227,3 +227,10 @@ def test_a_series_that_nobody_answers_ends(pair: Pair) -> None:
     pair.devices[0].fail(parse_faults("never@1+"))
     with pytest.raises(NoAnswer, match=r"no answer while reading a frame of 0\.001 s"):
         pair.series(2).next()
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "between"), [(0, 1, 0), (4, 7, 2), (65535, 1, 0), (65534, 2, 2), (7, 6, -2), (70000, 70001, 0)]
+)
+def test_numbers_of_16_bits_begin_again_at_1(before: int, now: int, between: int) -> None:
+    assert frames_between(before, now) == between
