@@ -233,9 +233,10 @@ class LibraryCamera(StreamingCamera):
             if self._armed is None or self._exposure_s is None or self._fired is None:
                 raise InstrumentError(f"{self._who}: no frame was asked for; call arm and fire first")
             grabbed = self._await_frame(self._exposure_s)
-            if grabbed.frame_id == self._frame_id:
-                raise Repeated(f"{self._who}: frame {grabbed.frame_id} came twice; it is dropped")
-            self._frame_id = grabbed.frame_id
+            if not grabbed.damage:
+                if grabbed.frame_id == self._frame_id != 0:  # 0 again: a camera that doesn't count
+                    raise Repeated(f"{self._who}: frame {grabbed.frame_id} came twice; it is dropped")
+                self._frame_id = grabbed.frame_id
             raw, pixel_format = grabbed.unpacked(self._who)
             return Frame(
                 raw,

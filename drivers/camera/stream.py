@@ -23,7 +23,12 @@ _LAST_OF_16_BIT = 0xFFFF
 
 
 def frames_between(before: int, now: int) -> int:
-    """How many frames were numbered between two; below 0 for one that comes out of order. GigE Vision's 16-bit numbers go from 65535 to 1."""
+    """How many frames were numbered between two; below 0 for one that comes out of order.
+
+    GigE Vision's 16-bit numbers go from 65535 to 1; a camera that doesn't count says 0.
+    """
+    if before == now == 0:
+        return 0
     if now < before <= _LAST_OF_16_BIT and before - now > _LAST_OF_16_BIT // 2:
         now += _LAST_OF_16_BIT
     return now - before - 1

@@ -292,8 +292,12 @@ class U3vCamera(StreamingCamera):
                 self._stream = U3vStream(
                     self._device, self._at.stream_in, self._layout, self._exposure_s + 0.5 * self._timeout_s
                 )
+                try:
+                    self.nodes.execute("AcquisitionStart")
+                except BaseException:
+                    self._end_stream()
+                    raise
                 self._armed = trigger
-                self.nodes.execute("AcquisitionStart")
             self._fired = datetime.now(UTC)
 
     def fire(self) -> None:
@@ -437,7 +441,9 @@ class U3vCamera(StreamingCamera):
         self._stopped.set()
         with contextlib.suppress(InstrumentError, usb.core.USBError), self._lock:
             self._stopped.clear()
-            if self._device is not None:
+            if self._armed is not None:
+                self._recover()
+            elif self._device is not None:
                 self._stop_acquisition()
 
     def close(self) -> None:

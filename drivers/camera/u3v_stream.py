@@ -28,7 +28,7 @@ LEADER = struct.Struct("<IHHQHHQIIIIIHH")  # 52 bytes
 TRAILER = struct.Struct("<IHHQHHQI")  # 32 bytes
 
 #: Frames that wait for whoever reads them; the camera itself drops the next ones.
-BUFFERS = 6
+BUFFERS = 4
 #: How often (s) the thread looks whether it is to end, while nothing comes.
 _LOOK_S = 0.1
 
@@ -77,7 +77,8 @@ class U3vStream:
         self._head = array("B", bytes(max(layout.leader_bytes, layout.trailer_bytes)))
         self._pieces = [array("B", bytes(size)) for size in layout.transfers]
         self._leader: _Leader | None = None  # one that came where a trailer was due
-        self._free: queue.SimpleQueue[NDArray[np.uint8]] = queue.SimpleQueue()
+        # The one given back last is filled next: of those that are never needed, no page is touched.
+        self._free: queue.LifoQueue[NDArray[np.uint8]] = queue.LifoQueue()
         for _ in range(BUFFERS):
             self._free.put(np.empty(sum(layout.transfers), np.uint8))
         self._came: queue.SimpleQueue[tuple[Grabbed, NDArray[np.uint8]] | usb.core.USBError] = queue.SimpleQueue()

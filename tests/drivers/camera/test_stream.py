@@ -230,7 +230,24 @@ def test_a_series_that_nobody_answers_ends(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "between"), [(0, 1, 0), (4, 7, 2), (65535, 1, 0), (65534, 2, 2), (7, 6, -2), (70000, 70001, 0)]
+    ("before", "now", "between"),
+    [(0, 1, 0), (4, 7, 2), (65535, 1, 0), (65534, 2, 2), (7, 6, -2), (70000, 70001, 0), (0, 0, 0)],
 )
 def test_numbers_of_16_bits_begin_again_at_1(before: int, now: int, between: int) -> None:
     assert frames_between(before, now) == between
+
+
+def test_an_acquisition_that_doesnt_start_is_started_again(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = pair.cameras[0].nodes
+    execute, failing = nodes.execute, ["AcquisitionStart"]
+
+    def once(name: str) -> None:
+        if name in failing:
+            failing.remove(name)
+            raise NoAnswer("camera L: no answer")
+        execute(name)
+
+    monkeypatch.setattr(nodes, "execute", once)
+    with pytest.raises(NoAnswer):
+        capture_together(pair.cameras)
+    assert [frame.frame_id for frame in capture_together(pair.cameras)] == [0, 0]
