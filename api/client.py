@@ -24,6 +24,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from api.schemas import (
     Certify,
+    ConnectedDevice,
     DeviceCheck,
     DeviceState,
     Health,
@@ -140,6 +141,10 @@ class ServiceClient:
     def station(self, name: str) -> StationState:
         """One station."""
         return self._get(StationState, f"/stations/{name}")
+
+    def connected(self) -> list[ConnectedDevice]:
+        """What is connected to the service's computer, and what drives it."""
+        return list(self._pages(ConnectedDevice, "/devices"))
 
     def devices(self, station: str) -> list[DeviceState]:
         """A station's instruments, and how their latest self-tests went."""

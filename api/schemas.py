@@ -323,6 +323,14 @@ class DeviceState(Schema):
     )
 
 
+class ConnectedDevice(Schema):
+    """Something that is connected to the service's computer."""
+
+    address: str
+    what: str = Field(description="what it says it is")
+    driver: str = Field(description="`family.name` of what drives it; empty where none is known, as of a serial port")
+
+
 class DeviceCheck(Schema):
     """How a device is checked."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Response
@@ -10,15 +11,35 @@ from fastapi.responses import PlainTextResponse
 
 from api.errors import answers
 from api.routes.sessions import station_state
-from api.schemas import DeviceCheck, DeviceState, StationState
+from api.schemas import ConnectedDevice, DeviceCheck, DeviceState, StationState
 from api.service import OPERATE, READ, Here, Service
+from drivers import discovery
+from drivers.errors import InstrumentError
 from lab.capture.station import Station
+from lab.errors import DeviceError
 
 router = APIRouter(tags=["stations"])
 StationName = Annotated[str, PathParameter(max_length=100, description="of the station file, without `.toml`")]
 DeviceName = Annotated[
     str, PathParameter(pattern=r"^[a-z]{1,40}(\.[a-z]{1,10})?$", description="`monochromator`, `cameras.left`, ...")
 ]
+
+
+_LOOKING = threading.Lock()
+
+
+@router.get("/devices", dependencies=[OPERATE], responses=answers(401, 403, 503))
+def list_connected(service: Here) -> list[ConnectedDevice]:
+    """What is connected to the service's computer, and what drives it, as `calibench devices` lists it: USB instruments, cameras of installed
+    libraries, serial ports. Takes seconds where a network is searched for cameras."""
+    try:
+        with _LOOKING:  # the libraries that list cameras aren't made for two at a time
+            return [
+                ConnectedDevice(address=found.address, what=service.public(found.what), driver=found.driver)
+                for found in discovery.find_all()
+            ]
+    except InstrumentError as error:
+        raise DeviceError(str(error)) from error
 
 
 def _device(service: Service, name: str, station: Station, device: str) -> DeviceState:

@@ -23,6 +23,7 @@ ROUTES = [
     ("GET", "/effects", "read"),
     ("GET", "/effects/{name}", "read"),
     ("GET", "/stations", "read"),
+    ("GET", "/devices", "operate"),
     ("GET", "/stations/{name}", "read"),
     ("GET", "/stations/{name}/devices", "read"),
     ("GET", "/stations/{name}/devices/{device}", "read"),

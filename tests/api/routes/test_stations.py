@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 
 from api.client import ServiceClient, ServiceProblem
+from drivers import discovery
 from drivers.contract.scripted import ScriptedPeer
+from drivers.discovery import Found
+from drivers.errors import Disconnected
 from tests.api.conftest import Running
 from tests.lab.fake_bench import Bench, FakeMonochromator
 
@@ -34,6 +37,24 @@ def test_devices_are_those_of_the_station_file(shared: Running) -> None:
         assert [one.driver for one in devices][2:4] == ["stage.fake", "camera.fake"]
         assert {(one.state, one.used_by, one.transcript) for one in devices} == {("unknown", None, None)}
         assert client.device("fakes", "cameras.left") == devices[3]
+
+
+def test_what_is_connected_is_what_the_command_line_finds(shared: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = [
+        Found("usb://4711", "Basler acA (2676:ba02) 4711", "camera", "u3v"),
+        Found("/dev/ttyUSB0", "serial port: FT232R"),
+    ]
+    monkeypatch.setattr(discovery, "find_all", lambda: iter(there))
+    with client_of(shared) as client:
+        told = [(one.address, one.what, one.driver) for one in client.connected()]
+        assert told == [(found.address, found.what, found.driver) for found in there]
+
+        def broken() -> list[Found]:
+            raise Disconnected("USB: gone; plug it in again")
+
+        monkeypatch.setattr(discovery, "find_all", broken)
+        with pytest.raises(ServiceProblem, match="503: USB: gone; plug it in again"):
+            client.connected()
 
 
 def test_a_check_says_who_it_is_and_leaves_it_safe(running: Running) -> None:
