@@ -19,6 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.middleware import Middleware
 
 from api import errors, schemas
+from api.checks import DeviceChecks
 from api.errors import DefectMiddleware, Problem, answers, problem
 from api.idempotency import PARAMETER, Idempotency
 from api.keys import LOOPBACK, stored_keys
@@ -26,6 +27,7 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.public_text import PublicText
 from api.routes import calibrations, jobs, knowledge, recordings, sessions
+from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
     COOKIE,
@@ -178,6 +180,7 @@ def create_app(
         rescue.start()
         yield
         await asyncio.to_thread(rescue.close)
+        await asyncio.to_thread(app.state.service.checks.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
 
@@ -206,15 +209,17 @@ def create_app(
     app.state.gate = gate
     app.state.metrics = counted
     app.state.public = PublicText(store.root)
+    live = LiveSessions(store, connect)
     app.state.service = Service(
         store=store,
         stations=folder,
-        live=LiveSessions(store, connect),
+        live=live,
         jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
         gate=gate,
         public=app.state.public,
         limits=caps,
+        checks=DeviceChecks(live, connect, store.root / "transcripts"),
     )
     errors.install(app)
 
@@ -223,6 +228,7 @@ def create_app(
 
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
+    app.include_router(stations_router, prefix=PREFIX)
     for part in (knowledge, sessions, recordings, jobs, calibrations):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]

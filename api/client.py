@@ -24,6 +24,9 @@ from pydantic import BaseModel, TypeAdapter
 
 from api.schemas import (
     Certify,
+    ConnectedDevice,
+    DeviceCheck,
+    DeviceState,
     Health,
     Job,
     JobKind,
@@ -134,6 +137,45 @@ class ServiceClient:
     def stations(self) -> list[StationState]:
         """The stations that the service knows."""
         return list(self._pages(StationState, "/stations"))
+
+    def station(self, name: str) -> StationState:
+        """One station."""
+        return self._get(StationState, f"/stations/{name}")
+
+    def connected(self) -> list[ConnectedDevice]:
+        """What is connected to the service's computer, and what drives it."""
+        return list(self._pages(ConnectedDevice, "/devices"))
+
+    def devices(self, station: str) -> list[DeviceState]:
+        """A station's instruments, and how their latest self-tests went."""
+        return list(self._pages(DeviceState, f"/stations/{station}/devices"))
+
+    def device(self, station: str, device: str) -> DeviceState:
+        """One instrument of a station."""
+        return self._get(DeviceState, f"/stations/{station}/devices/{device}")
+
+    def start_check(self, station: str, device: str, *, transcript: bool = False) -> DeviceState:
+        """Let an instrument work once, in the background."""
+        return self._post(
+            DeviceState, f"/stations/{station}/devices/{device}/check", DeviceCheck(transcript=transcript)
+        )
+
+    def check_device(
+        self, station: str, device: str, *, transcript: bool = False, patience_s: float = PATIENCE_S
+    ) -> DeviceState:
+        """Let an instrument work once and wait for the end of that; its `state` says whether it works."""
+        found = self.start_check(station, device, transcript=transcript)
+        until = time.monotonic() + patience_s
+        while found.state == "checking":
+            if time.monotonic() > until:
+                raise TimeoutError(f"after {patience_s:g} s: {found!r}")
+            time.sleep(LOOK_S)
+            found = self.device(station, device)
+        return found
+
+    def transcript(self, station: str, device: str) -> str:
+        """What went over an instrument's wire in the latest check that kept it."""
+        return self.request("GET", f"/stations/{station}/devices/{device}/transcript").text
 
     def sessions(self) -> Iterator[StoredSession]:
         """All sessions, the newest first."""

@@ -124,6 +124,15 @@ class LiveSessions:
         self._live: dict[str, LiveSession] = {}
         self._lock = threading.Lock()
         self._closed = False
+        self._held: list[frozenset[str]] = []  # addresses that sessions are kept off
+
+    def hold(self, station: Station) -> Callable[[], None]:
+        """Keep sessions off a station's instruments until what is returned is called. Raises Conflict where one runs on them, or they
+        are held already."""
+        with self._lock:
+            self._check_free(station)
+            self._held.append(station.addresses)
+        return lambda: self._held.remove(station.addresses)
 
     def find(self, session_id: str) -> LiveSession | None:
         """The session if this process runs it now, else None."""
@@ -253,27 +262,17 @@ class LiveSessions:
             raise Conflict("the service is being stopped; start the session when it is up again")
         if (busy := self.busy(station)) is not None:
             raise Conflict(f"session {busy} runs on these instruments; wait for it or abort it")
+        if any(held & station.addresses for held in self._held):
+            raise Conflict("one of these instruments is being checked; wait for the end of that")
 
     def busy(self, station: Station) -> str | None:
         """Id of a session that uses an instrument of this station now, in this process or another."""
-        wanted = _addresses(station)
+        wanted = station.addresses
         for id, session in self._live.items():
-            if not session.ended and wanted & _addresses(session.station):
+            if not session.ended and wanted & session.station.addresses:
                 return id
         for id in self._store.under_way():
             elsewhere = self.find(id) is None and self._store.session(id).state in RUNS
-            if elsewhere and wanted & _addresses(self._store.station(id)):
+            if elsewhere and wanted & self._store.station(id).addresses:
                 return id
         return None
-
-
-def _addresses(station: Station) -> set[str]:
-    """The addresses of a station's instruments."""
-    entries = [
-        station.monochromator,
-        station.spectroradiometer,
-        station.display,
-        station.stage,
-        *station.cameras.values(),
-    ]
-    return {entry.address for entry in entries if entry is not None}

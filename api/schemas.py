@@ -300,3 +300,38 @@ class Recordings(Schema):
     cameras: tuple[Side, ...]
     captures: int
     warnings: tuple[str, ...] = ()
+
+
+# --- a station's devices ----------------------------------------------------------------------------------------------
+
+
+class DeviceState(Schema):
+    """One instrument of a station, and how its latest self-test in this service went."""
+
+    name: str = Field(description="its table in the station file: `monochromator`, `cameras.left`")
+    driver: str = Field(description="`family.name` of what drives it")
+    address: str
+    state: Literal["unknown", "in use", "checking", "works", "fails"] = Field(
+        description="`unknown`: not checked since the service started; `in use`: a session works with it now"
+    )
+    used_by: str | None = Field(default=None, description="id of the session that works with it now")
+    checked: Utc | None = Field(default=None, description="when the latest self-test ended")
+    identity: str = Field(default="", description="maker, model, serial number and firmware, as it told them then")
+    words: str = Field(default="", description="how the latest self-test went, in one line")
+    transcript: str | None = Field(
+        default=None, description="where what went over its wire can be fetched; null: not kept"
+    )
+
+
+class ConnectedDevice(Schema):
+    """Something that is connected to the service's computer."""
+
+    address: str
+    what: str = Field(description="what it says it is")
+    driver: str = Field(description="`family.name` of what drives it; empty where none is known, as of a serial port")
+
+
+class DeviceCheck(Schema):
+    """How a device is checked."""
+
+    transcript: bool = Field(default=False, description="keep what goes over its wire meanwhile")

@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import Depends, HTTPException, Request
 from fastapi import Path as PathParameter
 
+from api.checks import DeviceChecks
 from api.errors import known
 from api.keys import Permission
 from api.live import LiveSessions
@@ -46,17 +47,22 @@ class Service:
     gate: Gate
     limits: Limits
     public: PublicText
+    checks: DeviceChecks
 
     def station_files(self) -> dict[str, Path]:
         """The station files by name."""
         return {file.stem: file for file in sorted(self.stations.glob("*.toml")) if file.is_file()}
 
-    def station(self, name: str) -> Station:
-        """A station by its file's name; 404 where there is none. Raises InputError where the file can't be used."""
+    def station_file(self, name: str) -> Path:
+        """A station's file; 404 where there is none."""
         file = self.station_files().get(name)  # looked up, never joined: a name can't leave the folder
         if file is None:
             raise HTTPException(404, f"no station {name[:100]!r}; GET /api/v1/stations lists them")
-        return read_station(file)
+        return file
+
+    def station(self, name: str) -> Station:
+        """A station by its file's name; 404 where there is none. Raises InputError where the file can't be used."""
+        return read_station(self.station_file(name))
 
     def session(self, session_id: str) -> SessionInfo:
         """A session; 404 where there is none."""

@@ -23,6 +23,10 @@ class Garbled(InstrumentError):
     """Something was received that isn't an answer to the request."""
 
 
+class Repeated(Garbled):
+    """A camera's frame came once more: its number is that of the frame before. No trigger is spent on it."""
+
+
 class Interrupted(InstrumentError):
     """`stop`, called from another thread, ended a wait."""
 

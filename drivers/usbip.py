@@ -49,6 +49,8 @@ URB_HEADER_BYTES = HEADER.size + SUBMIT.size
 
 #: Largest answer a server may announce; one frame of a 100-megapixel camera fits.
 MOST_BYTES = 512 * 1024 * 1024
+#: What `USBError.errno` is once a device is gone.
+GONE = (errno.ENODEV, errno.EIO, errno.ESHUTDOWN)
 _CONNECT_TIMEOUT_S = 5.0
 _UNLINK_GRACE_S = 2.0
 _CONTROL_TIMEOUT_MS = 5000
@@ -566,7 +568,7 @@ def translate(error: usb.core.USBError, who: str, doing: str) -> InstrumentError
     """The driver's error for one of pyusb's, in one line."""
     if isinstance(error, usb.core.USBTimeoutError):
         return NoAnswer(f"{who}: no answer while {doing}; check the cable and the power")
-    if error.errno in (errno.ENODEV, errno.EIO, errno.ESHUTDOWN):
+    if error.errno in GONE:
         return Disconnected(f"{who}: the connection was lost while {doing} ({error}); plug it in again")
     if error.errno == errno.EPIPE:
         return NoAnswer(f"{who}: halted its endpoint while {doing}; the halt is cleared, try again")

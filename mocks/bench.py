@@ -299,7 +299,9 @@ class Bench:
         with self._camera_locks[side]:
             source *= unsteady_source(camera.model, camera.acting, exposure.elapsed_s)
             held = collected_electrons(light, camera.model, exposure, camera.acting, source=source)
-            read, self._left_behind[side] = read_electrons(held + self._left_behind[side], camera.model, camera.acting)
+            if isinstance(self._left_behind[side], np.ndarray):
+                held += self._left_behind[side]
+            read, self._left_behind[side] = read_electrons(held, camera.model, camera.acting)
             frame = sample_from(
                 read,
                 camera.model,

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from mocks.conceal import Concealed
     from mocks.display import MockScreen
     from mocks.lamp import Lamp
+    from mocks.ready_frames import ReadyFrames
     from mocks.stage import Targets
 
     class Place(MeasuredLight, Targets, MockScreen, Protocol):
@@ -94,7 +95,10 @@ def mock(
     ] = "",
     fault: Annotated[
         str,
-        typer.Option(help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug."),
+        typer.Option(
+            help="How to fail: KIND[=VALUE][@N[+]], as in half@3; late never half wrong error drop unplug, "
+            "a camera's frames also torn repeated missed."
+        ),
     ] = "",
     real_time: Annotated[float, typer.Option(help="Real seconds for each of the instrument's (0: no waiting).")] = 0.0,
     dialect: Annotated[
@@ -103,6 +107,12 @@ def mock(
     ] = "",
     calibration: Annotated[
         Path | None, typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus).")
+    ] = None,
+    frames: Annotated[
+        Path | None,
+        typer.Option(
+            help="Replay the frames *-left.npy and *-right.npy of this folder, in real time (u3v, u3v-stereo)."
+        ),
     ] = None,
 ) -> None:
     """Serve one mock instrument on a pseudo-terminal, a TCP port or USB/IP; prints `ready ADDRESS` when it listens."""
@@ -119,9 +129,11 @@ def mock(
             raise _Unusable(f"mock {name}: no dialect {dialect!r}; pr655 and pr670 have {', '.join(DIALECTS)}")
         if calibration is not None and name != "usb2000plus":
             raise _Unusable(f"mock {name}: no calibration file comes with it; leave --calibration out")
+        if frames is not None and not name.startswith("u3v"):
+            raise _Unusable(f"mock {name}: it takes no frames; leave --frames out")
         if link is not None and tcp:
             raise _Unusable("mock: --link and --tcp exclude one another; give one of them")
-        faults = parse_faults(fault)
+        faults = parse_faults(fault, frames=name.startswith("u3v"))
         lamp = Lamp(clock=LampClock(max(0.0, real_time)))
         stop = threading.Event()
         with _ended_by_signals(stop):
@@ -130,9 +142,8 @@ def mock(
                 _say(f"ready {host}:{port}")
                 browse(Page(lamp), f"{host}:{port}", stop, faults)
             elif name in USB_INSTRUMENTS:
-                _serve_usb(
-                    name, lamp, _host_and_port(tcp or "127.0.0.1:0"), stop, faults, calibration, max(0.0, real_time)
-                )
+                light = lamp if not name.startswith("u3v") else _before_cameras(name, frames, max(0.0, real_time))
+                _serve_usb(name, light, _host_and_port(tcp or "127.0.0.1:0"), stop, faults, calibration)
             else:
                 endpoint = Tcp(*_host_and_port(tcp)) if tcp else Pty(link)
                 grammar = INSTRUMENTS[name](lamp)
@@ -141,24 +152,33 @@ def mock(
                 serve(grammar, endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
 
 
+def _before_cameras(name: str, frames: Path | None, real_time: float) -> Bench | ReadyFrames:
+    """What stands before cameras that are served alone: white light, or frames that are ready."""
+    from mocks.bench import Bench
+    from mocks.ready_frames import ReadyFrames
+
+    if frames is not None:
+        try:
+            return ReadyFrames.of_folder(frames, ("left", "right") if name == "u3v-stereo" else ("left",))
+        except ValueError as error:
+            raise _Unusable(f"--frames {error}") from error
+    light = Bench(real_time_factor=real_time)
+    light.place("sphere")
+    light.set_shutter(True)
+    return light
+
+
 def _serve_usb(
     name: str,
-    lamp: Lamp,
+    light: Bench | Lamp | ReadyFrames,
     at: tuple[str, int],
     stop: threading.Event,
     faults: tuple[Fault, ...],
     calibration: Path | None,
-    real_time: float,
 ) -> None:
-    from mocks.bench import Bench
     from mocks.usb import devices, serve_usbip
     from mocks.usb2000plus import calibration_csv
 
-    light: Bench | Lamp = lamp
-    if name.startswith("u3v"):
-        light = Bench(real_time_factor=real_time)
-        light.place("sphere")
-        light.set_shutter(True)
     exported = devices(name, light)
     for device in exported:
         device.fail(faults)
@@ -441,7 +461,7 @@ def _bench_faults(specs: list[str]) -> dict[str, tuple[Fault, ...]]:
         instrument, separator, what = spec.partition(":")
         if not separator or instrument not in instruments:
             raise _Unusable(f"--fault {spec}: write INSTRUMENT:SPEC with one of {', '.join(instruments)}")
-        faults[instrument] = faults.get(instrument, ()) + parse_faults(what)
+        faults[instrument] = faults.get(instrument, ()) + parse_faults(what, frames=instrument.startswith("cameras."))
     return faults
 
 

@@ -57,10 +57,13 @@ class MockSpecbos1211(Grammar):
         serial_number: str = "1211427",
         model: str = "specbos 1211",
         calibrated_nm: tuple[float, float] = (350.0, 1000.0),
+        told_nm: tuple[float, float] | None = None,
     ) -> None:
+        """`told_nm`: the range that it says it measures, where that isn't the one for which it is calibrated."""
         super().__init__(light.clock)
         self._model = model
         self._calibrated_nm = calibrated_nm
+        self._told_nm = told_nm or calibrated_nm
         self._light = light
         self._serial_number = serial_number
         self._line = bytearray()
@@ -193,9 +196,9 @@ class MockSpecbos1211(Grammar):
     def _get(self, tree: str, name: str) -> bytes:
         first_nm, last_nm, step_nm = self._range_nm
         if name == "wavbeg":
-            return b"Predefined start wave: %.1f\r" % self._calibrated_nm[0]
+            return b"Predefined start wave: %.1f\r" % self._told_nm[0]
         if name == "wavend":
-            return b"Predefined end wave: %.1f\r" % self._calibrated_nm[1]
+            return b"Predefined end wave: %.1f\r" % self._told_nm[1]
         if name == "spnum":
             return f"spectrometer number: {self._serial_number}\r".encode("ascii")
         if name == "wran":

@@ -20,9 +20,9 @@ import zipfile
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
-from mocks.bench import Bench, UInt16Array
+from mocks.bench import UInt16Array
+from mocks.pixels import BAYER_RG8, BAYER_RG12, BAYER_RG12P, encode, payload_bytes
+from mocks.ready_frames import BeforeCameras
 from mocks.usb_device import Cancelled, UsbDevice, UsbEndpoint, UsbIdentity, UsbInterface
 from sim.camera import Side
 
@@ -65,7 +65,6 @@ FEATURE_BYTES = 4 * 26
 TICKS_PER_US = 10
 MOST_EXPOSURE_US = 60e6
 MOST_GAIN_DB = 24.0
-BAYER_RG8, BAYER_RG12, BAYER_RG12P = 0x01080009, 0x01100011, 0x010C0059
 TRIGGER_ON = 1 << 0
 SOURCE_SHIFT, SOURCE_SOFTWARE, SOURCE_LINE = 4, 0, 1
 _MOST_QUEUED = 4
@@ -79,6 +78,9 @@ _AS_FRAMES = {
     "error": "halt",
     "drop": "lost-trailer",
     "unplug": "unplug",
+    "torn": "torn",
+    "repeated": "repeated",
+    "missed": "missed",
 }
 
 #: What a camera can be told to do wrong, once or several times (`U3vDevice.inject`).
@@ -88,6 +90,9 @@ FAULTS = {
     "short": "the next frame's payload breaks off",
     "lost-trailer": "the next frame's trailer is lost",
     "damaged": "the next frame's trailer says that data were discarded",
+    "torn": "a transfer in the middle of the next frame is lost, its trailer says nothing",
+    "repeated": "the next frame comes twice",
+    "missed": "the next trigger isn't heard",
     "unplug": "the cable is pulled in the middle of the next frame",
     "busy": "the next command is refused as busy",
     "pending": "the next command is answered after a pending acknowledge",
@@ -98,29 +103,7 @@ FAULTS = {
 }
 
 
-def pack_12p(raw: UInt16Array) -> bytes:
-    """12-bit pixels as a stream of bits, least significant first: two pixels in three bytes."""
-    flat = np.append(raw.reshape(-1), np.zeros(raw.size % 2, np.uint16)).astype(np.uint32)
-    pair = flat[0::2] | (flat[1::2] << 12)
-    return (
-        np.stack([pair & 0xFF, (pair >> 8) & 0xFF, (pair >> 16) & 0xFF], axis=1)
-        .astype(np.uint8)
-        .tobytes()[: (raw.size * 12 + 7) // 8]
-    )
-
-
-def payload_bytes(pixel_format: int, pixels: int) -> int:
-    """Size of a frame's payload."""
-    return (pixels * ((pixel_format >> 16) & 0xFF) + 7) // 8
-
-
-def encode(raw: UInt16Array, pixel_format: int) -> bytes:
-    """A 12-bit raw frame in one of the camera's formats."""
-    if pixel_format == BAYER_RG12P:
-        return pack_12p(raw)
-    if pixel_format == BAYER_RG8:
-        return (raw >> 4).astype(np.uint8).tobytes()
-    return raw.astype("<u2").tobytes()
+_OF_FRAMES = ("late", "never", "short", "lost-trailer", "damaged", "torn", "repeated", "missed", "unplug", "halt")
 
 
 # --- the camera's XML -------------------------------------------------------------------------------------------------
@@ -192,7 +175,7 @@ class U3vDevice(UsbDevice):
 
     speed = 5
 
-    def __init__(self, bench: Bench, side: Side, serial_number: str, line: TriggerLine | None = None) -> None:
+    def __init__(self, bench: BeforeCameras, side: Side, serial_number: str, line: TriggerLine | None = None) -> None:
         companion = bytes([6, 0x30, 15, 0, 0, 0])
         super().__init__(
             UsbIdentity(
@@ -552,12 +535,14 @@ class U3vDevice(UsbDevice):
         top, left = self._get(OFFSET_Y), self._get(OFFSET_X)
         rows, cols = self._get(HEIGHT), self._get(WIDTH)
         pixel_format = self._get(PIXEL_FORMAT)
-        frame_id, self._frame_id = self._frame_id, self._frame_id + 1
         payload = encode(raw[top : top + rows, left : left + cols], pixel_format)
-        fault = self._failing("late", "never", "short", "lost-trailer", "damaged", "unplug", "halt")
+        fault = self._failing(*_OF_FRAMES)
         seconds: float | None = None
         for told in self._faults_of_answer():
             fault, seconds = _AS_FRAMES[told.kind], told.value
+        if fault == "missed":
+            return
+        frame_id, self._frame_id = self._frame_id, self._frame_id + 1
         if fault == "late":
             time.sleep(1.0 if seconds is None else seconds)
         if fault == "halt":
@@ -586,6 +571,10 @@ class U3vDevice(UsbDevice):
         pieces = [leader, *self._split(payload), *([] if fault == "lost-trailer" else [trailer])]
         if fault == "unplug":
             pieces = pieces[:1]
+        elif fault == "torn":
+            del pieces[len(pieces) // 2]
+        elif fault == "repeated":
+            pieces += pieces
         with self.changed:
             enabled = self._memory["sirm"].data[0x04] & 1
             queued = sum(piece[:4] == b"U3VL" for piece in self._stream)

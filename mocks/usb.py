@@ -24,6 +24,7 @@ from typing import Any, Self
 from drivers.usbip import Pipe, PipeBackend, RemoteDevice, failed, timed_out
 from mocks.bench import Bench
 from mocks.cornerstone260b import MockCornerstone260B
+from mocks.ready_frames import BeforeCameras
 from mocks.u3v import TriggerLine, U3vDevice
 from mocks.usb2000plus import MockUsb2000Plus
 from mocks.usb_device import Abandoned, UsbDevice, UsbFault
@@ -32,7 +33,7 @@ from mocks.wire import MeasuredLight
 SERIAL_NUMBERS = {"left": "CB-U3V-0001", "right": "CB-U3V-0002"}
 
 
-def stereo_pair(bench: Bench) -> tuple[U3vDevice, U3vDevice]:
+def stereo_pair(bench: BeforeCameras) -> tuple[U3vDevice, U3vDevice]:
     """Both cameras of a bench, wired to trigger one another."""
     line = TriggerLine()
     return (
@@ -49,7 +50,7 @@ _INSTRUMENTS: dict[str, Callable[[Any], Sequence[UsbDevice]]] = {
 }
 
 
-def devices(name: str, bench: Bench | MeasuredLight | None = None) -> tuple[UsbDevice, ...]:
+def devices(name: str, bench: BeforeCameras | MeasuredLight | None = None) -> tuple[UsbDevice, ...]:
     """The device models of one instrument, on a bench of its own if none is given; cameras need a bench.
 
     Raises ValueError for an unknown name.

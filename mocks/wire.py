@@ -102,6 +102,8 @@ class Grammar(ABC):
 # --- faults ---------------------------------------------------------------------------------------------------------
 
 KINDS = ("late", "never", "half", "wrong", "error", "drop", "unplug")
+#: What only a camera's frames do: one comes torn, one comes twice, a trigger isn't heard. `never` is a frame that is dropped.
+FRAME_KINDS = ("torn", "repeated", "missed")
 
 
 class FaultSpecError(ValueError):
@@ -125,18 +127,19 @@ class Fault:
         return number == self.at or (self.onwards and number > self.at)
 
 
-def parse_faults(spec: str) -> tuple[Fault, ...]:
-    """Faults from `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`.
+def parse_faults(spec: str, frames: bool = False) -> tuple[Fault, ...]:
+    """Faults from `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`. `frames`: those of a camera, too.
 
     Raises `FaultSpecError`.
     """
+    kinds = KINDS + FRAME_KINDS if frames else KINDS
     faults: list[Fault] = []
     for item in filter(None, (part.strip() for part in spec.split(","))):
         what, has_when, when = item.partition("@")
         kind, has_value, value = what.partition("=")
         kind = {"dropped": "drop", "half-reply": "half"}.get(kind, kind)
-        if kind not in KINDS:
-            raise FaultSpecError(f"--fault {item}: no fault {kind!r}; choose from {', '.join(KINDS)}")
+        if kind not in kinds:
+            raise FaultSpecError(f"--fault {item}: no fault {kind!r}; choose from {', '.join(kinds)}")
         try:
             number = int(when.removesuffix("+")) if has_when else 1
             amount = float(value) if has_value else None

@@ -135,19 +135,25 @@ def collected_electrons(
         source *= irradiance_factor(camera.lens.f_number, exposure.magnification) / irradiance_factor(
             camera.lens.f_number
         )
-    scene = light.scene * source
+    mean: FloatArray = light.scene * source  # an array of its own: what follows writes into it
     rows = before_lens.row_factors(camera.rows, exposure.exposure_s, exposure.elapsed_s)
     if rows is not None:
-        scene = scene * rows[:, None]
-    collected = charge.lit((scene + light.room) * charge.collected_s(exposure.exposure_s))
-    return charge.overflown(charge.moved(collected + dark_electrons(camera, exposure, effects)))
+        mean *= rows[:, None]
+    if isinstance(light.room, np.ndarray) or light.room:
+        mean += light.room
+    mean *= charge.collected_s(exposure.exposure_s)
+    np.add(charge.lit(mean), dark_electrons(camera, exposure, effects), out=mean)
+    return charge.overflown(charge.moved(mean))
 
 
 def read_electrons(
     collected: FloatArray, camera: CameraModel, effects: Sequence[Effect] = ()
 ) -> tuple[FloatArray, FloatArray | float]:
     """Of the mean electrons that a frame holds, those that are read, and those that stay in the pixels for the next frame."""
-    left = charge_of(camera, effects).staying(np.minimum(collected, camera.full_well_e))
+    charge = charge_of(camera, effects)
+    if not charge.lag:
+        return collected, 0.0
+    left = charge.staying(np.minimum(collected, camera.full_well_e))
     return collected - left, left
 
 

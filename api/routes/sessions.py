@@ -38,13 +38,13 @@ router = APIRouter()
 OVER = frozenset({"created", "interrupted", "failed", "finished"})
 #: A capture never changes, and its path has its session's random id in it.
 FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
-_INSTRUMENTS = ("monochromator", "spectroradiometer", "display", "stage")
 
 
 # --- stations ----------------------------------------------------------------------------------------------------------
 
 
-def _station(service: Service, name: str) -> StationState:
+def station_state(service: Service, name: str) -> StationState:
+    """What a station file says, or why it can't be used."""
     try:
         station = service.station(name)
     except InputError as error:
@@ -53,9 +53,7 @@ def _station(service: Service, name: str) -> StationState:
         name=name,
         title=station.name or name,
         cameras=station.sides,
-        instruments={
-            family: entry.driver for family in _INSTRUMENTS if (entry := getattr(station, family)) is not None
-        },
+        instruments={name: entry.driver for name, entry in station.devices.items() if not name.startswith("cameras.")},
         targets=tuple(station.targets),
         sequences=full_plan(station).names,
         busy_with=service.live.busy(station),
@@ -65,7 +63,7 @@ def _station(service: Service, name: str) -> StationState:
 @router.get("/stations", tags=["stations"], dependencies=[READ], responses=answers(401))
 def list_stations(service: Here) -> list[StationState]:
     """The station files in the folder `stations` of the data folder. They are written there, not sent: they name devices."""
-    return [_station(service, name) for name in service.station_files()]
+    return [station_state(service, name) for name in service.station_files()]
 
 
 # --- sessions ----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,8 @@ from importlib.machinery import PathFinder
 from importlib.util import module_from_spec
 from typing import Any, TypeVar
 
-from drivers.camera.genicam_library import Grabbed, LibraryCamera
+from drivers.camera.buffers import Grabbed
+from drivers.camera.genicam_library import LibraryCamera
 from drivers.camera.genicam_settings import Setting
 from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
 from drivers.instrument import Identity
@@ -206,6 +207,7 @@ class AravisCamera(LibraryCamera):
             code=0 if damage else buffer.get_image_pixel_format() & 0xFFFFFFFF,
             frame_id=int(buffer.get_frame_id()),
             damage=damage,
+            camera_time_ns=int(buffer.get_timestamp()) or None,
         )
         self._stream.push_buffer(buffer)
         return grabbed

@@ -16,6 +16,9 @@ from drivers.instrument import Instrument
 
 Trigger = Literal["software", "line"]
 
+#: How old (ns of the camera's clock) a temperature may be that stands with a streamed frame.
+TEMPERATURE_NS = 250_000_000
+
 
 @dataclass(frozen=True)
 class SensorInfo:
@@ -35,7 +38,8 @@ class Frame:
     """One frame as it left the converter, (rows, cols) DN, with the settings that the camera reports.
 
     `exposure_s` and `gain_db` are the camera's rounded settings. `time` (UTC) is the start of the exposure. `frame_id`
-    counts the frames since acquisition started.
+    counts the frames since acquisition started. `camera_time_ns`: start of the exposure on the camera's own clock, whose zero
+    is its own; None where it doesn't tell.
     """
 
     raw: NDArray[np.uint16]
@@ -45,6 +49,7 @@ class Frame:
     time: datetime
     pixel_format: str
     frame_id: int
+    camera_time_ns: int | None = None
 
 
 class Camera(Instrument):
@@ -85,6 +90,28 @@ class Camera(Instrument):
         self.arm("software")
         self.fire()
         return self.collect()
+
+
+class StreamingCamera(Camera):
+    """A camera that keeps buffers queued from `arm` to `disarm`: it may be triggered again before a frame has been read.
+
+    `drivers.camera.stream.FrameStream` takes series with such cameras. A frame that fails ends nothing: the next one follows.
+    """
+
+    #: Whether the computer triggers it after the camera that leads, as it isn't wired; told by `arm`.
+    follows_by_software = False
+
+    @abstractmethod
+    def next_frame(self) -> Frame:
+        """The frame of the oldest trigger whose frame wasn't read yet. Ends within exposure + time-out; the camera stays armed.
+
+        Its temperature is at most `TEMPERATURE_NS` old on the camera's clock, read beside the stream. Raises
+        `drivers.errors.Garbled` for a torn frame, `drivers.errors.Repeated` for one that came before, and `NoAnswer`.
+        """
+
+    @abstractmethod
+    def disarm(self) -> None:
+        """End acquisition and discard what was triggered and not read; `arm` starts anew. Never raises."""
 
 
 def capture_together(cameras: Sequence[Camera]) -> tuple[Frame, ...]:

@@ -9,7 +9,8 @@ import warnings
 from collections.abc import Callable, Collection, Iterator
 from typing import Any, TypeVar
 
-from drivers.camera.genicam_library import Grabbed, LibraryCamera
+from drivers.camera.buffers import Grabbed
+from drivers.camera.genicam_library import LibraryCamera
 from drivers.camera.genicam_settings import Setting
 from drivers.errors import Disconnected, InstrumentError, InUse
 from drivers.instrument import Identity
@@ -75,7 +76,7 @@ class BaslerCamera(LibraryCamera):
     """The Basler camera with the serial number `address`."""
 
     _camera: Any = None
-    _grabbed = 0
+    _tick_ns = 1.0  # of the camera's clock
 
     @staticmethod
     def enumerate_cameras() -> Iterator[tuple[str, str]]:
@@ -106,7 +107,10 @@ class BaslerCamera(LibraryCamera):
             raise kind(f"camera {self.address}: can't be opened ({said}); close other programs that use it") from error
         firmware = info.GetDeviceVersion() if info.IsDeviceVersionAvailable() else ""
         identity = Identity(info.GetVendorName(), info.GetModelName(), info.GetSerialNumber(), firmware)
-        return _Nodes(self._camera.GetNodeMap(), f"camera {self.address}"), identity
+        nodes = _Nodes(self._camera.GetNodeMap(), f"camera {self.address}")
+        if nodes.has("GevTimestampTickFrequency"):
+            self._tick_ns = 1e9 / float(nodes.get("GevTimestampTickFrequency"))
+        return nodes, identity
 
     def _start(self) -> None:
         self._library(lambda: self._camera.StartGrabbing(pylon_library().GrabStrategy_OneByOne))
@@ -133,7 +137,7 @@ class BaslerCamera(LibraryCamera):
             return None
         try:
             return Grabbed(
-                payload=bytes(result.GetBuffer()),
+                payload=result.GetBuffer(),  # a copy
                 rows=int(result.GetHeight()),
                 cols=int(result.GetWidth()),
                 code=int(result.GetPixelType()) & 0xFFFFFFFF,
@@ -142,6 +146,7 @@ class BaslerCamera(LibraryCamera):
                 damage=""
                 if result.GrabSucceeded()
                 else " ".join(str(result.GetErrorDescription()).split()) or "no reason told",
+                camera_time_ns=round(int(result.GetTimeStamp()) * self._tick_ns) or None,
             )
         finally:
             result.Release()

@@ -12,11 +12,11 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Protocol
 
-from drivers.camera.base import Camera, Frame, SensorInfo, Trigger
+from drivers.camera.base import TEMPERATURE_NS, Frame, SensorInfo, StreamingCamera, Trigger
+from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam_settings import (
     Features,
     black_level,
@@ -25,26 +25,13 @@ from drivers.camera.genicam_settings import (
     switch_processing_off,
     trigger_line,
 )
-from drivers.camera.pixel_format import PIXEL_FORMATS, PREFERENCE, PixelFormat
-from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
+from drivers.camera.pixel_format import PREFERENCE, PixelFormat
+from drivers.errors import Disconnected, InstrumentError, Interrupted, NoAnswer, Repeated
 from drivers.instrument import Identity, Recorder
 
 _LOOK_S = 0.1
 #: The exposure time's names: SFNC's, and that of cameras before it.
 _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
-
-
-@dataclass(frozen=True)
-class Grabbed:
-    """A buffer that the library handed out: the payload, its layout, and what is wrong with it; nothing if it is whole."""
-
-    payload: bytes | bytearray
-    rows: int
-    cols: int
-    code: int
-    frame_id: int
-    padding: int = 0
-    damage: str = ""
 
 
 class _NoFrame(NoAnswer):
@@ -61,7 +48,7 @@ class LibraryFeatures(Features, Protocol):
         """Run a command."""
 
 
-class LibraryCamera(Camera):
+class LibraryCamera(StreamingCamera):
     """One camera at the library's own `address`.
 
     `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits. `timeout_s`: longest time beyond the exposure.
@@ -91,10 +78,12 @@ class LibraryCamera(Camera):
         self._identity = Identity("", "")
         self._format: PixelFormat = PREFERENCE[0]
         self._armed: Trigger | None = None
-        self._follows = False
         self._exposure_s: float | None = None
         self._gain_db = 0.0
         self._fired: datetime | None = None
+        self._frame_id: int | None = None  # of the frame before, since acquisition started
+        self._has_temperature = False
+        self._temperature: tuple[int, float] | None = None  # when (ns of the camera's clock), and degrees
 
     # --- what a library does ----------------------------------------------------------------------------------------
 
@@ -155,6 +144,7 @@ class LibraryCamera(Camera):
             trigger_line(features, self._who, self._wanted_line)
         if self._output_line is not None:
             give_pulses(features, self._who, self._output_line, self._output_source)
+        self._has_temperature = features.has("DeviceTemperature")
 
     def identity(self) -> Identity:
         with self._used():
@@ -200,55 +190,80 @@ class LibraryCamera(Camera):
         with self._used() as features:
             if self._exposure_s is None:
                 raise InstrumentError(f"{self._who}: no exposure time was set; call configure first")
-            self._follows = trigger == "line" and self._wanted_line == "Software"
+            self.follows_by_software = trigger == "line" and self._wanted_line == "Software"
             if self._armed != trigger:
                 self._stop_acquisition()
                 line = "Software"
-                if trigger == "line" and not self._follows:
+                if trigger == "line" and not self.follows_by_software:
                     line = trigger_line(features, self._who, self._wanted_line)
                 features.set("TriggerSource", line)
+                self._frame_id = None
                 self._start()
                 self._armed = trigger
             self._fired = datetime.now(UTC)
 
     def fire(self) -> None:
         with self._used() as features:
-            if self._armed != "software" and not (self._armed == "line" and self._follows):
+            if self._armed != "software" and not (self._armed == "line" and self.follows_by_software):
                 raise InstrumentError(f"{self._who}: it isn't armed for a software trigger; call arm first")
             self._await_trigger_ready()
             self._fired = datetime.now(UTC)
             features.execute("TriggerSoftware")
 
     def follow(self) -> None:
-        if self._follows:
+        if self.follows_by_software:
             self.fire()
 
     def collect(self) -> Frame:
+        with self._lock:
+            while True:
+                try:
+                    return self._next_frame(0)
+                except Repeated:
+                    continue  # of a trigger before this one
+                except InstrumentError:
+                    self.disarm()  # nothing of it may be taken for the next frame
+                    raise
+
+    def next_frame(self) -> Frame:
+        return self._next_frame(TEMPERATURE_NS)
+
+    def _next_frame(self, temperature_ns: int) -> Frame:
         with self._used() as features:
             if self._armed is None or self._exposure_s is None or self._fired is None:
                 raise InstrumentError(f"{self._who}: no frame was asked for; call arm and fire first")
-            try:
-                grabbed = self._await_frame(self._exposure_s)
-                if grabbed.damage:
-                    raise Garbled(
-                        f"{self._who}: frame {grabbed.frame_id} is damaged: {grabbed.damage}; use another cable or port"
-                    )
-                pixel_format = PIXEL_FORMATS.get(grabbed.code)
-                if pixel_format is None:
-                    raise Garbled(
-                        f"{self._who}: frame {grabbed.frame_id} has the unknown pixel format {grabbed.code:#010x}"
-                    )
-                try:
-                    raw = pixel_format.unpack(grabbed.payload, grabbed.rows, grabbed.cols, grabbed.padding)
-                except ValueError as error:
-                    raise _NoFrame(f"{self._who}: frame {grabbed.frame_id} broke off: {error}") from error
-            except InstrumentError:
-                self._stop_acquisition()  # nothing of it may be taken for the next frame
-                raise
-            temperature = float(features.get("DeviceTemperature")) if features.has("DeviceTemperature") else None
+            grabbed = self._await_frame(self._exposure_s)
+            if not grabbed.damage:
+                if grabbed.frame_id == self._frame_id != 0:  # 0 again: a camera that doesn't count
+                    raise Repeated(f"{self._who}: frame {grabbed.frame_id} came twice; it is dropped")
+                self._frame_id = grabbed.frame_id
+            raw, pixel_format = grabbed.unpacked(self._who)
             return Frame(
-                raw, self._exposure_s, self._gain_db, temperature, self._fired, pixel_format.name, grabbed.frame_id
+                raw,
+                self._exposure_s,
+                self._gain_db,
+                self._temperature_c(features, grabbed.camera_time_ns, temperature_ns),
+                self._fired,
+                pixel_format.name,
+                grabbed.frame_id,
+                grabbed.camera_time_ns,
             )
+
+    def _temperature_c(self, features: LibraryFeatures, time_ns: int | None, most_ns: int) -> float | None:
+        """The sensor's temperature, read again where the one before is `most_ns` older than the frame."""
+        if not self._has_temperature:
+            return None
+        at_ns = time.monotonic_ns() if time_ns is None else time_ns
+        if self._temperature is None or not 0 <= at_ns - self._temperature[0] < most_ns:
+            self._temperature = at_ns, float(features.get("DeviceTemperature"))
+        return self._temperature[1]
+
+    def disarm(self) -> None:
+        with self._lock:
+            try:
+                self._stop_acquisition()
+            except InstrumentError:
+                self._drop()
 
     def capture(self) -> Frame:
         with self._lock:
@@ -264,7 +279,7 @@ class LibraryCamera(Camera):
                 return grabbed
             if time.monotonic() >= deadline:
                 waited = ""
-                if self._armed == "line" and not self._follows:
+                if self._armed == "line" and not self.follows_by_software:
                     waited = f"; it waited for {self._wanted_line or 'Line0'}: the camera that leads needs output_line"
                 raise _NoFrame(
                     f"{self._who}: no frame within {self._timeout_s:g} s of its exposure of {exposure_s:g} s; check the cable{waited}"

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+#: The bytes of a frame's pixels.
+Payload = bytes | bytearray | NDArray[np.uint8]
+
 
 @dataclass(frozen=True)
 class PixelFormat:
@@ -22,7 +25,7 @@ class PixelFormat:
         """Bytes of that number of pixels."""
         return (pixels * self.bits + 7) // 8 if self.packed else pixels * (1 if self.bits == 8 else 2)
 
-    def unpack(self, payload: bytes | bytearray, rows: int, cols: int, padding: int = 0) -> NDArray[np.uint16]:
+    def unpack(self, payload: Payload, rows: int, cols: int, padding: int = 0) -> NDArray[np.uint16]:
         """(rows, cols) uint16 of a payload whose rows are followed by `padding` bytes. Raises ValueError if it is short."""
         line = self.payload_bytes(cols) + padding
         if padding == 0:

@@ -17,10 +17,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+import numpy as np
 import usb.core
 import usb.util
+from numpy.typing import NDArray
 
-from drivers.camera.base import Camera, Frame, SensorInfo, Trigger
+from drivers.camera.base import TEMPERATURE_NS, Frame, SensorInfo, StreamingCamera, Trigger
+from drivers.camera.buffers import Grabbed
 from drivers.camera.genapi import NodeMap
 from drivers.camera.gencp import (
     ABRM_DEVICE_VERSION,
@@ -35,7 +38,6 @@ from drivers.camera.gencp import (
     SBRM_MAX_ACK,
     SBRM_MAX_COMMAND,
     SBRM_SIRM,
-    STATUS,
     GenCp,
     read_xml,
 )
@@ -47,13 +49,10 @@ from drivers.camera.genicam_settings import (
     trigger_line,
 )
 from drivers.camera.pixel_format import PIXEL_FORMATS, PREFERENCE
-from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer
+from drivers.camera.u3v_stream import LEADER, TRAILER, StreamLayout, U3vStream
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted, NoAnswer, Repeated
 from drivers.instrument import Identity, Recorder
-from drivers.usbip import open_device, translate
-
-LEADER_MAGIC, TRAILER_MAGIC = 0x4C563355, 0x54563355  # "U3VL", "U3VT"
-LEADER = struct.Struct("<IHHQHHQIIIIIHH")  # 52 bytes
-TRAILER = struct.Struct("<IHHQHHQI")  # 32 bytes
+from drivers.usbip import GONE, open_device, translate
 
 # Offsets of the stream's registers (SIRM).
 SIRM_INFO, SIRM_CONTROL, SIRM_PAYLOAD, SIRM_LEADER, SIRM_TRAILER = 0x00, 0x04, 0x08, 0x10, 0x14
@@ -99,7 +98,7 @@ class _Interfaces:
         )
 
 
-class U3vCamera(Camera):
+class U3vCamera(StreamingCamera):
     """One USB3 Vision camera at `usbip://HOST:PORT/SERIAL` or `usb://SERIAL` (or an already found pyusb `device`).
 
     `pixel_format`: a format's name, or None for the deepest raw format of up to 14 bits that the camera offers (16
@@ -134,6 +133,9 @@ class U3vCamera(Camera):
         self._exposure_s: float | None = None
         self._gain_db = 0.0
         self._fired: datetime | None = None
+        self._stream: U3vStream | None = None
+        self._frame_id: int | None = None  # of the frame before, since acquisition started
+        self._temperature: tuple[int, float] | None = None  # when (ns of the camera's clock), and degrees
 
     # --- connection ---------------------------------------------------------------------------------------------------
 
@@ -214,20 +216,19 @@ class U3vCamera(Camera):
         payload = control.integer(sirm + SIRM_PAYLOAD, 8)
         if not 0 < payload <= 1 << 30:
             raise Garbled(f"{self._who}: frames of {payload} bytes; check its Width, Height and PixelFormat")
-        self._leader_bytes = -(-max(control.integer(sirm + SIRM_LEADER), LEADER.size) // alignment) * alignment
-        self._trailer_bytes = -(-max(control.integer(sirm + SIRM_TRAILER), TRAILER.size) // alignment) * alignment
+        leader_bytes = -(-max(control.integer(sirm + SIRM_LEADER), LEADER.size) // alignment) * alignment
+        trailer_bytes = -(-max(control.integer(sirm + SIRM_TRAILER), TRAILER.size) // alignment) * alignment
         size = -(-_TRANSFER_BYTES // alignment) * alignment
         count, rest = divmod(payload, size)
         final = -(-rest // alignment) * alignment
-        self._payload_bytes = payload
-        self._transfers = [size] * count + ([final] if final else [])
+        self._layout = StreamLayout(leader_bytes, trailer_bytes, (size,) * count + ((final,) if final else ()))
         for offset, value in (
-            (SIRM_MAX_LEADER, self._leader_bytes),
+            (SIRM_MAX_LEADER, leader_bytes),
             (SIRM_TRANSFER_SIZE, size),
             (SIRM_TRANSFER_COUNT, count),
             (SIRM_FINAL_1, final),
             (SIRM_FINAL_2, 0),
-            (SIRM_MAX_TRAILER, self._trailer_bytes),
+            (SIRM_MAX_TRAILER, trailer_bytes),
         ):
             control.write(sirm + offset, struct.pack("<I", value))
 
@@ -271,6 +272,8 @@ class U3vCamera(Camera):
                 raise InstrumentError(f"{self._who}: it has no gain to set to {gain_db} dB; leave it at 0")
             self._exposure_s = float(self.nodes.number("ExposureTime")) * 1e-6
             self._gain_db = float(self.nodes.number("Gain")) if self.nodes.has("Gain") else 0.0
+            if self._stream is not None:
+                self._stream.timeout_s = self._exposure_s + 0.5 * self._timeout_s
 
     def arm(self, trigger: Trigger = "software") -> None:
         with self._lock, self._lost():
@@ -285,7 +288,15 @@ class U3vCamera(Camera):
                 self.nodes.set("TriggerSource", line)
                 set_if_there(self.nodes, "TLParamsLocked", 1)
                 self._control.write(self._sirm + SIRM_CONTROL, struct.pack("<I", 1))
-                self.nodes.execute("AcquisitionStart")
+                self._frame_id = None
+                self._stream = U3vStream(
+                    self._device, self._at.stream_in, self._layout, self._exposure_s + 0.5 * self._timeout_s
+                )
+                try:
+                    self.nodes.execute("AcquisitionStart")
+                except BaseException:
+                    self._end_stream()
+                    raise
                 self._armed = trigger
             self._fired = datetime.now(UTC)
 
@@ -304,81 +315,83 @@ class U3vCamera(Camera):
                 self._control.attempts = ATTEMPTS
 
     def collect(self) -> Frame:
+        with self._lock:
+            while True:
+                try:
+                    return self._next_frame(0)
+                except Repeated:
+                    continue  # of a trigger before this one
+                except InstrumentError:
+                    self.disarm()  # nothing of it may be taken for the next frame
+                    raise
+
+    def next_frame(self) -> Frame:
+        return self._next_frame(TEMPERATURE_NS)
+
+    def _next_frame(self, temperature_ns: int) -> Frame:
         with self._lock, self._lost():
-            if self._device is None or self._armed is None or self._exposure_s is None or self._fired is None:
+            if self._stream is None or self._armed is None or self._exposure_s is None or self._fired is None:
                 raise InstrumentError(f"{self._who}: no frame was asked for; call arm and fire first")
+            grabbed, buffer = self._await_frame(self._stream, self._exposure_s)
             try:
-                return self._collect(self._exposure_s, self._fired)
-            except usb.core.USBError as error:
-                failure = translate(error, self._who, f"reading a frame of {self._exposure_s:g} s")
-            except InstrumentError as error:
-                failure = error
-            if self._armed == "line" and isinstance(failure, NoAnswer):
-                line = self._wanted_line or "Line0"
-                failure = NoAnswer(f"{failure}; it waited for {line}: the camera that leads needs output_line")
-            self._recover()
-            raise failure
+                if grabbed.frame_id == self._frame_id:
+                    raise Repeated(f"{self._who}: frame {grabbed.frame_id} came twice; it is dropped")
+                self._frame_id = grabbed.frame_id
+                raw, pixel_format = grabbed.unpacked(self._who)
+            finally:
+                self._stream.done(buffer)
+            time_ns = grabbed.camera_time_ns
+            assert time_ns is not None
+            return Frame(
+                raw=raw,
+                exposure_s=self._exposure_s,
+                gain_db=self._gain_db,
+                temperature_c=self._temperature_c(time_ns, temperature_ns),
+                time=self._fired,
+                pixel_format=pixel_format.name,
+                frame_id=grabbed.frame_id,
+                camera_time_ns=time_ns,
+            )
 
-    def _collect(self, exposure_s: float, fired: datetime) -> Frame:
+    def _await_frame(self, stream: U3vStream, exposure_s: float) -> tuple[Grabbed, NDArray[np.uint8]]:
+        """The next frame, whole or not; every now and then it is looked whether `stop` was called."""
         deadline = time.monotonic() + exposure_s + self._timeout_s
-        leader = self._await_leader(deadline)
-        if len(leader) < LEADER.size or LEADER.unpack_from(leader)[0] != LEADER_MAGIC:
-            raise Garbled(f"{self._who}: a frame began with {leader[:8].hex()}, not with a leader; it is taken again")
-        (_, _, _, frame_id, _, _, _, code, cols, rows, _, _, padding, _) = LEADER.unpack_from(leader)
-        pixel_format = PIXEL_FORMATS.get(code)
-        if pixel_format is None:
-            raise Garbled(f"{self._who}: frame {frame_id} has the unknown pixel format {code:#010x}")
-        payload = bytearray()
-        for size in self._transfers:
-            piece = self._stream(size, deadline)
-            payload += piece
-            if len(piece) < size:
-                break  # a short transfer ends the payload
-        expected = pixel_format.payload_bytes(cols) * rows + padding * rows
-        if len(payload) < expected:
-            if payload[-TRAILER.size :][:4] == struct.pack("<I", TRAILER_MAGIC):
-                del payload[-TRAILER.size :]
-            raise NoAnswer(
-                f"{self._who}: frame {frame_id} has {len(payload)} of {expected} bytes; use a shorter cable or another port"
-            )
-        trailer = self._stream(self._trailer_bytes, deadline)
-        if len(trailer) < TRAILER.size or TRAILER.unpack_from(trailer)[0] != TRAILER_MAGIC:
-            raise Garbled(f"{self._who}: frame {frame_id} ended with {trailer[:8].hex()}, not with a trailer")
-        _, _, _, trailer_id, status, _, valid, _ = TRAILER.unpack_from(trailer)
-        if status or trailer_id != frame_id or valid < expected:
-            raise Garbled(
-                f"{self._who}: frame {frame_id} is damaged: {STATUS.get(status, hex(status))}, {valid} of {expected} bytes "
-                f"valid, trailer of frame {trailer_id}"
-            )
-        temperature = float(self.nodes.number("DeviceTemperature")) if self.nodes.has("DeviceTemperature") else None
-        return Frame(
-            raw=pixel_format.unpack(payload, rows, cols, padding),
-            exposure_s=exposure_s,
-            gain_db=self._gain_db,
-            temperature_c=temperature,
-            time=fired,
-            pixel_format=pixel_format.name,
-            frame_id=frame_id,
-        )
-
-    def _await_leader(self, deadline: float) -> bytes:
-        """The leader, one short packet; until it comes, it is looked every now and then whether `stop` was called."""
         while True:
             if self._stopped.is_set():
                 raise Interrupted(f"{self._who}: stopped while waiting for a frame; start again")
+            left_s = deadline - time.monotonic()
             try:
-                return self._stream(self._leader_bytes, min(deadline, time.monotonic() + _LOOK_S))
-            except usb.core.USBTimeoutError:
-                if time.monotonic() >= deadline:
+                came = stream.get(max(0.0, min(_LOOK_S, left_s)))
+            except usb.core.USBError as error:
+                if error.errno in GONE:
                     raise
+                self.disarm()
+                raise translate(error, self._who, f"reading a frame of {exposure_s:g} s") from error
+            if came is not None:
+                return came
+            if left_s <= 0.0:
+                waited = ""
+                if self._armed == "line":
+                    waited = f"; it waited for {self._wanted_line or 'Line0'}: the camera that leads needs output_line"
+                raise NoAnswer(
+                    f"{self._who}: no answer while reading a frame of {exposure_s:g} s; check the cable and the power{waited}"
+                )
 
-    def _stream(self, size: int, deadline: float) -> bytes:
-        left_ms = max(1, int((deadline - time.monotonic()) * 1000))
-        assert self._device is not None
-        return bytes(self._device.read(self._at.stream_in, size, left_ms))
+    def _temperature_c(self, time_ns: int, most_ns: int) -> float | None:
+        """The sensor's temperature, read again where the one before is `most_ns` older than the frame."""
+        if not self.nodes.has("DeviceTemperature"):
+            return None
+        if self._temperature is None or not 0 <= time_ns - self._temperature[0] < most_ns:
+            self._temperature = time_ns, float(self.nodes.number("DeviceTemperature"))
+        return self._temperature[1]
+
+    def disarm(self) -> None:
+        with self._lock:
+            if self._device is not None and self._armed is not None:
+                self._recover()
 
     def _recover(self) -> None:
-        """After a broken frame: stop, and discard what is still in the pipe; the next `arm` starts anew."""
+        """Stop, and discard what is still in the pipe; the next `arm` starts anew."""
         try:
             self._stop_acquisition()
             assert self._device is not None
@@ -392,9 +405,17 @@ class U3vCamera(Camera):
 
     def _stop_acquisition(self) -> None:
         self._armed = None
-        self.nodes.execute("AcquisitionStop")
-        self._control.write(self._sirm + SIRM_CONTROL, struct.pack("<I", 0))
-        set_if_there(self.nodes, "TLParamsLocked", 0)
+        try:
+            self.nodes.execute("AcquisitionStop")
+            self._control.write(self._sirm + SIRM_CONTROL, struct.pack("<I", 0))
+            set_if_there(self.nodes, "TLParamsLocked", 0)
+        finally:
+            self._end_stream()
+
+    def _end_stream(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
 
     @contextlib.contextmanager
     def _lost(self) -> Iterator[None]:
@@ -410,6 +431,7 @@ class U3vCamera(Camera):
 
     def _drop(self) -> None:
         device, self._device, self._armed = self._device, None, None
+        self._end_stream()
         if device is not None:
             with contextlib.suppress(usb.core.USBError):
                 usb.util.dispose_resources(device)
@@ -419,7 +441,9 @@ class U3vCamera(Camera):
         self._stopped.set()
         with contextlib.suppress(InstrumentError, usb.core.USBError), self._lock:
             self._stopped.clear()
-            if self._device is not None:
+            if self._armed is not None:
+                self._recover()
+            elif self._device is not None:
                 self._stop_acquisition()
 
     def close(self) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.camera.base import Camera
+from drivers.camera.base import Camera, StreamingCamera
+from drivers.camera.stream import FrameStream
 from drivers.display.base import Display
 from drivers.errors import InstrumentError
 from drivers.monochromator.base import Monochromator
@@ -149,6 +150,9 @@ class CameraContract(FamilyContract):
             )
         before = driver.capture().frame_id
         require(driver.capture().frame_id == before + 1, "the frames' numbers don't go up by 1")
+        if isinstance(driver, StreamingCamera):
+            ids = [frame.frame_id for (frame,) in FrameStream([driver], 4)]
+            require(ids == list(range(ids[0], ids[0] + 4)), f"a series of 4 frames has the numbers {ids}")
         sensor = driver.sensor()
         if sensor.bit_depth is not None:
             highest = int(frame.raw.max())

@@ -27,6 +27,9 @@ ERRORS = {
     138: ("no measurement to fetch", "measure first"),
     141: ("outside the calibrated range", "ask for wavelengths within the instrument's calibration"),
 }
+OUT_OF_RANGE = 141
+#: Ranges (nm) that are tried, each within the one before, where a unit's own isn't calibrated to its ends: those of the maker's table.
+NARROWER_NM = ((350, 1000), (350, 830), (380, 780))
 #: A fetch that broke off is asked for again, this often in all.
 FETCHES = 5
 #: Silence after the last value of a fetch that says that no more comes; USB adapters hold characters back for 16 ms.
@@ -37,7 +40,8 @@ _HEADER_LINES = 2
 class Specbos1211(WireInstrument, Spectroradiometer):
     """A specbos or spectraval. Rates in `baudrates` are tried in turn; a TCP connection has none.
 
-    `from_nm`, `to_nm`: range asked for, in steps of 1 nm; None: as far as the unit is calibrated. `max_integration_s`: longest
+    `from_nm`, `to_nm`: range asked for, in steps of 1 nm; None: as far as the unit is calibrated, by its own word, or less where it then
+    refuses to measure that (error 141). `max_integration_s`: longest
     integration time that the instrument may choose; one measurement ends within 5 times that and 10 s.
     """
 
@@ -61,7 +65,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         if from_nm is not None and to_nm is not None and not from_nm < to_nm:
             raise InstrumentError(f"specbos 1211: {from_nm}..{to_nm} nm is no range; give from_nm below to_nm")
         self.from_nm, self.to_nm = 0, 0  # what the unit measures, known once it is connected
-        self._spectraval = False
+        self._spectraval = self._has_measured = False
         self.max_integration_s = max_integration_s
         self.fetch_timeout_s = fetch_timeout_s
         self.measure_timeout_s = 5 * max_integration_s + 10 if measure_timeout_s is None else measure_timeout_s
@@ -74,20 +78,31 @@ class Specbos1211(WireInstrument, Spectroradiometer):
 
     def measure(self) -> RadianceMeasurement:
         with self._conversation():
-            begin = "*init"
-            if self._spectraval:
-                self._set("*para:form 0")  # the spectrum is asked for once it is measured
-                begin = "*meas:refer"
-            self._set(begin)
-            done = self._byte(begin, self.measure_timeout_s)
-            if done == NAK:
-                raise self._refusal(begin)
-            if done != BEL:
-                raise self._strange(begin, done)
-            if self._spectraval:
-                self._set("*para:form 2")  # as text
-            spectrum = self._fetch_spectrum()
-            return RadianceMeasurement(spectrum, self._integration_time_s(), self._identity.serial_number)
+            while True:
+                try:
+                    spectrum = self._measured()
+                except Refused as error:
+                    # Later the spectra of a session would cover different ranges.
+                    if error.code != OUT_OF_RANGE or self._has_measured or not self._narrow():
+                        raise
+                else:
+                    self._has_measured = True
+                    return RadianceMeasurement(spectrum, self._integration_time_s(), self._identity.serial_number)
+
+    def _measured(self) -> Spectrum:
+        begin = "*init"
+        if self._spectraval:
+            self._set("*para:form 0")  # the spectrum is asked for once it is measured
+            begin = "*meas:refer"
+        self._set(begin)
+        done = self._byte(begin, self.measure_timeout_s)
+        if done == NAK:
+            raise self._refusal(begin)
+        if done != BEL:
+            raise self._strange(begin, done)
+        if self._spectraval:
+            self._set("*para:form 2")  # as text
+        return self._fetch_spectrum()
 
     def stop(self) -> None:
         """End a measurement that another thread waits for; there is nothing to bring into a safe state."""
@@ -141,7 +156,28 @@ class Specbos1211(WireInstrument, Spectroradiometer):
                 "correct from_nm and to_nm in the station file, or leave them out"
             )
         self.from_nm, self.to_nm = int(wanted[0]), int(wanted[1])
-        self._set(f"*{'para' if self._spectraval else 'conf'}:wran {self.from_nm} {self.to_nm} 1")
+        self._has_measured = False
+        self._set_range()
+
+    def _set_range(self) -> None:
+        """Send the range; a narrower one where that is refused as not calibrated."""
+        try:
+            self._set(f"*{'para' if self._spectraval else 'conf'}:wran {self.from_nm} {self.to_nm} 1")
+        except Refused as error:
+            if error.code != OUT_OF_RANGE or not self._narrow():
+                raise
+
+    def _narrow(self) -> bool:
+        """Take the next narrower range; whether there is one, and the station file left it to the unit."""
+        if self._wanted_nm != (None, None):
+            return False
+        for low, high in NARROWER_NM:
+            narrower = max(low, self.from_nm), min(high, self.to_nm)
+            if narrower[0] < narrower[1] and narrower != (self.from_nm, self.to_nm):
+                self.from_nm, self.to_nm = narrower
+                self._set_range()
+                return True
+        return False
 
     def _find(self) -> str:
         """Model that answers `*idn?`, at the first rate at which one does."""

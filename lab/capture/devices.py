@@ -7,7 +7,7 @@ time-out. On pause and stop, bluesky closes the shutter and darkens the screen t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.camera.base import Camera as CameraDriver
-from drivers.camera.base import Frame, capture_together
+from drivers.camera.base import Frame, StreamingCamera, capture_together
+from drivers.camera.stream import MOST_LOST, FrameStream
 from drivers.display.base import Display
-from drivers.errors import InstrumentError, NoAnswer, Refused
+from drivers.errors import Garbled, InstrumentError, NoAnswer, Refused
 from drivers.monochromator.base import Monochromator
+from drivers.photodiode.base import IrradianceMeasurement, Photodiode
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
 from lab.capture.blocking_calls import STOP_S, Status, bounded
@@ -222,13 +224,55 @@ class RadiometerDevice(Device):
         return {"radiance": self.stored.path if self.stored else ""}
 
 
+class PhotodiodeDevice(Device):
+    """The reference photodiode. Prepared with the wavelength (nm) of the light, and triggered to measure its irradiance; prepared with
+    None, its dark current."""
+
+    def __init__(self, photodiode: Photodiode) -> None:
+        super().__init__("photodiode")
+        self.photodiode = photodiode
+        self.wavelength_nm: float | None = None
+        self.dark_a: float | None = None  # None: not measured yet
+        self.measured: IrradianceMeasurement | None = None
+
+    def prepare(self, wavelength_nm: float | None) -> Status:
+        self.wavelength_nm, self.measured = wavelength_nm, None
+        return Status("photodiode", lambda: None, STOP_S)
+
+    def trigger(self) -> Status:
+        def measure() -> None:
+            if self.wavelength_nm is None:
+                self.dark_a = self.photodiode.measure_dark()
+            else:
+                self.measured = self.photodiode.measure(self.wavelength_nm)
+
+        return Status("photodiode", measure, MEASURE_S)
+
+    def readings(self) -> dict[str, float | str]:
+        found = self.measured
+        return {
+            "irradiance_w_m2": found.irradiance_w_m2 if found else 0.0,
+            "sd_irradiance_w_m2": found.sd_irradiance_w_m2 if found else 0.0,
+            "photodiode_dark_a": self.dark_a or 0.0,
+        }
+
+
 @dataclass(frozen=True)
 class Shot:
-    """One trigger of all cameras: exposures (s), gain (dB), and where the frames go; a side without a path isn't kept."""
+    """One trigger of all cameras: exposures (s), gain (dB), and where the frames go; a side without a path isn't kept.
+
+    `repeats`: shots with the same exposures and gain that follow at once, nothing else being moved; cameras that stream take them as
+    one series.
+    """
 
     exposure_s: Mapping[Side, float]
     gain_db: float
     paths: Mapping[Side, str]
+    repeats: int = 0
+
+    def same_settings(self, other: Shot) -> bool:
+        """Whether exposures and gain are those of the other shot."""
+        return dict(self.exposure_s) == dict(other.exposure_s) and self.gain_db == other.gain_db
 
 
 def level_of(frame: NDArray[np.uint16], sheet: DataSheet) -> float:
@@ -266,16 +310,49 @@ class CamerasDevice(Device):
         self.frames: dict[Side, Frame] = {}
         self.levels: dict[Side, float] = dict.fromkeys(self.cameras, 0.0)
         self.stored: dict[Side, StoredFile] = {}
+        self.retaken: list[str] = []  # what got lost of the present shot and was taken again, a line each
+        self._stream: FrameStream | None = None  # the series under way
         self.in_series = False  # whether the frame before is kept and nothing has moved since
 
     def prepare(self, shot: Shot) -> Status:
-        self.shot, self.frames, self.stored = shot, {}, {}
+        goes_on = self._stream is not None and self._stream.left > 0 and shot.same_settings(self.shot)
+        self.shot, self.frames, self.stored, self.retaken = shot, {}, {}, []
 
         def configure() -> None:
+            if goes_on:
+                return
+            self.end_stream()
             for side, camera in self.cameras.items():
                 camera.configure(shot.exposure_s[side], shot.gain_db)
 
         return Status("cameras", configure, READOUT_S)
+
+    def _expose(self, shot: Shot) -> Sequence[Frame]:
+        """A frame of each camera, the next of the series under way if there is one. A lost or torn frame is taken again."""
+        if self._stream is None and shot.repeats:
+            streaming = [camera for camera in self.cameras.values() if isinstance(camera, StreamingCamera)]
+            if len(streaming) == len(self.cameras):
+                self._stream = FrameStream(streaming, 1 + shot.repeats, on_loss=self._note_loss)
+        if self._stream is not None:
+            frames = self._stream.next()
+            if self._stream.left == 0:
+                self._stream = None
+            return frames
+        try:
+            return capture_together(list(self.cameras.values()))
+        except (NoAnswer, Garbled) as error:
+            # Nothing of it was kept, so a second try is safe.
+            self.retaken.append(f"{error}; it is taken again")
+            return capture_together(list(self.cameras.values()))
+
+    def _note_loss(self, line: str) -> None:
+        self.retaken.append(line)  # of whatever shot is the present one
+
+    def end_stream(self) -> None:
+        """Drop what a series has triggered and nobody asked for."""
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()
 
     def trigger(self) -> Status:
         shot = self.shot
@@ -283,10 +360,10 @@ class CamerasDevice(Device):
         def take() -> None:
             self.in_series = False
             try:
-                together = capture_together(list(self.cameras.values()))
-            except NoAnswer:
-                # A frame may get lost on a busy bus. Nothing of it was kept, so a second try is safe.
-                together = capture_together(list(self.cameras.values()))
+                together = self._expose(shot)
+            except BaseException:
+                self._stream = None  # it has closed itself
+                raise
             frames = dict(zip(self.cameras, together, strict=True))
             for side, frame in frames.items():
                 sheet = self.sheets[side]
@@ -300,9 +377,16 @@ class CamerasDevice(Device):
             self.frames = frames
             self.in_series = bool(shot.paths)
 
-        return Status("cameras", take, 2 * max(shot.exposure_s.values()) + READOUT_S)
+        return Status("cameras", take, (1 + MOST_LOST) * max(shot.exposure_s.values()) + READOUT_S)
+
+    async def pause(self) -> None:
+        await bounded("cameras", self.end_stream)
+
+    def resume(self) -> None:
+        """Nothing: after a pause, each step prepares the cameras."""
 
     async def stop(self, success: bool = True) -> None:
+        self._stream = None
         for side, camera in self.cameras.items():
             await bounded(f"camera {side}", camera.stop)
 

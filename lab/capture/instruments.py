@@ -16,6 +16,7 @@ from lab.capture.devices import (
     CamerasDevice,
     Device,
     LightDevice,
+    PhotodiodeDevice,
     RadiometerDevice,
     ScreenDevice,
     ShutterDevice,
@@ -49,6 +50,7 @@ class Instruments:
         self.screen = ScreenDevice(drivers.display, cells) if drivers.display else None
         radiometer = drivers.spectroradiometer
         self.radiometer = RadiometerDevice(radiometer, write_spectrum) if radiometer else None
+        self.photodiode = PhotodiodeDevice(drivers.photodiode) if drivers.photodiode else None
 
     @property
     def limits(self) -> CaptureLimits:
@@ -58,7 +60,7 @@ class Instruments:
     @property
     def devices(self) -> tuple[Device, ...]:
         """All devices that the station has, the cameras last."""
-        every = (self.target, self.light, self.shutter, self.screen, self.radiometer, self.cameras)
+        every = (self.target, self.light, self.shutter, self.screen, self.radiometer, self.photodiode, self.cameras)
         return tuple(device for device in every if device is not None)
 
     def connect(self) -> dict[str, Identity]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,25 @@ def self_tests(drivers: Drivers) -> Iterator[SelfTest]:
         yield _self_test(name, instrument)
 
 
+def self_test(station: Station, name: str, connect: Callable[[Station], Drivers] = drivers_of) -> SelfTest:
+    """The self-test of one instrument (`monochromator`, `cameras.left`, ...). Raises InputError if the station hasn't got it."""
+    _entry(station, name)
+    return _self_test(_said(name), connect(station).all[_said(name)])
+
+
+def _said(name: str) -> str:
+    """A device's name as messages use it: `camera left`."""
+    family, _, side = name.partition(".")
+    return f"camera {side}" if side else family
+
+
+def _entry(station: Station, name: str) -> Address:
+    entry = station.devices.get(name.replace("camera.", "cameras."))
+    if entry is None:
+        raise InputError(f"the station has no {name}; it has {', '.join(station.devices)}")
+    return entry
+
+
 def _self_test(name: str, instrument: Instrument) -> SelfTest:
     told: list[SelfTest] = []
 
@@ -70,16 +89,7 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
 
     Raises InputError if the station has no such instrument or the file can't be written.
     """
-    family, _, side = name.partition(".")
-    entry: Address | None = None
-    if family in ("camera", "cameras"):
-        entry = next((camera for at, camera in station.cameras.items() if at == side), None)
-    elif name in ("monochromator", "spectroradiometer", "display", "stage"):
-        entry = getattr(station, name)
-    if entry is None:
-        there = [f"cameras.{side}" for side in station.sides]
-        there += [one for one in ("monochromator", "spectroradiometer", "display", "stage") if getattr(station, one)]
-        raise InputError(f"the station has no {name}; it has {', '.join(there)}")
+    entry = _entry(station, name)
     try:
         recorder = TranscriptFile(file)
     except OSError as error:
@@ -87,12 +97,12 @@ def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
             f"{file}: can't be written ({error.strerror}); name a file in a folder that is yours"
         ) from error
     try:
-        kind = "camera" if side else name
+        said = _said(name)
         try:
-            made = driver(kind, entry.driver)(entry.address, recorder=recorder, **entry.settings)
+            made = driver(said.partition(" ")[0], entry.driver)(entry.address, recorder=recorder, **entry.settings)
         except (InstrumentError, TypeError) as error:
             raise DeviceError(f"{name}: {error}") from error
-        return _self_test(f"camera {side}" if side else name, made)
+        return _self_test(said, made)
     finally:
         recorder.close()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import logging
 import platform
@@ -35,7 +36,7 @@ from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.capture.take_step import Taken, take
+from lab.capture.take_step import Taken, repeats_of, take
 from lab.capture_kinds.base import Step
 from lab.errors import DeviceError, InputError
 from sim.parameters import Frozen
@@ -349,13 +350,18 @@ class CaptureSession:
                     break
                 self._tell("running", step.what, step.sequence, [other.step for other in entries[at:]])
                 started, began_s = now(), time.monotonic()
-                taken: Taken = yield from take(step, instruments, results)
+                later = (entries[place] for place in range(at + 1, len(entries)))
+                after = itertools.takewhile(lambda other: other.finished is None, later)
+                repeats = repeats_of(step, (other.step for other in after))
+                taken: Taken = yield from take(step, instruments, results, repeats)
                 yield Msg("in_a_thread", None, call=lambda s=step, t=taken, b=started: self._keep(s, t, b))
                 results[step.id] = taken.result
                 self._done += 1
                 self._pace.add(step, time.monotonic() - began_s)
                 if "skipped" in taken.result:
                     self._tell("running", step.what, step.sequence, remark=f"left out: {taken.result['skipped']}")
+                for line in taken.result.get("retaken", ()):
+                    self._tell("running", step.what, step.sequence, remark=line)
             yield Msg("close_run", None)
 
         def leave() -> Generator[Msg, Any, None]:

@@ -18,6 +18,7 @@ from drivers.display.base import Display
 from drivers.errors import InstrumentError
 from drivers.instrument import Instrument
 from drivers.monochromator.base import Monochromator
+from drivers.photodiode.base import Photodiode
 from drivers.registry import driver
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
@@ -32,7 +33,7 @@ from sim.spectrum import Spectrum
 
 T = TypeVar("T")
 
-_FAMILIES = ("monochromator", "spectroradiometer", "display", "stage")
+_FAMILIES = ("monochromator", "spectroradiometer", "photodiode", "display", "stage")
 
 
 class Address(BaseModel):
@@ -85,6 +86,7 @@ class Station(Frozen):
     resume_automatically: bool = False
     monochromator: Address | None = None
     spectroradiometer: Address | None = None
+    photodiode: Address | None = None
     display: Address | None = None
     stage: Address | None = None
     cameras: dict[Side, StationCamera] = Field(min_length=1)
@@ -107,9 +109,22 @@ class Station(Frozen):
         return self
 
     @property
+    def addresses(self) -> frozenset[str]:
+        """The addresses of its instruments; one without an address (a person at a prompt) is nobody else's."""
+        entries = [*(getattr(self, family) for family in _FAMILIES), *self.cameras.values()]
+        return frozenset(entry.address for entry in entries if entry is not None and entry.address)
+
+    @property
     def sides(self) -> tuple[Side, ...]:
         """The sides that have a camera, left first."""
         return tuple(sorted(self.cameras))
+
+    @property
+    def devices(self) -> dict[str, Address]:
+        """Its instruments by the name of their table: `monochromator`, `cameras.left`."""
+        found: dict[str, Address | None] = {family: getattr(self, family) for family in _FAMILIES}
+        found |= {f"cameras.{side}": self.cameras[side] for side in self.sides}
+        return {name: entry for name, entry in found.items() if entry is not None}
 
     def having(self, kind: type[TargetT]) -> dict[str, TargetT]:
         """Targets of one kind by name, in the station file's order."""
@@ -173,6 +188,7 @@ class Drivers:
     monochromator: Monochromator | None = None
     spectroradiometer: Spectroradiometer | None = None
     display: Display | None = None
+    photodiode: Photodiode | None = None
 
     @property
     def all(self) -> dict[str, Instrument]:
@@ -182,6 +198,7 @@ class Drivers:
             "stage": self.stage,
             "display": self.display,
             "spectroradiometer": self.spectroradiometer,
+            "photodiode": self.photodiode,
         }
         named |= {f"camera {side}": camera for side, camera in self.cameras.items()}
         return {name: found for name, found in named.items() if found is not None}
@@ -217,4 +234,5 @@ def drivers_of(station: Station) -> Drivers:
         monochromator=made("monochromator", station.monochromator),
         spectroradiometer=made("spectroradiometer", station.spectroradiometer),
         display=made("display", station.display),
+        photodiode=made("photodiode", station.photodiode),
     )

@@ -437,6 +437,7 @@ class Store:
         pack = folder / PACK
         if not info.packed:
             recordings = self.recording_set(session_id)
+            recordings.cache_bytes = 0  # each frame is read once
             files = self.files(session_id)
             frames = [file for file in files if file.role == "frame"]
             partial = pack.with_name(f".{PACK}.partial")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+import itertools
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -10,7 +11,7 @@ import bluesky.plan_stubs as bps
 import numpy as np
 from bluesky.utils import Msg
 
-from lab.capture.devices import LightSetting, Shot, ShownPattern
+from lab.capture.devices import LightSetting, PhotodiodeDevice, Shot, ShownPattern
 from lab.capture.instruments import Instruments
 from lab.capture.records import StoredFile
 from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
@@ -123,12 +124,34 @@ def _stuck(
     return shortened < 0.9 and levels[side] / before[1][side] > np.sqrt(shortened)
 
 
-def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> Plan[Taken]:
-    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id.
+def repeats_of(step: Step, following: Iterable[Step]) -> int:
+    """How many of the steps that follow at once only repeat a step's exposure."""
+    same = itertools.takewhile(
+        lambda other: (
+            bool(step.captures and other.captures)
+            and other.radiance is None
+            and other.setting == step.setting
+            and other.exposure == step.exposure
+        ),
+        following,
+    )
+    return sum(1 for _ in same)
+
+
+def take(
+    step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]], repeats: int = 0
+) -> Plan[Taken]:
+    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`:
+    `repeats_of` the step.
 
     A step with captures whose light the spectroradiometer refuses to measure is left out, with the reason in its result. In a step
     without captures the refusal is a DeviceError, as later steps use the spectrum.
     """
+    wavelength_nm = step.setting.wavelength_nm or 0.0
+    # One responsivity: light of one wavelength.
+    photodiode = instruments.photodiode if step.radiance and step.captures and wavelength_nm > 0.0 else None
+    if photodiode is not None and photodiode.dark_a is None:
+        yield from _dark_current(instruments)
     yield from arrange(step, instruments)
     files: list[StoredFile] = []
     result: dict[str, Any] = {}
@@ -146,6 +169,8 @@ def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str
             return Taken({"skipped": reason})
         files.append(radiometer.stored)
         result["radiance"] = step.radiance
+    if photodiode is not None:
+        yield from _measure_irradiance(photodiode, wavelength_nm)
     captures: tuple[Capture, ...] = ()
     if isinstance(step.exposure, FindExposure):
         exposure_s, levels = yield from find_exposure(step.exposure, instruments, _start(instruments, results))
@@ -155,19 +180,40 @@ def take(step: Step, instruments: Instruments, results: Mapping[str, Mapping[str
             _exposures(step, instruments, results),
             instruments.limits.gain_db,
             {capture.side: capture.frame for capture in step.captures},
+            repeats,
         )
         dummies = 0 if cameras.in_series or not step.captures else DUMMY_FRAMES
-        for _ in range(dummies):
-            yield from _shoot(instruments, Shot(shot.exposure_s, shot.gain_db, {}))
+        retaken: list[str] = []
+        for left in range(dummies, 0, -1):
+            yield from _shoot(instruments, Shot(shot.exposure_s, shot.gain_db, {}, repeats + left))
+            retaken += cameras.retaken
         yield from _shoot(instruments, shot)
+        retaken += cameras.retaken
         files += cameras.stored.values()
         captures = _completed(step, instruments, dummies)
         result |= {"level": dict(cameras.levels)}
+        if retaken:
+            result["retaken"] = retaken
     yield from bps.create(name=step.sequence)
     for device in instruments.devices:
         yield from bps.read(device)
     yield from bps.save()
     return Taken(result, tuple(files), captures)
+
+
+def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | None) -> Plan[None]:
+    """Irradiance of light of a wavelength; of None, the dark current."""
+    yield Msg("prepare", photodiode, wavelength_nm, group="irradiance")
+    yield from bps.trigger(photodiode, group="irradiance")
+    yield from bps.wait(group="irradiance")
+
+
+def _dark_current(instruments: Instruments) -> Plan[None]:
+    """The photodiode's dark current, with the shutter closed."""
+    assert instruments.photodiode is not None
+    if instruments.shutter is not None and instruments.shutter.value is not False:
+        yield from bps.abs_set(instruments.shutter, False, wait=True)
+    yield from _measure_irradiance(instruments.photodiode, None)
 
 
 def _start(instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -64,6 +65,16 @@ class FixedPattern:
     prnu: FloatArray
     dsnu_e: FloatArray
     column_e: FloatArray | None = None
+
+    @cached_property
+    def single_prnu(self) -> Float32Array:
+        """`prnu` in single precision, as frames are drawn."""
+        return self.prnu.astype(np.float32)
+
+    @cached_property
+    def single_dsnu_e(self) -> Float32Array:
+        """`dsnu_e` in single precision, as frames are drawn."""
+        return self.dsnu_e.astype(np.float32)
 
     @classmethod
     def draw(cls, camera: CameraModel, rng: np.random.Generator) -> Self:
@@ -285,11 +296,11 @@ def sample_from(
         strip = slice(start, start + rows)
         mean = electrons[strip].astype(np.float32)
         if fixed_pattern is not None:
-            mean += (mean - dark[strip]) * fixed_pattern.prnu[strip].astype(np.float32)
+            mean += (mean - dark[strip]) * fixed_pattern.single_prnu[strip]
             np.maximum(mean, np.float32(0.0), out=mean)
         charge = _read_charge(mean, camera, rng, read_out)
         if fixed_pattern is not None:
-            charge += fixed_pattern.dsnu_e[strip].astype(np.float32)
+            charge += fixed_pattern.single_dsnu_e[strip]
             if fixed_pattern.column_e is not None:
                 charge += fixed_pattern.column_e.astype(np.float32)
         if added is not None:

@@ -23,6 +23,12 @@ ROUTES = [
     ("GET", "/effects", "read"),
     ("GET", "/effects/{name}", "read"),
     ("GET", "/stations", "read"),
+    ("GET", "/devices", "operate"),
+    ("GET", "/stations/{name}", "read"),
+    ("GET", "/stations/{name}/devices", "read"),
+    ("GET", "/stations/{name}/devices/{device}", "read"),
+    ("POST", "/stations/{name}/devices/{device}/check", "operate"),
+    ("GET", "/stations/{name}/devices/{device}/transcript", "read"),
     ("GET", "/sessions", "read"),
     ("POST", "/sessions", "operate"),
     ("GET", "/sessions/{session_id}", "read"),
@@ -77,6 +83,7 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         "recordings_id": "0" * 16,
         "calibration_id": "0" * 16,
         "name": "nothing",
+        "device": "stage",
     }
     asked = "/api/v1" + re.sub(r"\{(\w+)\}", lambda found: ids[found[1]], path)
     body = BODIES.get(path, BODIES["jobs"] if path.endswith("/jobs") and method == "POST" else None)

@@ -16,8 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mocks.bench import Bench
+from mocks.pixels import encode, pack_12p, payload_bytes
 from mocks.truth import hidden_truth
-from mocks.u3v import FAULTS, TriggerLine, U3vDevice, encode, pack_12p, payload_bytes
+from mocks.u3v import FAULTS, TriggerLine, U3vDevice
 from mocks.usb_device import Abandoned, Stalled, Unplugged
 
 ABRM_SIRM = 0x2_0000

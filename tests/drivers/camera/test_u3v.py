@@ -18,7 +18,8 @@ from drivers.camera.pixel_format import PIXEL_FORMATS, PixelFormat
 from drivers.camera.u3v import U3vCamera
 from drivers.errors import Disconnected, Garbled, InstrumentError, NoAnswer, Refused
 from mocks.bench import Bench
-from mocks.u3v import GAMMA_ENABLE, U3vDevice, pack_12p
+from mocks.pixels import pack_12p
+from mocks.u3v import GAMMA_ENABLE, U3vDevice
 from mocks.usb import InProcessBackend, UsbIpServer, serve_usbip, stereo_pair
 from mocks.wire import parse_faults
 
@@ -262,8 +263,9 @@ def test_calls_out_of_order(device: U3vDevice) -> None:
     [
         ("never", NoAnswer, "no answer while reading a frame of 0.002 s"),
         ("late", NoAnswer, "no answer while reading a frame"),
-        ("short", NoAnswer, r"has \d+ of 614400 bytes"),
-        ("lost-trailer", NoAnswer, "no answer while reading a frame"),
+        ("short", Garbled, r"is torn: \d+ of 614400 bytes came"),
+        ("torn", Garbled, r"is torn: \d+ of 614400 bytes came"),
+        ("lost-trailer", Garbled, "is torn: its trailer was lost"),
         ("damaged", Garbled, "data discarded"),
         ("halt", NoAnswer, "halted its endpoint while reading a frame of 0.002 s; the halt is cleared"),
         ("unplug", Disconnected, "the connection was lost"),
@@ -382,10 +384,10 @@ def test_a_camera_that_keeps_its_gamma_is_refused(device: U3vDevice, monkeypatch
 @pytest.mark.parametrize(
     ("spec", "error"),
     [
-        ("half@2", NoAnswer),
+        ("half@2", Garbled),
         ("wrong@2", Garbled),
         ("error@2", NoAnswer),
-        ("drop@2", NoAnswer),
+        ("drop@2", Garbled),
         ("unplug=0.2@2", Disconnected),
     ],
 )

@@ -86,6 +86,29 @@ def test_every_model_measures_as_far_as_it_is_calibrated(served: Callable[..., s
     np.testing.assert_allclose(measured.value, lamp.radiance().at(np.arange(380, 781)), rtol=5e-7)
 
 
+def test_a_unit_that_claims_more_than_it_is_calibrated_for_is_asked_for_less(served: Callable[..., str]) -> None:
+    lamp = Lamp(20.0)
+    unit = Mock(lamp, calibrated_nm=(360.0, 800.0), told_nm=(330.0, 1020.0))
+    with Specbos1211(served(unit, Pty())) as radiometer:
+        measured = radiometer.measure().radiance_w_sr_m2_nm
+        assert (measured.wavelength_nm[0], measured.wavelength_nm[-1]) == (380.0, 780.0)
+        np.testing.assert_allclose(measured.value, lamp.radiance().at(np.arange(380, 781)), rtol=5e-7)
+        # once it has measured, a range that gets narrower by itself would be a session of two kinds of spectra
+        unit.fail_next(141)
+        with pytest.raises(Refused, match="error 141, outside the calibrated range"):
+            radiometer.measure()
+        assert len(radiometer.measure().radiance_w_sr_m2_nm.value) == 401
+
+
+def test_a_range_that_the_station_asks_for_isnt_narrowed(served: Callable[..., str]) -> None:
+    unit = Mock(Lamp(20.0), calibrated_nm=(360.0, 800.0), told_nm=(350.0, 1000.0))
+    with (
+        Specbos1211(served(unit, Pty()), from_nm=380, to_nm=900) as radiometer,
+        pytest.raises(Refused, match="error 141, outside the calibrated range; ask for wavelengths within"),
+    ):
+        radiometer.measure()
+
+
 def test_enq_inside_replies_is_passed_over(served: Callable[..., str]) -> None:
     class Enquiring(Mock):
         def receive(self, data: bytes) -> list[bytes]:

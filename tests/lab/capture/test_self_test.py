@@ -91,7 +91,7 @@ def test_a_station_is_tested_in_words(server: UsbIpServer, tmp_path: Path) -> No
         file = tmp_path / "mono.txt"
         assert record_transcript(station, "monochromator", file).works
         assert "> INFO?\\r\\n\n" in file.read_text()
-        with pytest.raises(InputError, match=r"the station has no stage; it has cameras\.left, monochromator"):
+        with pytest.raises(InputError, match=r"the station has no stage; it has monochromator, cameras\.left"):
             record_transcript(station, "stage", file)
         peer.mute(True)
         silent = check_station(station)[0]

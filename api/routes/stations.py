@@ -1,0 +1,118 @@
+"""A station, its devices, and their self-tests."""
+
+from __future__ import annotations
+
+import threading
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Response
+from fastapi import Path as PathParameter
+from fastapi.responses import PlainTextResponse
+
+from api.errors import answers
+from api.routes.sessions import station_state
+from api.schemas import ConnectedDevice, DeviceCheck, DeviceState, StationState
+from api.service import OPERATE, READ, Here, Service
+from drivers import discovery
+from drivers.errors import InstrumentError
+from lab.capture.station import Station
+from lab.errors import DeviceError
+
+router = APIRouter(tags=["stations"])
+StationName = Annotated[str, PathParameter(max_length=100, description="of the station file, without `.toml`")]
+DeviceName = Annotated[
+    str, PathParameter(pattern=r"^[a-z]{1,40}(\.[a-z]{1,10})?$", description="`monochromator`, `cameras.left`, ...")
+]
+
+
+_LOOKING = threading.Lock()
+
+
+@router.get("/devices", dependencies=[OPERATE], responses=answers(401, 403, 503))
+def list_connected(service: Here) -> list[ConnectedDevice]:
+    """What is connected to the service's computer, and what drives it, as `calibench devices` lists it: USB instruments, cameras of installed
+    libraries, serial ports. Takes seconds where a network is searched for cameras."""
+    try:
+        with _LOOKING:  # the libraries that list cameras aren't made for two at a time
+            return [
+                ConnectedDevice(address=found.address, what=service.public(found.what), driver=found.driver)
+                for found in discovery.find_all()
+            ]
+    except InstrumentError as error:
+        raise DeviceError(str(error)) from error
+
+
+def _device(service: Service, name: str, station: Station, device: str) -> DeviceState:
+    entry = station.devices.get(device)
+    if entry is None:
+        raise HTTPException(404, f"station {name!r} has no {device}; it has {', '.join(station.devices)}")
+    latest = service.checks.latest(name, device)
+    session_id = service.live.busy(station)
+    state = "unknown" if latest is None else latest.state
+    test = None if latest is None else latest.test
+    family = "camera" if device.startswith("cameras.") else device
+    return DeviceState(
+        name=device,
+        driver=f"{family}.{entry.driver}",
+        address=service.public(entry.address),
+        state="in use" if session_id is not None else state,
+        used_by=session_id,
+        checked=None if latest is None else latest.ended,
+        identity=service.public(test.identity) if test else "",
+        words=service.public(test.words) if test else "",
+        transcript=f"/api/v1/stations/{name}/devices/{device}/transcript"
+        if service.checks.transcript(name, device).is_file()
+        else None,
+    )
+
+
+@router.get("/stations/{name}", dependencies=[READ], responses=answers(401, 404, 422))
+def get_station(service: Here, name: StationName) -> StationState:
+    """One station."""
+    service.station_file(name)
+    return station_state(service, name)
+
+
+@router.get("/stations/{name}/devices", dependencies=[READ], responses=answers(401, 404, 422))
+def list_devices(service: Here, name: StationName) -> list[DeviceState]:
+    """A station's instruments: where each is, what drives it, and how its latest self-test went. Nothing is asked of them."""
+    station = service.station(name)
+    return [_device(service, name, station, device) for device in station.devices]
+
+
+@router.get("/stations/{name}/devices/{device}", dependencies=[READ], responses=answers(401, 404, 422))
+def get_device(service: Here, name: StationName, device: DeviceName) -> DeviceState:
+    """One instrument of a station."""
+    return _device(service, name, service.station(name), device)
+
+
+@router.post(
+    "/stations/{name}/devices/{device}/check",
+    status_code=202,
+    dependencies=[OPERATE],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def check_device(
+    service: Here, name: StationName, device: DeviceName, response: Response, check: DeviceCheck | None = None
+) -> DeviceState:
+    """Let a device work once, as `calibench devices check` does: connect, identify, safe state, what it is for, safe state. It runs in the
+    background, five minutes at most; `Location` says where to look. 409 while a session, or another check, has the station's instruments."""
+    station = service.station(name)
+    _device(service, name, station, device)
+    service.checks.start(name, station, device, check is not None and check.transcript)
+    response.headers["Location"] = f"/api/v1/stations/{name}/devices/{device}"
+    return _device(service, name, station, device)
+
+
+@router.get(
+    "/stations/{name}/devices/{device}/transcript",
+    dependencies=[READ],
+    response_class=PlainTextResponse,
+    responses=answers(401, 404, 409, 422),
+)
+def device_transcript(service: Here, name: StationName, device: DeviceName) -> PlainTextResponse:
+    """What went over a device's wire in the latest check that kept it: `>` sent, `<` received."""
+    found = _device(service, name, service.station(name), device)
+    if found.transcript is None:
+        raise HTTPException(404, f'no transcript of {device} is kept; check it with {{"transcript": true}}')
+    return PlainTextResponse(service.public.within(service.checks.transcript(name, device).read_text(encoding="ascii")))

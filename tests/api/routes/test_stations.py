@@ -1,0 +1,154 @@
+"""A station's devices over REST: where they are, what drives them, whether they work."""
+
+from __future__ import annotations
+
+import re
+import threading
+from pathlib import Path
+
+import pytest
+
+from api.client import ServiceClient, ServiceProblem
+from drivers import discovery
+from drivers.contract.scripted import ScriptedPeer
+from drivers.discovery import Found
+from drivers.errors import Disconnected
+from tests.api.conftest import Running
+from tests.lab.fake_bench import Bench, FakeMonochromator
+
+GOLDEN = Path(__file__).parents[2] / "wire"
+
+
+def client_of(running: Running, scope: str = "operate") -> ServiceClient:
+    return ServiceClient(running.url, running.keys[scope])
+
+
+def test_devices_are_those_of_the_station_file(shared: Running) -> None:
+    with client_of(shared, "read") as client:
+        assert client.station("fakes") == client.stations()[0]
+        devices = client.devices("fakes")
+        assert [one.name for one in devices] == [
+            "monochromator",
+            "spectroradiometer",
+            "stage",
+            "cameras.left",
+            "cameras.right",
+        ]
+        assert [one.driver for one in devices][2:4] == ["stage.fake", "camera.fake"]
+        assert {(one.state, one.used_by, one.transcript) for one in devices} == {("unknown", None, None)}
+        assert client.device("fakes", "cameras.left") == devices[3]
+
+
+def test_what_is_connected_is_what_the_command_line_finds(shared: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = [
+        Found("usb://4711", "Basler acA (2676:ba02) 4711", "camera", "u3v"),
+        Found("/dev/ttyUSB0", "serial port: FT232R"),
+    ]
+    monkeypatch.setattr(discovery, "find_all", lambda: iter(there))
+    with client_of(shared) as client:
+        told = [(one.address, one.what, one.driver) for one in client.connected()]
+        assert told == [(found.address, found.what, found.driver) for found in there]
+
+        def broken() -> list[Found]:
+            raise Disconnected("USB: gone; plug it in again")
+
+        monkeypatch.setattr(discovery, "find_all", broken)
+        with pytest.raises(ServiceProblem, match="503: USB: gone; plug it in again"):
+            client.connected()
+
+
+def test_a_check_says_who_it_is_and_leaves_it_safe(running: Running) -> None:
+    running.bench.opened = True
+    with client_of(running) as client:
+        found = client.check_device("fakes", "monochromator")
+        assert (found.state, found.identity) == ("works", "fake monochromator SN-1")
+        assert found.words == "works, and is in its safe state"
+        assert found.checked is not None
+        assert not running.bench.opened
+        assert client.check_device("fakes", "cameras.left").state == "works"
+        running.bench.unplugged.add("camera left")
+        broken = client.check_device("fakes", "cameras.left")
+        assert broken.state == "fails"
+        assert broken.words == "camera left at here: the line is gone; plug it in again"
+        assert [one.state for one in client.devices("fakes")] == ["works", "unknown", "unknown", "fails", "unknown"]
+
+
+def test_nothing_else_uses_the_instruments_during_a_check(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, may_end = threading.Event(), threading.Event()
+
+    def slowly(self: FakeMonochromator) -> None:
+        begun.set()
+        assert may_end.wait(30)
+
+    monkeypatch.setattr(FakeMonochromator, "connect", slowly)
+    with client_of(running) as client:
+        assert client.start_check("fakes", "monochromator").state == "checking"
+        assert begun.wait(30)
+        for refused in (
+            lambda: client.capture("fakes", quick=True, sequences=("dark",)),
+            lambda: client.start_check("fakes", "stage"),
+        ):
+            with pytest.raises(ServiceProblem, match="one of these instruments is being checked") as conflict:
+                refused()
+            assert conflict.value.status == 409
+        may_end.set()
+        monkeypatch.undo()
+        assert client.capture("fakes", quick=True, sequences=("dark",)).state == "finished"
+
+
+def test_no_check_while_a_session_runs(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, may_end = threading.Event(), threading.Event()
+    check = Bench.check
+    monkeypatch.setattr(Bench, "check", lambda *asked: (begun.set(), may_end.wait(30), check(*asked)))
+    with client_of(running, "admin") as client:
+        started = client.http.post("/sessions", json={"station": "fakes", "quick": True, "sequences": ["dark"]})
+        assert started.status_code == 201
+        assert begun.wait(30)
+        busy = client.device("fakes", "stage")
+        assert (busy.state, busy.used_by) == ("in use", started.json()["id"])
+        with pytest.raises(ServiceProblem, match=r"409: session .* runs on these instruments"):
+            client.start_check("fakes", "stage")
+        may_end.set()
+        assert client.wait_session(started.json()["id"]).state == "finished"
+
+
+def test_a_transcript_is_kept_on_request(running: Running) -> None:
+    peer = ScriptedPeer((GOLDEN / "cornerstone260-driver.txt").read_text(encoding="ascii"))
+    station = running.store.root / "stations" / "fakes.toml"
+    table = re.sub(
+        r'driver = "fake"\naddress = "monochromator"',
+        f'driver = "cornerstone260"\naddress = "{peer.address}"\ntimeout_s = 0.3',
+        station.read_text(),
+    )
+    (station.parent / "wired.toml").write_text(table)
+    try:
+        with client_of(running) as client:
+            with pytest.raises(ServiceProblem, match="404: no transcript of monochromator is kept; check it with"):
+                client.transcript("wired", "monochromator")
+            found = client.check_device("wired", "monochromator", transcript=True)
+            assert found.transcript == "/api/v1/stations/wired/devices/monochromator/transcript"
+            assert client.transcript("wired", "monochromator").startswith("> ")
+    finally:
+        peer.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "said"),
+    [
+        ("/stations/nowhere", 404, "no station 'nowhere'"),
+        ("/stations/..%2fstations/devices", 404, "Not Found"),
+        ("/stations/broken/devices", 422, "TOML"),
+        ("/stations/fakes/devices/display", 404, "station 'fakes' has no display; it has monochromator"),
+        ("/stations/fakes/devices/cameras.front", 404, "has no cameras.front"),
+        ("/stations/fakes/devices/Stage!", 422, "device"),
+    ],
+)
+def test_what_isnt_there_is_told_in_one_line(shared: Running, path: str, status: int, said: str) -> None:
+    (shared.store.root / "stations" / "broken.toml").write_text("name = ")
+    try:
+        with shared.client("read") as client:
+            response = client.get(f"/api/v1{path}")
+    finally:
+        (shared.store.root / "stations" / "broken.toml").unlink()
+    assert response.status_code == status
+    assert said in response.json()["detail"] and "\n" not in response.json()["detail"]
