@@ -28,7 +28,8 @@ ERRORS = {
     141: ("outside the calibrated range", "ask for wavelengths within the instrument's calibration"),
 }
 OUT_OF_RANGE = 141
-#: Ranges (nm) that are tried, each within the one before, where a unit's own isn't calibrated to its ends: those of the maker's table.
+#: Ranges (nm) that are tried, each within the one before, where a unit's own isn't calibrated to its ends: the usual calibrations, to 1000 nm, of visible light with its margins, and of 380 to 780 nm. Not from a manual: a unit whose own range
+#: differs takes `from_nm` and `to_nm` in the station file.
 NARROWER_NM = ((350, 1000), (350, 830), (380, 780))
 #: A fetch that broke off is asked for again, this often in all.
 FETCHES = 5
