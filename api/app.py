@@ -25,7 +25,7 @@ from api.keys import LOOPBACK, stored_keys
 from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.public_text import PublicText
-from api.routes import calibrations, jobs, knowledge, recordings, sessions
+from api.routes import calibrations, jobs, knowledge, queue, recordings, sessions
 from api.schemas import Health, Login, Me
 from api.security import (
     COOKIE,
@@ -39,6 +39,7 @@ from api.security import (
 )
 from api.service import READ, Here, Limits, Service
 from api.upload import Inbox
+from api.waiting import QueueRunner
 from lab.capture.recovery import Recovery
 from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
@@ -58,7 +59,7 @@ ASSETS = {
 TAGS = [
     {"name": "access", "description": "Keys, logins, health."},
     {"name": "stations", "description": "Which instruments stand where."},
-    {"name": "sessions", "description": "Capturing: start, follow, pause, resume, abort."},
+    {"name": "sessions", "description": "Capturing: start, queue, follow, pause, resume, abort, fetch, delete."},
     {"name": "captures", "description": "What was captured: pictures and raw frames."},
     {"name": "recordings", "description": "Recording sets that are sent in."},
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
@@ -176,7 +177,9 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         rescue.resume_with(app.state.service.live.resume)
         rescue.start()
+        app.state.service.waiting.start()
         yield
+        await asyncio.to_thread(app.state.service.waiting.close)
         await asyncio.to_thread(rescue.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
@@ -199,17 +202,19 @@ def create_app(
             Middleware(DefectMiddleware),
             Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
             Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_path=f"{PREFIX}/recordings"),
-            Middleware(Idempotency, store=store, prefix=PREFIX, except_path=f"{PREFIX}/recordings"),
+            Middleware(Idempotency, store=store, prefix=PREFIX, unread_path=f"{PREFIX}/recordings"),
         ],
     )
     gate = Gate(lambda: stored_keys(store))
     app.state.gate = gate
     app.state.metrics = counted
     app.state.public = PublicText(store.root)
+    live = LiveSessions(store, connect)
     app.state.service = Service(
         store=store,
         stations=folder,
-        live=LiveSessions(store, connect),
+        live=live,
+        waiting=QueueRunner(store, live, lambda: rescue.settled),
         jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
         gate=gate,
@@ -223,7 +228,7 @@ def create_app(
 
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
-    for part in (knowledge, sessions, recordings, jobs, calibrations):
+    for part in (knowledge, sessions, queue, recordings, jobs, calibrations):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
@@ -246,7 +251,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         )
         for path, operations in made["paths"].items():
             for method, operation in operations.items():
-                if method == "post" and path.startswith(PREFIX) and path != f"{PREFIX}/recordings":
+                if method == "post" and path.startswith(PREFIX):
                     operation.setdefault("parameters", []).append(PARAMETER)
                 everywhere = EVERYWHERE if method == "get" else EVERY_CHANGE
                 keyed = (429,) if operation.get("security") else ()

@@ -226,6 +226,16 @@ class LiveSessions:
         capture, _ = self._running(session_id)
         capture.abort(reason)
 
+    def halt(self, station: Station | None, reason: str) -> list[str]:
+        """End every run now, or those on the instruments of a station; the sessions' ids."""
+        wanted = None if station is None else station.addresses
+        ended = []
+        for id, live in list(self._live.items()):
+            if not live.ended and (wanted is None or wanted & live.station.addresses) and live.capture is not None:
+                live.capture.abort(reason)
+                ended.append(id)
+        return ended
+
     def close(self, patience_s: float = PATIENCE_S) -> None:
         """End every run: shutters are closed, and the sessions can be resumed."""
         with self._lock:
@@ -256,24 +266,12 @@ class LiveSessions:
 
     def busy(self, station: Station) -> str | None:
         """Id of a session that uses an instrument of this station now, in this process or another."""
-        wanted = _addresses(station)
+        wanted = station.addresses
         for id, session in self._live.items():
-            if not session.ended and wanted & _addresses(session.station):
+            if not session.ended and wanted & session.station.addresses:
                 return id
         for id in self._store.under_way():
             elsewhere = self.find(id) is None and self._store.session(id).state in RUNS
-            if elsewhere and wanted & _addresses(self._store.station(id)):
+            if elsewhere and wanted & self._store.station(id).addresses:
                 return id
         return None
-
-
-def _addresses(station: Station) -> set[str]:
-    """The addresses of a station's instruments."""
-    entries = [
-        station.monochromator,
-        station.spectroradiometer,
-        station.display,
-        station.stage,
-        *station.cameras.values(),
-    ]
-    return {entry.address for entry in entries if entry is not None}

@@ -9,12 +9,13 @@ from typing import Annotated
 from fastapi import Depends, HTTPException, Request
 from fastapi import Path as PathParameter
 
-from api.errors import known
+from api.errors import Conflict, known
 from api.keys import Permission
 from api.live import LiveSessions
 from api.public_text import PublicText
 from api.security import Demand, Gate
 from api.upload import Inbox
+from api.waiting import QueueRunner
 from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
@@ -41,6 +42,7 @@ class Service:
     store: Store
     stations: Path
     live: LiveSessions
+    waiting: QueueRunner
     jobs: JobRunner
     inbox: Inbox
     gate: Gate
@@ -67,6 +69,11 @@ class Service:
     def job(self, job_id: str) -> JobInfo:
         """A job; 404 where there is none."""
         return known(f"no job {job_id[:60]!r}; GET /api/v1/jobs lists them", lambda: self.jobs.job(job_id))
+
+    def check_no_job(self, source: str, what: str) -> None:
+        """Raises Conflict where a job on this source is queued or runs."""
+        for job in self.jobs.under_way(source):
+            raise Conflict(f"{what}: job {job.id} ({job.kind}) is {job.state}; wait for its end or cancel it")
 
     def recordings(self, recordings_id: str) -> Path:
         """The folder of recordings that were sent in; 404 where there are none of that id."""

@@ -287,6 +287,12 @@ class JobRunner:
                 asked = asked.where(sa.tuple_(JobRow.created, JobRow.id) < sa.tuple_(last.created, last.id))
             return [JobInfo.model_validate(row) for row in db.scalars(asked)]
 
+    def under_way(self, source: str) -> list[JobInfo]:
+        """Jobs on a source that aren't over."""
+        asked = sa.select(JobRow).where(JobRow.source == source, JobRow.state.in_(("queued", "running")))
+        with self.store.reading() as db:
+            return [JobInfo.model_validate(row) for row in db.scalars(asked)]
+
     def count_jobs(self) -> int:
         """How many jobs there are."""
         with self.store.reading() as db:

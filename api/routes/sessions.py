@@ -11,7 +11,8 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
-from api.errors import answers, known
+from api.archives import Zip, zipped
+from api.errors import Conflict, answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
@@ -26,16 +27,18 @@ from api.schemas import (
     StoredCapture,
     StoredSession,
 )
-from api.service import OPERATE, READ, Here, RegistryId, Service, SessionId
+from api.service import ADMIN, OPERATE, READ, Here, RegistryId, Service, SessionId
+from lab.calibration.life import check_nothing_rests_on
 from lab.capture.durable_files import npy_bytes
 from lab.capture.plan import full_plan
+from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
-from lab.capture.session import Progress
+from lab.capture.session import CaptureSession, Progress
 from lab.errors import InputError
 from sim.camera import Side
 
 router = APIRouter()
-OVER = frozenset({"created", "interrupted", "failed", "finished"})
+OVER = frozenset({"created", "queued", "interrupted", "failed", "finished"})
 #: A capture never changes, and its path has its session's random id in it.
 FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 _INSTRUMENTS = ("monochromator", "spectroradiometer", "display", "stage")
@@ -114,10 +117,23 @@ def list_sessions(
     responses=answers(401, 403, 404, 409, 422),
 )
 def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
-    """Start a session, which runs in the background. 409 while another session runs on the same instruments."""
+    """Start a session, which runs in the background. 409 while another session runs on the same instruments; with `queue` it waits for its turn
+    instead."""
     station = service.station(start.station)
     plan = full_plan(station, start.quick, start.sequences)
-    session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
+    if start.queue:
+        session_id = CaptureSession.start(
+            service.store,
+            station,
+            plan,
+            name=start.name,
+            notes=start.notes,
+            demands_certified=start.demands_certified,
+        ).id
+        put_into_queue(service.store, session_id, start.not_before)
+        service.waiting.look_soon()
+    else:
+        session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
     return _session(service, session_id)
 
@@ -136,6 +152,47 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
     )
+
+
+@router.delete(
+    "/sessions/{session_id}",
+    status_code=204,
+    tags=["sessions"],
+    dependencies=[ADMIN],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def delete_session(service: Here, session_id: SessionId) -> None:
+    """Delete a session for ever: its captures and its files. Results, reports and calibrations of it stay. 409 while it runs, while a job
+    works on it, and while a certified calibration rests on it. The key's scope has to be `admin`."""
+    state = state_now(service.session(session_id), service.live.find(session_id))
+    if state not in OVER:
+        raise Conflict(f"session {session_id} is {state}; abort it first")
+    service.check_no_job(session_id, f"session {session_id}")
+    try:
+        check_nothing_rests_on(service.store, session_id)
+        service.store.delete_session(session_id)
+    except InputError as error:
+        raise Conflict(str(error)) from None
+
+
+@router.get(
+    "/sessions/{session_id}/archive.zip",
+    tags=["sessions"],
+    dependencies=[READ],
+    response_class=Zip,
+    responses=answers(401, 404, 409, 422),
+)
+def session_archive(service: Here, session_id: SessionId) -> Response:
+    """The session as a recording set, a .zip as `POST /recordings` takes it: sent while it is packed, without a stated length. 409 while it
+    runs, because what it has is still changing, and where it has captured nothing."""
+    info = service.session(session_id)
+    state = state_now(info, service.live.find(session_id))
+    if state not in OVER:
+        raise Conflict(f"session {session_id} is {state}; wait for its end or abort it")
+    recordings = service.store.recording_set(session_id)
+    if not recordings.captures():
+        raise Conflict(f"session {session_id}: nothing was captured yet; resume it")
+    return zipped(recordings, f"session-{session_id}")
 
 
 @router.post(

@@ -107,6 +107,12 @@ class Station(Frozen):
         return self
 
     @property
+    def addresses(self) -> frozenset[str]:
+        """The addresses of its instruments; one without an address (a person at a prompt) is nobody else's."""
+        entries = [*(getattr(self, family) for family in _FAMILIES), *self.cameras.values()]
+        return frozenset(entry.address for entry in entries if entry is not None and entry.address)
+
+    @property
     def sides(self) -> tuple[Side, ...]:
         """The sides that have a camera, left first."""
         return tuple(sorted(self.cameras))

@@ -31,6 +31,7 @@ from sqlalchemy.orm import Session, defer, sessionmaker
 
 from lab.capture.durable_files import Lock, npy_bytes, write_durably
 from lab.capture.nexus import write_nexus
+from lab.capture.queue import hold_queue, release_held_by
 from lab.capture.records import (
     CaptureInfo,
     JournalEntry,
@@ -264,14 +265,36 @@ class Store:
         run: RunRecord | None = None,
         station: Station | None = None,
     ) -> None:
-        """Record the state of a session; `run` is added to its provenance, `station` is where it runs now."""
+        """Record the state of a session; `run` is added to its provenance, `station` is where it runs now. A run that ended badly holds the
+        sessions that wait for the same instruments."""
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.state, row.error = state, error
+            row.queue_place = row.not_before = None
+            if state in ("interrupted", "failed"):
+                hold_queue(
+                    db, f"session {session_id} is {state}: {error}; release it when the bench is ready", row.station
+                )
             if run is not None:
                 row.runs = [*row.runs, run.model_dump(mode="json")]
             if station is not None:
                 row.station = station.model_dump(mode="json")
+
+    def delete_session(self, session_id: str) -> None:
+        """Delete a session for ever: its captures, its journal, its files. Results of it stay. Raises InputError while a process runs it."""
+        lock = self.lock(session_id)
+        with self.reading() as db:
+            self._row(db, session_id)
+        if not lock.acquire(patience_s=0.0):
+            raise InputError(f"session {session_id}: a process runs it; abort it first")
+        try:
+            with self.transaction() as db:
+                for table in (CaptureRow, FileRow, StepRow):
+                    db.execute(sa.delete(table).where(table.session_id == session_id))
+                db.execute(sa.delete(SessionRow).where(SessionRow.id == session_id))
+        finally:
+            lock.release()
+        shutil.rmtree(self.folder(session_id), ignore_errors=True)
 
     # --- the journal -----------------------------------------------------------------------------------------------------
 
@@ -461,6 +484,8 @@ class Store:
                     )
                 row = self._row(db, session_id)
                 row.packed, row.closed, row.state, row.error = True, now(), "finished", None
+                row.queue_place = row.not_before = None
+                release_held_by(db, session_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
         return pack
 
