@@ -150,9 +150,9 @@ class LiveSessions:
             live.begin(capture)
         return capture.id
 
-    def resume(self, session_id: str, moved: Station | None = None) -> None:
+    def resume(self, session_id: str, moved: Station | None = None, in_turn: bool = False) -> None:
         """Continue a paused session, or a session that ended early. `moved`: the station, if its instruments have other addresses
-        now. Raises Conflict for a session that is running or finished."""
+        now. `in_turn`: only where it still waits in the queue and isn't held. Raises Conflict for a session that is running or finished."""
         with self._lock:
             live = self.find(session_id)
             if live is not None and live.capture is not None:
@@ -168,6 +168,11 @@ class LiveSessions:
                 raise Conflict(f"session {session_id} is run by another process; resume it there")
             station = moved or self._store.station(session_id)
             self._check_free(station)
+            # After that: the run before, which is over, has said whether it ended badly.
+            if in_turn:
+                now = self._store.session(session_id)
+                if now.state != "queued" or now.error is not None:
+                    raise Conflict(f"session {session_id} is {now.state} now: {now.error}")
             live = LiveSession(station)
             capture = CaptureSession(
                 self._store, session_id, station=station, on_progress=live.tell, connect=self._connect

@@ -75,9 +75,9 @@ class QueueRunner:
             put_into_queue(self._store, session_id, held="its run ended before it began; the service's log says more")
             return
         try:
-            self._live.resume(session_id)
+            self._live.resume(session_id, in_turn=True)
         except Conflict:
-            return  # its instruments are in use
+            return  # its instruments are in use, or it was held just now
         except InputError as error:
             log.warning("session %s: not started from the queue: %s", session_id, error)
             put_into_queue(self._store, session_id, held=str(error))
