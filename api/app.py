@@ -45,6 +45,7 @@ from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.jobs import JobRunner
+from lab.quick_look.process import QuickLook
 
 log = logging.getLogger(__name__)
 PREFIX = "/api/v1"
@@ -52,9 +53,10 @@ PAGES = Path(__file__).parent / "pages"
 ASSETS = {
     "operator.css": "text/css",
     "operator.js": "text/javascript",
-    "page.js": "text/javascript",
-    "calibrations.js": "text/javascript",
-    "docs.js": "text/javascript",
+    **dict.fromkeys(
+        ("page.js", "charts.js", "stations.js", "queue.js", "watch.js", "recordings.js", "calibrations.js", "docs.js"),
+        "text/javascript",
+    ),
 }
 TAGS = [
     {"name": "access", "description": "Keys, logins, health."},
@@ -183,6 +185,7 @@ def create_app(
         await asyncio.to_thread(rescue.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
+        app.state.service.quick_look.close()
 
     jobs_of = jobs_runner or JobRunner(store)
     counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})
@@ -215,6 +218,7 @@ def create_app(
         stations=folder,
         live=live,
         waiting=QueueRunner(store, live, lambda: rescue.settled),
+        quick_look=QuickLook(store),
         jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
         gate=gate,

@@ -46,6 +46,7 @@ from lab.calibration.life import CalibrationRecord, History
 from lab.calibration.limits import CalibrationLimits
 from lab.capture.queue import QueuedSession
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+from lab.quick_look.curves import Curves
 
 M = TypeVar("M", bound=BaseModel)
 W = TypeVar("W", SessionDetail, Job)
@@ -226,6 +227,10 @@ class ServiceClient:
     def captures(self, session_id: str, **only: str) -> Iterator[StoredCapture]:
         """The captures of a session; `only`: of a `kind`, a `side`."""
         return self._pages(StoredCapture, f"/sessions/{session_id}/captures", **only)
+
+    def curves(self, session_id: str) -> Curves:
+        """Photon transfer, sensitivity and MTF as a session's captures so far show them."""
+        return self._get(Curves, f"/sessions/{session_id}/curves")
 
     def frame(self, capture: StoredCapture) -> NDArray[np.uint16]:
         """The raw frame of a capture: uint16 (rows, cols)."""

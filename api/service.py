@@ -23,6 +23,7 @@ from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.results import ReportFile
 from lab.jobs import JobInfo, JobRunner
+from lab.quick_look.process import QuickLook
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Service:
     stations: Path
     live: LiveSessions
     waiting: QueueRunner
+    quick_look: QuickLook
     jobs: JobRunner
     inbox: Inbox
     gate: Gate

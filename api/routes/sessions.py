@@ -7,7 +7,9 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
 import anyio
+import numpy as np
 from fastapi import APIRouter, HTTPException, Query, Request, Response
+from numpy.typing import NDArray
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
@@ -35,6 +37,9 @@ from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
 from lab.capture.session import CaptureSession, Progress
 from lab.errors import InputError
+from lab.formats.recording_set import DataSheet
+from lab.quick_look.curves import Curves
+from lab.quick_look.frame_figures import FrameFigures, frame_figures
 from sim.camera import Side
 
 router = APIRouter()
@@ -338,6 +343,13 @@ def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) ->
     return _capture(_known_capture(service, session_id, capture_id))
 
 
+def _frame(service: Service, info: CaptureInfo) -> tuple[NDArray[np.uint16], DataSheet]:
+    """The frame of a capture, and its camera."""
+    recordings = service.store.recording_set(info.session_id, (info.id,))
+    (capture,) = recordings.captures()
+    return recordings.frame(capture), recordings.camera(capture.side)
+
+
 class Png(Response):
     media_type = "image/png"
 
@@ -367,8 +379,8 @@ def preview_capture(
     headers = FOR_EVER | {"ETag": tag}
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
-    camera = service.store.recording_set(session_id).camera(info.side)  # type: ignore[arg-type]
-    return Png(preview_png(service.store.frame(capture_id), camera, width, stretch), headers=headers)
+    frame, camera = _frame(service, info)
+    return Png(preview_png(frame, camera, width, stretch), headers=headers)
 
 
 @router.get(
@@ -382,4 +394,26 @@ def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) 
     """The raw frame as .npy: uint16 (rows, cols), checked against its SHA-256."""
     info = _known_capture(service, session_id, capture_id)
     headers = FOR_EVER | {"Content-Disposition": f'attachment; filename="capture-{info.id}.npy"'}
-    return Npy(npy_bytes(service.store.frame(capture_id)), headers=headers)
+    return Npy(npy_bytes(_frame(service, info)[0]), headers=headers)
+
+
+@router.get(
+    "/sessions/{session_id}/captures/{capture_id}/figures",
+    tags=["captures"],
+    dependencies=[READ],
+    responses=answers(401, 404, 422),
+)
+def capture_figures(service: Here, session_id: SessionId, capture_id: RegistryId, response: Response) -> FrameFigures:
+    """Histogram, mean and share of saturated pixels of each channel of the frame."""
+    info = _known_capture(service, session_id, capture_id)
+    response.headers.update(FOR_EVER)
+    return frame_figures(*_frame(service, info))
+
+
+@router.get("/sessions/{session_id}/curves", tags=["captures"], dependencies=[READ], responses=answers(401, 404, 422))
+def session_curves(service: Here, session_id: SessionId) -> Curves:
+    """Photon transfer, sensitivity and MTF as the captures so far show them: cheap estimates that grow while the session runs, computed in a
+    process of their own. A long session is looked at in several turns: ask again while `looked_at` is less than `captures`. The fit is what
+    counts."""
+    service.session(session_id)
+    return service.quick_look.curves(session_id)

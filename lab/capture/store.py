@@ -419,28 +419,27 @@ class Store:
 
     def frame(self, capture_id: int) -> NDArray[np.uint16]:
         """The frame of a capture by its id in the registry."""
-        capture = self.capture(capture_id)
-        return self.recording_set(capture.session_id).frame(CAPTURES.parse(capture.document))
+        recordings = self.recording_set(self.capture(capture_id).session_id, (capture_id,))
+        return recordings.frame(recordings.captures()[0])
 
-    def recording_set(self, session_id: str) -> RecordingSet:
-        """The captures of a session so far as a recording set."""
+    def recording_set(self, session_id: str, only: Sequence[int] | None = None) -> RecordingSet:
+        """The captures of a session so far as a recording set; `only`: those of these ids in the registry."""
+        asked = sa.select(CaptureRow.document).where(CaptureRow.session_id == session_id)
+        files = sa.select(FileRow.path, FileRow.sha256, FileRow.side, FileRow.pack_index)
+        files = files.where(FileRow.session_id == session_id)
+        if only is not None:
+            asked = asked.where(CaptureRow.id.in_(only))
+            theirs = sa.select(CaptureRow.file).where(CaptureRow.id.in_(only))
+            files = files.where(sa.or_(FileRow.role != "frame", FileRow.id.in_(theirs)))
         with self.reading() as db:
             row = self._row(db, session_id)
-            documents = db.scalars(
-                sa.select(CaptureRow.document).where(CaptureRow.session_id == session_id).order_by(CaptureRow.id)
-            )
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
                 cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},  # type: ignore[misc]
-                captures=tuple(CAPTURES.parse(document) for document in documents),
+                captures=tuple(CAPTURES.parse(one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
-            files = db.execute(
-                sa.select(FileRow.path, FileRow.sha256, FileRow.side, FileRow.pack_index).where(
-                    FileRow.session_id == session_id
-                )
-            )
-            where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in files}
+            where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}
         return RecordingSet(manifest, source=session_id, files=SessionFiles(self.folder(session_id), where))
 
     # --- closing ---------------------------------------------------------------------------------------------------------

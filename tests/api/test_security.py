@@ -34,6 +34,8 @@ ROUTES = [
     ("GET", "/sessions/{session_id}/captures/{capture_id}", "read"),
     ("GET", "/sessions/{session_id}/captures/{capture_id}/preview.png", "read"),
     ("GET", "/sessions/{session_id}/captures/{capture_id}/frame.npy", "read"),
+    ("GET", "/sessions/{session_id}/captures/{capture_id}/figures", "read"),
+    ("GET", "/sessions/{session_id}/curves", "read"),
     ("DELETE", "/sessions/{session_id}", "admin"),
     ("GET", "/sessions/{session_id}/archive.zip", "read"),
     ("GET", "/queue", "read"),
