@@ -24,6 +24,7 @@ from api.idempotency import PARAMETER, Idempotency
 from api.keys import LOOPBACK, stored_keys
 from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
+from api.pictures import Pictures
 from api.public_text import PublicText
 from api.routes import calibrations, jobs, knowledge, queue, recordings, sessions
 from api.schemas import Health, Login, Me
@@ -219,6 +220,7 @@ def create_app(
         live=live,
         waiting=QueueRunner(store, live, lambda: rescue.settled),
         quick_look=QuickLook(store),
+        pictures=Pictures(store),
         jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
         gate=gate,

@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 RUNS = frozenset({"running", "paused"})
 #: How often (s) a job looks at the session that it captures, and how long it waits for the end of an aborted one.
 POLL_S, PATIENCE_S = 0.2, 60.0
+#: The least time (s) between two events of one follower: quick steps share one.
+APART_S = 0.2
 
 
 class LiveSession:
@@ -109,6 +111,7 @@ class LiveSession:
                     yield latest
                 if ended or stopping.is_set():
                     return
+                await asyncio.sleep(APART_S)
                 with anyio.move_on_after(0.5):  # to look whether the service stops
                     await wake.wait()
         finally:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +14,7 @@ from fastapi import Path as PathParameter
 from api.errors import Conflict, known
 from api.keys import Permission
 from api.live import LiveSessions
+from api.pictures import Pictures
 from api.public_text import PublicText
 from api.security import Demand, Gate
 from api.upload import Inbox
@@ -45,6 +48,7 @@ class Service:
     live: LiveSessions
     waiting: QueueRunner
     quick_look: QuickLook
+    pictures: Pictures
     jobs: JobRunner
     inbox: Inbox
     gate: Gate
@@ -60,7 +64,11 @@ class Service:
         file = self.station_files().get(name)  # looked up, never joined: a name can't leave the folder
         if file is None:
             raise HTTPException(404, f"no station {name[:100]!r}; GET /api/v1/stations lists them")
-        return read_station(file)
+        with os.scandir(self.stations) as entries:  # a station's curves are files beside it
+            there = frozenset(
+                (one.name, (at := one.stat()).st_mtime_ns, at.st_size) for one in entries if one.is_file()
+            )
+        return _read_station(file, there)
 
     def session(self, session_id: str) -> SessionInfo:
         """A session; 404 where there is none."""
@@ -117,7 +125,13 @@ class Service:
         )
 
 
-def _service(request: Request) -> Service:
+@functools.lru_cache(maxsize=64)
+def _read_station(file: Path, there: frozenset[tuple[str, int, int]]) -> Station:
+    """A station's file, parsed once as long as the files `there` beside it are the same. Raises InputError."""
+    return read_station(file)
+
+
+async def _service(request: Request) -> Service:  # not in a thread: it has nothing to wait for
     service: Service = request.app.state.service
     return service
 

@@ -7,9 +7,7 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
 import anyio
-import numpy as np
 from fastapi import APIRouter, HTTPException, Query, Request, Response
-from numpy.typing import NDArray
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
@@ -18,7 +16,6 @@ from api.errors import Conflict, answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
-from api.preview import preview_png
 from api.schemas import (
     CaptureCount,
     CaptureKind,
@@ -37,9 +34,8 @@ from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
 from lab.capture.session import CaptureSession, Progress
 from lab.errors import InputError
-from lab.formats.recording_set import DataSheet
 from lab.quick_look.curves import Curves
-from lab.quick_look.frame_figures import FrameFigures, frame_figures
+from lab.quick_look.frame_figures import FrameFigures
 from sim.camera import Side
 
 router = APIRouter()
@@ -343,13 +339,6 @@ def get_capture(service: Here, session_id: SessionId, capture_id: RegistryId) ->
     return _capture(_known_capture(service, session_id, capture_id))
 
 
-def _frame(service: Service, info: CaptureInfo) -> tuple[NDArray[np.uint16], DataSheet]:
-    """The frame of a capture, and its camera."""
-    recordings = service.store.recording_set(info.session_id, (info.id,))
-    (capture,) = recordings.captures()
-    return recordings.frame(capture), recordings.camera(capture.side)
-
-
 class Png(Response):
     media_type = "image/png"
 
@@ -379,8 +368,7 @@ def preview_capture(
     headers = FOR_EVER | {"ETag": tag}
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
-    frame, camera = _frame(service, info)
-    return Png(preview_png(frame, camera, width, stretch), headers=headers)
+    return Png(service.pictures.png(session_id, info.id, width, stretch), headers=headers)
 
 
 @router.get(
@@ -394,7 +382,7 @@ def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) 
     """The raw frame as .npy: uint16 (rows, cols), checked against its SHA-256."""
     info = _known_capture(service, session_id, capture_id)
     headers = FOR_EVER | {"Content-Disposition": f'attachment; filename="capture-{info.id}.npy"'}
-    return Npy(npy_bytes(_frame(service, info)[0]), headers=headers)
+    return Npy(npy_bytes(service.store.frame(info.id)), headers=headers)
 
 
 @router.get(
@@ -407,7 +395,7 @@ def capture_figures(service: Here, session_id: SessionId, capture_id: RegistryId
     """Histogram, mean and share of saturated pixels of each channel of the frame."""
     info = _known_capture(service, session_id, capture_id)
     response.headers.update(FOR_EVER)
-    return frame_figures(*_frame(service, info))
+    return service.pictures.figures(session_id, info.id)
 
 
 @router.get("/sessions/{session_id}/curves", tags=["captures"], dependencies=[READ], responses=answers(401, 404, 422))
