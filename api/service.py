@@ -72,9 +72,7 @@ class Service:
 
     def session(self, session_id: str) -> SessionInfo:
         """A session; 404 where there is none."""
-        return known(
-            f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them", lambda: self.store.session(session_id)
-        )
+        return known(missing_session(session_id), lambda: self.store.session(session_id))
 
     def job(self, job_id: str) -> JobInfo:
         """A job; 404 where there is none."""
@@ -123,6 +121,11 @@ class Service:
             )
             for run in self.store.runs(session_id)
         )
+
+
+def missing_session(session_id: str) -> str:
+    """What is said of a session that isn't there."""
+    return f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them"
 
 
 @functools.lru_cache(maxsize=64)

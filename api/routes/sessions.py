@@ -26,7 +26,7 @@ from api.schemas import (
     StoredCapture,
     StoredSession,
 )
-from api.service import ADMIN, OPERATE, READ, Here, RegistryId, Service, SessionId
+from api.service import ADMIN, OPERATE, READ, Here, RegistryId, Service, SessionId, missing_session
 from lab.calibration.life import check_nothing_rests_on
 from lab.capture.durable_files import npy_bytes
 from lab.capture.plan import full_plan
@@ -145,7 +145,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     info = service.session(session_id)
     return SessionDetail(
         **_fields(service, info),
-        station=service.store.station(session_id).name,
+        station=service.store.station_name(session_id),
         progress=service.progress(session_id) if info.closed is None else None,
         runs=service.runs(session_id),
         captures=tuple(
@@ -315,9 +315,11 @@ def list_captures(
     limit: Limit = PAGE,
 ) -> list[StoredCapture]:
     """The captures of a session, in the order in which they were taken or the newest first, in pages."""
-    service.session(session_id)
-    found = service.store.captures(
-        session_id, kind=kind, side=side, after=after, newest_first=order == "newest", limit=limit
+    found = known(
+        missing_session(session_id),
+        lambda: service.store.captures(
+            session_id, kind=kind, side=side, after=after, newest_first=order == "newest", limit=limit
+        ),
     )
     total = sum(
         n

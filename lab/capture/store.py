@@ -252,6 +252,11 @@ class Store:
         with self.reading() as db:
             return Station.model_validate(self._row(db, session_id).station)
 
+    def station_name(self, session_id: str) -> str:
+        """What the station of a session calls itself."""
+        with self.reading() as db:
+            return str(self._row(db, session_id).station.get("name", ""))
+
     def runs(self, session_id: str) -> list[RunRecord]:
         """Provenance: every run of a session, in order."""
         with self.reading() as db:

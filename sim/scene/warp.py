@@ -8,7 +8,6 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import RectBivariateSpline
 
 from sim.camera import Geometry
 from sim.spectrum import FloatArray
@@ -95,6 +94,8 @@ class Warp:
         assert self.geometry is not None
         y0, x0 = (np.linspace(low, high, max(8, int((high - low) / 8) + 2)) for low, high in (rows, cols))
         straight_x, straight_y = undistort(*np.meshgrid(x0, y0), self.geometry)
+        from scipy.interpolate import RectBivariateSpline
+
         x, y = RectBivariateSpline(y0, x0, straight_x), RectBivariateSpline(y0, x0, straight_y)
         return lambda row, col: _project(back, x(row, col), y(row, col))
 
