@@ -67,8 +67,9 @@ def halt(
     """End every session that this service runs now, or those on one station: shutters close, screens go dark, each can be resumed. What waits
     for the same instruments is held until somebody releases it."""
     station = service.station(asked.station) if asked is not None and asked.station is not None else None
-    document = station.model_dump(mode="json") if station is not None else None
+    why = f"halted by {key.name}"
+    ended = service.live.halt(station, why)  # first: nothing that the registry does delays it
     with service.store.transaction() as db:
-        hold_queue(db, f"halted by {key.name}", document)
-    ended = service.live.halt(station, f"halted by {key.name}")
-    return Halted(sessions=tuple(ended))
+        hold_queue(db, why, station.model_dump(mode="json") if station is not None else None)
+    ended += service.live.halt(station, why)  # what the queue began in between
+    return Halted(sessions=tuple(dict.fromkeys(ended)))

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 #: How long (s) an answer holds, how long one is waited for, and after how long without a question the process ends.
 HOLDS_S, PATIENCE_S, IDLE_S = 2.0, 60.0, 120.0
 SESSIONS = 16
-NICE = 10
+NICE = 19
 
 
 @dataclass(frozen=True)
