@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium soak setup run test serve bench proof proof-live slow lint clean
+.PHONY: aravis chromium soak kills setup run test serve bench proof proof-live slow lint clean
 
 setup: $(STAMP)
 
@@ -22,7 +22,12 @@ $(STAMP): pyproject.toml constraints.txt
 # A day in virtual time on a bench whose instruments fail at 1 % of their answers; takes hours. ARGS as pytest's.
 SOAK_CAPTURES ?= 20000
 soak: $(STAMP)
-	SOAK_CAPTURES=$(SOAK_CAPTURES) $(BIN)/python -m pytest tests/soak -m slow -s $(ARGS)
+	SOAK_CAPTURES=$(SOAK_CAPTURES) $(BIN)/python -m pytest tests/soak/test_soak.py -m slow -s $(ARGS)
+
+# kill -9 of service, worker and bench at random moments, KILLS of them; about ten seconds each.
+KILLS ?= 20
+kills: $(STAMP)
+	KILLS=$(KILLS) $(BIN)/python -m pytest tests/soak/test_kills.py -m slow -s $(ARGS)
 
 # The library for GigE cameras of any maker, from the distribution; tests that need it skip without it.
 aravis:

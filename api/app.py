@@ -25,8 +25,9 @@ from api.idempotency import PARAMETER, Idempotency
 from api.keys import LOOPBACK, stored_keys
 from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
+from api.pictures import Pictures
 from api.public_text import PublicText
-from api.routes import calibrations, jobs, knowledge, recordings, sessions
+from api.routes import calibrations, jobs, knowledge, queue, recordings, sessions
 from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -41,11 +42,13 @@ from api.security import (
 )
 from api.service import READ, Here, Limits, Service
 from api.upload import Inbox
+from api.waiting import QueueRunner
 from lab.capture.recovery import Recovery
 from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
 from lab.jobs import JobRunner
+from lab.quick_look.process import QuickLook
 
 log = logging.getLogger(__name__)
 PREFIX = "/api/v1"
@@ -53,14 +56,15 @@ PAGES = Path(__file__).parent / "pages"
 ASSETS = {
     "operator.css": "text/css",
     "operator.js": "text/javascript",
-    "page.js": "text/javascript",
-    "calibrations.js": "text/javascript",
-    "docs.js": "text/javascript",
+    **dict.fromkeys(
+        ("page.js", "charts.js", "stations.js", "queue.js", "watch.js", "recordings.js", "calibrations.js", "docs.js"),
+        "text/javascript",
+    ),
 }
 TAGS = [
     {"name": "access", "description": "Keys, logins, health."},
     {"name": "stations", "description": "Which instruments stand where."},
-    {"name": "sessions", "description": "Capturing: start, follow, pause, resume, abort."},
+    {"name": "sessions", "description": "Capturing: start, queue, follow, pause, resume, abort, fetch, delete."},
     {"name": "captures", "description": "What was captured: pictures and raw frames."},
     {"name": "recordings", "description": "Recording sets that are sent in."},
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
@@ -178,11 +182,14 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         rescue.resume_with(app.state.service.live.resume)
         rescue.start()
+        app.state.service.waiting.start()
         yield
+        await asyncio.to_thread(app.state.service.waiting.close)
         await asyncio.to_thread(rescue.close)
         await asyncio.to_thread(app.state.service.checks.close)
         app.state.service.jobs.close()  # first: a job that captures ends its session itself
         app.state.service.live.close()
+        app.state.service.quick_look.close()
 
     jobs_of = jobs_runner or JobRunner(store)
     counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})
@@ -202,7 +209,7 @@ def create_app(
             Middleware(DefectMiddleware),
             Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
             Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_path=f"{PREFIX}/recordings"),
-            Middleware(Idempotency, store=store, prefix=PREFIX, except_path=f"{PREFIX}/recordings"),
+            Middleware(Idempotency, store=store, prefix=PREFIX, unread_path=f"{PREFIX}/recordings"),
         ],
     )
     gate = Gate(lambda: stored_keys(store))
@@ -214,6 +221,9 @@ def create_app(
         store=store,
         stations=folder,
         live=live,
+        waiting=QueueRunner(store, live, lambda: rescue.settled),
+        quick_look=QuickLook(store),
+        pictures=Pictures(store),
         jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
         gate=gate,
@@ -229,7 +239,7 @@ def create_app(
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
     app.include_router(stations_router, prefix=PREFIX)
-    for part in (knowledge, sessions, recordings, jobs, calibrations):
+    for part in (knowledge, sessions, queue, recordings, jobs, calibrations):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
@@ -252,7 +262,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         )
         for path, operations in made["paths"].items():
             for method, operation in operations.items():
-                if method == "post" and path.startswith(PREFIX) and path != f"{PREFIX}/recordings":
+                if method == "post" and path.startswith(PREFIX):
                     operation.setdefault("parameters", []).append(PARAMETER)
                 everywhere = EVERYWHERE if method == "get" else EVERY_CHANGE
                 keyed = (429,) if operation.get("security") else ()

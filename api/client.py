@@ -27,6 +27,8 @@ from api.schemas import (
     ConnectedDevice,
     DeviceCheck,
     DeviceState,
+    Halt,
+    Halted,
     Health,
     Job,
     JobKind,
@@ -34,7 +36,9 @@ from api.schemas import (
     Me,
     PipelineResults,
     PipelineStart,
+    QueuePlace,
     Recordings,
+    SentAs,
     SessionDetail,
     SessionStart,
     StationState,
@@ -43,7 +47,9 @@ from api.schemas import (
 )
 from lab.calibration.life import CalibrationRecord, History
 from lab.calibration.limits import CalibrationLimits
+from lab.capture.queue import QueuedSession
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+from lab.quick_look.curves import Curves
 
 M = TypeVar("M", bound=BaseModel)
 W = TypeVar("W", SessionDetail, Job)
@@ -57,6 +63,14 @@ class ServiceProblem(Exception):
     def __init__(self, status: int, detail: str) -> None:
         super().__init__(f"{status}: {detail}")
         self.status, self.detail = status, detail
+
+
+def _problem(response: httpx.Response) -> ServiceProblem:
+    try:
+        detail = str(response.json()["detail"])
+    except (ValueError, KeyError, TypeError):
+        detail = response.text[:200]
+    return ServiceProblem(response.status_code, detail)
 
 
 class ServiceClient:
@@ -88,12 +102,23 @@ class ServiceClient:
             options["headers"] = {"Idempotency-Key": secrets.token_hex(16)} | dict(options.get("headers") or {})
         response = self.http.request(method, path, **options)
         if response.is_error:
-            try:
-                detail = str(response.json()["detail"])
-            except (ValueError, KeyError, TypeError):
-                detail = response.text[:200]
-            raise ServiceProblem(response.status_code, detail)
+            raise _problem(response)
         return response
+
+    def _fetched(self, path: str, file: Path) -> Path:
+        """Write what a path answers to `file`, as it arrives: completely, or not at all."""
+        partial = file.with_name(f".{file.name}.partial")
+        try:
+            with self.http.stream("GET", path) as response, partial.open("wb") as to:
+                if response.is_error:
+                    response.read()
+                    raise _problem(response)
+                for piece in response.iter_bytes():
+                    to.write(piece)
+            partial.replace(file)
+        finally:
+            partial.unlink(missing_ok=True)
+        return file
 
     def _get(self, model: type[M], path: str, **params: Any) -> M:
         return model.model_validate_json(self.request("GET", path, params=params).content)
@@ -189,6 +214,25 @@ class ServiceClient:
         """Start a session, which runs in the background."""
         return self._post(StoredSession, "/sessions", start)
 
+    def queue(self) -> list[QueuedSession]:
+        """The sessions that wait for their instruments, in their order."""
+        return list(self._pages(QueuedSession, "/queue"))
+
+    def queue_session(self, session_id: str, asked: QueuePlace | None = None) -> list[QueuedSession]:
+        """Let a session wait for its turn, move one that waits, or release one that is held; the queue then."""
+        body = (asked or QueuePlace()).model_dump(mode="json")
+        response = self.request("PUT", f"/sessions/{session_id}/queue", json=body)
+        return TypeAdapter(list[QueuedSession]).validate_json(response.content)
+
+    def unqueue_session(self, session_id: str) -> list[QueuedSession]:
+        """Take a session out of the queue; the queue then."""
+        response = self.request("DELETE", f"/sessions/{session_id}/queue")
+        return TypeAdapter(list[QueuedSession]).validate_json(response.content)
+
+    def halt(self, station: str | None = None) -> tuple[str, ...]:
+        """End every session now, or those on one station, and hold the queue; the ids of the sessions that ran."""
+        return self._post(Halted, "/halt", Halt(station=station)).sessions
+
     def pause(self, session_id: str) -> StoredSession:
         """Pause a session at the end of its step."""
         return self._post(StoredSession, f"/sessions/{session_id}/pause")
@@ -226,6 +270,10 @@ class ServiceClient:
         """The captures of a session; `only`: of a `kind`, a `side`."""
         return self._pages(StoredCapture, f"/sessions/{session_id}/captures", **only)
 
+    def curves(self, session_id: str) -> Curves:
+        """Photon transfer, sensitivity and MTF as a session's captures so far show them."""
+        return self._get(Curves, f"/sessions/{session_id}/curves")
+
     def frame(self, capture: StoredCapture) -> NDArray[np.uint16]:
         """The raw frame of a capture: uint16 (rows, cols)."""
         content = self.request("GET", f"{self.url}{capture.frame}").content
@@ -234,12 +282,33 @@ class ServiceClient:
 
     # --- recordings and jobs ---------------------------------------------------------------------------------------------
 
-    def send_recordings(self, archive: Path) -> Recordings:
-        """Send in a recording set, a .zip."""
+    def send_recordings(self, archive: Path, asked: SentAs | None = None) -> Recordings:
+        """Send in a recording set, a .zip; with `asked`, recordings of another format, which become one."""
         headers = {"Content-Type": "application/zip", "Content-Length": str(archive.stat().st_size)}
+        stated = {} if asked is None else asked.model_dump(mode="json", exclude_unset=True)
         with archive.open("rb") as file:  # sent piece by piece: a set may be larger than the memory
-            response = self.request("POST", "/recordings", content=file, headers=headers)
+            response = self.request("POST", "/recordings", content=file, headers=headers, params=stated)
         return Recordings.model_validate_json(response.content)
+
+    def recordings(self) -> Iterator[Recordings]:
+        """All recording sets that were sent in, the newest first."""
+        return self._pages(Recordings, "/recordings")
+
+    def fetch_recordings(self, recordings_id: str, file: Path) -> Path:
+        """Write a recording set that was sent in to `file`, a .zip."""
+        return self._fetched(f"/recordings/{recordings_id}/archive.zip", file)
+
+    def delete_recordings(self, recordings_id: str) -> None:
+        """Delete a recording set for ever."""
+        self.request("DELETE", f"/recordings/{recordings_id}")
+
+    def fetch_session(self, session_id: str, file: Path) -> Path:
+        """Write a session to `file`, a .zip of a recording set."""
+        return self._fetched(f"/sessions/{session_id}/archive.zip", file)
+
+    def delete_session(self, session_id: str) -> None:
+        """Delete a session for ever; its results and calibrations stay."""
+        self.request("DELETE", f"/sessions/{session_id}")
 
     def start_job(self, kind: JobKind, session_id: str) -> Job:
         """Start work on a finished session."""

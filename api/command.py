@@ -6,6 +6,7 @@ import contextlib
 import copy
 import os
 import socket
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,6 +28,8 @@ Folder = Annotated[
 FIRST_KEY = "first"
 #: How long (s) the stations of sessions that ended without a word are waited for before the service is loaded.
 RESCUE_FIRST_S = 4.0
+#: How long (s) a thread computes while others wait, at most: a session's steps and the answers hand over to each other often.
+SWITCH_S = 0.001
 _ANY = ("0.0.0.0", "::", "")  # addresses that listen everywhere and name no computer
 
 
@@ -112,6 +115,7 @@ def serve(
             _first_key(store)
         names = {name.strip("[]").lower() for name in [*(allow_host or []), host] if name not in _ANY}
         app = create_app(store, hosts=names, recovery=recovery)
+        sys.setswitchinterval(SWITCH_S)
         server = uvicorn.Server(
             uvicorn.Config(
                 app,

@@ -42,15 +42,16 @@ def _digest(*parts: bytes) -> str:
 
 
 class Idempotency:
-    """Answers a repeated POST below `prefix`, other than to `except_path`, from what was kept; only a success is kept."""
+    """Answers a repeated POST below `prefix` from what was kept; only a success is kept. Of the bodies sent to `unread_path`, which may
+    be larger than the memory, only the stated length is compared."""
 
-    def __init__(self, app: ASGIApp, store: Store, prefix: str, except_path: str) -> None:
-        self.app, self.store, self.prefix, self.except_path = app, store, prefix, except_path
+    def __init__(self, app: ASGIApp, store: Store, prefix: str, unread_path: str) -> None:
+        self.app, self.store, self.prefix, self.unread_path = app, store, prefix, unread_path
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or answer it from what was kept."""
         wanted = scope["type"] == "http" and scope["method"] == "POST" and scope["path"].startswith(self.prefix)
-        request = Request(scope, receive) if wanted and scope["path"] != self.except_path else None
+        request = Request(scope, receive) if wanted else None
         key = request.headers.get(HEADER) if request is not None else None
         if request is None or key is None:
             await self.app(scope, receive, send)
@@ -66,8 +67,9 @@ class Idempotency:
         if holder is None:  # the route refuses it
             await self.app(scope, receive, send)
             return
+        unread = scope["path"] == self.unread_path
         try:
-            body = await request.body()
+            body = request.headers.get("content-length", "").encode() if unread else await request.body()
         except HTTPException as refused:  # larger than allowed
             await problem(refused.status_code, str(refused.detail), refused.headers)(scope, receive, send)
             return
@@ -79,15 +81,15 @@ class Idempotency:
         if known is not None:
             await known(scope, receive, send)
             return
-        await self._carry_out(id, body, scope, receive, send)
+        await self._carry_out(id, None if unread else body, scope, receive, send)
 
-    async def _carry_out(self, id: str, body: bytes, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on and keep its answer. Where it fails, the key is free again."""
+    async def _carry_out(self, id: str, body: bytes | None, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on and keep its answer. Where it fails, the key is free again. `body`: what was read of the request already."""
         sent, status, location, answer = False, 500, "", b""
 
         async def again() -> Message:
             nonlocal sent
-            if sent:
+            if sent or body is None:
                 return await receive()
             sent = True
             return {"type": "http.request", "body": body, "more_body": False}

@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 RUNS = frozenset({"running", "paused"})
 #: How often (s) a job looks at the session that it captures, and how long it waits for the end of an aborted one.
 POLL_S, PATIENCE_S = 0.2, 60.0
+#: The least time (s) between two events of one follower: quick steps share one.
+APART_S = 0.2
 
 
 class LiveSession:
@@ -109,6 +111,7 @@ class LiveSession:
                     yield latest
                 if ended or stopping.is_set():
                     return
+                await asyncio.sleep(APART_S)
                 with anyio.move_on_after(0.5):  # to look whether the service stops
                     await wake.wait()
         finally:
@@ -159,9 +162,9 @@ class LiveSessions:
             live.begin(capture)
         return capture.id
 
-    def resume(self, session_id: str, moved: Station | None = None) -> None:
+    def resume(self, session_id: str, moved: Station | None = None, in_turn: bool = False) -> None:
         """Continue a paused session, or a session that ended early. `moved`: the station, if its instruments have other addresses
-        now. Raises Conflict for a session that is running or finished."""
+        now. `in_turn`: only where it still waits in the queue and isn't held. Raises Conflict for a session that is running or finished."""
         with self._lock:
             live = self.find(session_id)
             if live is not None and live.capture is not None:
@@ -177,6 +180,11 @@ class LiveSessions:
                 raise Conflict(f"session {session_id} is run by another process; resume it there")
             station = moved or self._store.station(session_id)
             self._check_free(station)
+            # After that: the run before, which is over, has said whether it ended badly.
+            if in_turn:
+                now = self._store.session(session_id)
+                if now.state != "queued" or now.error is not None:
+                    raise Conflict(f"session {session_id} is {now.state} now: {now.error}")
             live = LiveSession(station)
             capture = CaptureSession(
                 self._store, session_id, station=station, on_progress=live.tell, connect=self._connect
@@ -234,6 +242,16 @@ class LiveSessions:
         """End the run now. Finished steps are kept, and the session can be resumed."""
         capture, _ = self._running(session_id)
         capture.abort(reason)
+
+    def halt(self, station: Station | None, reason: str) -> list[str]:
+        """End every run now, or those on the instruments of a station; the sessions' ids."""
+        wanted = None if station is None else station.addresses
+        ended = []
+        for id, live in list(self._live.items()):
+            if not live.ended and (wanted is None or wanted & live.station.addresses) and live.capture is not None:
+                live.capture.abort(reason)
+                ended.append(id)
+        return ended
 
     def close(self, patience_s: float = PATIENCE_S) -> None:
         """End every run: shutters are closed, and the sessions can be resumed."""

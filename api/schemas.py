@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from api.keys import Permission
 from lab.calibration.limits import CalibrationLimits
 from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
+from lab.formats.importers import KINDS
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from sim.camera import Side
 
@@ -37,6 +38,7 @@ CaptureKind = Annotated[
 ]
 SessionState = Literal[
     "created",
+    "queued",
     "connecting",
     "running",
     "pausing",
@@ -89,12 +91,8 @@ class StationState(Schema):
     problem: str | None = None
 
 
-class SessionStart(Schema):
+class CaptureStart(Schema):
     """What to capture, and on which station."""
-
-    model_config = ConfigDict(
-        json_schema_extra={"example": {"station": "bench", "name": "after the move", "quick": True}}
-    )
 
     station: str = Field(max_length=100)
     name: str = Field(default="", max_length=120)
@@ -106,6 +104,42 @@ class SessionStart(Schema):
     demands_certified: bool = Field(
         default=False, description="end the run when it has connected, unless the cameras have a certified calibration"
     )
+
+
+class SessionStart(CaptureStart):
+    """A new session, started now or when its turn comes."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"station": "bench", "name": "after the move", "quick": True}}
+    )
+
+    queue: bool = Field(default=False, description="wait in the queue until the instruments are free")
+    not_before: AwareDatetime | None = Field(default=None, description="with `queue`: the earliest time, with its zone")
+
+    @model_validator(mode="after")
+    def _time_of_a_queued_one(self) -> Self:
+        if self.not_before is not None and not self.queue:
+            raise ValueError("not_before: goes with queue = true; give both")
+        return self
+
+
+class QueuePlace(Schema):
+    """Where in the queue a session waits, and until when at least. A session that is held is released by it."""
+
+    place: int | None = Field(default=None, ge=1, le=100_000, description="1: first; null: where it is, or last")
+    not_before: AwareDatetime | None = Field(default=None, description="the earliest time, with its zone")
+
+
+class Halt(Schema):
+    """What to halt."""
+
+    station: str | None = Field(default=None, max_length=100, description="null: every station")
+
+
+class Halted(Schema):
+    """Ids of the sessions that a halt ended; each can be resumed."""
+
+    sessions: tuple[str, ...]
 
 
 class Certify(Schema):
@@ -225,7 +259,7 @@ class JobStart(Schema):
     )
 
 
-class PipelineStart(SessionStart):
+class PipelineStart(CaptureStart):
     """A new session, and the whole pipeline on it."""
 
     model_config = ConfigDict(json_schema_extra={"example": {"station": "bench", "quick": True, "resolve": True}})
@@ -276,6 +310,30 @@ class Job(Schema):
     created: Utc
     started: Utc | None
     finished: Utc | None
+
+
+class SentAs(Schema):
+    """What an archive holds: a recording set, or with `format` recordings as `calibench import` takes them."""
+
+    format: Annotated[str, _one_of("format", KINDS), Field(json_schema_extra={"enum": list(KINDS)})] | None = Field(
+        default=None, description="null: the archive is a recording set"
+    )
+    path: str = Field(default="", max_length=400, description="the picture, or the folder, inside the archive")
+    checkerboard: str = Field(default="", max_length=9, description="raw-folder: ROWSxCOLS of inner corners")
+    dots: str = Field(default="", max_length=9, description="dot-grid: ROWSxCOLS")
+    square_mm: float | None = Field(
+        default=None, gt=0, le=1e6, description="the checkerboard's squares, the dots' spacing"
+    )
+    tap: str = Field(default="", max_length=100, description="raw-folder, fits: this tap of the sensor alone")
+    camera: str = Field(default="", max_length=400, description="a picture's camera.toml inside the archive")
+    exposure_s: float | None = Field(default=None, gt=0, le=1e6, description="a picture's exposure")
+    transfer: Literal["linear", "srgb"] | None = Field(default=None, description="what a picture's codes are")
+    channel: Literal["R", "G", "B"] | None = Field(default=None, description="slanted-edge: of a colour picture")
+    corners: str = Field(
+        default="", max_length=200, description="colorchecker: ROW,COL of dark skin, bluish green, black, white"
+    )
+    light: str = Field(default="", max_length=400, description="colorchecker: CSV inside the archive")
+    white_patch: str = Field(default="", max_length=400, description="colorchecker: CSV inside the archive")
 
 
 class Recordings(Schema):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,12 +12,14 @@ from fastapi import Depends, HTTPException, Request
 from fastapi import Path as PathParameter
 
 from api.checks import DeviceChecks
-from api.errors import known
+from api.errors import Conflict, known
 from api.keys import Permission
 from api.live import LiveSessions
+from api.pictures import Pictures
 from api.public_text import PublicText
 from api.security import Demand, Gate
 from api.upload import Inbox
+from api.waiting import QueueRunner
 from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
@@ -23,6 +27,7 @@ from lab.capture.store import Store
 from lab.errors import InputError
 from lab.formats.results import ReportFile
 from lab.jobs import JobInfo, JobRunner
+from lab.quick_look.process import QuickLook
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,9 @@ class Service:
     store: Store
     stations: Path
     live: LiveSessions
+    waiting: QueueRunner
+    quick_look: QuickLook
+    pictures: Pictures
     jobs: JobRunner
     inbox: Inbox
     gate: Gate
@@ -62,17 +70,25 @@ class Service:
 
     def station(self, name: str) -> Station:
         """A station by its file's name; 404 where there is none. Raises InputError where the file can't be used."""
-        return read_station(self.station_file(name))
+        file = self.station_file(name)
+        with os.scandir(self.stations) as entries:  # a station's curves are files beside it
+            there = frozenset(
+                (one.name, (at := one.stat()).st_mtime_ns, at.st_size) for one in entries if one.is_file()
+            )
+        return _read_station(file, there)
 
     def session(self, session_id: str) -> SessionInfo:
         """A session; 404 where there is none."""
-        return known(
-            f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them", lambda: self.store.session(session_id)
-        )
+        return known(missing_session(session_id), lambda: self.store.session(session_id))
 
     def job(self, job_id: str) -> JobInfo:
         """A job; 404 where there is none."""
         return known(f"no job {job_id[:60]!r}; GET /api/v1/jobs lists them", lambda: self.jobs.job(job_id))
+
+    def check_no_job(self, source: str, what: str) -> None:
+        """Raises Conflict where a job on this source is queued or runs."""
+        for job in self.jobs.under_way(source):
+            raise Conflict(f"{what}: job {job.id} ({job.kind}) is {job.state}; wait for its end or cancel it")
 
     def recordings(self, recordings_id: str) -> Path:
         """The folder of recordings that were sent in; 404 where there are none of that id."""
@@ -114,7 +130,18 @@ class Service:
         )
 
 
-def _service(request: Request) -> Service:
+def missing_session(session_id: str) -> str:
+    """What is said of a session that isn't there."""
+    return f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them"
+
+
+@functools.lru_cache(maxsize=64)
+def _read_station(file: Path, there: frozenset[tuple[str, int, int]]) -> Station:
+    """A station's file, parsed once as long as the files `there` beside it are the same. Raises InputError."""
+    return read_station(file)
+
+
+async def _service(request: Request) -> Service:  # not in a thread: it has nothing to wait for
     service: Service = request.app.state.service
     return service
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
+import os
 import re
 import secrets
 import shutil
@@ -17,13 +19,14 @@ import time
 import zipfile
 import zlib
 from collections.abc import AsyncIterator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from lab.errors import InputError
 from lab.formats import recording_set as recording
-from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.importers.import_options import ImportOptions
+from lab.formats.recording_set import FolderFiles, RecordingSet
 
 _CHUNK = 1 << 20
 _ID = re.compile(r"[0-9a-f]{16}")
@@ -173,14 +176,52 @@ def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> N
 
 
 @dataclass(frozen=True)
+class Foreign:
+    """What an archive holds that isn't a recording set: the format, which file or folder of it, and what the format doesn't say.
+
+    The files that `statements` name (`camera`, `light`, `white_patch`) are in the archive.
+    """
+
+    format: str
+    path: str
+    statements: ImportOptions
+
+    def read(self, folder: Path) -> RecordingSet:
+        """The recordings below `folder`. Raises InputError."""
+        from lab.formats.importers import KINDS, read_foreign
+
+        of_a_file = self.format in KINDS and KINDS[self.format].of_a_file
+        if of_a_file and not self.path:
+            raise InputError(f"path: a recording of the format {self.format} is one file; name it as in the archive")
+        stated = self.statements
+        there = replace(
+            stated,
+            camera=stated.camera and self._located(folder, "camera", str(stated.camera)),
+            light=stated.light and self._located(folder, "light", str(stated.light)),
+            white_patch=stated.white_patch and self._located(folder, "white_patch", str(stated.white_patch)),
+        )
+        at = self._located(folder, "path", self.path, a_file=of_a_file) if self.path else folder
+        return read_foreign(self.format, at, there)
+
+    @staticmethod
+    def _located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
+        """A file or folder of the archive. Raises InputError where it isn't in it."""
+        found = folder / _inside(path)
+        if not (found.is_file() or (found.is_dir() and not a_file)):
+            raise InputError(f"{name} {path[:80]!r}: isn't in the archive; name it as in the archive")
+        return found
+
+
+@dataclass(frozen=True)
 class Inbox:
     """The recording sets that were sent in: `DATA/recordings/ID/`."""
 
     root: Path
 
     def ids(self) -> list[str]:
-        """Ids of all, in order."""
-        return sorted(entry.name for entry in self.root.glob("*") if _ID.fullmatch(entry.name) and entry.is_dir())
+        """Ids of all, the newest first."""
+        entries = [entry for entry in self.root.glob("*") if _ID.fullmatch(entry.name) and entry.is_dir()]
+        return [entry.name for entry in sorted(entries, key=lambda one: (-one.stat().st_mtime_ns, one.name))]
 
     def folder(self, id: str) -> Path:
         """The recording set's folder. Raises InputError where there is none of that id."""
@@ -198,7 +239,7 @@ class Inbox:
     def receiving(self) -> Iterator[Path]:
         """A temporary folder for an archive while it arrives."""
         self.root.mkdir(parents=True, exist_ok=True)
-        for left in self.root.glob(".incoming-*"):
+        for left in self.root.glob(".*-*"):  # what a crash left
             if left.lstat().st_mtime < time.time() - _STALE_S:
                 shutil.rmtree(left, ignore_errors=True)
         place = self.root / f".incoming-{secrets.token_hex(8)}"
@@ -208,26 +249,59 @@ class Inbox:
         finally:
             shutil.rmtree(place, ignore_errors=True)
 
-    def take_in(self, place: Path, archive: Path, limit_bytes: int, limit_files: int) -> tuple[str, RecordingSet]:
-        """Unpack a recording set, check it completely, and keep it. Raises InputError with all problems; nothing is kept then."""
+    def take_in(
+        self, place: Path, archive: Path, limit_bytes: int, limit_files: int, foreign: Foreign | None = None
+    ) -> tuple[str, RecordingSet]:
+        """Unpack a recording set, or what `foreign` says, check it completely, and keep it as a recording set. Raises InputError with all
+        problems; nothing is kept then."""
         unpacked = place / "set"
-        unpack(archive, unpacked, limit_bytes, limit_files)
-        top = _top(unpacked)
+        sent = unpacked if foreign is None else place / "sent"
+        unpack(archive, sent, limit_bytes, limit_files)
         try:
-            recordings = recording.read(top)
+            if foreign is None:
+                recordings = recording.read(_top(sent))
+            else:
+                recordings = foreign.read(_top(sent, None))
+                recording.write(recordings, unpacked)
         except InputError as error:
-            raise InputError(str(error).replace(f"{top}/", "").replace(str(top), "archive")) from None
+            raise InputError(as_in_archive(str(error), place)) from None
         id = secrets.token_hex(8)
         unpacked.rename(self.root / id)
+        os.utime(self.root / id)  # by which they are listed
         return id, recordings
 
-    def manifest(self, id: str) -> Manifest:
-        """The manifest of kept recordings, which were checked when they were sent in."""
-        file = self.folder(id) / _MANIFEST
-        return recording.parse_manifest(file.read_text(encoding="utf-8-sig"), _MANIFEST)[0]
+    def remove(self, id: str) -> None:
+        """Take recordings away. Raises InputError where there are none of that id."""
+        self.folder(id)
+        away = self.root / f".removed-{id}"
+        (self.root / id).rename(away)  # gone at once
+        shutil.rmtree(away)
+
+    def manifest(self, id: str) -> dict[str, Any]:
+        """The manifest of kept recordings as it is written: it was checked when they were sent in."""
+        found: dict[str, Any] = json.loads((self.folder(id) / _MANIFEST).read_text(encoding="utf-8-sig"))
+        return found
+
+    def recordings(self, id: str) -> RecordingSet:
+        """Kept recordings, whose frames are checked when they are read."""
+        folder = self.folder(id)
+        manifest, _ = recording.parse_manifest((folder / _MANIFEST).read_text(encoding="utf-8-sig"), _MANIFEST)
+        return RecordingSet(manifest, source=id, files=FolderFiles(folder))
 
 
-def _top(folder: Path) -> Path:
-    """The folder that holds the manifest: `folder`, or the only folder in it."""
-    inner = [entry for entry in folder.iterdir() if entry.is_dir() and entry.name != "__MACOSX"]
-    return inner[0] if not (folder / _MANIFEST).exists() and len(inner) == 1 else folder
+def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:
+    """The folder that holds the file `holds`: `folder`, or the only folder in it. None: the only folder where no file is beside it."""
+    entries = [entry for entry in folder.iterdir() if entry.name != "__MACOSX"]
+    inner = [entry for entry in entries if entry.is_dir()]
+    here = (folder / holds).exists() if holds is not None else len(entries) > 1
+    return inner[0] if not here and len(inner) == 1 else folder
+
+
+def as_in_archive(text: str, place: Path) -> str:
+    """A message with the archive's files named as in the archive."""
+    for part in ("set", "sent"):
+        for top in place.glob(f"{part}/*"):
+            if top.is_dir() and len(list((place / part).iterdir())) == 1:
+                text = text.replace(f"{top}/", "").replace(str(top), "the archive")
+        text = text.replace(f"{place / part}/", "").replace(str(place / part), "the archive")
+    return text

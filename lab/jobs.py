@@ -265,8 +265,18 @@ class JobRunner:
             self._started[job_id] = thread
             thread.start()
         else:
-            self._started[job_id] = client.submit(run_job, *work, key=f"job-{job_id}", pure=False)
+            future = client.submit(run_job, *work, key=f"job-{job_id}", pure=False)
+            self._started[job_id] = future
+            future.add_done_callback(lambda _: self._left(job_id))
         return job_id
+
+    def _left(self, job_id: str) -> None:
+        """No worker has the job any more. Where it isn't over, its worker died (kill -9, out of memory): another one that Dask gave it to
+        doesn't begin a job that had begun."""
+        with contextlib.suppress(InputError, sa.exc.SQLAlchemyError):
+            if not self.job(job_id).is_over:
+                why = "the worker that did this job ended before it was done (kill -9, or memory was short); start the job again"
+                _over(self.store, job_id, "failed", why)
 
     def job(self, job_id: str) -> JobInfo:
         """One job. Raises InputError if there is none of that id."""
@@ -285,6 +295,12 @@ class JobRunner:
                 if last is None:
                     raise InputError(f"job {after!r} isn't in {self.store.root}; list the jobs for their ids")
                 asked = asked.where(sa.tuple_(JobRow.created, JobRow.id) < sa.tuple_(last.created, last.id))
+            return [JobInfo.model_validate(row) for row in db.scalars(asked)]
+
+    def under_way(self, source: str) -> list[JobInfo]:
+        """Jobs on a source that aren't over."""
+        asked = sa.select(JobRow).where(JobRow.source == source, JobRow.state.in_(("queued", "running")))
+        with self.store.reading() as db:
             return [JobInfo.model_validate(row) for row in db.scalars(asked)]
 
     def count_jobs(self) -> int:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 from scipy import constants
-from scipy.interpolate import PPoly
 
 from sim.parameters import Frozen
 
@@ -98,6 +97,8 @@ class Spectrum(Frozen):
         breaks = np.concatenate([[low], knots, [high]])
         slope = np.concatenate([[0.0], np.diff(value) / np.diff(knots), [0.0]])
         start = np.concatenate([[0.0], value[:-1], [0.0]])
+        from scipy.interpolate import PPoly
+
         curve = PPoly(np.vstack([slope, start]), breaks)
         once, twice = curve.antiderivative(1)(grid), curve.antiderivative(2)(grid)
         mean = np.diff(twice) / np.diff(grid)

@@ -1,15 +1,14 @@
 // Calibrations: their states, certifying one, and the history of a figure with its bands.
 
+import { number, svg, ticks } from "./charts.js";
 import { $, ask, element, post, show, time, told } from "./page.js";
 
-const SVG = $("svg").content.firstElementChild.namespaceURI;
 const HEIGHT = 240;
 const LEFT = 76;
 const RIGHT = 14;
 const TOP = 12;
 const BOTTOM = 34;
 
-const number = (value, digits = 5) => Number(value.toPrecision(digits)).toString();
 const measured = (value, std) => (value == null ? "" : `${number(value, 6)} ± ${number(std, 2)}`);
 
 function row(one) {
@@ -106,23 +105,6 @@ async function showHistory() {
   if (!form.figure.value) return;
   const [figure, place] = JSON.parse(form.figure.value);
   draw(await ask(`/history?${new URLSearchParams({ camera: form.camera.value, figure, place })}`));
-}
-
-function svg(tag, attributes, ...children) {
-  const made = document.createElementNS(SVG, tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  made.append(...children);
-  return made;
-}
-
-// Round values between two ends, four or so.
-function ticks(low, high) {
-  const rough = (high - low) / 5;
-  const power = 10 ** Math.floor(Math.log10(rough));
-  const step = power * [1, 2, 2.5, 5, 10].find((factor) => factor * power >= rough);
-  const found = [];
-  for (let at = Math.ceil(low / step); at * step <= high; at++) found.push(Number((at * step).toPrecision(12)));
-  return found;
 }
 
 function draw(history) {

@@ -1,21 +1,18 @@
 // The operator's page: what runs now, the sessions, the jobs and their reports. No framework: a few functions over fetch.
 
 import { showCalibrations } from "./calibrations.js";
-import { $, Problem, api, ask, element, post, show, time, told } from "./page.js";
+import { $, Problem, api, ask, element, post, put, show, time, told } from "./page.js";
+import { queueIs, showQueue } from "./queue.js";
+import { recordingsAre, showRecordings } from "./recordings.js";
+import { leaveStations, showStations, stationsAre } from "./stations.js";
+import { showWatched, watch, watches } from "./watch.js";
 
-const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
 const PICTURES_AT_ONCE = 48;
 let atOnce = PICTURES_AT_ONCE;
 let selected = null; // the session whose captures are shown
-let live = null; // the id of the session that runs now
+let running = []; // the sessions that run now
 let jobsDone = 0;
-let following = null; // the open event stream, with the session it follows
-
-function duration(seconds) {
-  if (seconds == null) return "";
-  const s = Math.round(seconds);
-  return s < 90 ? ` · ${s} s left` : ` · ${Math.round(s / 60)} min left`;
-}
+let scope = "read";
 
 function exposure(seconds) {
   if (seconds == null) return "";
@@ -32,8 +29,7 @@ const guarded = (place, action) => async (event) => {
 document.addEventListener("logged-out", () => showLogin());
 
 function showLogin() {
-  following?.stream.close();
-  following = null;
+  leaveStations();
   $("login").hidden = false;
   $("desk").hidden = $("logout").hidden = $("halt").hidden = true;
   $("who").textContent = "";
@@ -42,26 +38,56 @@ function showLogin() {
 
 async function enter() {
   const me = await ask("/me");
+  scope = me.scope;
   $("who").textContent = `${me.name} (${me.scope})`;
   $("login").hidden = true;
   $("desk").hidden = $("logout").hidden = false;
   $("halt").hidden = !["operate", "admin"].includes(me.scope);
-  await showStations();
+  stationsAre(me.scope, () => refresh().catch(() => {}));
+  queueIs(refresh);
+  recordingsAre(me.scope, async () => (await showRecordings(), await refresh()));
   await refresh();
-  await showCalibrations();
+  await Promise.all([showCalibrations(), showRecordings()]);
 }
 
-async function showStations() {
-  const stations = await ask("/stations");
+// --- starting -------------------------------------------------------------------------------------------------------
+
+let stations = [];
+
+function showStart() {
   const usable = stations.filter((s) => !s.problem);
   const select = $("start-form").elements.station;
-  select.replaceChildren(...usable.map((s) => element("option", { value: s.name, textContent: s.title === s.name ? s.name : `${s.name}: ${s.title}` })));
+  show("start-station", usable.map((s) => ({ id: s.name, title: s.title })), (s) => element("option", { value: s.id, textContent: s.title === s.id ? s.id : `${s.id}: ${s.title}` }));
   const problems = stations.filter((s) => s.problem).map((s) => `${s.name}: ${s.problem}`);
   if (!stations.length) problems.push("No station file yet: put one into the folder 'stations' of the data folder.");
   $("no-station").hidden = problems.length === 0;
   $("no-station").textContent = problems.join(" ");
-  $("start-form").hidden = usable.length === 0;
+  $("start-form").hidden = usable.length === 0 || !["operate", "admin"].includes(scope);
+  showStartButton(usable.find((s) => s.name === select.value));
 }
+
+// A station that is busy, or a time, makes it a place in the queue.
+function showStartButton(station) {
+  const waits = station?.busy_with || $("start-form").elements.not_before.value;
+  $("start").textContent = waits ? "Queue a session" : "Start a session";
+}
+
+$("start-form").addEventListener("change", () => showStart());
+$("start-form").addEventListener(
+  "submit",
+  guarded("live-problem", async (event) => {
+    const fields = event.target.elements;
+    const at = fields.not_before.value ? new Date(fields.not_before.value).toISOString() : null;
+    const queued = Boolean(at || stations.find((s) => s.name === fields.station.value)?.busy_with);
+    const asked = { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked, demands_certified: fields.certified.checked };
+    const session = await post("/sessions", { ...asked, queue: queued, not_before: at });
+    fields.name.value = fields.not_before.value = "";
+    if (!queued) await select(session);
+  }),
+);
+
+// Ends every session that runs, without a question: shutters close, screens go dark, each can be resumed, and the queue is held.
+$("halt").addEventListener("click", guarded("live-problem", () => post("/halt")));
 
 $("login-form").addEventListener("submit", async (event) => {
   event.preventDefault();
@@ -82,76 +108,6 @@ $("logout").addEventListener("click", async () => {
   await fetch("/logout", { method: "POST" });
   showLogin();
 });
-
-// --- what runs now --------------------------------------------------------------------------------------------------
-
-function showLive(session) {
-  live = session?.id ?? null;
-  $("live").hidden = !session;
-  $("live-idle").hidden = Boolean(session);
-  if (!session) return;
-  $("live-name").textContent = session.name || session.id;
-  $("live-state").textContent = session.state;
-  $("pause").disabled = session.state !== "running";
-  $("resume").disabled = !["paused", "pausing"].includes(session.state);
-  $("live-bar").max = session.steps || 1;
-  if (following?.id !== session.id) follow(session.id);
-}
-
-function showProgress(p) {
-  $("live-bar").max = p.total || 1;
-  $("live-bar").value = p.done;
-  const step = p.total ? ` · step ${Math.min(p.done + 1, p.total)} of ${p.total}` : "";
-  $("live-step").textContent = `${p.what}${p.state === "running" ? step : ""}${duration(p.left_s)}`;
-  if (p.remark) $("live-remarks").prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
-}
-
-function follow(id) {
-  following?.stream.close();
-  $("live-step").textContent = "";
-  $("live-remarks").replaceChildren();
-  $("live-bar").value = 0;
-  const stream = new EventSource(`${api}/sessions/${id}/events`);
-  following = { id, stream };
-  stream.addEventListener("progress", (event) => showProgress(JSON.parse(event.data)));
-  stream.addEventListener("state", () => refresh().catch(() => {}));
-  stream.addEventListener("end", () => {
-    stream.close();
-    following = null;
-    refresh()
-      .then(() => selected === id && showCaptures())
-      .catch(() => {});
-  });
-}
-
-$("start-form").addEventListener(
-  "submit",
-  guarded("live-problem", async (event) => {
-    const fields = event.target.elements;
-    const session = await post("/sessions", { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked, demands_certified: fields.certified.checked });
-    await select(session);
-  }),
-);
-for (const verb of ["pause", "resume", "abort"]) {
-  $(verb).addEventListener(
-    "click",
-    guarded("live-problem", async () => {
-      if (verb === "abort" && !confirm("Abort the run? What was captured stays, and the session can be resumed.")) return;
-      await post(`/sessions/${live}/${verb}`);
-    }),
-  );
-}
-
-// Ends every session that runs, without a question: shutters close, screens go dark, and each can be resumed.
-$("halt").addEventListener(
-  "click",
-  guarded("live-problem", async () => {
-    const running = (await ask("/sessions?limit=50")).filter((s) => LIVE.includes(s.state));
-    const answers = await Promise.allSettled(running.map((s) => post(`/sessions/${s.id}/abort`)));
-    const failed = answers.filter((one) => one.status === "rejected").map((one) => one.reason.message);
-    if (failed.length) throw new Problem(failed.join("; "));
-  }),
-);
 
 // A session that ended early goes on where its station is now: the file of that name may have other addresses.
 async function goOn(session) {
@@ -174,6 +130,9 @@ function sessionRow(session) {
     const resume = element("button", { textContent: "Resume" });
     resume.addEventListener("click", guarded("live-problem", () => goOn(session)));
     actions.append(resume, " ");
+    const wait = element("button", { textContent: "Queue", title: "Resume it when its turn comes" });
+    wait.addEventListener("click", guarded("live-problem", () => put(`/sessions/${session.id}/queue`, {})));
+    actions.append(wait, " ");
   }
   const open = element("button", { textContent: "Open" });
   open.addEventListener("click", guarded("session-problem", () => select(session)));
@@ -235,11 +194,23 @@ async function select(session) {
     );
     return button;
   });
-  $("session-actions").replaceChildren(...buttons.flatMap((b) => [b, " "]));
+  const link = element("a", { href: `${api}/sessions/${session.id}/archive.zip`, textContent: "Download" });
+  const away = element("button", { textContent: "Delete", className: "danger", hidden: scope !== "admin" });
+  away.addEventListener("click", guarded("session-problem", () => deleteSession(session)));
+  $("session-actions").replaceChildren(...[...buttons, link, away].flatMap((b) => [b, " "]));
+  watch(session);
   const filter = $("capture-filter").elements;
   filter.kind.replaceChildren();
   await showCaptures();
   $("session").scrollIntoView({ block: "nearest" });
+}
+
+async function deleteSession(session) {
+  if (!confirm(`Delete ${session.name || session.id} and all its captures for ever? Results and calibrations of it stay.`)) return;
+  await ask(`/sessions/${session.id}`, { method: "DELETE" });
+  selected = null;
+  $("session").hidden = true;
+  watch(null);
 }
 
 const option = (value) => element("option", { value, textContent: value || "all" });
@@ -283,7 +254,7 @@ async function showCaptures() {
     asked.set("order", "newest");
     captures = await page(asked);
     shownFor = `${selected} ${filtered()}`;
-  } else if (live === selected) {
+  } else if (running.includes(selected)) {
     const known = captures.length;
     for (let more = true; more; ) {
       const asked = filtered();
@@ -340,11 +311,14 @@ $("capture-filter").addEventListener("change", guarded("session-problem", showCa
 
 async function refresh() {
   if ($("desk").hidden) return;
-  const [sessions, jobs] = await Promise.all([ask("/sessions?limit=50"), ask("/jobs?limit=50")]);
+  let sessions, jobs;
+  [sessions, jobs, stations] = await Promise.all([ask("/sessions?limit=50"), ask("/jobs?limit=50"), ask("/stations")]);
   const names = new Map(sessions.map((s) => [s.id, s.name || s.id]));
-  const running = sessions.find((s) => LIVE.includes(s.state));
-  if (!running && live) await showStations();
-  showLive(running);
+  const live = await showStations(stations, sessions);
+  const ended = running.includes(selected) && !live.some((s) => s.id === selected);
+  running = live.map((s) => s.id);
+  showStart();
+  await showQueue();
   show("sessions", sessions, sessionRow);
   $("no-sessions").hidden = sessions.length > 0;
   show("jobs", jobs.map((job) => ({ ...job, of: names.get(job.session_id) ?? job.session_id ?? `recordings ${job.recordings_id}` })), jobRow);
@@ -352,9 +326,12 @@ async function refresh() {
   const done = jobs.filter((job) => job.state === "done").length;
   if (done !== jobsDone) await showCalibrations(); // a fit is a new candidate
   jobsDone = done;
-  if (live && live === selected) await showCaptures();
+  if (!watches() && live.length) watch(live[0]);
+  await showWatched();
+  if (ended || running.includes(selected)) await showCaptures();
 }
 
+$("watch-side").addEventListener("change", () => showWatched().catch(() => {}));
 // What runs tells of itself through its events; the lists are looked at now and then, and not where nobody sees them.
 setInterval(() => document.hidden || refresh().catch(() => {}), 3000);
 enter().catch(() => showLogin());

@@ -3,6 +3,8 @@
 export const $ = (id) => document.getElementById(id);
 export const api = "/api/v1";
 
+export const LIVE = ["connecting", "running", "pausing", "paused", "packing"];
+
 export class Problem extends Error {}
 
 export async function ask(path, options = {}) {
@@ -20,6 +22,8 @@ export async function ask(path, options = {}) {
 }
 
 export const post = (path, body) => ask(path, { method: "POST", body: body === undefined ? undefined : JSON.stringify(body) });
+
+export const put = (path, body) => ask(path, { method: "PUT", body: JSON.stringify(body) });
 
 export function element(tag, properties = {}, ...children) {
   const made = Object.assign(document.createElement(tag), properties);
@@ -44,13 +48,14 @@ export function show(place, items, row) {
 
 export const time = (text) => (text ? text.replace("T", " ").slice(0, 19) : "");
 
-// A button's or form's action: what goes wrong stands in `place`.
+// A button's or form's action: what goes wrong stands in `place`, an element or the id of one.
 export const told = (place, action) => async (event) => {
   event?.preventDefault();
-  $(place).textContent = "";
+  const problem = typeof place === "string" ? $(place) : place;
+  problem.textContent = "";
   try {
     await action(event);
   } catch (error) {
-    $(place).textContent = error.message;
+    problem.textContent = error.message;
   }
 };

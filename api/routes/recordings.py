@@ -1,31 +1,68 @@
-"""Recording sets that are sent in, on which jobs run as on a session."""
+"""Recording sets that are sent in, listed, fetched and deleted; jobs run on them as on a session."""
 
 from __future__ import annotations
 
 import asyncio
 import errno
+import re
+from pathlib import Path
+from typing import Annotated, Any
 
-from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import APIRouter, HTTPException, Query, Request, Response
 
+from api.archives import Zip, zipped
 from api.errors import answers
-from api.schemas import Recordings
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
+from api.schemas import Recordings, SentAs
 from api.service import CALIBRATE, READ, Here, HexId
-from api.upload import NoRoom, TooMuch, check_room, check_size, receive
-from lab.formats.recording_set import Manifest
+from api.upload import Foreign, NoRoom, TooMuch, as_in_archive, check_room, check_size, receive
+from lab.errors import InputError
+from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
 
 router = APIRouter()
 TYPES = ("application/zip", "application/x-zip-compressed", "application/octet-stream")
 
 
-def _recordings(id: str, manifest: Manifest, warnings: tuple[str, ...] = ()) -> Recordings:
+def _recordings(id: str, manifest: dict[str, Any], warnings: tuple[str, ...] = ()) -> Recordings:
     return Recordings(
         id=id,
-        name=manifest.name,
-        notes=manifest.notes,
-        cameras=tuple(manifest.cameras),
-        captures=len(manifest.captures),
+        name=manifest.get("name", ""),
+        notes=manifest.get("notes", ""),
+        cameras=tuple(manifest["cameras"]),
+        captures=len(manifest["captures"]),
         warnings=warnings,
     )
+
+
+def _as_parameters(text: str) -> str:
+    """A sentence about the command line's options as one about this route's parameters."""
+    text = re.sub(r"--from (?=[a-z])", "format ", text)
+    return re.sub(r"--([a-z]+(?:-[a-z]+)*)", lambda found: found[1].replace("-", "_"), text)
+
+
+def _foreign(asked: SentAs) -> Foreign | None:
+    """What the parameters say of an archive that isn't a recording set; None where it is one. Raises InputError."""
+    stated = sorted(asked.model_fields_set - {"format"})
+    if asked.format is None:
+        if stated:
+            raise HTTPException(
+                422, f"{', '.join(stated)}: a recording set states it itself; leave it out, or give the format"
+            )
+        return None
+    statements = ImportOptions(
+        checkerboard=grid("checkerboard", asked.checkerboard),
+        dots=grid("dots", asked.dots),
+        square_mm=asked.square_mm,
+        camera=Path(asked.camera) if asked.camera else None,
+        exposure_s=asked.exposure_s,
+        channel=asked.channel,
+        transfer=asked.transfer,
+        corners=chart_corners("corners", asked.corners),
+        light=Path(asked.light) if asked.light else None,
+        white_patch=Path(asked.white_patch) if asked.white_patch else None,
+        tap=asked.tap or None,
+    )
+    return Foreign(asked.format, asked.path, statements)
 
 
 @router.post(
@@ -41,8 +78,13 @@ def _recordings(id: str, manifest: Manifest, warnings: tuple[str, ...] = ()) -> 
         }
     },
 )
-async def send_recordings(service: Here, request: Request, response: Response) -> Recordings:
-    """Send in a recording set: its folder as a .zip, as the body. It is checked completely before it is kept."""
+async def send_recordings(
+    service: Here, request: Request, response: Response, asked: Annotated[SentAs, Query()]
+) -> Recordings:
+    """Send in a recording set: its folder as a .zip, as the body. It is checked completely before it is kept. With `format`, the
+    archive holds recordings as `calibench import` takes them, which become a recording set; the other parameters state what that format
+    doesn't."""
+    foreign = _foreign(asked)
     sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if sent not in TYPES:
         raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the .zip itself as application/zip")
@@ -57,10 +99,12 @@ async def send_recordings(service: Here, request: Request, response: Response) -
             with archive.open("wb") as file:
                 await receive(request.stream(), file, limits.upload_bytes)
             id, found = await asyncio.to_thread(
-                service.inbox.take_in, place, archive, limits.unpacked_bytes, limits.unpacked_files
+                service.inbox.take_in, place, archive, limits.unpacked_bytes, limits.unpacked_files, foreign
             )
-        except TooMuch as error:
-            raise HTTPException(413, str(error), headers={"Connection": "close"}) from None
+        except InputError as error:
+            if isinstance(error, TooMuch):
+                raise HTTPException(413, str(error), headers={"Connection": "close"}) from None
+            raise InputError(_as_parameters(str(error)) if foreign is not None else str(error)) from None
         except NoRoom as error:
             raise HTTPException(503, str(error), headers={"Connection": "close"}) from None
         except OSError as error:
@@ -68,20 +112,24 @@ async def send_recordings(service: Here, request: Request, response: Response) -
                 raise
             raise HTTPException(503, "the data folder is full; make room", headers={"Connection": "close"}) from None
     response.headers["Location"] = f"/api/v1/recordings/{id}"
-    return _recordings(
-        id,
-        found.manifest,
-        tuple(
-            service.public(line.replace(f"{place}/set/", "").replace(f"{place}/set", "the archive"))
-            for line in found.warnings
-        ),
-    )
+    lines = tuple(service.public(as_in_archive(line, place)) for line in found.warnings)
+    return _recordings(id, found.manifest.model_dump(include={"name", "notes", "cameras", "captures"}), lines)
 
 
-@router.get("/recordings", tags=["recordings"], dependencies=[READ], responses=answers(401))
-def list_recordings(service: Here) -> list[Recordings]:
-    """All recordings that were sent in."""
-    return [_recordings(id, service.inbox.manifest(id)) for id in service.inbox.ids()]
+@router.get(
+    "/recordings", tags=["recordings"], dependencies=[READ], responses=answers(401, 422) | {200: {"headers": HEADERS}}
+)
+def list_recordings(
+    service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
+) -> list[Recordings]:
+    """Recordings that were sent in, the newest first, in pages."""
+    ids = service.inbox.ids()
+    if after is not None and after not in ids:
+        raise HTTPException(422, f"after: no recordings {after!r}; begin without it")
+    begin = ids.index(after) + 1 if after is not None else 0
+    page = ids[begin : begin + limit]
+    page_headers(request, response, len(ids), limit, page)
+    return [_recordings(id, service.inbox.manifest(id)) for id in page]
 
 
 @router.get("/recordings/{recordings_id}", tags=["recordings"], dependencies=[READ], responses=answers(401, 404, 422))
@@ -89,3 +137,30 @@ def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
     """One recording set."""
     service.recordings(recordings_id)
     return _recordings(recordings_id, service.inbox.manifest(recordings_id))
+
+
+@router.get(
+    "/recordings/{recordings_id}/archive.zip",
+    tags=["recordings"],
+    dependencies=[READ],
+    response_class=Zip,
+    responses=answers(401, 404, 422),
+)
+def recordings_archive(service: Here, recordings_id: HexId) -> Response:
+    """The recording set as a .zip, as `POST /recordings` takes it: sent while it is packed, without a stated length."""
+    service.recordings(recordings_id)
+    return zipped(service.inbox.recordings(recordings_id), f"recordings-{recordings_id}")
+
+
+@router.delete(
+    "/recordings/{recordings_id}",
+    status_code=204,
+    tags=["recordings"],
+    dependencies=[CALIBRATE],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def delete_recordings(service: Here, recordings_id: HexId) -> None:
+    """Delete a recording set for ever. Results and reports of it stay. 409 while a job works on it."""
+    folder = service.recordings(recordings_id)
+    service.check_no_job(str(folder), f"recordings {recordings_id}")
+    service.inbox.remove(recordings_id)

@@ -11,11 +11,11 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
-from api.errors import answers, known
+from api.archives import Zip, zipped
+from api.errors import Conflict, answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
-from api.preview import preview_png
 from api.schemas import (
     CaptureCount,
     CaptureKind,
@@ -26,16 +26,20 @@ from api.schemas import (
     StoredCapture,
     StoredSession,
 )
-from api.service import OPERATE, READ, Here, RegistryId, Service, SessionId
+from api.service import ADMIN, OPERATE, READ, Here, RegistryId, Service, SessionId, missing_session
+from lab.calibration.life import check_nothing_rests_on
 from lab.capture.durable_files import npy_bytes
 from lab.capture.plan import full_plan
+from lab.capture.queue import put_into_queue
 from lab.capture.records import CaptureInfo, SessionInfo
-from lab.capture.session import Progress
+from lab.capture.session import CaptureSession, Progress
 from lab.errors import InputError
+from lab.quick_look.curves import Curves
+from lab.quick_look.frame_figures import FrameFigures
 from sim.camera import Side
 
 router = APIRouter()
-OVER = frozenset({"created", "interrupted", "failed", "finished"})
+OVER = frozenset({"created", "queued", "interrupted", "failed", "finished"})
 #: A capture never changes, and its path has its session's random id in it.
 FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
@@ -112,10 +116,23 @@ def list_sessions(
     responses=answers(401, 403, 404, 409, 422),
 )
 def start_session(service: Here, start: SessionStart, response: Response) -> StoredSession:
-    """Start a session, which runs in the background. 409 while another session runs on the same instruments."""
+    """Start a session, which runs in the background. 409 while another session runs on the same instruments; with `queue` it waits for its turn
+    instead."""
     station = service.station(start.station)
     plan = full_plan(station, start.quick, start.sequences)
-    session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
+    if start.queue:
+        session_id = CaptureSession.start(
+            service.store,
+            station,
+            plan,
+            name=start.name,
+            notes=start.notes,
+            demands_certified=start.demands_certified,
+        ).id
+        put_into_queue(service.store, session_id, start.not_before)
+        service.waiting.look_soon()
+    else:
+        session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     response.headers["Location"] = f"/api/v1/sessions/{session_id}"
     return _session(service, session_id)
 
@@ -126,7 +143,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     info = service.session(session_id)
     return SessionDetail(
         **_fields(service, info),
-        station=service.store.station(session_id).name,
+        station=service.store.station_name(session_id),
         progress=service.progress(session_id) if info.closed is None else None,
         runs=service.runs(session_id),
         captures=tuple(
@@ -134,6 +151,47 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
     )
+
+
+@router.delete(
+    "/sessions/{session_id}",
+    status_code=204,
+    tags=["sessions"],
+    dependencies=[ADMIN],
+    responses=answers(401, 403, 404, 409, 422),
+)
+def delete_session(service: Here, session_id: SessionId) -> None:
+    """Delete a session for ever: its captures and its files. Results, reports and calibrations of it stay. 409 while it runs, while a job
+    works on it, and while a certified calibration rests on it. The key's scope has to be `admin`."""
+    state = state_now(service.session(session_id), service.live.find(session_id))
+    if state not in OVER:
+        raise Conflict(f"session {session_id} is {state}; abort it first")
+    service.check_no_job(session_id, f"session {session_id}")
+    try:
+        check_nothing_rests_on(service.store, session_id)
+        service.store.delete_session(session_id)
+    except InputError as error:
+        raise Conflict(str(error)) from None
+
+
+@router.get(
+    "/sessions/{session_id}/archive.zip",
+    tags=["sessions"],
+    dependencies=[READ],
+    response_class=Zip,
+    responses=answers(401, 404, 409, 422),
+)
+def session_archive(service: Here, session_id: SessionId) -> Response:
+    """The session as a recording set, a .zip as `POST /recordings` takes it: sent while it is packed, without a stated length. 409 while it
+    runs, because what it has is still changing, and where it has captured nothing."""
+    info = service.session(session_id)
+    state = state_now(info, service.live.find(session_id))
+    if state not in OVER:
+        raise Conflict(f"session {session_id} is {state}; wait for its end or abort it")
+    recordings = service.store.recording_set(session_id)
+    if not recordings.captures():
+        raise Conflict(f"session {session_id}: nothing was captured yet; resume it")
+    return zipped(recordings, f"session-{session_id}")
 
 
 @router.post(
@@ -255,9 +313,11 @@ def list_captures(
     limit: Limit = PAGE,
 ) -> list[StoredCapture]:
     """The captures of a session, in the order in which they were taken or the newest first, in pages."""
-    service.session(session_id)
-    found = service.store.captures(
-        session_id, kind=kind, side=side, after=after, newest_first=order == "newest", limit=limit
+    found = known(
+        missing_session(session_id),
+        lambda: service.store.captures(
+            session_id, kind=kind, side=side, after=after, newest_first=order == "newest", limit=limit
+        ),
     )
     total = sum(
         n
@@ -308,8 +368,7 @@ def preview_capture(
     headers = FOR_EVER | {"ETag": tag}
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
-    camera = service.store.recording_set(session_id).camera(info.side)  # type: ignore[arg-type]
-    return Png(preview_png(service.store.frame(capture_id), camera, width, stretch), headers=headers)
+    return Png(service.pictures.png(session_id, info.id, width, stretch), headers=headers)
 
 
 @router.get(
@@ -323,4 +382,26 @@ def capture_frame(service: Here, session_id: SessionId, capture_id: RegistryId) 
     """The raw frame as .npy: uint16 (rows, cols), checked against its SHA-256."""
     info = _known_capture(service, session_id, capture_id)
     headers = FOR_EVER | {"Content-Disposition": f'attachment; filename="capture-{info.id}.npy"'}
-    return Npy(npy_bytes(service.store.frame(capture_id)), headers=headers)
+    return Npy(npy_bytes(service.store.frame(info.id)), headers=headers)
+
+
+@router.get(
+    "/sessions/{session_id}/captures/{capture_id}/figures",
+    tags=["captures"],
+    dependencies=[READ],
+    responses=answers(401, 404, 422),
+)
+def capture_figures(service: Here, session_id: SessionId, capture_id: RegistryId, response: Response) -> FrameFigures:
+    """Histogram, mean and share of saturated pixels of each channel of the frame."""
+    info = _known_capture(service, session_id, capture_id)
+    response.headers.update(FOR_EVER)
+    return service.pictures.figures(session_id, info.id)
+
+
+@router.get("/sessions/{session_id}/curves", tags=["captures"], dependencies=[READ], responses=answers(401, 404, 422))
+def session_curves(service: Here, session_id: SessionId) -> Curves:
+    """Photon transfer, sensitivity and MTF as the captures so far show them: cheap estimates that grow while the session runs, computed in a
+    process of their own. A long session is looked at in several turns: ask again while `looked_at` is less than `captures`. The fit is what
+    counts."""
+    service.session(session_id)
+    return service.quick_look.curves(session_id)

@@ -116,6 +116,19 @@ def check_certified(store: Store, cameras: Mapping[Side, str]) -> None:
     )
 
 
+def check_nothing_rests_on(store: Store, session_id: str) -> None:
+    """Raises InputError where a calibration that is certified now rests on the session; enters the others, which stay without it."""
+    register(store)
+    with store.reading() as db:
+        found = [_calibration(*row) for row in db.execute(_asked().where(CalibrationRow.session_id == session_id))]
+    for one in found:
+        if one.state == "certified":
+            raise InputError(
+                f"session {session_id}: the certified calibration {one.id} rests on it; its captures are kept until that is "
+                "superseded or expired"
+            )
+
+
 # --- registering ---------------------------------------------------------------------------------------------------------
 
 
@@ -200,7 +213,9 @@ def _calibration(row: CalibrationRow, name: str) -> CalibrationRecord:
 
 
 def _asked() -> Any:
-    return sa.select(CalibrationRow, SessionRow.name).join(SessionRow, SessionRow.id == CalibrationRow.session_id)
+    """Calibrations with their sessions' names; a session that was deleted has its id for one."""
+    name = sa.func.coalesce(SessionRow.name, CalibrationRow.session_id)
+    return sa.select(CalibrationRow, name).outerjoin(SessionRow, SessionRow.id == CalibrationRow.session_id)
 
 
 def calibrations(store: Store, after: str | None = None, limit: int | None = None) -> list[CalibrationRecord]:

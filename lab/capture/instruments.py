@@ -27,6 +27,16 @@ from lab.capture.devices import (
 from lab.capture.station import Drivers, Station
 from lab.capture_kinds.base import CaptureLimits
 from lab.errors import DeviceError
+from sim.camera import Side
+from sim.parameters import Frozen
+
+
+class BenchState(Frozen):
+    """How the bench stands in a run. `wavelength_nm` 0: white light. None: there is no such instrument, or it moves."""
+
+    shutter_open: bool | None = None
+    wavelength_nm: float | None = None
+    temperature_c: dict[Side, float] = {}
 
 
 class Instruments:
@@ -62,6 +72,15 @@ class Instruments:
         """All devices that the station has, the cameras last."""
         every = (self.target, self.light, self.shutter, self.screen, self.radiometer, self.photodiode, self.cameras)
         return tuple(device for device in every if device is not None)
+
+    def state(self) -> BenchState:
+        """How the bench stands, as the devices last said; the temperature is that of the frames."""
+        taken = {side: frame.temperature_c for side, frame in self.cameras.frames.items()}
+        return BenchState(
+            shutter_open=self.shutter.value if self.shutter is not None else None,
+            wavelength_nm=self.light.value.wavelength_nm if self.light is not None and self.light.value else None,
+            temperature_c={side: value for side, value in taken.items() if value is not None},
+        )
 
     def connect(self) -> dict[str, Identity]:
         """Connect to every instrument and bring it into its safe state; the identities by name. Raises DeviceError."""

@@ -12,7 +12,7 @@ from lab.capture_kinds.base import Step
 from sim.camera import Side
 from sim.parameters import Frozen
 
-SessionState = Literal["created", "running", "paused", "interrupted", "failed", "finished"]
+SessionState = Literal["created", "queued", "running", "paused", "interrupted", "failed", "finished"]
 JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 Role = Literal["frame", "spectrum", "target"]
 

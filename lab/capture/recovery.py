@@ -92,6 +92,11 @@ class Recovery:
         self._resume = resume
         self._wake.set()
 
+    @property
+    def settled(self) -> bool:
+        """Whether the first look is over, and no session waits to go on by itself."""
+        return self._looked.is_set() and not self._waiting
+
     def close(self) -> None:
         """End the thread."""
         self._ended.set()

@@ -31,7 +31,7 @@ from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, T
 from drivers.errors import InstrumentError
 from drivers.instrument import Identity
 from lab.capture.blocking_calls import in_thread
-from lab.capture.instruments import Instruments
+from lab.capture.instruments import BenchState, Instruments
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
@@ -55,7 +55,8 @@ PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
 
 
 class Progress(Frozen):
-    """Progress of a session: `done` of `total` steps are in the journal, `what` is the current one; times in s."""
+    """Progress of a session: `done` of `total` steps are in the journal, `what` is the current one; times in s. `bench`: how the instruments
+    stood after the step before."""
 
     session: str
     state: Literal["connecting", "running", "paused", "packing", "interrupted", "failed", "finished"]
@@ -66,6 +67,7 @@ class Progress(Frozen):
     elapsed_s: float
     left_s: float | None = None
     remark: str | None = None
+    bench: BenchState | None = None
 
 
 class _Pace:
@@ -131,6 +133,7 @@ class CaptureSession:
         self._on_progress = on_progress
         self._connect = connect
         self._engine: RunEngine | None = None
+        self._instruments: Instruments | None = None
         self._control = threading.Condition()
         self._ended_by: str | None = None
         self._resume_asked = False
@@ -261,6 +264,7 @@ class CaptureSession:
         failure: BaseException | None = None
         try:
             identities = instruments.connect()
+            self._instruments = instruments
             self._check_identities(identities)
             if self.store.session(self.id).demands_certified:
                 from lab.calibration.life import cameras_of, check_certified
@@ -275,6 +279,7 @@ class CaptureSession:
         self._writes.close()
         complaints = instruments.make_safe()
         instruments.close()
+        self._instruments = None
         if failure is not None:
             raise _plain(failure, complaints) from failure
         if complaints:
@@ -395,6 +400,7 @@ class CaptureSession:
             elapsed_s=time.monotonic() - self._began_s,
             left_s=self._pace.left_s(to_do) if to_do else None,
             remark=remark,
+            bench=self._instruments.state() if self._instruments is not None else None,
         )
         try:
             self._on_progress(progress)

@@ -31,6 +31,7 @@ from sqlalchemy.orm import Session, defer, sessionmaker
 
 from lab.capture.durable_files import Lock, npy_bytes, write_durably
 from lab.capture.nexus import write_nexus
+from lab.capture.queue import hold_queue, release_held_by
 from lab.capture.records import (
     CaptureInfo,
     JournalEntry,
@@ -251,6 +252,11 @@ class Store:
         with self.reading() as db:
             return Station.model_validate(self._row(db, session_id).station)
 
+    def station_name(self, session_id: str) -> str:
+        """What the station of a session calls itself."""
+        with self.reading() as db:
+            return str(self._row(db, session_id).station.get("name", ""))
+
     def runs(self, session_id: str) -> list[RunRecord]:
         """Provenance: every run of a session, in order."""
         with self.reading() as db:
@@ -264,14 +270,36 @@ class Store:
         run: RunRecord | None = None,
         station: Station | None = None,
     ) -> None:
-        """Record the state of a session; `run` is added to its provenance, `station` is where it runs now."""
+        """Record the state of a session; `run` is added to its provenance, `station` is where it runs now. A run that ended badly holds the
+        sessions that wait for the same instruments."""
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.state, row.error = state, error
+            row.queue_place = row.not_before = None
+            if state in ("interrupted", "failed"):
+                hold_queue(
+                    db, f"session {session_id} is {state}: {error}; release it when the bench is ready", row.station
+                )
             if run is not None:
                 row.runs = [*row.runs, run.model_dump(mode="json")]
             if station is not None:
                 row.station = station.model_dump(mode="json")
+
+    def delete_session(self, session_id: str) -> None:
+        """Delete a session for ever: its captures, its journal, its files. Results of it stay. Raises InputError while a process runs it."""
+        lock = self.lock(session_id)
+        with self.reading() as db:
+            self._row(db, session_id)
+        if not lock.acquire(patience_s=0.0):
+            raise InputError(f"session {session_id}: a process runs it; abort it first")
+        try:
+            with self.transaction() as db:
+                for table in (CaptureRow, FileRow, StepRow):
+                    db.execute(sa.delete(table).where(table.session_id == session_id))
+                db.execute(sa.delete(SessionRow).where(SessionRow.id == session_id))
+        finally:
+            lock.release()
+        shutil.rmtree(self.folder(session_id), ignore_errors=True)
 
     # --- the journal -----------------------------------------------------------------------------------------------------
 
@@ -396,28 +424,27 @@ class Store:
 
     def frame(self, capture_id: int) -> NDArray[np.uint16]:
         """The frame of a capture by its id in the registry."""
-        capture = self.capture(capture_id)
-        return self.recording_set(capture.session_id).frame(CAPTURES.parse(capture.document))
+        recordings = self.recording_set(self.capture(capture_id).session_id, (capture_id,))
+        return recordings.frame(recordings.captures()[0])
 
-    def recording_set(self, session_id: str) -> RecordingSet:
-        """The captures of a session so far as a recording set."""
+    def recording_set(self, session_id: str, only: Sequence[int] | None = None) -> RecordingSet:
+        """The captures of a session so far as a recording set; `only`: those of these ids in the registry."""
+        asked = sa.select(CaptureRow.document).where(CaptureRow.session_id == session_id)
+        files = sa.select(FileRow.path, FileRow.sha256, FileRow.side, FileRow.pack_index)
+        files = files.where(FileRow.session_id == session_id)
+        if only is not None:
+            asked = asked.where(CaptureRow.id.in_(only))
+            theirs = sa.select(CaptureRow.file).where(CaptureRow.id.in_(only))
+            files = files.where(sa.or_(FileRow.role != "frame", FileRow.id.in_(theirs)))
         with self.reading() as db:
             row = self._row(db, session_id)
-            documents = db.scalars(
-                sa.select(CaptureRow.document).where(CaptureRow.session_id == session_id).order_by(CaptureRow.id)
-            )
             manifest = Manifest(
                 name=row.name or session_id,
                 notes=row.notes,
                 cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},  # type: ignore[misc]
-                captures=tuple(CAPTURES.parse(document) for document in documents),
+                captures=tuple(CAPTURES.parse(one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
-            files = db.execute(
-                sa.select(FileRow.path, FileRow.sha256, FileRow.side, FileRow.pack_index).where(
-                    FileRow.session_id == session_id
-                )
-            )
-            where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in files}
+            where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}
         return RecordingSet(manifest, source=session_id, files=SessionFiles(self.folder(session_id), where))
 
     # --- closing ---------------------------------------------------------------------------------------------------------
@@ -462,6 +489,8 @@ class Store:
                     )
                 row = self._row(db, session_id)
                 row.packed, row.closed, row.state, row.error = True, now(), "finished", None
+                row.queue_place = row.not_before = None
+                release_held_by(db, session_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
         return pack
 

@@ -39,6 +39,8 @@ class SessionRow(Base):
     runs: Mapped[list[Any]]
     packed: Mapped[bool] = mapped_column(default=False)
     demands_certified: Mapped[bool] = mapped_column(default=False, server_default=sa.false())
+    queue_place: Mapped[int | None] = mapped_column(index=True)
+    not_before: Mapped[datetime | None]
 
 
 class StepRow(Base):
@@ -79,8 +81,8 @@ class CaptureRow(Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     session_id: Mapped[str] = mapped_column(sa.ForeignKey("sessions.id", ondelete="CASCADE"), index=True)
-    step: Mapped[int] = mapped_column(sa.ForeignKey("steps.id", ondelete="CASCADE"))
-    file: Mapped[int] = mapped_column(sa.ForeignKey("files.id", ondelete="CASCADE"))
+    step: Mapped[int] = mapped_column(sa.ForeignKey("steps.id", ondelete="CASCADE"), index=True)
+    file: Mapped[int] = mapped_column(sa.ForeignKey("files.id", ondelete="CASCADE"), index=True)
     name: Mapped[str] = mapped_column(sa.String(160))
     kind: Mapped[str] = mapped_column(sa.String(20))
     side: Mapped[str] = mapped_column(sa.String(10))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -69,19 +68,19 @@ def import_(
     """Turn another format into a recording set."""
     from lab.formats import recording_set
     from lab.formats.importers import read_foreign
-    from lab.formats.importers.import_options import ImportOptions
+    from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
 
     if transfer not in ("", "linear", "srgb"):
         raise InputError(f"--transfer {transfer}: give linear or srgb")
     options = ImportOptions(
-        checkerboard=_pair("--checkerboard", checkerboard),
-        dots=_pair("--dots", dots),
+        checkerboard=grid("--checkerboard", checkerboard),
+        dots=grid("--dots", dots),
         square_mm=square_mm or None,
         camera=camera,
         exposure_s=exposure_s,
         channel=channel or None,
         transfer="srgb" if transfer == "srgb" else "linear" if transfer else None,
-        corners=_corners(corners),
+        corners=chart_corners("--corners", corners),
         light=light,
         white_patch=white_patch,
         tap=tap or None,
@@ -115,31 +114,6 @@ def _import_table(kind: str, path: Path, options: ImportOptions, file: Path) -> 
     result = (fit_level_table if kind == LEVEL_TABLE else fit_mean_table)(path, camera)
     write_json(result, file)
     print_fit(RecordingSet(Manifest(cameras={"left": camera}, captures=())), result)
-
-
-def _pair(option: str, text: str) -> tuple[int, int] | None:
-    """ROWSxCOLS."""
-    if not text:
-        return None
-    found = re.fullmatch(r"(\d+)x(\d+)", text)
-    if found is None:
-        raise InputError(f"{option} {text}: give ROWSxCOLS, as in 6x9")
-    return int(found[1]), int(found[2])
-
-
-def _corners(text: str) -> tuple[tuple[float, float], ...] | None:
-    """Eight numbers with commas."""
-    if not text:
-        return None
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 8:
-        raise InputError(
-            f"--corners {text}: give eight numbers, row and column of dark skin, bluish green, black, white"
-        )
-    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 @commands.command()

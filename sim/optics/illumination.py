@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
-from scipy.interpolate import PchipInterpolator, RectBivariateSpline
 
 from sim.parameters import Frozen
 from sim.spectrum import FloatArray
 
 if TYPE_CHECKING:  # a lens's fall-off is a part of the camera
+    from scipy.interpolate import PchipInterpolator, RectBivariateSpline
+
     from sim.camera import CameraModel
 
 
@@ -51,6 +52,8 @@ class RadialIllumination(Frozen):
 
     @cached_property
     def _curve(self) -> PchipInterpolator:
+        from scipy.interpolate import PchipInterpolator
+
         return PchipInterpolator(self.radius_mm, self.relative_illumination)
 
     def at(self, radius_mm: FloatArray) -> FloatArray:
@@ -116,6 +119,8 @@ class MeasuredIllumination(Frozen):
 
     @cached_property
     def _surface(self) -> RectBivariateSpline:
+        from scipy.interpolate import RectBivariateSpline
+
         values = np.array(self.values)
         y, x = (np.linspace(0.0, 1.0, n) for n in values.shape)
         return RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))

@@ -17,8 +17,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_serializer, model_validator
-from scipy.interpolate import RegularGridInterpolator
-from scipy.special import sici
 
 from sim.optics.diffraction import diffraction_cutoff_cy_per_um, diffraction_otf
 from sim.optics.pupil import Wavefront, noll_order, osa_order, pupil_otf, pupil_ratio, seidel, zernike
@@ -265,6 +263,8 @@ class MeasuredOtf(Frozen):
             return np.asarray(np.interp(np.hypot(fx, fy), x, np.real(value[0]), right=0.0) * ratio)
         turned = np.where(fx < 0, -1.0, 1.0)
         across = np.abs(fy) if y[0] == 0.0 else fy * turned
+        from scipy.interpolate import RegularGridInterpolator
+
         table = RegularGridInterpolator((y, x), value if self.phase_rad else np.real(value), bounds_error=False, fill_value=0.0)  # fmt: skip
         found = table(np.stack([across, np.abs(fx)], axis=-1))
         return np.asarray(np.where(turned < 0, np.conj(found), found) * ratio)
@@ -394,6 +394,8 @@ def _beyond(fx: FloatArray, fy: FloatArray, half_um: float) -> FloatArray:
     Along each direction from the square's border outwards, integral_1^inf cos(a t) / t^2 dt = cos a - a (pi/2 - Si a)
     with a = 2 pi f_along border; summed over the directions.
     """
+    from scipy.special import sici
+
     phi = np.pi * (np.arange(96) + 0.5) / 96
     cos, sin = np.cos(phi), np.sin(phi)
     rim = half_um / np.maximum(np.abs(cos), np.abs(sin))

@@ -22,7 +22,6 @@ from math import comb, factorial, isclose
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import spline_filter1d
 
 from sim.optics.diffraction import diffraction_otf
 from sim.spectrum import FloatArray
@@ -490,6 +489,8 @@ def _polar_table(bend: Wavefront, wavelength_um: float) -> ComplexArray:
     steps = np.arange(1, PAD + 1, dtype=float)
     low, high = (_continued(edge, steps) for edge in (dense[:4], dense[:-5:-1]))
     dense = np.concatenate([low[::-1], dense, high])
+
+    from scipy.ndimage import spline_filter1d
 
     along = spline_filter1d(dense, axis=0, mode="mirror", output=complex)
     return np.asarray(spline_filter1d(along, axis=1, mode="grid-wrap", output=complex))

@@ -8,7 +8,6 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, make_interp_spline
 
 from sim.camera import Geometry
 from sim.spectrum import FloatArray
@@ -108,12 +107,16 @@ class _RowSpline:
     @classmethod
     def through(cls, row_nodes: FloatArray, col_nodes: FloatArray, values: FloatArray, col: FloatArray) -> Self:
         """The spline that takes `values`, (rows, cols), at the nodes, at the columns `col` within them."""
+        from scipy.interpolate import make_interp_spline  # here: the library takes a while to load
+
         across = make_interp_spline(col_nodes, values, k=3, axis=1)(col)
         down = make_interp_spline(row_nodes, across, k=3, axis=0)
         return cls(down.t, np.ascontiguousarray(down.c))
 
     def __call__(self, row: FloatArray) -> FloatArray:
         """Values (len(row), cols) at ascending rows within the nodes."""
+        from scipy.interpolate import BSpline
+
         basis = BSpline.design_matrix(np.clip(row, self.knots[0], self.knots[-1]), self.knots, 3)
         used = slice(int(basis.indices.min()), int(basis.indices.max()) + 1)  # in a strip of rows, few differ from 0
         return np.asarray(basis[:, used].toarray() @ self.coefficients[used])

@@ -66,10 +66,10 @@ def test_every_route_says_what_it_answers(shared: Running) -> None:
         assert set(one["tags"]) <= tags and one["tags"], where
         good = [one["responses"][status] for status in one["responses"] if status.startswith("2")]
         assert len(good) == 1, where
-        if path == "/logout":
+        if "204" in one["responses"]:
             continue
         for kind, content in good[0]["content"].items():
-            assert content["schema"] or kind in ("image/png", "application/x-npy"), where
+            assert content["schema"] or kind in ("image/png", "application/x-npy", "application/zip"), where
         for status, answer in one["responses"].items():
             if status.startswith("4"):
                 assert answer["content"]["application/problem+json"]["schema"] == {

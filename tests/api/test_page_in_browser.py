@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import shutil
 from collections.abc import Iterator
@@ -12,7 +13,9 @@ from typing import Any
 
 import pytest
 
-from tests.api.conftest import Running, serving, until_state
+from api.client import ServiceClient
+from lab.capture.queue import put_into_queue
+from tests.api.conftest import STATION, Running, serving, until_state
 from tests.lab.calibration.test_life import fitted
 
 PHONE, DESK = {"width": 420, "height": 860}, {"width": 1280, "height": 860}
@@ -45,15 +48,21 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """A service with a finished session that was calibrated three times; the last one drifted."""
+    """A service with a finished session that was calibrated three times, the last one drifted; a session that is held; a recording set."""
     with serving(tmp_path_factory.mktemp("data")) as running, running.client() as client:
         (running.store.root / "limits.toml").write_text(LIMITS)
-        started = client.post(
-            "/api/v1/sessions", json={"station": "fakes", "quick": True, "sequences": ["dark"], "name": "nightly"}
+        asked = {"station": "fakes", "quick": True, "sequences": ["dark", "flat"], "name": "nightly"}
+        waits = client.post(
+            "/api/v1/sessions", json=asked | {"queue": True, "not_before": "2999-01-01T00:00:00Z"}
         ).json()
+        started = client.post("/api/v1/sessions", json=asked).json()
         until_state(client, started["id"], "finished")
         for value in READ_NOISE_E:
             running.store.add_result("fit", started["id"], fitted(value).model_dump(mode="json"))
+        put_into_queue(running.store, waits["id"], held="halted by a test")
+        with ServiceClient(running.url, running.keys["admin"]) as sender:
+            archive = sender.fetch_session(started["id"], running.store.root / "nightly.zip")
+            sender.send_recordings(archive)
         yield running
 
 
@@ -78,8 +87,9 @@ class Watched:
         self.page.wait_for_selector("#history svg")
 
     def open_session(self) -> None:
-        self.page.click("#sessions tr:last-child button:has-text('Open')")
+        self.page.click("#sessions tr:has(.state.finished) button:has-text('Open')")
         self.page.wait_for_selector("#captures img")
+        self.page.wait_for_selector("#transfer svg .c1")  # from the process that looks at the captures
 
     def serious(self) -> list[str]:
         """What axe finds that is serious or critical."""
@@ -141,7 +151,9 @@ def test_everyone_can_read_and_use_it(browser: Any, lab: Running, scheme: str, v
     watched.log_in(lab)
     watched.open_session()
     watched.page.click("#history-words")
-    watched.page.eval_on_selector("#live", "live => { live.hidden = false }")
+    watched.page.wait_for_selector("#recordings td")
+    watched.page.wait_for_selector("#queue .held")
+    watched.page.eval_on_selector(".station .run", "run => { run.hidden = false }")
     watched.page.eval_on_selector("#live-problem", "one => { one.textContent = 'instrument: doesn\\'t answer' }")
     assert watched.serious() == [] and watched.sideways_px() == 0
     watched.page.click("#calibrations button")
@@ -185,6 +197,54 @@ def test_a_session_by_keyboard_alone(browser: Any, lab: Running) -> None:
     watched.page.wait_for_selector("#sessions tr:first-child .state.interrupted")
     lab.bench.delay_s = 0.0
     assert not lab.bench.opened  # the shutter
+    watched.close()
+
+
+def test_two_stations_a_queue_and_recordings_that_are_dropped(browser: Any, lab: Running) -> None:
+    other = STATION.replace('address = "', 'address = "other ').replace("a bench of fakes", "another bench")
+    (lab.store.root / "stations" / "other.toml").write_text(other)
+    watched = Watched(browser, lab)
+    page = watched.page
+    watched.log_in(lab)
+    page.wait_for_selector(".station:nth-child(2)")
+    lab.bench.delay_s = 0.05
+    page.fill("input[name=name]", "watched")
+    page.click("#start")
+    page.wait_for_selector(".station.busy progress")
+    assert len(page.query_selector_all(".station.busy")) == 1
+    page.wait_for_selector(".station.busy dd:has-text('closed')")  # darks: the shutter
+    page.wait_for_selector("#watch-histogram svg .line")
+    page.wait_for_selector("#start:has-text('Queue a session')")
+    page.fill("input[name=name]", "next")
+    page.click("#start")
+    page.click("#queue tr:has-text('next') button:has-text('Earlier')")
+    page.wait_for_selector("#queue tr:first-child:has-text('1. next')")
+    page.click("#queue tr:has-text('next') button:has-text('Remove')")
+    page.wait_for_selector("#queue tr:has-text('next')", state="detached")
+    page.click(".station.busy button:has-text('Halt')")
+    page.wait_for_selector("#sessions tr:has-text('watched') .state.interrupted")
+    lab.bench.delay_s = 0.0
+    assert not lab.bench.opened
+    page.wait_for_selector("#queue .reason:has-text('halted by admin')")
+
+    there = len(page.query_selector_all("#recordings tr"))
+    page.set_input_files("#drop-file", lab.store.root / "nightly.zip")
+    page.wait_for_selector(f"#recordings tr:nth-child({there + 1})")
+    code = """async ([name, content]) => {
+        const data = new DataTransfer();
+        data.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
+        document.getElementById("drop").dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true})) }"""
+    page.evaluate(code, ["wrong.zip", base64.b64encode(b"no archive").decode()])
+    page.wait_for_selector("#recordings-problem:has-text('wrong.zip: archive: can')")
+    content = (lab.store.root / "nightly.zip").read_bytes()
+    page.evaluate(code, ["dropped.zip", base64.b64encode(content).decode()])
+    page.wait_for_selector(f"#recordings tr:nth-child({there + 2})")
+    assert page.inner_text("#recordings-problem") == ""
+    page.on("dialog", lambda asked: asked.accept())
+    page.click("#recordings tr:first-child button:has-text('Delete')")
+    page.wait_for_selector(f"#recordings tr:nth-child({there + 2})", state="detached")
+    (lab.store.root / "stations" / "other.toml").unlink()
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
     watched.close()
 
 

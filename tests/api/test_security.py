@@ -40,6 +40,14 @@ ROUTES = [
     ("GET", "/sessions/{session_id}/captures/{capture_id}", "read"),
     ("GET", "/sessions/{session_id}/captures/{capture_id}/preview.png", "read"),
     ("GET", "/sessions/{session_id}/captures/{capture_id}/frame.npy", "read"),
+    ("GET", "/sessions/{session_id}/captures/{capture_id}/figures", "read"),
+    ("GET", "/sessions/{session_id}/curves", "read"),
+    ("DELETE", "/sessions/{session_id}", "admin"),
+    ("GET", "/sessions/{session_id}/archive.zip", "read"),
+    ("GET", "/queue", "read"),
+    ("PUT", "/sessions/{session_id}/queue", "operate"),
+    ("DELETE", "/sessions/{session_id}/queue", "operate"),
+    ("POST", "/halt", "operate"),
     ("POST", "/sessions/{session_id}/jobs", "calibrate"),
     ("POST", "/pipelines", "admin"),
     ("GET", "/calibrations", "read"),
@@ -50,6 +58,8 @@ ROUTES = [
     ("GET", "/recordings", "read"),
     ("POST", "/recordings", "calibrate"),
     ("GET", "/recordings/{recordings_id}", "read"),
+    ("GET", "/recordings/{recordings_id}/archive.zip", "read"),
+    ("DELETE", "/recordings/{recordings_id}", "calibrate"),
     ("POST", "/recordings/{recordings_id}/jobs", "calibrate"),
     ("GET", "/jobs", "read"),
     ("GET", "/jobs/{job_id}", "read"),
@@ -63,6 +73,8 @@ BODIES: dict[str, Any] = {
     "/pipelines": {"station": "nowhere"},
     "jobs": {"kind": "fit"},
     "/calibrations/{calibration_id}/certify": {},
+    "/halt": {"station": "nowhere"},
+    "/sessions/{session_id}/queue": {},
 }
 
 

@@ -171,6 +171,25 @@ def test_what_is_not_there_is_said(store: Store) -> None:
         assert "no such folder" in (info.error or "")
 
 
+def test_a_job_that_no_worker_has_any_more_is_failed_with_the_reason(
+    store: Store, session: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began, go = threading.Event(), threading.Event()
+
+    def task(asked: PipelineRequest, tell: Tell) -> None:
+        began.set()
+        assert go.wait(20)
+
+    with_task(monkeypatch, task)
+    with JobRunner(store) as runner:
+        job = runner.submit("fit", session)
+        assert began.wait(20)
+        runner._left(job)  # what Dask tells when the worker was killed and another one found that the job had begun
+        info = runner.job(job)
+        assert info.state == "failed" and "worker" in (info.error or "")
+        go.set()
+
+
 def test_a_real_fit_on_a_worker_process(store: Store, session: str) -> None:
     # In a process of its own the task has only references: the store's folder and the job's id.
     with (

@@ -32,10 +32,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Importer:
-    """A format: how it is read, and which options it takes."""
+    """A format: how it is read, which options it takes, and whether it is one file, not a folder."""
 
     read: Callable[[Path, ImportOptions], RecordingSet]
     takes: frozenset[str] = frozenset()
+    of_a_file: bool = False
 
 
 def _raw_folder(path: Path, options: ImportOptions) -> RecordingSet:
@@ -60,8 +61,8 @@ KINDS: dict[str, Importer] = {
     "emva1288": Importer(lambda path, _: read_emva1288(path)),
     "raw-folder": Importer(_raw_folder, frozenset({"--checkerboard", "--square-mm", "--tap"})),
     "fits": Importer(lambda path, options: read_fits_folder(path, options.tap or ""), frozenset({"--tap"})),
-    "slanted-edge": Importer(read_slanted_edge, _PICTURE | {"--channel"}),
-    "colorchecker": Importer(read_colour_chart, _PICTURE | {"--corners", "--light", "--white-patch"}),
+    "slanted-edge": Importer(read_slanted_edge, _PICTURE | {"--channel"}, of_a_file=True),
+    "colorchecker": Importer(read_colour_chart, _PICTURE | {"--corners", "--light", "--white-patch"}, of_a_file=True),
     "dot-grid": Importer(_dot_grids, frozenset({"--dots", "--square-mm"})),
 }
 

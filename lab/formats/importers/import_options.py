@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
+
+from lab.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -33,3 +36,28 @@ class ImportOptions:
         """Names of the options that are stated, as on the command line."""
         names = (field.name for field in fields(self))
         return tuple(f"--{name.replace('_', '-')}" for name in names if getattr(self, name) is not None)
+
+
+def grid(option: str, text: str) -> tuple[int, int] | None:
+    """ROWSxCOLS as two numbers; None where `text` is empty. Raises InputError, with the option's name."""
+    if not text:
+        return None
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    if found is None:
+        raise InputError(f"{option} {text}: give ROWSxCOLS, as in 6x9")
+    return int(found[1]), int(found[2])
+
+
+def chart_corners(option: str, text: str) -> tuple[tuple[float, float], ...] | None:
+    """Eight numbers with commas as four corners (row, col); None where `text` is empty. Raises InputError, with the option's name."""
+    if not text:
+        return None
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 8:
+        raise InputError(
+            f"{option} {text}: give eight numbers, row and column of dark skin, bluish green, black, white"
+        )
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True))

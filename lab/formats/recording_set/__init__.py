@@ -3,6 +3,7 @@
 `read` checks a whole folder and reports all problems at once, one line each. `write` writes a folder completely or not at all. The kinds of capture are in `lab.capture_kinds`.
 """
 
+from lab.formats.recording_set.archive import archive
 from lab.formats.recording_set.checks import inspect
 from lab.formats.recording_set.clipping import clipped_share
 from lab.formats.recording_set.files import FolderFiles, RecordingFiles
@@ -22,6 +23,7 @@ __all__ = [
     "RecordingFiles",
     "RecordingSet",
     "Target",
+    "archive",
     "clipped_share",
     "inspect",
     "load_frame",

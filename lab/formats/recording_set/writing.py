@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -19,45 +20,60 @@ from lab.formats.recording_set.manifest import RecordingError, manifest_json
 from lab.formats.recording_set.recordings import RecordingSet
 from lab.formats.spectrum_csv import format_spectrum
 
+MANIFEST = "manifest.json"
+
 
 def _place(recordings: RecordingSet, root: Path, path: str) -> Path:
     """The file below `root` that the manifest calls `path`; its folder is made."""
     pure = PurePosixPath(path)
-    if "\\" in path or pure.is_absolute() or ".." in pure.parts or path == "manifest.json":
+    if "\\" in path or pure.is_absolute() or ".." in pure.parts or path == MANIFEST:
         raise InputError(f"{recordings.source}: the path '{path}' leaves the folder; name it frames/..., spectra/...")
     file = root / pure
     file.parent.mkdir(parents=True, exist_ok=True)
     return file
 
 
-def _write_frame(recordings: RecordingSet, root: Path, path: str, frame: Frame) -> None:
-    file, there = _place(recordings, root, path), recordings.file(path)
-    if there is not None:
-        shutil.copyfile(there, file)  # byte by byte, whatever the format
-    elif file.suffix == ".npy":
-        np.save(file, frame, allow_pickle=False)
-    elif file.suffix in (".tif", ".tiff"):
-        tifffile.imwrite(file, frame, photometric="minisblack", metadata=None)
+def _frame_content(recordings: RecordingSet, path: str, frame: Frame) -> bytes:
+    """A frame as a file of the format that its name says: the set's own file, byte by byte, where it has one."""
+    if (there := recordings.file(path)) is not None:
+        return there.read_bytes()
+    buffer, suffix = io.BytesIO(), PurePosixPath(path).suffix
+    if suffix == ".npy":
+        np.save(buffer, frame, allow_pickle=False)
+    elif suffix in (".tif", ".tiff"):
+        tifffile.imwrite(buffer, frame, photometric="minisblack", metadata=None)
     else:
         raise InputError(f"{recordings.source}: can't write a frame to '{path}'; name it .npy or .tif")
+    return buffer.getvalue()
 
 
-def _write_rest(recordings: RecordingSet, root: Path) -> None:
-    """Spectra, targets, lens files and the manifest."""
+def _rest(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
+    """Path and content of spectra, targets and lens files."""
     manifest = recordings.manifest
     named = [(what, path) for capture in manifest.captures for _, what, path in names_in(capture)]
     spectra = {path for what, path in named if what is Names.SPECTRUM}
     for camera in manifest.cameras.values():
         spectra |= set((camera.quantum_efficiency or {}).values())
         if camera.lens_file is not None and (there := recordings.file(camera.lens_file)) is not None:
-            shutil.copyfile(there, _place(recordings, root, camera.lens_file))
-    for path in spectra:
+            yield camera.lens_file, there.read_bytes()
+    for path in sorted(spectra):
         there = recordings.file(path)
-        text = format_spectrum(recordings.spectrum(path)) if there is None else there.read_text(encoding="utf-8")
-        _place(recordings, root, path).write_text(text, encoding="utf-8")
-    for path in {path for what, path in named if what is Names.TARGET}:
-        np.save(_place(recordings, root, path), recordings.target(path), allow_pickle=False)
-    (root / "manifest.json").write_text(manifest_json(manifest), encoding="utf-8")
+        yield path, format_spectrum(recordings.spectrum(path)).encode() if there is None else there.read_bytes()
+    for path in sorted({path for what, path in named if what is Names.TARGET}):
+        buffer = io.BytesIO()
+        np.save(buffer, recordings.target(path), allow_pickle=False)
+        yield path, buffer.getvalue()
+
+
+def contents(recordings: RecordingSet) -> Iterator[tuple[str, bytes]]:
+    """Path and content of every file of the set as a folder, frames first, one at a time. Each frame is checked as it is read."""
+    written: set[str] = set()
+    for capture in recordings.manifest.captures:
+        if capture.frame not in written:
+            written.add(capture.frame)
+            yield capture.frame, _frame_content(recordings, capture.frame, recordings.frame(capture))
+    yield from _rest(recordings)
+    yield MANIFEST, manifest_json(recordings.manifest).encode()
 
 
 def write(
@@ -81,14 +97,17 @@ def write(
         def loaded(capture: Capture, frame: Frame, share: float) -> None:
             if capture.frame not in written:
                 written.add(capture.frame)
-                _write_frame(recordings, partial, capture.frame, frame)
+                content = _frame_content(recordings, capture.frame, frame)
+                _place(recordings, partial, capture.frame).write_bytes(content)
             if progress is not None:
                 progress(capture.id, share)
 
         problems, _ = inspect(recordings, loaded)
         if problems:
             raise RecordingError(problems)  # noqa: TRY301
-        _write_rest(recordings, partial)
+        for name, content in _rest(recordings):
+            _place(recordings, partial, name).write_bytes(content)
+        (partial / MANIFEST).write_text(manifest_json(recordings.manifest), encoding="utf-8")
         partial.chmod(0o755)
         if folder.exists():
             folder.rmdir()

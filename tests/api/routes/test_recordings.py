@@ -10,18 +10,22 @@ import os
 import shutil
 import socket
 import stat
+import threading
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import cv2
 import httpx
 import numpy as np
 import pytest
 import tifffile
 
 import lab.fit
+from api.client import ServiceClient, ServiceProblem
+from api.schemas import SentAs
 from api.service import Limits
 from api.upload import RESERVE_BYTES, TooMuch, unpack
 from lab.errors import InputError
@@ -340,3 +344,144 @@ def test_unknown_recordings_are_404(shared: Running) -> None:
     with shared.client("calibrate") as client:
         assert client.get("/api/v1/recordings/" + "0" * 16).status_code == 404
         assert client.post("/api/v1/recordings/" + "0" * 16 + "/jobs", json={"kind": "fit"}).status_code == 404
+
+
+# --- listed, fetched, imported, deleted --------------------------------------------------------------------------------
+
+
+def test_what_was_sent_in_is_fetched_again_and_deleted(
+    running: Running, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive = tmp_path / "sent.zip"
+    archive.write_bytes(packed(folder, "my recordings/"))
+    with ServiceClient(running.url, running.keys["calibrate"]) as client:
+        first, second = client.send_recordings(archive), client.send_recordings(archive)
+        assert [one.id for one in client.recordings()] == [second.id, first.id]
+        assert len(client.request("GET", "/recordings", params={"limit": 1}).json()) == 1
+        fetched = client.fetch_recordings(first.id, tmp_path / "fetched.zip")
+        again = client.send_recordings(fetched)
+        assert (again.name, again.captures) == ("two darks", 2)
+        unpack(fetched, tmp_path / "fetched", 1 << 20, 100)
+        for path in ("manifest.json", "frames/0.npy", "frames/1.npy"):
+            assert (tmp_path / "fetched" / path).read_bytes() == (folder / path).read_bytes()
+        begun, go_on = threading.Event(), threading.Event()
+
+        def slow(*_: object) -> FitResult:
+            begun.set()
+            assert go_on.wait(30.0)
+            return FitResult(source="sent", cameras={}, skipped=())
+
+        monkeypatch.setattr(lab.fit, "fit_recording_set", slow)
+        job = client.request("POST", f"/recordings/{first.id}/jobs", json={"kind": "fit"}).json()["id"]
+        assert begun.wait(30.0)
+        with pytest.raises(ServiceProblem, match=f"409: recordings {first.id}: job {job} .fit. is running"):
+            client.delete_recordings(first.id)
+        go_on.set()
+        client.wait_job(job)
+        client.delete_recordings(first.id)
+        for method, path in (("GET", ""), ("DELETE", ""), ("GET", "/archive.zip")):
+            with pytest.raises(ServiceProblem, match="404: no recordings"):
+                client.request(method, f"/recordings/{first.id}{path}")
+        assert client.job(job).state == "done"  # what was found stays
+        assert [one.id for one in client.recordings()] == [again.id, second.id]
+    assert kept(running) == sorted([again.id, second.id])
+    with ServiceClient(running.url, running.keys["read"]) as client:
+        with pytest.raises(ServiceProblem, match="403"):
+            client.delete_recordings(second.id)
+        with pytest.raises(ServiceProblem, match="422: after"):
+            client.request("GET", "/recordings", params={"after": first.id})
+        with pytest.raises(ServiceProblem, match="404: no recordings"):
+            client.fetch_recordings(first.id, tmp_path / "none.zip")
+    assert not list(tmp_path.glob("*none.zip*"))
+
+
+def test_a_damaged_frame_breaks_the_archive_off(running: Running, folder: Path, tmp_path: Path) -> None:
+    with running.client("calibrate") as client:
+        sent = send(client, packed(folder)).json()["id"]
+        (running.store.root / "recordings" / sent / "frames" / "1.npy").write_bytes(b"damaged")
+        with pytest.raises(httpx.RemoteProtocolError):
+            client.get(f"/api/v1/recordings/{sent}/archive.zip")
+        (running.store.root / "recordings" / sent / "frames" / "0.npy").unlink()
+        refused = client.get(f"/api/v1/recordings/{sent}/archive.zip")
+        assert refused.status_code == 422 and "frames/0.npy" in refused.json()["detail"]
+
+
+@pytest.fixture
+def foreign(tmp_path: Path) -> Path:
+    """Two dark images with the index of a raw folder."""
+    path = tmp_path / "foreign"
+    path.mkdir()
+    for n in range(2):
+        assert cv2.imwrite(str(path / f"{n}.png"), np.full((6, 8), 60 + n, np.uint8))
+    (path / "camera.toml").write_text('cfa = "MONO"\nbit_depth = 8\n')
+    (path / "index.csv").write_text("frame,kind,exposure_s\n0.png,dark,0.1\n1.png,dark,0.1\n")
+    return path
+
+
+@pytest.mark.parametrize("top", ["", "their folder/"])
+def test_another_format_becomes_a_recording_set(running: Running, foreign: Path, tmp_path: Path, top: str) -> None:
+    archive = tmp_path / "sent.zip"
+    archive.write_bytes(packed(foreign, top))
+    with ServiceClient(running.url, running.keys["calibrate"]) as client:
+        found = client.send_recordings(archive, SentAs(format="raw-folder"))
+        assert found.captures == 2 and found.cameras == ("left",)
+        assert [one.id for one in client.recordings()] == [found.id]
+        read = recording.read(running.store.root / "recordings" / found.id)
+        assert [int(read.frame(capture).max()) for capture in read.captures()] == [60, 61]
+
+
+@pytest.mark.parametrize(
+    ("params", "said"),
+    [
+        ({}, "manifest.json"),
+        ({"format": "nothing"}, "format"),
+        ({"square_mm": 2}, "square_mm: a recording set states it itself"),
+        ({"format": "raw-folder", "dots": "9x9"}, "format raw-folder doesn't take dots"),
+        ({"format": "raw-folder", "checkerboard": "9"}, "checkerboard 9: give ROWSxCOLS"),
+        ({"format": "raw-folder", "checkerboard": "6x9"}, "state square_mm"),
+        ({"format": "raw-folder", "square_mm": -1}, "square_mm"),
+        ({"format": "raw-folder", "path": "../0.png"}, "isn't a path inside it"),
+        ({"format": "raw-folder", "path": "elsewhere"}, "isn't in the archive"),
+        ({"format": "slanted-edge"}, "path: a recording of the format slanted-edge is one file"),
+        ({"format": "slanted-edge", "path": "0.png", "camera": "/etc/passwd"}, "isn't a path inside it"),
+        ({"format": "slanted-edge", "path": "0.png", "exposure_s": 0.1, "transfer": "linear"}, "0.png"),
+        ({"format": "emva1288"}, "no EMVA 1288 descriptor"),
+        ({"wrong": 1}, "wrong"),
+    ],
+)
+def test_what_no_format_is_is_refused_and_nothing_is_kept(
+    shared: Running, foreign: Path, params: dict[str, Any], said: str
+) -> None:
+    before = kept(shared)
+    with shared.client("calibrate") as client:
+        refused = client.post("/api/v1/recordings", content=packed(foreign), headers=ZIP, params=params)
+    detail = refused.json()["detail"]
+    assert refused.status_code == 422 and said in detail, detail
+    assert "--" not in detail and str(shared.store.root) not in detail and "incoming" not in detail
+    assert kept(shared) == before
+
+
+def test_an_index_leads_out_of_no_folder(running: Running, foreign: Path) -> None:
+    outside = running.store.root / "secret.npy"
+    np.save(outside, np.zeros((6, 8), np.uint16))
+    for frame in (str(outside), "../../../secret.npy"):
+        (foreign / "index.csv").write_text(f"frame,kind,exposure_s\n{frame},dark,0.1\n")
+        with running.client("calibrate") as client:
+            for format in ("raw-folder", "fits"):
+                refused = client.post(
+                    "/api/v1/recordings", content=packed(foreign), headers=ZIP, params={"format": format}
+                )
+                assert refused.status_code == 422 and "folder" in refused.json()["detail"]
+    assert kept(running) == []
+
+
+def test_an_upload_is_carried_out_once(running: Running, folder: Path) -> None:
+    with running.client("calibrate") as client:
+        sent = [send(client, packed(folder), ZIP | {"Idempotency-Key": "once"}) for _ in range(2)]
+        assert sent[0].json() == sent[1].json() and sent[1].headers["idempotency-replayed"] == "true"
+        other = send(client, b"something else", ZIP | {"Idempotency-Key": "once"})
+        assert other.status_code == 422 and "another request" in other.json()["detail"]
+        # What was refused doesn't use the key up.
+        assert send(client, b"no archive", ZIP | {"Idempotency-Key": "twice"}).status_code == 422
+        assert send(client, packed(folder), ZIP | {"Idempotency-Key": "twice"}).status_code == 201
+    assert len(kept(running)) == 2

@@ -13,6 +13,7 @@ import httpx
 import numpy as np
 import pytest
 
+from api.client import ServiceClient
 from drivers.errors import Disconnected
 from lab.capture.tables import IdempotentRow
 from tests.api.conftest import Running, events, serving, until, until_state
@@ -320,3 +321,21 @@ def test_a_capture_belongs_to_its_session(shared: Running) -> None:
             assert client.get(f"/api/v1/sessions/{path}").status_code == 404
         for odd in ("0", "-1", "x", str(2**70), "1.5"):
             assert client.get(f"/api/v1/sessions/{session_id}/captures/{odd}").status_code == 422
+
+
+def test_figures_and_curves_of_what_was_captured(shared: Running) -> None:
+    here = f"/api/v1/sessions/{only_session(shared)}"
+    with shared.client("read") as client:
+        capture = client.get(f"{here}/captures", params={"limit": 1}).json()[0]
+        answer = client.get(f"{here}/captures/{capture['id']}/figures")
+        frame = shared.store.frame(capture["id"])
+        found = answer.json()["channels"]
+        assert answer.headers["cache-control"].endswith("immutable")
+        assert found[0]["channel"] == "R" and found[0]["mean_dn"] == pytest.approx(frame[::2, ::2].mean())
+        assert all(sum(one["counts"]) == frame.size / 4 for one in found)
+        assert client.get(f"{here}/captures/99999/figures").status_code == 404
+        looked = until(client, f"{here}/curves", lambda now: 0 < now["captures"] == now["looked_at"])
+        assert looked["transfer"] == []  # darks alone
+        with ServiceClient(shared.url, shared.keys["read"]) as typed:
+            assert typed.curves(only_session(shared)).looked_at == looked["looked_at"]
+        assert client.get("/api/v1/sessions/none/curves").status_code == 404

@@ -1,0 +1,85 @@
+"""Starts the sessions that wait in the queue, each when its turn has come and its instruments are free."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from api.errors import Conflict
+from api.live import LiveSessions
+from lab.capture.queue import put_into_queue, queue
+from lab.capture.records import now
+from lab.capture.store import Store
+from lab.errors import InputError
+
+log = logging.getLogger(__name__)
+#: How often (s) the queue is looked at.
+LOOK_S = 1.0
+
+
+class QueueRunner:
+    """Looks at the queue in a thread of its own, from `start` to `close`. `ready`: False while stations are still made safe after a
+    crash, whose sessions go on first."""
+
+    def __init__(self, store: Store, live: LiveSessions, ready: Callable[[], bool]) -> None:
+        self._store, self._live, self._ready = store, live, ready
+        self._begun: set[str] = set()
+        self._ended, self._wake = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._work, name="queue", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def look_soon(self) -> None:
+        """Look at the queue now, not at the next turn."""
+        self._wake.set()
+
+    def close(self) -> None:
+        """End the thread; what waits goes on waiting."""
+        self._ended.set()
+        self._wake.set()
+        if self._thread.ident is not None:
+            self._thread.join(10.0)
+
+    def _work(self) -> None:
+        while not self._ended.is_set():
+            try:
+                if self._ready():
+                    self.look()
+            except Exception:
+                log.exception("looking at the queue: a defect")
+            self._wake.wait(LOOK_S)
+            self._wake.clear()
+
+    def look(self) -> None:
+        """Start every session whose turn has come."""
+        waiting = queue(self._store)
+        if not waiting:
+            return
+        ended = [id for id in self._store.under_way() if self._live.find(id) is None]
+        taken = {address for id in ended for address in self._store.station(id).addresses}
+        for one in waiting:
+            if self._ended.is_set() or self._live.find(one.id) is not None:
+                continue
+            addresses = self._store.station(one.id).addresses
+            if one.held is None and (one.not_before is None or one.not_before <= now()) and not addresses & taken:
+                self._start(one.id)
+            if one.not_before is None or one.held is not None:
+                taken |= addresses  # who comes later on these instruments waits for its turn
+
+    def _start(self, session_id: str) -> None:
+        if session_id in self._begun:  # it began, and nothing of that was recorded
+            self._begun.discard(session_id)
+            put_into_queue(self._store, session_id, held="its run ended before it began; the service's log says more")
+            return
+        try:
+            self._live.resume(session_id, in_turn=True)
+        except Conflict:
+            return  # its instruments are in use, or it was held just now
+        except InputError as error:
+            log.warning("session %s: not started from the queue: %s", session_id, error)
+            put_into_queue(self._store, session_id, held=str(error))
+            return
+        self._begun.add(session_id)

@@ -1,0 +1,109 @@
+"""Sessions that wait for their instruments: registered in an order, so that the queue survives the service.
+
+A queued session starts when its turn has come, its instruments are free and its time (`not_before`) is reached. A run that ended badly (aborted,
+failed, its process killed) holds the sessions that wait for the same instruments: nothing opens a shutter again that somebody just closed.
+They go on when they are released, or when the run that held them is resumed and finishes.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import sqlalchemy as sa
+from sqlalchemy.orm import Session
+
+from lab.capture.station import Station
+from lab.capture.tables import SessionRow
+from lab.errors import InputError
+from sim.parameters import Frozen
+
+if TYPE_CHECKING:
+    from lab.capture.store import Store
+
+#: States from which a session may be queued.
+STARTABLE = ("created", "interrupted", "failed", "queued")
+#: How the reason of a hold begins.
+HELD = "held: "
+
+
+class QueuedSession(Frozen):
+    """A session in the queue. `place`: 1 is first; `held`: why it doesn't start, None where its turn is enough."""
+
+    id: str
+    name: str
+    station: str
+    place: int
+    not_before: datetime | None
+    held: str | None
+
+
+def queue(store: Store) -> list[QueuedSession]:
+    """The sessions that wait, in their order."""
+    with store.reading() as db:
+        return [
+            QueuedSession(
+                id=row.id,
+                name=row.name,
+                station=row.station.get("name", ""),
+                place=place,
+                not_before=_aware(row.not_before),
+                held=row.error.removeprefix(HELD) if row.error else None,
+            )
+            for place, row in enumerate(_waiting(db), start=1)
+        ]
+
+
+def put_into_queue(
+    store: Store, session_id: str, not_before: datetime | None = None, place: int | None = None, held: str | None = None
+) -> None:
+    """Let a session wait, or move one that does to another place (None: last, or where it is), and release it unless `held` says why not.
+
+    Raises InputError for a session that runs or is finished.
+    """
+    with store.transaction() as db:
+        row = db.get(SessionRow, session_id)
+        if row is None or row.state not in STARTABLE:
+            state = "unknown" if row is None else row.state
+            raise InputError(f"session {session_id} is {state}; only one that can be started or resumed can wait")
+        others = [other for other in _waiting(db) if other.id != session_id]
+        now_at = row.queue_place if row.queue_place is not None else len(others)
+        others.insert(min(place - 1 if place is not None else now_at, len(others)), row)
+        row.state, row.not_before, row.error = "queued", not_before, f"{HELD}{held}" if held else None
+        for at, other in enumerate(others):
+            other.queue_place = at
+
+
+def leave_queue(store: Store, session_id: str) -> None:
+    """Take a session out of the queue: it can be started by hand. Raises InputError where it doesn't wait."""
+    with store.transaction() as db:
+        row = db.get(SessionRow, session_id)
+        if row is None or row.state != "queued":
+            raise InputError(f"session {session_id} isn't in the queue; GET /queue lists those that are")
+        done = bool(row.runs)
+        row.state, row.error = ("interrupted", "taken out of the queue") if done else ("created", None)
+        row.queue_place = row.not_before = None
+
+
+def hold_queue(db: Session, why: str, station: dict[str, Any] | None = None) -> None:
+    """Hold the sessions that wait for an instrument of `station`, a station as the registry has it; None: all that wait."""
+    addresses = None if station is None else Station.model_validate(station).addresses
+    for row in _waiting(db):
+        if addresses is None or addresses & Station.model_validate(row.station).addresses:
+            row.error = f"{HELD}{why}"
+
+
+def release_held_by(db: Session, session_id: str) -> None:
+    """Release the sessions that this one held, as it has finished after all."""
+    for row in _waiting(db):
+        if row.error is not None and row.error.startswith(f"{HELD}session {session_id} "):
+            row.error = None
+
+
+def _waiting(db: Session) -> list[SessionRow]:
+    asked = sa.select(SessionRow).where(SessionRow.queue_place.is_not(None))
+    return list(db.scalars(asked.order_by(SessionRow.queue_place, SessionRow.created)))
+
+
+def _aware(at: datetime | None) -> datetime | None:
+    return at.replace(tzinfo=UTC) if at is not None and at.tzinfo is None else at

@@ -1,0 +1,45 @@
+"""A recording set as a .zip, made piece by piece while it is sent: unpacked, it is what `read` takes."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator
+
+from lab.formats.recording_set.recordings import RecordingSet
+from lab.formats.recording_set.writing import contents
+
+
+class _Sent(io.RawIOBase):
+    """A file that can only be written to, and gives out what it was given."""
+
+    def __init__(self) -> None:
+        self._held = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, piece: object) -> int:
+        written = bytes(piece)  # type: ignore[call-overload]
+        self._held += written
+        return len(written)
+
+    def taken(self) -> bytes:
+        """What came since the last call."""
+        held, self._held = bytes(self._held), bytearray()
+        return held
+
+
+def archive(recordings: RecordingSet) -> Iterator[bytes]:
+    """The pieces of a .zip of the set: one file of it in memory at a time, stored without compression.
+
+    Raises InputError where a frame is missing or damaged; the archive then has no list of files, so nobody takes it for a whole one.
+    """
+    sent = _Sent()
+    with zipfile.ZipFile(
+        sent, "w", zipfile.ZIP_STORED
+    ) as packed:  # closed after an error, too; what that writes isn't sent
+        for path, content in contents(recordings):
+            packed.writestr(zipfile.ZipInfo(path), content)
+            yield sent.taken()
+    yield sent.taken()
