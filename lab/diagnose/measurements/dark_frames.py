@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.capture_kinds.dark import DarkCapture
@@ -30,6 +31,8 @@ CLIP = 4.5  # standard deviations at which single pixels are cut off where they 
 MEDIAN_OF = 5  # frames at most, whose median shows defective pixels
 #: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
 TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
+#: Standard deviations of single pixels' fixed pattern from which on a pixel counts as defective, and no longer in the frames' means.
+DEFECTIVE = TAIL_EDGES[2]
 SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their noise are taken
 
 
@@ -158,17 +161,31 @@ def dark_frames(study: Study) -> list[DarkStatistics]:
     usual = [c for c in every if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0] or every  # fmt: skip
     warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
     picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]
-    return [_read(study, c, c.name in picked) for c in every]
+    sound = np.ones((study.camera.rows, study.camera.cols), bool)
+    for condition in {one.name: one for one in (usual[-1], warmest)}.values():
+        sound &= ~_defective(study, condition)
+    return [_read(study, c, c.name in picked, sound) for c in every]
 
 
-def _read(study: Study, condition: DarkCondition, with_pattern: bool) -> DarkStatistics:
+def _defective(study: Study, condition: DarkCondition) -> NDArray[np.bool_]:
+    """Pixels that stand far out of their surroundings in the median of repeats: where they are hot most, at the longest exposure and the
+    highest temperature. One hot pixel of 3000 e/s has more shot noise than the mean of a small frame's others."""
+    captures = condition.seen if len(condition.seen) > 1 else condition.captures
+    frames = [study.recordings.frame(c).astype(np.float32) for c in captures[:MEDIAN_OF]]
+    away, local = _from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in frames])
+    return np.asarray(np.abs(away) > DEFECTIVE * local)
+
+
+def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDArray[np.bool_]) -> DarkStatistics:
+    """`sound` (rows, cols): the pixels that count in the frames' means."""
     means: dict[str, float] = {}
     mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
     contrasts: dict[bool, list[Image]] = {False: [], True: []}
     stacks: dict[bool, list[Image]] = {False: [], True: []}
     for k, capture in enumerate(condition.captures):
         frame = study.recordings.frame(capture).astype(np.float32)
-        means[capture.id] = level = float(frame.mean(dtype=np.float64))
+        means[capture.id] = float(frame.mean(dtype=np.float64, where=sound))
+        level = float(frame.mean(dtype=np.float64))
         held_out = k >= len(condition.seen)
         frame -= np.float32(level)
         if k:
@@ -227,24 +244,7 @@ def _changing(contrasts: list[Image]) -> DarkNoise:
 def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float | None) -> DarkPattern:
     mean: Image = np.asarray(np.mean(frames, axis=0, dtype=np.float32))
     part = frames[:MEDIAN_OF]
-    level = [f - _row_means(f)[:, None] for f in part]
-    median: Image = np.sort(np.array(level), axis=0)[(len(part) - 1) // 2]
-    # defective pixels: deviation from their surroundings without lines, in standard deviations of these
-    std = _robust_std(median)
-    flat, _ = _without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
-    step = 2
-    for r in range(step):
-        for c in range(step):
-            phase = flat[r::step, c::step]
-            phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
-    around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
-    steep = np.clip(flat - around, -CLIP * std, CLIP * std)
-    # a second pass, so that hot pixels in a glow don't shift the mean around them
-    around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
-    away = flat - around
-    local = np.sqrt(np.maximum(_local_variance(np.square(away), 1), 0.25)) * np.sqrt(
-        SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0)
-    )
+    away, local = _from_surroundings(part)
     z = away / local
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
     counts = np.histogram(z, edges)[0].astype(float)
@@ -272,6 +272,29 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
         spread_dn=float(np.median(local)),
         skewness=float(np.clip(3.0 * (low + high) / 5.63, 0.0, 1.0)),
     )
+
+
+def _from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
+    """How far pixels of the lower median of frames lie from their surroundings, without lines; and the standard deviation of these, DN."""
+    level = [f - _row_means(f)[:, None] for f in frames]
+    median: Image = np.sort(np.array(level), axis=0)[(len(frames) - 1) // 2]
+    # defective pixels: deviation from their surroundings without lines, in standard deviations of these
+    std = _robust_std(median)
+    flat, _ = _without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
+    step = 2
+    for r in range(step):
+        for c in range(step):
+            phase = flat[r::step, c::step]
+            phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
+    around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
+    steep = np.clip(flat - around, -CLIP * std, CLIP * std)
+    # a second pass, so that hot pixels in a glow don't shift the mean around them
+    around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
+    away = flat - around
+    local = np.sqrt(np.maximum(_local_variance(np.square(away), 1), 0.25)) * np.sqrt(
+        SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0)
+    )
+    return away, local
 
 
 def _robust_std(image: Image) -> float:
