@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -105,11 +106,11 @@ def test_shares_of_defective_pixels_are_those_of_drawn_pixels() -> None:
     noise = np.sqrt(moving**2 + 0.5 * more)
     drawn = (
         more + fixed * rng.standard_normal(n) + noise * rng.standard_normal((frames, n))
-        + jump * (rng.integers(0, 2, (frames, n)) - 0.5)
+        + jump * ((rng.random((frames, n)) < 0.25) - 0.25)
     )  # fmt: skip
     median = np.sort(drawn, axis=0)[(frames - 1) // 2] - defective_pixels._order_moments(frames)[0] * moving
     spread = 1.6
-    classes = [defective_pixels._DefectClass(0.01, 30.0, 0.0), defective_pixels._DefectClass(0.01, 0.0, 40.0)]
+    classes = [defective_pixels._DefectClass(0.01, 30.0, 0.0), defective_pixels._DefectClass(0.01, 0.0, 40.0, 0.25)]
     shares = defective_pixels._tail_shares(classes, moving, fixed, frames, spread, 0.5, 0.0)
     edges = np.array([-np.inf, -6.0, -4.5, *TAIL_EDGES, np.inf]) * spread
     counts = np.histogram(median, edges)[0]
@@ -118,21 +119,23 @@ def test_shares_of_defective_pixels_are_those_of_drawn_pixels() -> None:
     np.testing.assert_array_less(np.abs(got - expected), 4.5 * np.sqrt(expected) + 4.0)
 
 
-def test_shares_of_flickering_pixels_are_those_of_drawn_pixels() -> None:
+@pytest.mark.parametrize("high_share", [0.5, 0.2])
+def test_shares_of_flickering_pixels_are_those_of_drawn_pixels(high_share: float) -> None:
     """Contrasts of frames that are high or low at random: the cube root is good to a few per cent of a share."""
     rng = np.random.default_rng(2)
     n, frames, amplitude = 200_000, 5, 6.0
-    values = rng.standard_normal((frames, n)) + amplitude * (rng.integers(0, 2, (frames, n)) - 0.5)
+    values = rng.standard_normal((frames, n)) + amplitude * (rng.random((frames, n)) < high_share)
     total = np.square(values - values.mean(0)).sum(0)
     condition = DarkCondition(1.0, None, tuple([None] * frames), ())  # type: ignore[arg-type]
     edges = defective_pixels._flicker_edges(frames - 1)[:3]
-    away = amplitude**2 * defective_pixels._jump_sums(condition)[False]
-    shares = defective_pixels._chance_above(np.full(len(away), frames - 1.0), np.maximum(away, 1e-9), edges).mean(
-        axis=0
-    )
+    draws = defective_pixels._JumpDraws.of([SimpleNamespace(condition=condition)])  # type: ignore[list-item]
+    away, weight = amplitude**2 * draws.sums[0, False], draws.weights(high_share)
+    shares = weight @ defective_pixels._chance_above(np.full(len(away), frames - 1.0), np.maximum(away, 1e-9), edges)
     drawn = (total[:, None] > edges).mean(axis=0)
-    # 256 draws of states: a share p is known to sqrt(p (1 - p) / 256)
-    assert np.all(np.abs(shares - drawn) < 4.0 * np.sqrt(drawn * (1 - drawn) / defective_pixels.JUMPS) + 0.01)
+    # draws of states, worth 1 / sum of their squared weights: a share p is known to sqrt(p (1 - p) / that)
+    worth = 1.0 / float(weight @ weight)
+    assert worth > 60.0
+    assert np.all(np.abs(shares - drawn) < 4.0 * np.sqrt(drawn * (1 - drawn) / worth) + 0.01)
 
 
 def test_clipped_square_is_its_integral() -> None:
