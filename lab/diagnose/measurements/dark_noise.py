@@ -6,8 +6,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_frames import CLIP, DEFECTS, captures_of, dark_frames, too_coarse
+from lab.diagnose.measurements.dark_frames import DEFECTS, captures_of, dark_frames, too_coarse
 from lab.diagnose.measurements.dark_level import added_dark_e_per_s
+from lab.diagnose.measurements.pixel_outliers import CLIP
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.spectrum import FloatArray

@@ -18,6 +18,7 @@ from lab.diagnose.measurements import dark_noise, defective_pixels
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.library import measurements
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
@@ -315,3 +316,17 @@ def test_recordings_without_noise_are_not_stale() -> None:
     first = {c.exposure_s: np.array(recordings.frame(c)) for c in reversed(captures)}
     still = RecordingSet(recordings.manifest, {c.frame: first[c.exposure_s] for c in captures}, {}, {})
     assert Study(still, "left", camera_model(still, "left")).stale == ()
+
+
+@pytest.mark.parametrize("seed", [9, 10])
+def test_a_hot_pixel_does_not_move_the_mean_of_a_small_frame(seed: int) -> None:
+    """Two or three of 3072 pixels, 20000 e/s: 200 e of shot noise at 2 s, 0.1 e of the frames' mean, which pixels' noise knows to 0.07 e.
+    chi2 of n numbers, 4 sigma."""
+    law = laws.HotPixelsLaw(20000.0, 0, 5)
+    camera = ConcealedCamera(seed, (law,), cfa="MONO", rows=48, cols=64, bit_depth=16)
+    recordings = recordings_of(camera, Plan(("dark",), repeats=6))
+    block = dark_level_block(Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True)))
+    prediction = block.predict(())
+    free = np.array(list(prediction.jacobian.values()))
+    n = len(block.value)
+    assert chi2(block.value - prediction.mean, block.covariance + free.T @ free) < n + 4.0 * np.sqrt(2.0 * n)
