@@ -237,6 +237,7 @@ def test_dark_squares_that_the_border_cuts_are_looked_at_inside_only(seed: int) 
     assert away @ np.linalg.solve(block.covariance, away) < n + 5.0 * np.sqrt(2.0 * n)
 
 
+@pytest.mark.slow
 def test_a_displaced_colour_before_an_aligned_screen_keeps_its_contrast() -> None:
     """Cells of 4 px, straight: red and blue are displaced by 0.6 px in the corners. The camera of this former only displaces a channel, so
     that each band's contrast is 1 but for what the last step leaves, 0.1 px: 1 - cos(2 pi 0.1 0.3) = 2 % up to 0.3 cy/px, and the noise of
