@@ -24,7 +24,7 @@ from scipy.ndimage import convolve
 from sim.camera import CameraModel
 from sim.optics.filters import veil_otf
 from sim.optics.pupil import Wavefront, pupil_ratio
-from sim.sensor.defects import Defects
+from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineNoise
 from sim.spectrum import FloatArray
 
@@ -327,7 +327,7 @@ class Signal(State):
     response: tuple[Callable[[FloatArray], FloatArray], ...] = ()
     offset_dn: tuple[Callable[[float, float | None], float], ...] = ()
     lines: tuple[LineNoise, ...] = ()
-    telegraph: tuple[Defects, ...] = ()
+    telegraph: tuple[Jumps, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     filters: tuple[FloatArray, ...] = ()
 
@@ -355,14 +355,15 @@ class Signal(State):
 
 @dataclass(frozen=True)
 class Telegraph:
-    """Random telegraph noise: each pixel of `jumps` is read with +A/2 or -A/2, each half of the time and anew in every frame."""
+    """Random telegraph noise: each pixel of `jumps` is read with +(1 - p) A in a share p of the frames, else with -p A, anew in every frame."""
 
-    jumps: Defects
+    jumps: Jumps
 
     def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Electrons (rows, cols) of one frame."""
         jump, pixels = np.zeros(shape), self.jumps.pixels(shape)
-        jump.flat[pixels] = self.jumps.sizes(shape).flat[pixels] * (rng.integers(0, 2, pixels.size) - 0.5)
+        share = self.jumps.high_share
+        jump.flat[pixels] = self.jumps.sizes(shape).flat[pixels] * ((rng.random(pixels.size) < share) - share)
         return jump
 
     def mean_e(self, shape: tuple[int, ...]) -> float:
@@ -370,8 +371,9 @@ class Telegraph:
         return 0.0
 
     def variance_e2(self, shape: tuple[int, ...]) -> FloatArray:
-        """A^2 / 4 in these pixels."""
-        return np.asarray(self.jumps.sizes(shape) ** 2 / 4.0)
+        """p (1 - p) A^2 in these pixels."""
+        share = self.jumps.high_share
+        return np.asarray(share * (1.0 - share) * self.jumps.sizes(shape) ** 2)
 
 
 @dataclass(frozen=True)

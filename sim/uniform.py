@@ -13,7 +13,7 @@ from sim.camera import CameraModel
 from sim.detection import collection_m2_sr, detected
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.sensor import mosaic
-from sim.sensor.defects import Defects
+from sim.sensor.defects import Defects, Jumps
 from sim.sensor.lines import LineNoise
 from sim.spectrum import FloatArray, Spectrum
 from sim.stages import Acts, Charge, Codes, Image, Light, Signal, charge_of, codes_of, image_of, light_of, signal_of
@@ -273,7 +273,7 @@ class Uniform:
         return self._signal.lines
 
     @property
-    def telegraph(self) -> tuple[Defects, ...]:
+    def telegraph(self) -> tuple[Jumps, ...]:
         """Pixels that jump between two levels, sizes in e."""
         return self._signal.telegraph
 

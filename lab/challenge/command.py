@@ -58,7 +58,12 @@ def make_command(
     truths: Annotated[
         Path | None, typer.Option("--truths", metavar="FILE", help="where the truths go (DIR.truths.json beside DIR)")
     ] = None,
-    size: Annotated[str, typer.Option("--size", help="small, medium or full frames")] = "medium",
+    size: Annotated[
+        str,
+        typer.Option(
+            "--size", help="small, medium or full frames; foreign: frames, converters and screens of all sizes"
+        ),
+    ] = "medium",
     cfa: Annotated[str | None, typer.Option("--cfa", help="MONO, RGGB, ... for all cases (without: as drawn)")] = None,
     proof: Annotated[
         bool, typer.Option("--proof", help="a proof: its seed is scored once, and never tuned on")

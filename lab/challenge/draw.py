@@ -15,11 +15,20 @@ from lab.challenge.recordings import recording_set
 from lab.challenge.truth import CaseTruth, Concealed, Kind
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.formats.recording_set import RecordingSet
-from mocks.former import LISTED, OUTSIDE, ConcealedCamera, DrawnSession, Law, Plan, record
+from mocks.former import BIT_DEPTH, LISTED, OUTSIDE, ConcealedCamera, DrawnSession, Law, Plan, record
 
-SIZES = {"small": (96, 128), "medium": (192, 256), "full": (384, 512)}
+#: (rows, cols) of frames by the name of their size; None: each case has a frame of its own, see `DrawnFrame.drawn`.
+SIZES: dict[str, tuple[int, int] | None] = {
+    "small": (96, 128),
+    "medium": (192, 256),
+    "full": (384, 512),
+    "foreign": None,
+}
 #: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
 SHARES: tuple[tuple[Kind, int], ...] = (("healthy", 6), ("single", 7), ("compound", 3), ("outside", 4))
+FOREIGN_FRAMES = ((24, 32), (48, 64), (96, 128), (192, 256), (384, 512))
+FOREIGN_SHARES = (0.1, 0.2, 0.35, 0.25, 0.1)
+FOREIGN_BITS = (8, 10, 12, 14, 16)
 WEAK, STRONG = (10.0, 50.0), (50.0, 2000.0)  # non-centralities aimed at, half of the cases each
 INVISIBLE = 1.0  # a non-centrality below which no strength is searched
 SIZING_ROUNDS, SIZING_FACTOR = 3, 1.6  # attempts to reach the non-centrality aimed at, and how near is near enough
@@ -35,6 +44,31 @@ class Case:
     truth: CaseTruth
 
 
+@dataclass(frozen=True)
+class DrawnFrame:
+    """A camera's frame, its converter, and how a screen stands before it."""
+
+    rows: int
+    cols: int
+    bit_depth: int = BIT_DEPTH
+    screen_cell_px: float = Plan.screen_cell_px
+    screen_turn_deg: float = Plan.screen_turn_deg
+
+    @staticmethod
+    def drawn(rng: np.random.Generator) -> DrawnFrame:
+        """One that the tool was not tuned on: tiny and large frames, 8 to 16 bit, screens of 2 to 6 px a cell, turned by 0 to 2 degrees; cells of
+        integral numbers of pixels that stand straight, as a careful laboratory sets a screen up, in a third of the cases."""
+        rows, cols = FOREIGN_FRAMES[int(rng.choice(len(FOREIGN_FRAMES), p=FOREIGN_SHARES))]
+        aligned = rng.random() < 1.0 / 3.0
+        return DrawnFrame(
+            rows=rows,
+            cols=cols,
+            bit_depth=int(rng.choice(FOREIGN_BITS)),
+            screen_cell_px=float(rng.integers(2, 7)) if aligned else float(rng.uniform(2.0, 6.0)),
+            screen_turn_deg=0.0 if aligned else float(rng.uniform(0.0, 2.0)),
+        )
+
+
 def draw(
     seed: int, index: int, size: str = "medium", *, cfa: str | None = None, kind: Kind | None = None, law: type[Law] | None = None, sizing: Sizing = "aimed"
 ) -> Case:  # fmt: skip
@@ -46,13 +80,17 @@ def draw(
     """
     rng = np.random.default_rng([seed, index])
     what = kind or kind_of(seed, index)
-    rows, cols = SIZES[size]
+    of_size = SIZES[size]
+    frame = DrawnFrame.drawn(np.random.default_rng([seed, index, 2])) if of_size is None else DrawnFrame(*of_size)
+    rows, cols = frame.rows, frame.cols
     camera_seed = int(rng.integers(1, 2**31))
     plan = Plan(
         lights=bool(rng.random() < 0.3),
         warm=bool(rng.random() < 0.4),
         shuttle=bool(rng.random() < 0.4),
         exposures=bool(rng.random() < 0.3),
+        screen_cell_px=frame.screen_cell_px,
+        screen_turn_deg=frame.screen_turn_deg,
     )
     healthy = ConcealedCamera(camera_seed, cfa=cfa, rows=rows, cols=cols)
     dealer = _Dealer(seed, index, rng, healthy.cfa)
@@ -74,7 +112,10 @@ def draw(
 
     @lru_cache(maxsize=4)  # what was measured last is what is handed out
     def take(present: tuple[Law, ...], noise_draw: int) -> DrawnSession:
-        return record(ConcealedCamera(camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw), plan)
+        camera = ConcealedCamera(
+            camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw, bit_depth=frame.bit_depth
+        )
+        return record(camera, plan)
 
     targets = [float(np.exp(rng.uniform(*np.log(WEAK if rng.random() < 0.5 else STRONG)))) for _ in laws]
     accepted = {*(fault.accepts if fault else ()), *(a for one in laws for a in one.accepts)}

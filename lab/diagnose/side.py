@@ -14,7 +14,7 @@ from lab.diagnose.inference.bootstrap import healthy_draws, image_threshold
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.diagnose.metadata import misstatements
+from lab.diagnose.metadata import misstatements, unchecked
 from lab.diagnose.outcome.detectability import detectability
 from lab.diagnose.outcome.effect_sets import side_models
 from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, places, residual_curves
@@ -112,6 +112,7 @@ def diagnose_side(
         fit = fit.model_copy(update={"cameras": {s: c for s, c in fit.cameras.items() if s != side}})
     report("summarising the recordings")
     model, skipped = measurement_model(recordings, side, fit, baseline)
+    skipped = (*skipped, *unchecked(recordings, side))
     if model is None:
         return SideFindings(side, skipped, unexplained=wrong)
     rng = np.random.default_rng(SEED)

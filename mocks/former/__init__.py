@@ -6,12 +6,13 @@ It shares no stage and no code with `sim`: an error of `sim` can't cancel agains
 """
 
 from mocks.former.camera import ConcealedCamera
-from mocks.former.law import WAVELENGTH_NM, Law
+from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Law
 from mocks.former.laws import BESIDE, LISTED, OUTSIDE
 from mocks.former.session import WHOLE_SESSION, DrawnSession, Plan, record, record_pair
 
 __all__ = [
     "BESIDE",
+    "BIT_DEPTH",
     "LISTED",
     "OUTSIDE",
     "WAVELENGTH_NM",

@@ -8,14 +8,14 @@ from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
-from sim.sensor.defects import Defects
+from sim.sensor.defects import Jumps
 from sim.stages import Signal
 
 
 class RandomTelegraphNoise(Effect):
-    """A share of the pixels, `pattern_seed` says which, is read with +A/2 or -A/2, each half of the time and anew in every frame
-    (traps much faster than the frame rate): mean 0, variance A^2 / 4, two peaks in a pixel's histogram. A is the same in all
-    (relative spread 0), or gamma distributed about its mean."""
+    """A share of the pixels, `pattern_seed` says which, jumps between two levels at a distance A, anew in every frame (traps much
+    faster than the frame rate): it is read with +(1 - p) A in a share p of the frames, else with -p A. Mean 0, variance p (1 - p) A^2, two
+    peaks in a pixel's histogram. A is the same in all (relative spread 0), or gamma distributed about its mean."""
 
     name: ClassVar[str] = "random_telegraph_noise"
     family: ClassVar[Family] = Family.DEFECTIVE_PIXELS
@@ -24,7 +24,7 @@ class RandomTelegraphNoise(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset(
         {"f_number", "exposure", "wavelength", "field", "level", "orientation", "time"}
     )
-    shapes: ClassVar[frozenset[str]] = frozenset({"share_percent", "relative_spread"})
+    shapes: ClassVar[frozenset[str]] = frozenset({"share_percent", "relative_spread", "high_share"})
     sentence: ClassVar[str] = (
         "A few pixels blink: always the same ones jump between two levels, with far more temporal noise than their neighbours."
     )
@@ -58,20 +58,33 @@ class RandomTelegraphNoise(Effect):
             absent=0.0,
         ),
     ] = 0.0
+    high_share: Annotated[
+        float,
+        Quantity(
+            "1",
+            "share of the frames in which such a pixel is at its higher level",
+            lower=0.02,
+            upper=0.98,
+            prior=(0.5, 0.25),
+            absent=0.5,
+        ),
+    ] = 0.5
     pattern_seed: int = 0
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
         return tuple(
-            (cls(amplitude_e=amplitude, share_percent=share, relative_spread=spread),)
+            (cls(amplitude_e=amplitude, share_percent=share, relative_spread=spread, high_share=high),)
             for amplitude in (5.0, 12.0, 30.0, 80.0)
             for share in (0.02, 0.2, 2.0)
-            for spread in (0.0, 1.0)
+            for spread, high in ((0.0, 0.5), (1.0, 0.5), (0.0, 0.25))
         )
 
     def on_signal(self, signal: Signal) -> Signal:
         if self.amplitude_e == 0.0:
             return signal
         return signal.adding(
-            telegraph=Defects(self.share_percent / 100.0, self.amplitude_e, self.relative_spread, self.pattern_seed)
+            telegraph=Jumps(
+                self.share_percent / 100.0, self.amplitude_e, self.relative_spread, self.pattern_seed, self.high_share
+            )
         )

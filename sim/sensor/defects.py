@@ -80,3 +80,10 @@ class Defects:
         """The distribution of sizes by nodes: shares of all pixels (k,) and sizes (k,)."""
         weights, sizes = size_nodes(self.relative_std)
         return self.share * weights, self.mean_size * sizes
+
+
+@dataclass(frozen=True)
+class Jumps(Defects):
+    """Pixels that jump between two levels, a size apart: the higher one in `high_share` of the frames. Their mean is nil."""
+
+    high_share: float = 0.5

@@ -11,11 +11,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.line_spectra import Image, periodogram, pooled, pooled_along
+from lab.diagnose.measurements.pixel_outliers import (
+    CLIP,
+    MEDIAN_OF,
+    SMOOTH_PX,
+    from_surroundings,
+    local_variance,
+    robust_std,
+    sound_pixels,
+    without_lines,
+)
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor.lines import Lines
@@ -26,11 +37,8 @@ CELLS = 4, 6  # of a frame: rows, columns
 LEAST_CELL_PX = 2  # a side of the smallest frame's cells
 CELL_FLOOR_DN = 0.005
 MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
-CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
-MEDIAN_OF = 5  # frames at most, whose median shows defective pixels
 #: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
 TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
-SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their noise are taken
 
 
 @dataclass(frozen=True)
@@ -158,17 +166,20 @@ def dark_frames(study: Study) -> list[DarkStatistics]:
     usual = [c for c in every if study.temperature_c is None or c.temperature_c is None or abs(c.temperature_c - study.temperature_c) < 2.0] or every  # fmt: skip
     warmest = max(every, key=lambda c: (c.temperature_c or 0.0, c.exposure_s))
     picked = list(dict.fromkeys([usual[0].name, usual[-1].name, warmest.name]))[:MOST_CONDITIONS]
-    return [_read(study, c, c.name in picked) for c in every]
+    sound = study.once(sound_pixels)
+    return [_read(study, c, c.name in picked, sound) for c in every]
 
 
-def _read(study: Study, condition: DarkCondition, with_pattern: bool) -> DarkStatistics:
+def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDArray[np.bool_]) -> DarkStatistics:
+    """`sound` (rows, cols): the pixels that count in the frames' means."""
     means: dict[str, float] = {}
     mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
     contrasts: dict[bool, list[Image]] = {False: [], True: []}
     stacks: dict[bool, list[Image]] = {False: [], True: []}
     for k, capture in enumerate(condition.captures):
         frame = study.recordings.frame(capture).astype(np.float32)
-        means[capture.id] = level = float(frame.mean(dtype=np.float64))
+        means[capture.id] = float(frame.mean(dtype=np.float64, where=sound))
+        level = float(frame.mean(dtype=np.float64))
         held_out = k >= len(condition.seen)
         frame -= np.float32(level)
         if k:
@@ -193,13 +204,13 @@ def _changing(contrasts: list[Image]) -> DarkNoise:
     rows, cols, along_rows, along_cols = [], [], [], []
     excess: dict[Lines, list[float]] = {"rows": [], "columns": []}
     for contrast in contrasts:
-        std = _robust_std(contrast)
+        std = robust_std(contrast)
         cut = np.clip(contrast, -CLIP * std, CLIP * std)
-        rest, spare = _without_lines(contrast, cut)
+        rest, spare = without_lines(contrast, cut)
         for lines, value in spare.items():
             excess[lines].append(value)
         variance.append(float(np.mean(np.square(cut), dtype=np.float64)))
-        own = _robust_std(rest)
+        own = robust_std(rest)
         pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
         total += np.square(rest)
         cells.append(float(np.mean(np.square(cell_means(cut)))))
@@ -210,7 +221,7 @@ def _changing(contrasts: list[Image]) -> DarkNoise:
             cols.append(power.line("columns"))
             along_rows.append(power.along("rows"))
             along_cols.append(power.along("columns"))
-    local = _local_variance(total, len(contrasts))
+    local = local_variance(total, len(contrasts))
     return DarkNoise(
         contrasts=len(contrasts),
         variance_dn2=float(np.mean(variance)),
@@ -227,35 +238,18 @@ def _changing(contrasts: list[Image]) -> DarkNoise:
 def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float | None) -> DarkPattern:
     mean: Image = np.asarray(np.mean(frames, axis=0, dtype=np.float32))
     part = frames[:MEDIAN_OF]
-    level = [f - _row_means(f)[:, None] for f in part]
-    median: Image = np.sort(np.array(level), axis=0)[(len(part) - 1) // 2]
-    # defective pixels: deviation from their surroundings without lines, in standard deviations of these
-    std = _robust_std(median)
-    flat, _ = _without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
-    step = 2
-    for r in range(step):
-        for c in range(step):
-            phase = flat[r::step, c::step]
-            phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
-    around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
-    steep = np.clip(flat - around, -CLIP * std, CLIP * std)
-    # a second pass, so that hot pixels in a glow don't shift the mean around them
-    around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
-    away = flat - around
-    local = np.sqrt(np.maximum(_local_variance(np.square(away), 1), 0.25)) * np.sqrt(
-        SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0)
-    )
+    away, local = from_surroundings(part)
     z = away / local
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
     counts = np.histogram(z, edges)[0].astype(float)
     low, high = np.quantile(z, [0.005, 0.995])
     # smooth structure and lines: the mean, defective pixels clipped
-    std = _robust_std(mean)
+    std = robust_std(mean)
     smooth = ndimage.uniform_filter(np.clip(mean, -8.0 * std, 8.0 * std), SMOOTH_PX, mode="mirror")
-    spread = np.sqrt(_local_variance(np.square(mean - smooth), 1))
+    spread = np.sqrt(local_variance(np.square(mean - smooth), 1))
     mean = smooth + np.clip(mean - smooth, -CLIP * spread, CLIP * spread)
     power = periodogram(mean)
-    _, excess = _without_lines(mean, mean)
+    _, excess = without_lines(mean, mean)
     return DarkPattern(
         frames=len(frames),
         of_median=len(part),
@@ -272,44 +266,6 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
         spread_dn=float(np.median(local)),
         skewness=float(np.clip(3.0 * (low + high) / 5.63, 0.0, 1.0)),
     )
-
-
-def _robust_std(image: Image) -> float:
-    """Standard deviation of the pixels within five of it. At least a quarter of a code."""
-    low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
-    std = max(float(high - low) / 4.107, 0.3)
-    for _ in range(3):
-        inside = image[np.abs(image) < 5.0 * std]
-        std = max(float(inside.std(dtype=np.float64)), 0.25)
-    return std
-
-
-def _row_means(image: Image) -> Image:
-    std = _robust_std(image)
-    return np.asarray(np.clip(image, -CLIP * std, CLIP * std).mean(axis=1))
-
-
-def _without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
-    """An image less the means of its rows and columns (of `cut`); and the variance of the lines' means beyond that of independent pixels,
-    from differences of neighbouring lines, in which smooth structure cancels."""
-    rows, cols = cut.mean(axis=1, dtype=np.float64), cut.mean(axis=0, dtype=np.float64)
-    own = float(np.var(np.diff(cut, axis=1), dtype=np.float64)) / 2.0
-    spare: dict[Lines, float] = {
-        "rows": float(np.var(np.diff(rows))) / 2.0 - own / cut.shape[1],
-        "columns": float(np.var(np.diff(cols))) / 2.0 - own / cut.shape[0],
-    }
-    mean = float(cut.mean(dtype=np.float64))
-    return (image - (rows - mean)[:, None].astype(np.float32) - cols[None, :].astype(np.float32)), spare
-
-
-def _local_variance(squares: Image, freedom: int) -> Image:
-    """Mean square of a pixel's surroundings a degree of freedom, outliers clipped."""
-    usual = float(np.mean(np.minimum(squares, 16.0 * freedom * np.median(squares) / 0.45)))
-    cap = np.float32(64.0 * usual)
-    rough = ndimage.uniform_filter(np.minimum(squares, cap), LOCAL_PX, mode="mirror")
-    cap_here = 16.0 * rough if freedom == 1 else (1.0 + 12.0 / np.sqrt(freedom)) * rough
-    fine = ndimage.uniform_filter(np.minimum(squares, cap_here), LOCAL_PX, mode="mirror")
-    return np.asarray(np.maximum(fine / np.float32(freedom), np.float32(1e-3)))
 
 
 def cell_means(image: Image) -> FloatArray:

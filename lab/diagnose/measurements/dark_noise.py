@@ -6,8 +6,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
-from lab.diagnose.measurements.dark_frames import CLIP, DEFECTS, captures_of, dark_frames, too_coarse
+from lab.diagnose.measurements.dark_frames import DEFECTS, captures_of, dark_frames, too_coarse
 from lab.diagnose.measurements.dark_level import added_dark_e_per_s
+from lab.diagnose.measurements.pixel_outliers import CLIP
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
@@ -85,11 +86,12 @@ def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn
         more += float(share @ (_cut_square(np.zeros_like(noisy), noisy, cut) - variance_dn2))
     for jumps in model.telegraph:
         share, distance_e = jumps.nodes()
-        # two frames: both high or both low half of the time
+        # of two frames one is high and the other low
+        differ = 2.0 * jumps.high_share * (1.0 - jumps.high_share)
         apart = gain * distance_e / np.sqrt(2.0)
         still = np.full_like(apart, variance_dn2)
         apart_square = _cut_square(apart, still, cut)
-        more += float(share @ (0.5 * (apart_square - variance_dn2)))
+        more += float(share @ (differ * (apart_square - variance_dn2)))
     return more
 
 

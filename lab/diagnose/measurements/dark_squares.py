@@ -157,7 +157,8 @@ def _dark_squares(
     for channel, (plane, full, share, bright) in lit_by_channel.items():
         lit = share > 0.25
         away = ndimage.distance_transform_edt(~lit) * step
-        inside = ndimage.distance_transform_edt(bright) * step
+        # what lies beyond the frame's border may be lit
+        inside = ndimage.distance_transform_edt(np.pad(bright, 1))[1:-1, 1:-1] * step
         for reach in (12.0, 9.0, 7.0):
             use = (away >= reach) & (inside >= reach)
             if use.sum() >= 60:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,6 @@ from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, 
 from lab.diagnose.measurements.dark_frames import (
     DEFECTS,
     TAIL_EDGES,
-    DarkCondition,
     DarkPattern,
     DarkStatistics,
     by_part,
@@ -28,7 +27,7 @@ LEAST_COUNTED_DN = 0.6  # the same of single pixels, whose far tail counts
 #: Of the first edge, which one pixel in 1e5 passes by chance: edges of the bins of temporal variance.
 FLICKER_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
 FLICKER_CHANCE = 1e-5
-JUMPS = 256  # draws of which frames of a jumping pixel are high
+JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)  # draws of which frames of a jumping pixel are high
 #: Standard deviation of a count's root beside chance (which is about 1 where many are expected): one defective pixel more is no finding.
 COUNT_STD = 0.6
 
@@ -102,11 +101,13 @@ def _order_moments(n: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _DefectClass:
-    """Defective pixels of one size: their share of all pixels, additional dark signal (DN), and distance of two levels (DN)."""
+    """Defective pixels of one size: their share of all pixels, additional dark signal (DN), and distance of two levels (DN), of which the
+    higher one is met in `high_share` of the frames."""
 
     share: float
     more_dn: float
     jump_dn: float
+    high_share: float = 0.5
 
 
 def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_DefectClass]:
@@ -114,7 +115,9 @@ def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_Def
     for hot in model.hot:
         found += [_DefectClass(float(s), gain * float(x) * exposure_s, 0.0) for s, x in zip(*hot.nodes(), strict=True)]
     for jumps in model.telegraph:
-        found += [_DefectClass(float(s), 0.0, gain * float(x)) for s, x in zip(*jumps.nodes(), strict=True)]
+        found += [
+            _DefectClass(float(s), 0.0, gain * float(x), jumps.high_share) for s, x in zip(*jumps.nodes(), strict=True)
+        ]
     return found
 
 
@@ -131,11 +134,13 @@ def _tail_shares(
     share = np.array([max(rest, 0.0), *(c.share for c in classes)])
     more = np.array([0.0, *(c.more_dn for c in classes)])
     jump = np.array([0.0, *(c.jump_dn for c in classes)])
+    high = np.array([0.5, *(c.high_share for c in classes)])[:, None, None]
     s = np.sqrt(moving**2 + gain * more)
     at = low[None, :, None] - fixed * u[None, None, :] - more[:, None, None]
-    z = [(at + sign * 0.5 * jump[:, None, None]) / s[:, None, None] for sign in (1.0, -1.0)]
-    single = [_upper(part, skew) for part in z]
-    above = np.clip(0.5 * (single[0] + single[1]), 0.0, 1.0)
+    low_level, high_level = (
+        _upper((at - level * jump[:, None, None]) / s[:, None, None], skew) for level in (-high, 1.0 - high)
+    )
+    above = np.clip(high * high_level + (1.0 - high) * low_level, 0.0, 1.0)
     # the (n - k)-th highest of n is above where n - k of them are at least
     needed = frames - (frames - 1) // 2
     if frames > 1:
@@ -156,18 +161,18 @@ def _upper(z: FloatArray, skew: float) -> FloatArray:
 def flickering_pixel_block(study: Study) -> Block:
     """Roots of the numbers of pixels whose temporal variance is far above their surroundings', by how far: all dark frames together."""
     fine = fine_conditions("flickering_pixels", study.once(dark_frames), LEAST_COUNTED_DN)
-    parts = {out: [f for f in fine if out in f.changing] for out in by_part(fine)}
+    draws = _JumpDraws.of(fine)
+    parts = {out: [(k, f) for k, f in enumerate(fine) if out in f.changing] for out in by_part(fine)}
     size = study.camera.rows * study.camera.cols
     value, labels, sums = [], [], []
     for out, part in parts.items():
-        freedom = sum(f.changing[out].contrasts for f in part)
+        freedom = sum(f.changing[out].contrasts for _, f in part)
         edges = _flicker_edges(freedom)
-        total = np.sum([f.changing[out].squares for f in part], axis=0)
+        total = np.sum([f.changing[out].squares for _, f in part], axis=0)
         value.append(_rooted(np.histogram(total, [*edges, np.inf])[0].astype(float)))
-        ids = tuple(i for f in part for i in captures_of(f, out))
+        ids = tuple(i for _, f in part for i in captures_of(f, out))
         labels += [Label(float(x), "all", "all exposures", ids, out) for x in edges / freedom]
         sums.append((out, part, freedom, edges))
-    draws = {id(f): _jump_sums(f.condition) for f in fine}
 
     def expected(effects: Effects) -> FloatArray:
         model, found = Uniform(study.camera, effects), []
@@ -175,10 +180,11 @@ def flickering_pixel_block(study: Study) -> Block:
             shares = _chance_above(np.array([freedom], float), np.zeros(1), edges)[0]
             for hot in model.hot:
                 weight, rate = hot.nodes()
-                shares = shares + weight @ (_hot_above(study, part, out, rate, edges) - shares)
+                shares = shares + weight @ (_hot_above(study, [f for _, f in part], out, rate, edges) - shares)
             for jumps in model.telegraph:
                 weight, distance_e = jumps.nodes()
-                above = _jump_above(study, part, out, draws, distance_e, edges, freedom)
+                unit = np.sum([draws.sums[k, out] / f.changing[out].pixel_dn2 for k, f in part], axis=0)
+                above = _jump_above(study, unit, draws.weights(jumps.high_share), distance_e, edges, freedom)
                 shares = shares + weight @ (above - shares)
             found.append(size * (shares - np.append(shares[1:], 0.0)))
         return np.maximum(np.concatenate(found), 0.0)
@@ -222,36 +228,62 @@ def _hot_above(
     return np.asarray(chdtrc(freedom[:, None], edges[None, :] / scale[:, None]))
 
 
+@dataclass(frozen=True)
+class _JumpDraws:
+    """Draws of which frames of a jumping pixel are high, JUMPS of them, always the same.
+
+    Shares of high frames are those of `HIGH_SHARES`, in turn; any other share weighs the draws by their likelihood under it over that under
+    all of these, so that means over them follow the share smoothly (Veach and Guibas 1995).
+    """
+
+    sums: dict[tuple[int, bool], FloatArray]  # of squared contrasts, by number of the condition and whether held out
+    ones: FloatArray  # (JUMPS,): high frames
+    frames: int
+
+    @staticmethod
+    def of(parts: Sequence[DarkStatistics]) -> _JumpDraws:
+        share = np.resize(HIGH_SHARES, JUMPS)[:, None]
+        rng = np.random.default_rng([len(f.condition.captures) for f in parts])
+        sums: dict[tuple[int, bool], FloatArray] = {}
+        ones, frames = np.zeros(JUMPS), 0
+        for number, f in enumerate(parts):
+            n, seen = len(f.condition.captures), len(f.condition.seen)
+            state = (rng.random((JUMPS, n)) < share).astype(float)
+            sums |= {(number, out): np.zeros(JUMPS) for out in (False, True)}
+            mean = np.zeros(JUMPS)
+            for k in range(n):
+                if k:
+                    sums[number, k >= seen] += (state[:, k] - mean) ** 2 * k / (k + 1.0)
+                mean += (state[:, k] - mean) / (k + 1.0)
+            ones, frames = ones + state.sum(axis=1), frames + n
+        return _JumpDraws(sums, ones, frames)
+
+    def weights(self, high_share: float) -> FloatArray:
+        """(JUMPS,), of sum 1."""
+
+        def log_chance(share: float) -> FloatArray:
+            return np.asarray(self.ones * np.log(share) + (self.frames - self.ones) * np.log1p(-share))
+
+        drawn = np.logaddexp.reduce([log_chance(share) for share in HIGH_SHARES], axis=0)
+        weight = np.exp(log_chance(high_share) - drawn)
+        return np.asarray(weight / weight.sum())
+
+
 def _jump_above(
     study: Study,
-    part: Sequence[DarkStatistics],
-    out: bool,
-    draws: Mapping[int, Mapping[bool, FloatArray]],
+    unit: FloatArray,
+    weight: FloatArray,
     amplitude_e: FloatArray,
     edges: FloatArray,
     freedom: int,
 ) -> FloatArray:
-    """Shares of pixels with two levels above the edges, (amplitudes, edges): mean over random sequences of levels."""
-    unit = np.sum([draws[id(f)][out] / f.changing[out].pixel_dn2 for f in part], axis=0)
+    """Shares of pixels with two levels above the edges, (amplitudes, edges): mean over draws of levels, whose sums of squares over the noise
+    are `unit` for an amplitude of 1 DN."""
     found = []
     for amplitude in amplitude_e:
         away = np.square(study.noise.gain * amplitude) * unit
-        found.append(_chance_above(np.full(len(away), float(freedom)), np.maximum(away, 1e-9), edges).mean(axis=0))
+        found.append(weight @ _chance_above(np.full(len(away), float(freedom)), np.maximum(away, 1e-9), edges))
     return np.array(found)
-
-
-def _jump_sums(condition: DarkCondition) -> dict[bool, FloatArray]:
-    """Sums of squared contrasts (seen, held out) of numbers that are -1/2 or 1/2 at random, JUMPS draws: always the same ones."""
-    n, seen = len(condition.captures), len(condition.seen)
-    rng = np.random.default_rng([n, seen, round(1e6 * condition.exposure_s)])
-    state = rng.integers(0, 2, (JUMPS, n)) - 0.5
-    square: dict[bool, FloatArray] = {False: np.zeros(JUMPS), True: np.zeros(JUMPS)}
-    mean = np.zeros(JUMPS)
-    for k in range(n):
-        if k:
-            square[k >= seen] += (state[:, k] - mean) ** 2 * k / (k + 1.0)
-        mean += (state[:, k] - mean) / (k + 1.0)
-    return square
 
 
 DEFECTIVE_PIXELS = Measurement(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +16,9 @@ from lab.fit.mtf.edges_in_frame import find_edges
 from lab.fit.mtf.recordings import measure_edge
 from lab.fit.mtf.samples import Region
 from lab.fit.mtf.transfer_function import EdgeMtf
+from sim.sensor import mosaic
 
+LEAST_TILT_DEG = 0.5  # below, no frame has lines enough
 PLAIN = np.array([0.25])  # cy/px, of the estimator's own transfer function, which isn't used here
 
 
@@ -66,6 +69,7 @@ def measured_edges(study: Study) -> list[MeasuredEdge]:
                 for region in regions:
                     try:
                         measured = measure_edge(study.recordings, part, channel, None, PLAIN, region)
+                        _check_phases(study, channel, region, measured.angle_deg)
                     except NotDetermined as refused:
                         reasons.append(refused.reason)
                         continue
@@ -77,6 +81,25 @@ def measured_edges(study: Study) -> list[MeasuredEdge]:
     if not edges:
         raise NotDetermined("slanted_edge", reasons[0])
     return edges
+
+
+def _check_phases(study: Study, channel: str, region: Region, angle_deg: float) -> None:
+    """Raise `NotDetermined` where the edge doesn't cross a whole period of the channel's samples: where a line crosses the edge is aliased, by
+    an error of that period, which biases the angle unless it averages out."""
+    tilt_deg = abs((angle_deg + 45.0) % 90.0 - 45.0)
+    lines = region[2] - region[0] if abs((angle_deg + 90.0) % 180.0 - 90.0) < 45.0 else region[3] - region[1]
+    period_px = mosaic.step(study.stated.cfa) / len(mosaic.phases(study.stated.cfa)[channel])
+    crossed_px = lines * float(np.tan(np.deg2rad(tilt_deg)))
+    if crossed_px < period_px:
+        wanted = (
+            f"{math.ceil(lines * period_px / crossed_px)} lines are enough"
+            if tilt_deg > LEAST_TILT_DEG
+            else "tilt it by 5 deg"
+        )
+        raise NotDetermined(
+            "slanted_edge",
+            f"an edge at {tilt_deg:.2g} deg over {lines} lines crosses {crossed_px:.2g} of the {period_px:g} px between samples of {channel}: {wanted}",
+        )
 
 
 def _found(study: Study, capture: SlantedEdgeCapture) -> list[Region]:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from lab.capture_kinds.base import Capture
+from lab.diagnose.measurements.pixel_outliers import sound_pixels
 from lab.diagnose.measurements.repeatability import (
     LAMP_FLOOR,
     RepeatedMeans,
@@ -73,7 +74,8 @@ def noise_guess(study: Study) -> NoiseGuess:
     if darks:
         # at one temperature, at which most captures were taken: what the others change isn't the baseline's
         off = [0.0 if study.temperature_c is None or g[0].temperature_c is None else abs(g[0].temperature_c - study.temperature_c) for g in darks]  # fmt: skip
-        frames_mean = [np.array([float(recordings.frame(c).mean()) for c in g]) for g in darks]
+        sound = study.once(sound_pixels)
+        frames_mean = [np.array([float(recordings.frame(c).mean(where=sound)) for c in g]) for g in darks]
         near = [i for i, away in enumerate(off) if away <= min(off) + ALIKE_C]
         t = np.array([darks[i][0].exposure_s for i in near])
         level = np.array([frames_mean[i].mean() for i in near])
@@ -84,7 +86,7 @@ def noise_guess(study: Study) -> NoiseGuess:
             warm = [c for i in near for c in darks[i] if c.temperature_c is not None]
             if warm:  # the longest ones tell
                 dark_c = float(np.average([c.temperature_c for c in warm], weights=[c.exposure_s for c in warm]))
-            dark_std = max(dark, 0.5)  # effects (a glow, hot pixels) may be all of it
+            dark_std = max(dark, 0.5)  # effects (a glow) may be all of it
         else:
             black = float(level[0])
             black_std += dark_std * float(t[0])

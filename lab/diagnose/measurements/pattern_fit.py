@@ -62,6 +62,8 @@ GHOST_BLUR_PX = 3.0
 LEAST_BEYOND = 5e-4  # of the contrast: weaker parts beyond the bands are taken as drawn
 REFINEMENTS = 2
 FEWEST_CELLS = 400
+MOST_MOVES = 4  # of a channel's drawing: a linear step finds some half of a shift of half a cell
+SCALING = np.array([0.0, 0.0, 1.0, 1.0, 1.0])  # of the shifts (x, y, radial, radial^3, across): what an axis keeps
 MOVED_PX = 0.1  # a channel further off is drawn where it is: less shows as well where the blur is not the drawn one
 
 
@@ -190,20 +192,24 @@ def _measured(
     for channel in camera.channels:
         design = _Design.of(study, canvas, channel, light, whole, turned, laid)
         picture = whole[window]
-        moved = design.coefficients(picture[design.mask])[design.shifts]
         points = mask_points(design.mask, window)
-        field = _field(camera, points, moved)
-        drawn = canvas
-        if channel != reference and np.abs(field).max() > MOVED_PX:
-            # too far for a linear step: the pattern is drawn anew at the shifted place
-            there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
-            displaced = Canvas.of(target, warp.displaced(there), window)
-            anew = _Design.of(study, displaced, channel, light, whole, turned, laid)
-            # where cells are a whole number of pixels, a loss of contrast looks like a shift
-            if anew.left_rms(picture) < design.left_rms(picture):
-                design, drawn = anew, displaced
-        if drawn is canvas:
-            moved = np.zeros(len(moved))
+        drawn, moved = canvas, np.zeros(len(design.coefficients(picture[design.mask])[design.shifts]))
+        # too far for a linear step: the pattern is drawn anew at the shifted place, until the rest is small
+        for _ in range(MOST_MOVES if channel != reference else 0):
+            step = design.coefficients(picture[design.mask])[design.shifts]
+            if np.abs(_field(camera, points, step)).max() <= MOVED_PX:
+                break
+            # where cells are a whole number of pixels, a loss of contrast looks like a shift of the whole: a lens scales colours
+            tried = []
+            for part in (step, step * SCALING):
+                field = _field(camera, points, moved + part)
+                there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
+                displaced = Canvas.of(target, warp.displaced(there), window)
+                tried.append((part, displaced, _Design.of(study, displaced, channel, light, whole, turned, laid)))
+            part, displaced, anew = min(tried, key=lambda one: one[2].left_rms(picture))
+            if anew.left_rms(picture) >= design.left_rms(picture):
+                break
+            design, drawn, moved = anew, displaced, moved + part
         area = contrast[window][design.mask]
         exposure = group[0].exposure_s
         levels = (

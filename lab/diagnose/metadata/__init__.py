@@ -8,17 +8,26 @@ from __future__ import annotations
 
 from lab.diagnose.metadata.bit_depth import misstated_bit_depth
 from lab.diagnose.metadata.black_level import misstated_black_level
+from lab.diagnose.metadata.board_squares import misstated_board
 from lab.diagnose.metadata.cell_size import misstated_cell_size
 from lab.diagnose.metadata.exchanged_lights import exchanged_lights
 from lab.diagnose.metadata.misstatement import Misstatement
 from lab.diagnose.metadata.mosaic_phase import misstated_mosaic_phase
+from lab.diagnose.metadata.unchecked import unchecked
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-__all__ = ["Misstatement", "misstatements"]
+__all__ = ["Misstatement", "misstatements", "unchecked"]
 
 #: In this order: what follows is judged with what was found before it.
-_CHECKS = (misstated_bit_depth, misstated_black_level, misstated_mosaic_phase, exchanged_lights, misstated_cell_size)
+_CHECKS = (
+    misstated_bit_depth,
+    misstated_black_level,
+    misstated_mosaic_phase,
+    exchanged_lights,
+    misstated_cell_size,
+    misstated_board,
+)
 
 
 def misstatements(recordings: RecordingSet, side: Side) -> tuple[RecordingSet, tuple[Misstatement, ...]]:

@@ -69,12 +69,17 @@ def luminance(frame: NDArray[np.generic], cfa: Any) -> Array:
     return picture
 
 
+def as_grey(picture: Array) -> NDArray[np.uint8]:
+    """A picture (rows, cols) of 0..1, smoothed, as detectors take it."""
+    return np.clip(255.0 * ndimage.gaussian_filter(picture, 0.7), 0, 255).astype(np.uint8)
+
+
 def find_board(picture: Array, capture: CharucoCapture) -> BoardView:
     """Corners of the board in a picture (rows, cols) of 0..1. Raises `NotDetermined` where it isn't found, with the
     reason.
     """
     rows, cols = capture.squares
-    grey = np.clip(255.0 * ndimage.gaussian_filter(picture, 0.7), 0, 255).astype(np.uint8)
+    grey = as_grey(picture)
     if capture.dictionary == "dots":
         return _dot_view(picture, grey, capture)
     if capture.dictionary == "none":

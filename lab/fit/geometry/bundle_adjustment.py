@@ -50,7 +50,7 @@ DISTORTION_PRIOR = {
 }  # fmt: skip
 WARP_PRIOR = 0.005  # standard deviation of the prior of a warp, of the diagonal of the board
 FIRST_NOISE_PX = 0.1  # of a corner, for the weight of the priors in the first solve
-MAX_STEPS = 60
+MAX_STEPS = 300  # a long lens of a small frame takes 60 to 200: its centre and its distortion trade with each other
 
 
 def board_key(view: BoardView) -> tuple[object, ...]:

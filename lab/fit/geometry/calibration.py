@@ -93,13 +93,14 @@ def observations_of(views: Sequence[BoardView]) -> list[Observation]:
 def calibrate(views: Sequence[BoardView], shape: tuple[int, int], coefficients: Sequence[str] = MODELS[-1]) -> Solution:
     """Calibrate one camera from all views, in frames of `shape` (rows, cols), with the distortion `coefficients`.
 
-    The solve starts from a pinhole and goes by way of k1: started without distortion, a rich model may end in another
-    minimum.
+    The solve starts from a pinhole and goes by way of k1 about the middle of the frame: started without distortion, a
+    rich model may end in another minimum. With a free centre k1 alone takes a decentred lens for one whose centre is
+    far off, from where the richer model doesn't come back.
     """
     observations = observations_of(views)
     start = first_state(views, first_intrinsics(views, shape))
     start = with_boards(start, 1 + max(observation.board for observation in observations))
-    rough = BundleAdjustment(observations, free_intrinsics(MODELS[0])[None, :], shape).solve(start)
+    rough = BundleAdjustment(observations, free_intrinsics(MODELS[0], centre=False)[None, :], shape).solve(start)
     return BundleAdjustment(observations, free_intrinsics(coefficients)[None, :], shape).solve(rough.state)
 
 

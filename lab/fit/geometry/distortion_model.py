@@ -24,9 +24,12 @@ OVERFITTING_SHARE = (
 MODELS = (("k1",), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"))
 
 
-def free_intrinsics(coefficients: Sequence[str]) -> NDArray[np.bool_]:
-    """Mask (12,) of the intrinsics that a distortion model fits: the pinhole and these coefficients."""
-    return np.array([name in ("fx", "fy", "cx", "cy", *coefficients) for name in NAMES])
+def free_intrinsics(coefficients: Sequence[str], *, centre: bool = True) -> NDArray[np.bool_]:
+    """Mask (12,) of the intrinsics that a distortion model fits: the pinhole and these coefficients; without `centre`
+    the principal point is held.
+    """
+    pinhole = ("fx", "fy", "cx", "cy") if centre else ("fx", "fy")
+    return np.array([name in (*pinhole, *coefficients) for name in NAMES])
 
 
 def choose_model(

@@ -23,18 +23,20 @@ class SourceDriftLaw(Law):
 
 
 class SourceInstabilityLaw(Law):
-    """The source is unsteady at random. Variants: anew in each frame; correlated from frame to frame."""
+    """The source is unsteady at random. Variants: anew in each frame; correlated from frame to frame; an arc that jumps between two places."""
 
     name = effect = "source_instability"
-    variants, unit, nominal, limits, power = 2, "%", 0.6, (0.01, 8.0), 2.0
+    variants, unit, nominal, limits, power = 3, "%", 0.6, (0.01, 8.0), 2.0
 
     def source_factor(self, elapsed_s: float) -> float:
+        if self.variant == 2:
+            return 1 + self.strength / 100 * float(self.rng(13, round(elapsed_s)).choice([-1.0, 1.0]))
         turns = [self.rng(13, round(elapsed_s) + 20 * lag).standard_normal() for lag in range(6 if self.variant else 1)]
         weight = 0.6 ** np.arange(len(turns))
         return float(1 + self.strength / 100 * (weight @ turns) / np.sqrt(weight @ weight))
 
     def library_parameters(self) -> dict[str, float]:
-        return {"instability_percent": self.strength} if self.variant == 0 else {}
+        return {"instability_percent": self.strength} if self.variant != 1 else {}
 
 
 class LampJumpLaw(Law):

@@ -41,19 +41,24 @@ class CompandingKneeLaw(Law):
 
 
 class AdcNonlinearityLaw(Law):
-    """The converter's steps are unequal. Variants: the weight of the highest bit; of the two highest; a sine over 512 codes (integral
-    nonlinearity of a folding converter); a saw tooth of 1024 codes (the second stage of a pipeline has another gain)."""
+    """The converter's steps are unequal. Variants: the weight of the highest bit; of the two highest; a sine over an eighth of the codes
+    (integral nonlinearity of a folding converter); a saw tooth of a quarter of them (the second stage of a pipeline has another gain); a
+    step at a code that is no power of two (a comparator of a flash stage). Strength in codes of 12 bit."""
 
     name = effect = "adc_nonlinearity"
-    variants, unit, nominal, limits, signed = 4, "DN", 3.0, (0.05, 20.0), True
+    variants, unit, nominal, limits, signed = 5, "DN", 3.0, (0.05, 20.0), True
 
     def adc_output(self, dn: Array) -> Array:
+        full = self.camera.full_code_dn + 1.0
+        error, share = self.signed_strength * full / 4096.0, dn / full
         if self.variant == 2:
-            return dn + self.signed_strength * np.sin(2 * np.pi * (dn / 512.0 + self.uniform[0]))
+            return dn + error * np.sin(2 * np.pi * (8.0 * share + self.uniform[0]))
         if self.variant == 3:
-            return dn + self.signed_strength * (dn % 1024.0 / 1024.0 - 0.5)
-        out = dn + self.signed_strength * (dn >= 2048)
-        return out + (0.5 * self.signed_strength * ((dn % 2048) >= 1024) if self.variant == 1 else 0.0)
+            return dn + error * (4.0 * share % 1.0 - 0.5)
+        if self.variant == 4:
+            return dn + error * (share >= 0.15 + 0.6 * self.uniform[1])
+        out = dn + error * (share >= 0.5)
+        return out + (0.5 * error * (share % 0.5 >= 0.25) if self.variant == 1 else 0.0)
 
 
 class DigitalGainLaw(Law):
@@ -174,10 +179,10 @@ class ColumnNoiseLaw(Law):
 
 class RandomTelegraphNoiseLaw(Law):
     """Some pixels switch between two levels. Variants: equal amplitudes; exponentially distributed ones; equal ones, high in a quarter of
-    the frames."""
+    the frames; equal ones that stay for four frames (slow traps)."""
 
     name = effect = "random_telegraph_noise"
-    variants, unit, nominal, limits, power, shown_by = 3, "e", 15.0, (1.0, 200.0), 2.0, DARK
+    variants, unit, nominal, limits, power, shown_by = 4, "e", 15.0, (1.0, 200.0), 2.0, DARK
 
     def noise_e(self, shape: tuple[int, int], k: int) -> Array:
         still = self.rng(4)
@@ -185,6 +190,10 @@ class RandomTelegraphNoiseLaw(Law):
         size = self.strength * (still.exponential(0.7, shape) if self.variant == 1 else np.ones(shape))
         if self.variant == 2:
             return np.where(odd, size * ((self.rng(5, k).random(shape) < 0.25) - 0.25), 0.0)
+        if self.variant == 3:  # each pixel's dwell begins at another of four frames
+            begun = (k + still.integers(0, 4, shape)) // 4
+            high = sum(np.where(begun == n, self.rng(5, int(n)).integers(0, 2, shape), 0) for n in np.unique(begun))
+            return np.where(odd, size * (high - 0.5), 0.0)
         return np.where(odd, size * (self.rng(5, k).integers(0, 2, shape) - 0.5), 0.0)
 
 

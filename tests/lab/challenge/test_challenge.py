@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.challenge.draw import SHARES, draw, kind_of
+from lab.challenge.draw import FOREIGN_BITS, FOREIGN_FRAMES, SHARES, DrawnFrame, draw, kind_of
 from lab.challenge.faults import FAULTS
 from lab.challenge.make import make
 from lab.challenge.run import run_all
@@ -124,6 +124,21 @@ def test_a_case_is_drawn_again_alike() -> None:
     )
     # the former's own figure of how much it shows: a split of 1.5 um can't be missed on edges
     assert one.truth.concealed[0].noncentrality > 25.0
+
+
+def test_foreign_frames_are_of_all_sizes_and_depths() -> None:
+    """Of 200 frames: every size, every depth, and a third with aligned cells (+- 4 sigma of a binomial)."""
+    frames = [DrawnFrame.drawn(np.random.default_rng([3, index, 2])) for index in range(200)]
+    assert {(f.rows, f.cols) for f in frames} == set(FOREIGN_FRAMES)
+    assert {f.bit_depth for f in frames} == set(FOREIGN_BITS)
+    aligned = [f for f in frames if f.screen_turn_deg == 0.0]
+    assert abs(len(aligned) / 200 - 1 / 3) < 4.0 * np.sqrt(2 / 9 / 200)
+    assert all(f.screen_cell_px.is_integer() for f in aligned)
+    assert all(2.0 <= f.screen_cell_px <= 6.0 and 0.0 <= f.screen_turn_deg <= 2.0 for f in frames)
+    index = next(k for k, frame in enumerate(frames) if frame.rows == 24)
+    case, expected = draw(3, index, "foreign", kind="healthy", sizing="unmeasured"), frames[index]
+    camera = case.recordings.camera("left")
+    assert (camera.rows, camera.cols, camera.bit_depth) == (expected.rows, expected.cols, expected.bit_depth)
 
 
 def test_an_interrupted_one_goes_on(copy: tuple[Path, Seals, Truths], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from lab.diagnose.measurements import dark_noise, defective_pixels
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.blocks import measurement_model
 from lab.diagnose.measurements.dark_frames import TAIL_EDGES, DarkCondition
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.library import measurements
 from lab.diagnose.measurements.study import Study
 from lab.diagnose.policy import DecisionPolicy
@@ -105,11 +107,11 @@ def test_shares_of_defective_pixels_are_those_of_drawn_pixels() -> None:
     noise = np.sqrt(moving**2 + 0.5 * more)
     drawn = (
         more + fixed * rng.standard_normal(n) + noise * rng.standard_normal((frames, n))
-        + jump * (rng.integers(0, 2, (frames, n)) - 0.5)
+        + jump * ((rng.random((frames, n)) < 0.25) - 0.25)
     )  # fmt: skip
     median = np.sort(drawn, axis=0)[(frames - 1) // 2] - defective_pixels._order_moments(frames)[0] * moving
     spread = 1.6
-    classes = [defective_pixels._DefectClass(0.01, 30.0, 0.0), defective_pixels._DefectClass(0.01, 0.0, 40.0)]
+    classes = [defective_pixels._DefectClass(0.01, 30.0, 0.0), defective_pixels._DefectClass(0.01, 0.0, 40.0, 0.25)]
     shares = defective_pixels._tail_shares(classes, moving, fixed, frames, spread, 0.5, 0.0)
     edges = np.array([-np.inf, -6.0, -4.5, *TAIL_EDGES, np.inf]) * spread
     counts = np.histogram(median, edges)[0]
@@ -118,21 +120,23 @@ def test_shares_of_defective_pixels_are_those_of_drawn_pixels() -> None:
     np.testing.assert_array_less(np.abs(got - expected), 4.5 * np.sqrt(expected) + 4.0)
 
 
-def test_shares_of_flickering_pixels_are_those_of_drawn_pixels() -> None:
+@pytest.mark.parametrize("high_share", [0.5, 0.2])
+def test_shares_of_flickering_pixels_are_those_of_drawn_pixels(high_share: float) -> None:
     """Contrasts of frames that are high or low at random: the cube root is good to a few per cent of a share."""
     rng = np.random.default_rng(2)
     n, frames, amplitude = 200_000, 5, 6.0
-    values = rng.standard_normal((frames, n)) + amplitude * (rng.integers(0, 2, (frames, n)) - 0.5)
+    values = rng.standard_normal((frames, n)) + amplitude * (rng.random((frames, n)) < high_share)
     total = np.square(values - values.mean(0)).sum(0)
     condition = DarkCondition(1.0, None, tuple([None] * frames), ())  # type: ignore[arg-type]
     edges = defective_pixels._flicker_edges(frames - 1)[:3]
-    away = amplitude**2 * defective_pixels._jump_sums(condition)[False]
-    shares = defective_pixels._chance_above(np.full(len(away), frames - 1.0), np.maximum(away, 1e-9), edges).mean(
-        axis=0
-    )
+    draws = defective_pixels._JumpDraws.of([SimpleNamespace(condition=condition)])  # type: ignore[list-item]
+    away, weight = amplitude**2 * draws.sums[0, False], draws.weights(high_share)
+    shares = weight @ defective_pixels._chance_above(np.full(len(away), frames - 1.0), np.maximum(away, 1e-9), edges)
     drawn = (total[:, None] > edges).mean(axis=0)
-    # 256 draws of states: a share p is known to sqrt(p (1 - p) / 256)
-    assert np.all(np.abs(shares - drawn) < 4.0 * np.sqrt(drawn * (1 - drawn) / defective_pixels.JUMPS) + 0.01)
+    # draws of states, worth 1 / sum of their squared weights: a share p is known to sqrt(p (1 - p) / that)
+    worth = 1.0 / float(weight @ weight)
+    assert worth > 60.0
+    assert np.all(np.abs(shares - drawn) < 4.0 * np.sqrt(drawn * (1 - drawn) / worth) + 0.01)
 
 
 def test_clipped_square_is_its_integral() -> None:
@@ -312,3 +316,17 @@ def test_recordings_without_noise_are_not_stale() -> None:
     first = {c.exposure_s: np.array(recordings.frame(c)) for c in reversed(captures)}
     still = RecordingSet(recordings.manifest, {c.frame: first[c.exposure_s] for c in captures}, {}, {})
     assert Study(still, "left", camera_model(still, "left")).stale == ()
+
+
+@pytest.mark.parametrize("seed", [9, 10])
+def test_a_hot_pixel_does_not_move_the_mean_of_a_small_frame(seed: int) -> None:
+    """Two or three of 3072 pixels, 20000 e/s: 200 e of shot noise at 2 s, 0.1 e of the frames' mean, which pixels' noise knows to 0.07 e.
+    chi2 of n numbers, 4 sigma."""
+    law = laws.HotPixelsLaw(20000.0, 0, 5)
+    camera = ConcealedCamera(seed, (law,), cfa="MONO", rows=48, cols=64, bit_depth=16)
+    recordings = recordings_of(camera, Plan(("dark",), repeats=6))
+    block = dark_level_block(Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True)))
+    prediction = block.predict(())
+    free = np.array(list(prediction.jacobian.values()))
+    n = len(block.value)
+    assert chi2(block.value - prediction.mean, block.covariance + free.T @ free) < n + 4.0 * np.sqrt(2.0 * n)

@@ -11,8 +11,10 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.gaussian import chi2
 from lab.diagnose.measurements.block import Block
 from lab.diagnose.measurements.edge_estimator import REAL_AT, profile_interpolation, spread_operator
+from lab.diagnose.measurements.edge_profiles import _check_phases
 from lab.diagnose.measurements.slanted_edge import ASIDE, _Edges, edge_block
 from lab.diagnose.measurements.study import Study
+from lab.errors import NotDetermined
 from lab.formats.recording_set import Manifest, RecordingSet
 from lab.predict.camera_model import camera_model
 from mocks.former import ConcealedCamera, Law, Plan
@@ -161,3 +163,17 @@ def test_field_curvature_needs_more_than_one_place() -> None:
         changes.append(float(np.abs(block.predict((bowl,)).mean - block.predict(()).mean).max()))
     assert changes[0] == 0.0
     assert changes[1] > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("cfa", "rows", "told"), [("MONO", 24, "23 lines are enough"), ("RGGB", 40, "45 lines are enough")]
+)
+def test_an_edge_that_meets_too_few_phases_is_left_out(cfa: str, rows: int, told: str) -> None:
+    """At 2.6 deg over the region's lines, which are 8 fewer than the frame's: 0.73 of 1 px, and 1.45 of the 2 px between reds."""
+    study = _recorded(cfa=cfa, rows=rows)
+    labels = {(label.condition.removesuffix(ASIDE), label.channel) for label in edge_block(study).labels}
+    assert ("5 deg", study.camera.channels[0]) in labels
+    assert ("2.6 deg", study.camera.channels[0]) not in labels
+    capture = next(c for c in study.recordings.captures("slanted_edge") if c.angle_deg == 2.6)
+    with pytest.raises(NotDetermined, match=told):
+        _check_phases(study, study.camera.channels[0], capture.region, 2.6)

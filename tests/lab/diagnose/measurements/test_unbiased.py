@@ -31,6 +31,8 @@ COVARIANCE_SHARE = 0.15
 NEGLIGIBLE_PULL = 0.1
 EVEN = ("dark", "flat")
 SPECTRAL = (*EVEN, "narrowband")
+EDGES = (*EVEN, "slanted_edge")
+SMALL_SCENES = (*EDGES, "screen")
 SCENES = (*SPECTRAL, "chart", "slanted_edge", "charuco", "screen")
 #: Measurements of two cameras: this contract draws one (test_board.py has pairs).
 OF_PAIRS = {"stereo_gain", "stereo_time"}
@@ -69,6 +71,7 @@ FEW = (
     Healthy(16, 2, "MONO", 8, 8),
     Healthy(24, 3, "GBRG", 14, 4),
     Healthy(40, 8, "MONO", 12, 3),
+    Healthy(24, 3, "MONO", 14, 6, EDGES),
 )
 #: Sizes by mosaics, depths and repeats where frames are small, and whole sessions where they are large.
 GRID = (
@@ -76,6 +79,7 @@ GRID = (
     *(Healthy(side, 10, cfa, bits, 20) for side in (16, 32) for cfa in ("MONO", "RGGB") for bits in (8, 10, 14, 16)),
     *(Healthy(side, repeats, "RGGB", 12, 12) for side in (16, 32, 64) for repeats in (2, 50, 200)),
     *(Healthy(side, 3, cfa, 12, 10, SPECTRAL) for side in (32, 128) for cfa in ("MONO", "RGGB", "GRBG")),
+    *(Healthy(side, 3, cfa, 12, 20, SMALL_SCENES) for side in (24, 32, 48, 64) for cfa in ("MONO", "RGGB")),
     *(Healthy(side, 3, cfa, 12, 6, SCENES) for side in (256, 384, 512) for cfa in ("MONO", "RGGB", "BGGR")),
 )
 

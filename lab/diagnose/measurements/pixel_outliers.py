@@ -1,0 +1,99 @@
+"""Single pixels of dark frames against their surroundings: which stand out, and statistics in which those don't count."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lab.diagnose.measurements.line_spectra import Image
+from sim.sensor.lines import Lines
+
+if TYPE_CHECKING:
+    from lab.diagnose.measurements.study import Study
+
+CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
+MEDIAN_OF = 5  # frames at most, whose median shows defective pixels
+SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their noise are taken
+#: Standard deviations of single pixels' fixed pattern from which on a pixel counts as defective, and no longer in the frames' means.
+DEFECTIVE = 10.0
+
+
+def sound_pixels(study: Study) -> NDArray[np.bool_]:
+    """(rows, cols): pixels that don't stand far out of their surroundings in the median of repeated dark frames, where they are hot most: at
+    the longest exposure and at the highest temperature.
+
+    One hot pixel of 3000 e/s has more shot noise than the mean of a small frame's others; one that saturates bends it.
+    """
+    groups = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
+    sound = np.ones((study.camera.rows, study.camera.cols), bool)
+    if not groups:
+        return sound
+    longest = max(groups, key=lambda g: g[0].exposure_s)
+    warmest = max(groups, key=lambda g: (g[0].temperature_c or 0.0, g[0].exposure_s))
+    for group in (longest, warmest) if longest is not warmest else (longest,):
+        frames = [study.recordings.frame(c).astype(np.float32) for c in group[:MEDIAN_OF]]
+        away, local = from_surroundings([f - np.float32(f.mean(dtype=np.float64)) for f in frames])
+        sound &= np.abs(away) <= DEFECTIVE * local
+    return sound
+
+
+def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
+    """How far pixels of the lower median of frames lie from their surroundings, without lines; and the standard deviation of these, DN."""
+    level = [f - row_means(f)[:, None] for f in frames]
+    median: Image = np.sort(np.array(level), axis=0)[(len(frames) - 1) // 2]
+    # defective pixels: deviation from their surroundings without lines, in standard deviations of these
+    std = robust_std(median)
+    flat, _ = without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
+    step = 2
+    for r in range(step):
+        for c in range(step):
+            phase = flat[r::step, c::step]
+            phase -= np.float32(np.mean(np.clip(phase, -CLIP * std, CLIP * std)))
+    around = ndimage.uniform_filter(np.clip(flat, -CLIP * std, CLIP * std), SMOOTH_PX, mode="mirror")
+    steep = np.clip(flat - around, -CLIP * std, CLIP * std)
+    # a second pass, so that hot pixels in a glow don't shift the mean around them
+    around += ndimage.uniform_filter(steep, SMOOTH_PX, mode="mirror")
+    away = flat - around
+    local = np.sqrt(np.maximum(local_variance(np.square(away), 1), 0.25)) * np.sqrt(SMOOTH_PX**2 / (SMOOTH_PX**2 - 1.0))
+    return away, local
+
+
+def robust_std(image: Image) -> float:
+    """Standard deviation of the pixels within five of it. At least a quarter of a code."""
+    low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
+    std = max(float(high - low) / 4.107, 0.3)
+    for _ in range(3):
+        inside = image[np.abs(image) < 5.0 * std]
+        std = max(float(inside.std(dtype=np.float64)), 0.25)
+    return std
+
+
+def row_means(image: Image) -> Image:
+    std = robust_std(image)
+    return np.asarray(np.clip(image, -CLIP * std, CLIP * std).mean(axis=1))
+
+
+def without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
+    """An image less the means of its rows and columns (of `cut`); and the variance of the lines' means beyond that of independent pixels,
+    from differences of neighbouring lines, in which smooth structure cancels."""
+    rows, cols = cut.mean(axis=1, dtype=np.float64), cut.mean(axis=0, dtype=np.float64)
+    own = float(np.var(np.diff(cut, axis=1), dtype=np.float64)) / 2.0
+    spare: dict[Lines, float] = {
+        "rows": float(np.var(np.diff(rows))) / 2.0 - own / cut.shape[1],
+        "columns": float(np.var(np.diff(cols))) / 2.0 - own / cut.shape[0],
+    }
+    mean = float(cut.mean(dtype=np.float64))
+    return (image - (rows - mean)[:, None].astype(np.float32) - cols[None, :].astype(np.float32)), spare
+
+
+def local_variance(squares: Image, freedom: int) -> Image:
+    """Mean square of a pixel's surroundings a degree of freedom, outliers clipped."""
+    usual = float(np.mean(np.minimum(squares, 16.0 * freedom * np.median(squares) / 0.45)))
+    cap = np.float32(64.0 * usual)
+    rough = ndimage.uniform_filter(np.minimum(squares, cap), LOCAL_PX, mode="mirror")
+    cap_here = 16.0 * rough if freedom == 1 else (1.0 + 12.0 / np.sqrt(freedom)) * rough
+    fine = ndimage.uniform_filter(np.minimum(squares, cap_here), LOCAL_PX, mode="mirror")
+    return np.asarray(np.maximum(fine / np.float32(freedom), np.float32(1e-3)))
