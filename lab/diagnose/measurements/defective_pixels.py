@@ -49,7 +49,8 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
 def defective_pixel_block(study: Study) -> Block:
     """Roots of the numbers of pixels that lie far from their surroundings in the median of repeats, by how far and by exposure.
 
-    Hot pixels are the same in every frame, and bright in proportion to the exposure.
+    Hot pixels are the same in every frame, and bright in proportion to the exposure. Jumps between two levels count where the temporal
+    noise is fine enough to tell them from a fixed level, as for `flickering_pixel_block`: below, all repeats of a pixel have one code.
     """
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
@@ -62,6 +63,8 @@ def defective_pixel_block(study: Study) -> Block:
         found = []
         for (f, _, part), (moving, fixed) in zip(points, own, strict=True):
             classes = _defect_classes(Uniform(study.camera, effects), study.noise.gain, f.condition.exposure_s)
+            if moving < LEAST_COUNTED_DN:
+                classes = [c for c in classes if c.jump_dn == 0.0]
             skew = times * part.skewness * (part.spread_dn / moving) ** 3
             found.append(
                 size * _tail_shares(classes, moving, fixed, part.of_median, part.spread_dn, study.noise.gain, skew)
