@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import base64
-import os
 import shutil
 from collections.abc import Iterator
 from typing import Any
@@ -17,6 +16,7 @@ from api.client import ServiceClient
 from lab.capture.queue import put_into_queue
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.lab.calibration.test_life import fitted
+from tests.peers import missing
 
 PHONE, DESK = {"width": 420, "height": 860}, {"width": 1280, "height": 860}
 READ_NOISE_E = (2.0, 2.01, 2.15)
@@ -26,13 +26,11 @@ FINISHED = "#sessions tr:first-child .state.finished"
 
 
 def chromium() -> str:
-    """The browser's program. In CI there has to be one."""
+    """The browser's program."""
     for name in ("chromium", "chromium-browser", "google-chrome"):
         if found := shutil.which(name):
             return found
-    if os.environ.get("CI"):
-        pytest.fail("no Chromium in CI: `make chromium` installs it")
-    pytest.skip("no Chromium; `make chromium` installs it")
+    missing("no Chromium; `make chromium` installs it")
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from drivers.contract.checks import check_driver
 from drivers.contract.peer import peers
 from drivers.errors import InstrumentError
 from drivers.registry import drivers
+from tests.peers import missing
 
 #: Each call on a silent GigE camera takes the library seconds.
 SLOW = {("camera", "aravis")}
@@ -26,7 +27,7 @@ def test_it_keeps_the_contract(family: str, name: str) -> None:
     try:
         peer = point.load()()
     except InstrumentError as error:
-        pytest.skip(str(error))  # a library that isn't installed here
+        missing(str(error))  # a library that isn't installed here
     with peer:
         found = list(check_driver(family, name, peer))
     assert [(outcome.asks, outcome.why) for outcome in found if outcome.ended == "not met"] == []

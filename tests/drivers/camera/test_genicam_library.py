@@ -12,6 +12,7 @@ from drivers.camera.base import capture_together
 from drivers.camera.basler import BaslerCamera
 from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
 from mocks.peers import AravisFakeCamera, EmulatedBasler
+from tests.peers import missing
 
 LEFT, RIGHT = "0815-0000", "0815-0001"
 
@@ -21,7 +22,7 @@ def emulated() -> None:
     try:
         EmulatedBasler()
     except InstrumentError as error:
-        pytest.skip(str(error))
+        missing(str(error))
 
 
 @pytest.mark.usefixtures("emulated")
@@ -93,7 +94,7 @@ def fake() -> Iterator[AravisFakeCamera]:
     try:
         peer = AravisFakeCamera()
     except InstrumentError as error:
-        pytest.skip(str(error))
+        missing(str(error))
     with peer:
         yield peer
 
