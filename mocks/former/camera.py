@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.special import ndtr, pdtrik
+from scipy.special import ndtr
 
 from mocks.former.law import BIT_DEPTH, WAVELENGTH_NM, Array, Law
 from mocks.former.transfer import Transfer
@@ -201,11 +201,21 @@ def poisson(mean: Array, z: Array) -> Array:
     out = np.round(mean + np.sqrt(mean) * z + (z * z - 1.0) / 6.0)
     small = mean < NORMAL_FROM_E
     if np.any(small):
-        m = mean[small]
-        # pdtrik gives a real k at which the distribution function reaches p; none below P(0)
-        p = np.clip(ndtr(z[small]), 1e-12, 1 - 1e-12)
-        positive = (m > 0) & (p > np.exp(-m))
-        k = np.zeros_like(m)
-        k[positive] = np.ceil(pdtrik(p[positive], m[positive]) - 1e-9)
-        out[small] = k
+        out[small] = _poisson_quantile(mean[small], np.clip(ndtr(z[small]), 1e-12, 1 - 1e-12))
     return np.maximum(out, 0.0)
+
+
+def _poisson_quantile(mean: Array, probability: Array) -> Array:
+    """Least k at which the distribution function of a Poisson number reaches a probability, by adding its terms exp(-m) m^k / k!."""
+    k = np.zeros_like(mean)
+    term = np.exp(-mean)
+    left = np.flatnonzero((probability > term) & (mean > 0))  # not reached by the terms up to `number`
+    m, above, term, number = mean[left], probability[left] - term[left], term[left], 0
+    while left.size:
+        number += 1
+        term = term * m / number
+        above = above - term
+        k[left] = number
+        more = above > 0
+        left, m, above, term = left[more], m[more], above[more], term[more]
+    return k

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -132,5 +133,6 @@ def _children(of: int | None = None) -> list[int]:
     parent = of or os.getpid()
     found = []
     for task in Path(f"/proc/{parent}/task").iterdir():
-        found += [int(child) for child in (task / "children").read_text().split()]
+        with suppress(FileNotFoundError):  # a thread that has just ended
+            found += [int(child) for child in (task / "children").read_text().split()]
     return [child for child in found if b"lab.side_processes" in Path(f"/proc/{child}/cmdline").read_bytes()]
