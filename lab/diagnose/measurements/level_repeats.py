@@ -7,6 +7,7 @@ from scipy.special import digamma, polygamma
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.repeatability import RepeatedMeans, repeated_levels, steady
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -26,7 +27,7 @@ def level_repeats_block(study: Study) -> Block:
     """log((S + s0^2) / (noise + s0^2)) of flat settings with repeats, several of neighbouring exposures together.
 
     S is the mean square of a setting's relative levels about their mean, with n - 1 degrees of freedom; noise what pixels' noise makes of
-    it; s0 a steady lamp's scatter. Settings that are out of line with the others don't count: they are other measurements' finding.
+    it; s0 a steady lamp's scatter. Image lag adds what the frames before leave in each repeat. Settings that are out of line with the others don't count: they are other measurements' finding.
     """
     groups = _by_exposure(_seen(study))
     if not groups:
@@ -49,6 +50,8 @@ def level_repeats_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         model = Uniform(study.camera, effects)
         more = np.array([model.unsteadiness**2 + _of_rows(model, study, t) for t in exposure_s])
+        if acting(effects, LAG):
+            more = more + np.array([_of_lag(study, effects, group) for group in groups])
         return Prediction(np.log((noise + more + STEADY_LAMP**2) / (noise + STEADY_LAMP**2)) + bias, {})
 
     labels = tuple(
@@ -57,7 +60,7 @@ def level_repeats_block(study: Study) -> Block:
     )
     return Block(
         measurement=LEVEL_REPEATS, reach=1.0, value=value, covariance=covariance, labels=labels,
-        reads=frozenset({"light.unsteadiness", "light.rows"}), predict=predict, scale=np.ones(len(value)),
+        reads=frozenset({"light.unsteadiness", "light.rows"}) | LAG, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -107,6 +110,21 @@ def _of_rows(model: Uniform, study: Study, exposure_s: float) -> float:
     mean = [float(np.mean(model.row_factors(study.camera.rows, exposure_s, float(t)))) for t in begin_s]
     level: FloatArray = np.array(mean)
     return float(np.var(level))
+
+
+def _of_lag(study: Study, effects: Effects, group: list[RepeatedMeans]) -> float:
+    """Mean square of what image lag adds to the repeats' relative levels, about the mean of each setting: the first often follows another
+    level."""
+    carried, total = study.carried_e(effects), 0.0
+    for repeats in group:
+        signal_e = [
+            sum(max(v - study.noise.black, 1e-9) for v in study.levels(c).whole.values()) / study.noise.gain
+            for c in repeats.captures
+        ]
+        added_e = [sum(carried(c, channel) for channel in study.levels(c).whole) for c in repeats.captures]
+        share = np.array(added_e) / np.array(signal_e)
+        total += float(np.sum(np.square(share - share.mean())))
+    return total / sum(len(r.away) - 1 for r in group)
 
 
 LEVEL_REPEATS = Measurement(

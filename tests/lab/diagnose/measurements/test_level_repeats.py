@@ -9,7 +9,8 @@ from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.level_repeats import level_repeats_block
 from lab.diagnose.policy import DecisionPolicy
-from mocks.former.laws import LightFlickerLaw, SourceInstabilityLaw
+from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
+from sim.effects.image_lag import ImageLag
 from sim.effects.light_flicker import LightFlicker
 from sim.effects.source_instability import SourceInstability
 from tests.lab.diagnose.on_blocks import former, study
@@ -47,6 +48,17 @@ def test_flicker_within_frames_moves_whole_frames_too() -> None:
     std = np.sqrt(np.diag(block.covariance))
     assert np.any(block.value - block.predict(()).mean > 3.0 * std)
     assert np.all(np.abs(block.value - block.predict((flicker,)).mean) < 3.0 * std)
+
+
+@pytest.mark.parametrize("seed", [772551, 772556])
+def test_image_lag_scatters_repeats_by_what_the_frames_before_left(seed: int) -> None:
+    """5 % of the frame before, exposures up and down, the same noise with and without it. S = (lag + noise)^2 over 4 degrees of freedom:
+    beside a change of ln S by d, the product of both scatters ln S by 2 exp(-d / 2) / sqrt(4). It was called source_instability."""
+    with_lag = level_repeats_block(study(former(seed, ImageLagLaw(5.0, 0, 9), shuttle=True)))
+    without = level_repeats_block(study(former(seed, shuttle=True)))
+    change = with_lag.predict((ImageLag(lag_percent=5.0),)).mean - with_lag.predict(()).mean
+    assert np.all(change > 2.0)
+    assert np.all(np.abs(with_lag.value - without.value - change) < 3.0 * np.exp(-0.5 * change))
 
 
 def test_the_law_adds_its_variance() -> None:
