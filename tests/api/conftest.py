@@ -24,6 +24,8 @@ from api.app import create_app
 from api.failed_keys import FailedKeys
 from api.keys import Permission, create_key
 from api.service import Limits
+from drivers.monochromator.base import Monochromator
+from lab.capture.station import drivers_of, read_station
 from lab.capture.store import Store
 from lab.formats.recording_set import Manifest, RecordingSet
 from tests.lab.fake_bench import BLACK, COLS, ROWS, WHITE, Bench
@@ -198,3 +200,13 @@ def little_set() -> RecordingSet:
     ]
     manifest = Manifest.model_validate({"name": "two darks", "cameras": {"left": camera}, "captures": captures})
     return RecordingSet(manifest, frames)
+
+
+def shutter_is_open(station: Path) -> bool:
+    """As the monochromator itself says, on its own line, which nobody else may use now."""
+    monochromator = drivers_of(read_station(station)).monochromator
+    assert isinstance(monochromator, Monochromator)
+    monochromator.connect()
+    found = monochromator.shutter_is_open()
+    monochromator._transport.close()  # type: ignore[attr-defined]  # `close` would close the shutter, too
+    return found

@@ -10,11 +10,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from drivers.monochromator.base import Monochromator
-from lab.capture.station import drivers_of, read_station
 from lab.capture.store import Store
 from lab.cli.bench_process import mock_bench
-from tests.api.conftest import served, until, until_state
+from tests.api.conftest import served, shutter_is_open, until, until_state
 
 
 @pytest.fixture
@@ -25,16 +23,6 @@ def stations(tmp_path: Path) -> Iterator[Path]:
     with mock_bench([]) as file:
         shutil.copy(file, folder / "bench.toml")
         yield folder
-
-
-def shutter_is_open(station: Path) -> bool:
-    """As the monochromator itself says, on its own line."""
-    monochromator = drivers_of(read_station(station)).monochromator
-    assert isinstance(monochromator, Monochromator)
-    monochromator.connect()
-    found = monochromator.shutter_is_open()
-    monochromator._transport.close()  # type: ignore[attr-defined]  # `close` would close the shutter, too
-    return found
 
 
 def test_after_kill_9_of_the_service_the_shutter_is_closed_at_its_next_start(stations: Path) -> None:

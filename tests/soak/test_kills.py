@@ -23,11 +23,9 @@ from distributed import LocalCluster
 from api.client import ServiceClient
 from api.keys import Permission, create_key
 from api.schemas import SessionStart
-from drivers.monochromator.base import Monochromator
-from lab.capture.station import drivers_of, read_station
 from lab.capture.store import Store
 from lab.cli.bench_process import mock_bench
-from tests.api.conftest import served
+from tests.api.conftest import served, shutter_is_open
 
 KILLS = int(os.environ.get("KILLS", "20"))
 SEED = int(os.environ.get("KILLS_SEED", "1"))
@@ -35,16 +33,6 @@ SEED = int(os.environ.get("KILLS_SEED", "1"))
 CLOSED_S, PATIENCE_S = 5.0, 120.0
 WHAT = ("service", "worker", "bench")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(60 * KILLS + 600)]
-
-
-def shutter_is_open(station: Path) -> bool:
-    """As the monochromator itself says, on its own line, which nobody else may use now."""
-    monochromator = drivers_of(read_station(station)).monochromator
-    assert isinstance(monochromator, Monochromator)
-    monochromator.connect()
-    found = monochromator.shutter_is_open()
-    monochromator._transport.close()  # type: ignore[attr-defined]  # `close` would close the shutter, too
-    return found
 
 
 class Laboratory:

@@ -328,7 +328,6 @@ class Search:
         """Log posterior of sets of listed effects, by name. A set's prior is `policy.included_log_odds` for each effect, how often effects
         occur; a name has to earn more, for its false alarms are limited. Of sets that weren't fitted, by the linear problem about a
         fitted set that isn't far below the likeliest."""
-        costs = {e.name: sum(not q.dispensable for q in e.quantities().values()) for e in self.candidates}
         prior = self.policy.included_log_odds
         found = {frozenset(f.names): f.log_posterior - prior * len(f.effects) for f in self._listed()}
         least = max(found.values()) + math.log(self.policy.least_rival_probability)
@@ -339,7 +338,7 @@ class Search:
             for one in (*problem.singles.values(), *problem.best(2)):
                 owners = [problem.owners[m] for m in one.members]
                 key = frozenset((*fit.names, *owners))
-                earned = 0.5 * one.score - sum(self.policy.parameter_log_odds * costs[n] + prior for n in owners)
+                earned = one.log_odds + (0.5 * self.threshold - prior) * len(owners)
                 if key not in found and len(key) <= self.policy.most_effects:
                     beside[key] = max(beside.get(key, -math.inf), found[frozenset(fit.names)] + earned)
         return found | beside
