@@ -133,23 +133,37 @@ def calibrate_command(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="what `challenge make` wrote")],
     truths: Annotated[Path, typer.Option("--truths", metavar="FILE", help="the truths that `challenge make` wrote")],
     rules: Annotated[
-        list[str], typer.Option("--rule", metavar="NAME=VALUE", help="a rule of decision at another value; repeatable")
-    ],
+        list[str] | None,
+        typer.Option("--rule", metavar="NAME=VALUE", help="a rule of decision at another value; repeatable"),
+    ] = None,
+    each: Annotated[
+        bool, typer.Option("--each", help="take out the rules without a derivation one by one, and print a table")
+    ] = False,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
     """Score tuning cases under other rules of decision, beside the default ones; results stay in DIR for the next time."""
-    from lab.challenge.calibrate import changed_policy, comparison, refuse_proof
+    from lab.challenge.calibrate import answers, changed_policy, comparison, policies_without, refuse_proof, rule_table
     from lab.challenge.run import run_all
     from lab.challenge.score import broken_seals, score
     from lab.challenge.truth import Seals, Truths, load
 
-    policy = changed_policy(rules)
+    if each == bool(rules):
+        raise InputError("give either --each or --rule NAME=VALUE")
     seals, opened = load(Seals, folder / "seals.json"), load(Truths, truths)
     refuse_proof(opened)
     cases = tuple(case for case in sorted(seals.seals) if (folder / case).is_dir())
     broken = broken_seals(folder, seals, opened)
-    under = {"results": None, f"results {' '.join(sorted(rules))}": policy}
+    if each:
+        whole = [case for case in cases if case not in broken]
+        folders, by_case = [folder.resolve() / case for case in whole], {}
+        for number, found in _workers(jobs, scheduler).done(answers, folders, policies_without()):
+            by_case[whole[number]] = found
+            _say(f"{len(by_case)} of {len(whole)} cases", len(by_case) / len(whole))
+        print(rule_table({case: opened.truths[case].truth for case in whole}, by_case))
+        return
+    policy = changed_policy(rules or ())
+    under = {"results": None, f"results {' '.join(sorted(rules or ()))}": policy}
     scores = [
         score(opened, seals, run_all(folder, cases, _workers(jobs, scheduler), _say, policy=one, results=where), broken)
         for where, one in under.items()

@@ -4,10 +4,10 @@ from.
 Odds are natural logarithms throughout ("log odds"): 2.3 is ten to one, 4.6 is a hundred to one. A score is the gain in
 chi2 that an effect's signature promises: twice its log odds.
 
-Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge. `calibench challenge calibrate
---rule NAME=VALUE` scores tuning cases under another value beside the default: healthy cases for false alarms, concealed
-effects for names and rivals, siblings outside the library for false names. docs/reference/decision-policy.md is
-generated from this module by docs/write_tables.py.
+Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge, and each states a value at which
+it doesn't act (`Rule.off`). `calibench challenge calibrate --each` takes them out one by one and counts right and false
+names of tuning cases; `--rule NAME=VALUE` scores the cases under any other value. docs/reference/decision-policy.md is generated
+from this module by docs/write_tables.py.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ TUNED = "tuned: `calibench challenge calibrate`"
 @dataclass(frozen=True)
 class Rule:
     """Declaration of one field: its group, its unit ("1": a share, a ratio or a count), its meaning, and where its
-    value comes from."""
+    value comes from. `off`: the value at which the rule doesn't act, of those that have no derivation."""
 
     group: str
     unit: str
     meaning: str
     basis: str
+    off: float | None = None
 
 
 class DecisionPolicy(Frozen):
@@ -84,7 +85,11 @@ class DecisionPolicy(Frozen):
     covariance_slack: Annotated[
         float,
         Rule(
-            "significance", "1", "relative error of stated standard deviations; chi2 is divided by (1 + slack)^2", TUNED
+            "significance",
+            "1",
+            "relative error of stated standard deviations; chi2 is divided by (1 + slack)^2",
+            TUNED,
+            off=0.0,
         ),
     ] = 0.15
     lone_score_margin: Annotated[
@@ -94,6 +99,7 @@ class DecisionPolicy(Frozen):
             "score",
             "excess of the best score over the threshold that is a mismatch where neither a slice nor a refit shows one",
             TUNED,
+            off=0.0,
         ),
     ] = 10.0
 
@@ -141,6 +147,7 @@ class DecisionPolicy(Frozen):
             "threshold",
             "gain that an effect has to earn where a stronger one acts on the same measurement",
             TUNED,
+            off=1.0,
         ),
     ] = 1.5
     exchange_log_odds: Annotated[
@@ -159,6 +166,7 @@ class DecisionPolicy(Frozen):
             "log odds",
             "prior odds that the model lacks an effect, against a misstated f-number or pitch",
             TUNED,
+            off=0.0,
         ),
     ] = 10.0
     misstated_ratio: Annotated[
@@ -182,10 +190,10 @@ class DecisionPolicy(Frozen):
 
     # --- name ------------------------------------------------------------------------------------------------------------
     most_unknown_probability: Annotated[
-        float, Rule("name", "1", "probability of an unknown cause above which no name is given", TUNED)
+        float, Rule("name", "1", "probability of an unknown cause above which no name is given", TUNED, off=1.0)
     ] = 0.4
     least_probability: Annotated[
-        float, Rule("name", "1", "least probability of a name that explains at least `exact_share`", TUNED)
+        float, Rule("name", "1", "least probability of a name that explains at least `exact_share`", TUNED, off=0.0)
     ] = 0.35
     least_probability_inexact: Annotated[
         float,
@@ -212,7 +220,7 @@ class DecisionPolicy(Frozen):
         ),
     ] = 0.76
     exact_share: Annotated[
-        float, Rule("name", "1", "share of the excess chi2 from which on a name explains it nearly all", TUNED)
+        float, Rule("name", "1", "share of the excess chi2 from which on a name explains it nearly all", TUNED, off=0.0)
     ] = 0.95
     least_explained_share: Annotated[
         float,
@@ -221,10 +229,11 @@ class DecisionPolicy(Frozen):
             "1",
             "least share of the excess chi2, in the measurements that an effect acts on, that its name explains",
             TUNED,
+            off=0.0,
         ),
     ] = 0.8
     least_explained_share_open: Annotated[
-        float, Rule("name", "1", "the same where what is left exceeds noise and form tolerances", TUNED)
+        float, Rule("name", "1", "the same where what is left exceeds noise and form tolerances", TUNED, off=0.8)
     ] = 0.98
     noise_sigma: Annotated[
         float,
@@ -242,6 +251,7 @@ class DecisionPolicy(Frozen):
             "standard deviations",
             "the same where form tolerances are in the covariance",
             "wider than `noise_sigma`, as the correlation kernel of a law's error is assumed; " + TUNED,
+            off=3.0,
         ),
     ] = 5.0
     companion_share: Annotated[
@@ -251,6 +261,7 @@ class DecisionPolicy(Frozen):
             "1",
             "share of a stronger effect's size below which an effect beside it counts as that one's law's error, unless nothing departs with it and something without it",
             TUNED,
+            off=0.0,
         ),
     ] = 0.03
     remainder_log_odds: Annotated[
@@ -263,6 +274,7 @@ class DecisionPolicy(Frozen):
             "1",
             "gain of a discrepancy in the same frames, over the name's gain, above which both count as one unknown cause",
             TUNED,
+            off=1.0,
         ),
     ] = 0.1
     own_remainder_share: Annotated[
@@ -313,6 +325,7 @@ class DecisionPolicy(Frozen):
             "1",
             "share of a name's gain that an effect promises in closed form, from which on it is fitted in its place; and of the best score beside a set, from which on an effect is added",
             "a refit of a large effect may gain two and a half times what its small signature promises; " + TUNED,
+            off=0.0,
         ),
     ] = 0.4
     search_cpu_s: Annotated[
@@ -350,6 +363,7 @@ class DecisionPolicy(Frozen):
             "log odds",
             "gain of a member below which the others are fitted once more without it, from where they stand",
             TUNED,
+            off=0.0,
         ),
     ] = 100.0
     hopeless_log_odds: Annotated[
@@ -368,6 +382,7 @@ class DecisionPolicy(Frozen):
             "1",
             "gain that a rough fit may still make, in gains that its next Newton step promises",
             TUNED,
+            off=1.0,
         ),
     ] = 10.0
 

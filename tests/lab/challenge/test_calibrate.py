@@ -4,11 +4,22 @@ from __future__ import annotations
 
 import pytest
 
-from lab.challenge.calibrate import changed_policy, comparison, refuse_proof
+from lab.challenge.calibrate import (
+    DEFAULT,
+    Answer,
+    changed_policy,
+    comparison,
+    policies_without,
+    refuse_proof,
+    rule_table,
+    tally,
+)
 from lab.challenge.run import CaseRun
 from lab.challenge.score import ChallengeScore, score
 from lab.challenge.truth import Seals, Truths, salted, seal
+from lab.cli.entry import main
 from lab.diagnose import DecisionPolicy
+from lab.diagnose.policy import TUNED
 from lab.errors import InputError
 from lab.formats.results import DiagnosisResult
 from tests.lab.challenge.test_score import HEALTHY, named, truth
@@ -53,3 +64,49 @@ def test_what_differs_is_listed_by_case() -> None:
     assert "1 of 2 cases differ" in text
     assert "case-1, concealed defocus: explained (defocus) -> unexplained (no name)" in text
     assert "case-2" not in text
+
+
+def test_each_rule_without_a_derivation_has_a_value_at_which_it_does_not_act() -> None:
+    tuned = {name for name, rule in DecisionPolicy.rules().items() if TUNED in rule.basis}
+    without = policies_without()
+    assert set(without) == {DEFAULT} | tuned
+    for name in tuned:
+        changed = {n for n in DecisionPolicy.model_fields if getattr(without[name], n) != getattr(DecisionPolicy(), n)}
+        assert changed == {name}
+
+
+def _answer(*told: str, mismatch: bool = True) -> Answer:
+    return Answer(named=told, mismatch=mismatch, cpu_s=1.5)
+
+
+CASES = {
+    "a": truth("compound", ("defocus", 80.0), ("crosstalk", 90.0)),
+    "b": truth("healthy"),
+    "c": truth("single", ("adc_ripple", 80.0), accepts=("vignetting",)),
+}
+
+
+def test_answers_are_counted_by_effect_and_by_family() -> None:
+    by_default = {
+        "a": _answer("crosstalk", "coma"),
+        "b": _answer(mismatch=False),
+        "c": _answer("converter", "vignetting"),
+    }
+    without = {"a": _answer("crosstalk", "defocus"), "b": _answer("nonlinearity"), "c": by_default["c"]}
+    by_case = {case: {DEFAULT: by_default[case], "exact_share": without[case]} for case in CASES}
+    one, other = tally(CASES, by_case, DEFAULT), tally(CASES, by_case, "exact_share")
+    # coma is of another family than defocus; the converter's name is right for a ripple, vignetting describes that case
+    assert (one.effects, one.families, one.concealed, one.wrong, one.alarms, one.healthy) == (1, 2, 3, 1, 0, 1)
+    assert (other.effects, other.families, other.wrong, other.alarms, other.differ, other.cpu_s) == (2, 3, 1, 1, 2, 4.5)
+
+
+def test_a_table_has_a_row_for_each_rule() -> None:
+    by_case = {case: {name: _answer() for name in policies_without()} for case in CASES}
+    rows = rule_table(CASES, by_case).splitlines()
+    assert len(rows) == 2 + len(policies_without())
+    assert "| `added_threshold_factor` | 1 | 1.5 | 0 of 3 | 0 | 0 | 1 of 1 | 0 of 3 |" in "\n".join(rows)
+
+
+def test_either_each_rule_or_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["challenge", "calibrate", "DIR", "--truths", "FILE"]) != 0
+    assert "give either --each or --rule" in capsys.readouterr().err

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.challenge.calibrate import DEFAULT, answers
 from lab.challenge.draw import FOREIGN_BITS, FOREIGN_FRAMES, SHARES, DrawnFrame, draw, kind_of
 from lab.challenge.faults import FAULTS
 from lab.challenge.make import make
@@ -28,6 +29,7 @@ from lab.challenge.truth import (
     store,
 )
 from lab.cli import main
+from lab.diagnose import DecisionPolicy
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.results import DiagnosisResult
@@ -184,6 +186,11 @@ def test_a_case_that_fails_does_not_end_the_run(copy: tuple[Path, Seals, Truths]
     assert found.broken_seals == ("case-0001",)
     assert found.cases == 1
     assert not found.reached
+    # the same decisions, taken under several policies at once, say the same
+    told = answers(folder / "case-0002", {DEFAULT: DecisionPolicy()})[DEFAULT]
+    diagnosis = runs["case-0002"].diagnosis
+    assert set(told.named) == {e.name for e in diagnosis.effects}
+    assert told.mismatch == (diagnosis.verdict != "no_mismatch")
 
 
 def test_seeds_of_tuning_and_of_proofs_are_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
