@@ -7,12 +7,15 @@ values, the result is the baseline bit for bit.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from itertools import product
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline
+from scipy.signal import convolve2d
 
 from sim.camera import CameraModel
 from sim.detection import check_finite, detected, otf_wavelengths, otf_weight
@@ -54,15 +57,18 @@ HIGHEST_CY_PER_PX = 64.0
 class Blur:
     """Transfer of lens and effects at one wavelength, without the pixel's aperture; the stages' states taken once."""
 
-    def __init__(self, camera: CameraModel, effects: Sequence[Acts] = (), *, collected: bool = False) -> None:
+    def __init__(
+        self, camera: CameraModel, effects: Sequence[Acts] = (), *, collected: bool = False, moving: bool = True
+    ) -> None:
         """`collected`: what frames are drawn with: without light that is scattered evenly over the frame, without what moves charge between
-        pixels, and without filters on the chip."""
+        pixels, and without filters on the chip. `moving`: with what moves charge between pixels, as among pixels of one colour; `mixed` has it
+        for a mosaic."""
         self.camera = camera
         image = image_of(camera, effects)
         self.image: Image = image.unveiled() if collected else image
         self.charge: Charge = charge_of(camera, effects)
         self.signal = Signal(camera) if collected else signal_of(camera, effects)
-        self.kernels = () if collected else self.charge.kernels
+        self.kernels = self.charge.kernels if moving and not collected else ()
 
     def at(
         self,
@@ -183,6 +189,45 @@ def detected_transfer(
     return np.asarray(np.einsum("sw,sw...,w...->s...", shares, apart, transfers), complex)
 
 
+def mixes_colours(camera: CameraModel, effects: Sequence[Acts]) -> bool:
+    """Whether effects move charge between pixels of different colours."""
+    return camera.cfa != "MONO" and bool(charge_of(camera, effects).kernels)
+
+
+def mixed(
+    camera: CameraModel,
+    transfers: ComplexArray,
+    signals: FloatArray,
+    fx_cy_per_px: FloatArray,
+    fy_cy_per_px: FloatArray,
+    effects: Sequence[Acts],
+) -> ComplexArray:
+    """Transfer functions of a mosaic's channels after charge has moved between pixels, (channels, *frequencies), from those before and each
+    channel's mean signal before, (channels,), on any scale.
+
+    T'_c(f) = sum_n k_n s_n T_n(f) exp(-2 pi i f n) / sum_n k_n s_n, over the offsets n of the kernel k of all moves together; s_n and T_n are of
+    the channel from which charge moves by n to a pixel of channel c. Of a channel with several phases in the mosaic, their mean.
+    """
+    kernel = reduce(convolve2d, charge_of(camera, effects).kernels, np.ones((1, 1)))
+    half, step, phases = np.array(kernel.shape) // 2, mosaic.step(camera.cfa), mosaic.phases(camera.cfa)
+    channel_at = {place: i for i, name in enumerate(camera.channels) for place in phases[name]}
+    out = np.zeros(transfers.shape, complex)
+    for i, name in enumerate(camera.channels):
+        total = 0.0
+        for (row, col), ((r, c), share) in product(phases[name], np.ndenumerate(kernel)):
+            if share == 0.0:
+                continue
+            down, right = int(r - half[0]), int(c - half[1])
+            source = channel_at[(row - down) % step, (col - right) % step]
+            part = float(share) * float(signals[source])
+            out[i] += part * transfers[source] * np.exp(-2j * np.pi * (fx_cy_per_px * right + fy_cy_per_px * down))
+            total += part
+        if not total > 0.0:  # no light: as it was
+            out[i], total = transfers[i], 1.0
+        out[i] /= total
+    return out
+
+
 def even_share(camera: CameraModel, effects: Sequence[Acts]) -> float:
     """Of the light: what effects spread evenly over the frame."""
     return 1.0 - float(np.prod([1.0 - veil.even_share for veil in image_of(camera, effects).veils]))
@@ -226,15 +271,22 @@ def optical_transfer(
     between pixels and filters on the chip act: what a frame is drawn with, in which these act on the pixels themselves.
     """
     fx, fy = np.broadcast_arrays(np.asarray(fx_cy_per_px, float), np.asarray(fy_cy_per_px, float))
-    wavelength_nm, weight = detected(camera, channel, [(radiance, reflectance)], effects, kind)
-    nodes, share = otf_wavelengths(camera, channel, wavelength_nm, weight[0], OTF_WAVELENGTHS)
-    total: FloatArray | ComplexArray = np.zeros(fx.shape)
-    blur = Blur(camera, effects, collected=collected)
-    apart = dispersal(camera, nodes, share[None], fx, fy, effects, [place_um])
-    for k, (node, part) in enumerate(zip(nodes, share, strict=True)):
-        single = blur.at(float(node), fx, fy, place_um)
-        total = total + part * (single if apart is None else single * apart[0, k])
-    return np.asarray(total * aperture_otf(fx, fy, camera.fill_factor), complex)
+    mixing = not collected and mixes_colours(camera, effects)
+    blur = Blur(camera, effects, collected=collected, moving=not mixing)
+    transfers, signals = [], []
+    for name in camera.channels if mixing else (channel,):
+        wavelength_nm, weight = detected(camera, name, [(radiance, reflectance)], effects, kind)
+        nodes, share = otf_wavelengths(camera, name, wavelength_nm, weight[0], OTF_WAVELENGTHS)
+        total: FloatArray | ComplexArray = np.zeros(fx.shape)
+        apart = dispersal(camera, nodes, share[None], fx, fy, effects, [place_um])
+        for k, (node, part) in enumerate(zip(nodes, share, strict=True)):
+            single = blur.at(float(node), fx, fy, place_um)
+            total = total + part * (single if apart is None else single * apart[0, k])
+        transfers.append(np.asarray(total * aperture_otf(fx, fy, camera.fill_factor), complex))
+        signals.append(float(np.sum(weight)))
+    if not mixing:
+        return transfers[0]
+    return mixed(camera, np.array(transfers), np.array(signals), fx, fy, effects)[camera.channels.index(channel)]
 
 
 def common_wavelengths(
@@ -302,10 +354,11 @@ def transfer_at(
     effects: Sequence[Acts] = (),
     *,
     place_um: tuple[float, float] = (0.0, 0.0),
+    moving: bool = True,
 ) -> FloatArray | ComplexArray:
     """Transfer of lens, pixel and effects at one wavelength, of the broadcast shape of fx and fy (cy/px). `place_um` matters to
-    path errors that change over the field."""
-    blur = Blur(camera, effects)
+    path errors that change over the field; `moving` as in `Blur`."""
+    blur = Blur(camera, effects, moving=moving)
     transfer = blur.at(wavelength_nm, fx_cy_per_px, fy_cy_per_px, place_um)
     return transfer * aperture_otf(fx_cy_per_px, fy_cy_per_px, camera.fill_factor)
 

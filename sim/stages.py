@@ -229,7 +229,7 @@ class Charge(State):
     pixel. `dark_current`: (e/s, sensor temperature) -> e/s, of all
     pixels or of each (rows, cols). `defects`: pixels with additional dark current. `transfer`: (fx, fy in cy/um, wavelength_nm) ->
     factor on the transfer function, alike for all colours. `kernels`: where the charge of a pixel ends up, (odd, odd) of sum 1: they
-    act on whole frames, and as transfer functions where there is one channel. `exchange`: mean electrons (rows, cols) -> the same after
+    act on whole frames, and on transfer functions (`sim.point.mixed` for a mosaic). `exchange`: mean electrons (rows, cols) -> the same after
     neighbours have exchanged charge by how much they hold. `overflow`: mean electrons (rows, cols) -> the same
     after full wells have run over. `lag`: electrons collected -> electrons that stay for the next frame. `variance_e2`: (mean electrons,
     shot noise's variance) -> variance. `correlation`: mean electrons -> correlation of the shot noise with each of the four next pixels.

@@ -3,19 +3,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import integrate
+from scipy.ndimage import convolve
 
 from sim import frame as sim_frame
-from sim.camera import CameraModel, Lens
+from sim.camera import CameraModel, Cfa, Lens
+from sim.effects.crosstalk import Crosstalk
 from sim.effects.infrared_cut_filter import InfraredCutFilter
+from sim.effects.inter_pixel_capacitance import InterPixelCapacitance
 from sim.frame import Exposure
 from sim.optics.diffraction import aperture_otf, diffraction_otf
 from sim.optics.illumination import relative_illumination
-from sim.point import common_wavelengths, edge_profile, kernel, optical_transfer, wavelength_shares
+from sim.point import common_wavelengths, edge_profile, kernel, mixed, optical_transfer, wavelength_shares
 from sim.scene import (
     ScreenPattern,
     Warp,
 )
+from sim.sensor.mosaic import phases
 from sim.spectrum import Spectrum, photons_from_energy
+from sim.stages import charge_of, kernel_otf
 from sim.uniform import electron_rate
 from tests.sim.local_effects import Birefringent, Shift, Veil
 
@@ -126,3 +131,43 @@ def test_wavelengths_share_a_sight_s_light(colour_camera: CameraModel, lamp: Spe
     cut = InfraredCutFilter(cut_wavelength_nm=600.0, width_nm=1.0)
     without_red = wavelength_shares(colour_camera, sights, grid, (cut,))
     assert np.all(without_red[:, grid > 615.0].sum(axis=1) < 1e-5)  # e^-12 of a width's light behind the edge
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "GBRG"])
+def test_charge_brings_the_transfer_of_neighbours_of_other_colours(colour_camera: CameraModel, cfa: Cfa) -> None:
+    """Against plane waves on the mosaic's pixels, each channel with its own signal and transfer, whose charge is moved in the frame."""
+    camera = colour_camera.model_copy(update={"cfa": cfa})
+    effects = (Crosstalk(share_percent=3.0, row_excess=0.4, corner_share=0.3), InterPixelCapacitance(share_percent=1.0))
+    signals = np.array([0.7, 2.0, 0.4])
+    size, across, down = 48, 11, 7
+    fx, fy = across / size, down / size
+    transfers = np.array([0.5 + 0.1j, 0.8, 0.3 - 0.2j])
+    row, col = np.mgrid[:size, :size]
+    wave = np.exp(2j * np.pi * (fx * col + fy * row))
+    amplitude, level, channel = np.zeros((size, size), complex), np.zeros((size, size)), np.zeros((size, size), int)
+    for i, name in enumerate(camera.channels):
+        for r, c in phases(cfa)[name]:
+            amplitude[r::2, c::2], level[r::2, c::2], channel[r::2, c::2] = signals[i] * transfers[i], signals[i], i
+    for moves in charge_of(camera, effects).kernels:
+        amplitude, level = (
+            convolve(part * phase, moves, mode="wrap") / phase
+            for part, phase in ((amplitude, wave), (level, np.ones_like(level)))
+        )
+    wanted = [(amplitude[channel == i].mean() / level[channel == i].mean()) for i in range(3)]
+    got = mixed(camera, transfers[:, None], signals, np.array([fx]), np.array([fy]), effects)[:, 0]
+    assert np.allclose(got, wanted, rtol=0, atol=1e-12)
+
+
+def test_charge_between_colours_takes_more_contrast_of_the_fainter(colour_camera: CameraModel, lamp: Spectrum) -> None:
+    """Where all channels have one transfer, what neighbours bring grows with their signal over a pixel's own; of one colour's
+    pixels alone, the factor is the kernel's."""
+    effects, f = (Crosstalk(share_percent=2.0),), np.array([0.0, 0.2])
+    of_camera = {c: optical_transfer(colour_camera, c, lamp, f, 0 * f, effects) for c in "RGB"}
+    plain = {c: optical_transfer(colour_camera, c, lamp, f, 0 * f) for c in "RGB"}
+    rate = {c: electron_rate(colour_camera, c, lamp) for c in "RGB"}
+    assert all(value[0] == pytest.approx(1.0, abs=1e-12) for value in of_camera.values())
+    kept = {c: float(np.real(of_camera[c][1] / plain[c][1])) for c in "RGB"}
+    faint, bright = min(rate, key=lambda c: rate[c]), max(rate, key=lambda c: rate[c])
+    assert kept[faint] < kept[bright]
+    mono = kernel_otf(effects[0].kernel(), f, 0 * f)[1]
+    assert kept[faint] < mono < kept[bright]

@@ -74,11 +74,11 @@ class LinearProblem:
             made = (
                 list(self.singles.values())
                 if size == 1
-                else self._pairs()
+                else self.pairs
                 if size == 2
                 else self._larger(self.best(size - 1))
             )
-            self._known.update({self._key(s): s for s in made})
+            self._known.update({self.names(s): s for s in made})
             every = sorted(made, key=lambda s: -s.log_odds)
             if size == 2:
                 self.best(1)
@@ -115,11 +115,12 @@ class LinearProblem:
         number = {name: k for k, name in enumerate(dict.fromkeys(self.owners))}
         return np.array([number[self.owners[a]] for a in self._alternative], int)
 
-    def _key(self, one: LinearSet) -> frozenset[str]:
+    def names(self, one: LinearSet) -> frozenset[str]:
+        """The owners of a set's members."""
         return frozenset(self.owners[m] for m in one.members)
 
     def _is_worth_its_members(self, one: LinearSet, known: Mapping[frozenset[str], LinearSet]) -> bool:
-        key = self._key(one)
+        key = self.names(one)
         less = [known[key - {name}] for name in key if key - {name} in known]
         return one.score > 0.0 and all(one.log_odds > s.log_odds for s in less)
 
@@ -133,7 +134,8 @@ class LinearProblem:
                 best[owner] = tried
         return best
 
-    def _pairs(self) -> list[LinearSet]:
+    @cached_property
+    def pairs(self) -> Sequence[LinearSet]:
         """Every pair of owners. Which of their alternatives is fixed by the best two columns: exact where each alternative has one."""
         z, size = self.z / self._size, self._size
         rho = self.gram / np.outer(size, size)
@@ -154,7 +156,7 @@ class LinearProblem:
         found: dict[frozenset[str], LinearSet] = {}
         for start in smaller[:EXTENDED]:
             gain = self._gain_beside(start)
-            names = self._key(start)
+            names = self.names(start)
             inside = np.array([self.owners[a] in names for a in self._alternative], bool)
             gain[inside] = 0.0
             taken: set[int] = set()
@@ -165,7 +167,7 @@ class LinearProblem:
                     continue
                 taken.add(int(self._owner[column]))
                 tried = self.scored((*start.members, int(self._alternative[column])))
-                key = self._key(tried)
+                key = self.names(tried)
                 if key not in found or tried.score > found[key].score:
                     found[key] = tried
         return list(found.values())

@@ -326,22 +326,25 @@ class Search:
 
     def weighed(self) -> dict[frozenset[str], float]:
         """Log posterior of sets of listed effects, by name. A set's prior is `policy.included_log_odds` for each effect, how often effects
-        occur; a name has to earn more, for its false alarms are limited. Of sets that weren't fitted, by the linear problem about a
-        fitted set that isn't far below the likeliest."""
-        prior = self.policy.included_log_odds
+        occur; a name has to earn more, for its false alarms are limited. Of sets that weren't fitted, those of one or two effects beside a
+        fitted set that isn't far below the likeliest, by the linear problem about that: the value about the nearest, the fitted set
+        that has most of their effects."""
+        prior, near = self.policy.included_log_odds, math.log(self.policy.least_rival_probability)
         found = {frozenset(f.names): f.log_posterior - prior * len(f.effects) for f in self._listed()}
-        least = max(found.values()) + math.log(self.policy.least_rival_probability)
-        near = [f for f in self._listed() if found[frozenset(f.names)] > least and f.effects in self._problems]
-        beside: dict[frozenset[str], float] = {}
-        for fit in near:
-            problem = self._problems[fit.effects]
-            for one in (*problem.singles.values(), *problem.best(2)):
-                owners = [problem.owners[m] for m in one.members]
-                key = frozenset((*fit.names, *owners))
-                earned = one.log_odds + (0.5 * self.threshold - prior) * len(owners)
+        cost = {n: c - 0.5 * self.threshold + prior for n, c in self._cost.items()}
+        likely = sorted(self._listed(), key=lambda f: -found[frozenset(f.names)])
+        least = found[frozenset(likely[0].names)] + near
+        beside: dict[frozenset[str], tuple[int, float]] = {}
+        for fit in [f for f in likely if found[frozenset(f.names)] > least][: self.policy.refitted_sets]:
+            if fit.effects not in self._problems and self.is_spent:
+                continue
+            problem = self.signatures(fit).problem(cost)
+            for one in (*problem.singles.values(), *problem.pairs):
+                key = frozenset(fit.names) | problem.names(one)
                 if key not in found and len(key) <= self.policy.most_effects:
-                    beside[key] = max(beside.get(key, -math.inf), found[frozenset(fit.names)] + earned)
-        return found | beside
+                    value = len(fit.names), found[frozenset(fit.names)] + one.log_odds
+                    beside[key] = max(beside.get(key, value), value)
+        return found | {key: value for key, (_, value) in beside.items()}
 
     def _in_order(self, names: frozenset[str]) -> tuple[str, ...]:
         """As the set was fitted, else as the candidates stand."""

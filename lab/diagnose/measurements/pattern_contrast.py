@@ -10,8 +10,9 @@ from lab.diagnose.measurements.pattern_fit import EVEN_TERMS, Pattern, even_powe
 from lab.diagnose.measurements.reads import SHOWN
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, transfer_at
+from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, mixed, mixes_colours, transfer_at
 from sim.spectrum import FloatArray
+from sim.uniform import electron_rate
 
 LARGEST_STD = 0.04  # of a band's contrast: beyond, it says nothing
 CONTRAST_FLOOR = 0.0015  # of a band's contrast: drawing and registration
@@ -80,13 +81,18 @@ def _transfers(
     study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
 ) -> NDArray[np.complex128]:
     """Of a pose's channels at the frequencies of all bands and of the parts beyond, one after another: (channels, nodes)."""
-    first = next(iter(sights.values()))[0]
+    camera, first = study.camera, next(iter(sights.values()))[0]
     fx = np.concatenate([*(b.fx for b in first.bands), first.beyond[:, 0].ravel()])
     fy = np.concatenate([*(b.fy for b in first.bands), first.beyond[:, 1].ravel()])
-    lit = [(channel, first.light) for channel in sights]
-    nodes, shares = common_wavelengths(study.camera, lit, effects, "bernoulli")
-    whole = [transfer_at(study.camera, float(w), fx, fy, effects) for w in nodes]
-    return detected_transfer(study.camera, nodes, shares, np.array(whole), fx, fy, effects, first.places_um)
+    mixing = mixes_colours(camera, effects)
+    channels = camera.channels if mixing else tuple(sights)  # neighbours of other colours count
+    nodes, shares = common_wavelengths(camera, [(c, first.light) for c in channels], effects, "bernoulli")
+    whole = np.array([transfer_at(camera, float(w), fx, fy, effects, moving=not mixing) for w in nodes])
+    found = detected_transfer(camera, nodes, shares, whole, fx, fy, effects, first.places_um)
+    if not mixing:
+        return found
+    rates = [1.0 if first.light is None else max(electron_rate(camera, c, first.light), 0.0) for c in channels]
+    return mixed(camera, found, np.array(rates), fx, fy, effects)[[channels.index(c) for c in sights]]
 
 
 def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -34,7 +34,6 @@ from lab.diagnose.measurements.reads import acting
 from lab.diagnose.measurements.study import Study
 from lab.fit.rounding import rounding_waves_dn
 from sim.effects.base import Effect
-from sim.frame import charge_response
 from sim.optics.illumination import optical_axis_px, relative_illumination
 from sim.point import (
     MOST_SHARES,
@@ -42,12 +41,12 @@ from sim.point import (
     common_wavelengths,
     detected_transfer,
     halos,
+    mixed,
     transfer_at,
     varies_over_field,
     wavelength_shares,
     wide_contrast,
 )
-from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
 
@@ -318,28 +317,10 @@ class _Edges:
 
     def _mixed(self, otf: ComplexArray, moving: tuple[Effect, ...]) -> ComplexArray:
         """Charge that moves between pixels of different colours: neighbours' edges, weighted by their light."""
-        camera, step = self._camera, mosaic.step(self._camera.cfa)
-        fx, fy = self._frequencies
-        middle = 4 * step
-        out = np.zeros(otf.shape, complex)
-        single = charge_response(camera, (2 * middle + 1, 2 * middle + 1), moving)
-        rows, cols = np.nonzero(np.abs(single) > 1e-9)
-        phases = mosaic.phases(camera.cfa)
-        channel_at = {(r % step, c % step): ch for ch, places in phases.items() for r, c in places}
-        for k, (channel, _light) in enumerate(self._sights):
-            first = k - camera.channels.index(channel)
-            rates = [max(self._rate(first + i), 0.0) for i in range(len(camera.channels))]
-            total = 0.0
-            for row, col in phases[channel]:
-                for r, c in zip(rows, cols, strict=True):
-                    # charge from a pixel at (-dr, -dc) arrives here: an edge seen there lies further on here
-                    dr, dc = int(r) - middle, int(c) - middle
-                    source = camera.channels.index(channel_at[(row - dr) % step, (col - dc) % step])
-                    share = float(single[r, c]) * rates[source]
-                    out[k] += share * otf[first + source] * np.exp(-2j * np.pi * (fx * dc + fy * dr))
-                    total += share
-            out[k] /= max(total, 1e-300)
-        return out
+        count = len(self._camera.channels)
+        parts = [slice(first, first + count) for first in range(0, len(otf), count)]
+        rates = np.array([max(self._rate(k), 0.0) for k in range(len(otf))])
+        return np.concatenate([mixed(self._camera, otf[p], rates[p], *self._frequencies, moving) for p in parts])
 
     def _rate(self, sight: int) -> float:
         channel, light = self._lit[sight]
