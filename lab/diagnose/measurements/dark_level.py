@@ -17,7 +17,7 @@ from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
-from sim.uniform import Uniform
+from sim.uniform import NOISE_NODES, Uniform
 
 #: Points of the grid on which a dark current over the field is evaluated, at most. A grid that is much coarser than the pixels
 #: moves the laws' origin and the cells' borders: at 50 DN of glow in a corner by a hundred standard deviations of a cell's mean.
@@ -55,7 +55,8 @@ def added_dark_dn(study: Study, effects: Effects) -> Callable[[Capture], float]:
 def dark_level_block(study: Study) -> Block:
     """Mean of every dark frame, DN.
 
-    Nuisance parameters: black level and dark current. Effects change it with time, temperature and the frame before.
+    Nuisance parameters: black level and dark current. Effects change it with time, temperature and the frame before; and what the
+    converter does at these codes, as the levels of all other frames lie above it.
     """
     frames = study.once(dark_frames)
     captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
@@ -71,6 +72,9 @@ def dark_level_block(study: Study) -> Block:
         for i, (capture, _, _) in enumerate(captures):
             lag_e = np.mean([carried(capture, c) for c in study.channels])
             mean[i] += offset(capture) + more(capture) + gain * float(lag_e)
+        model = Uniform(study.camera, effects)
+        if not model.has_even_codes:
+            mean = model.codes(mean[:, None] + gain * study.camera.read_noise_e * NOISE_NODES).mean(axis=1)
         return Prediction(mean, study.free_offsets(exposures) | lines.jacobian(effects))
 
     # codes as coarse as the noise move a mean, depending on where it lies between two of them
@@ -83,7 +87,7 @@ def dark_level_block(study: Study) -> Block:
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
         covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | DARK_CURRENT | {"signal.offset_dn"}, scattered_by=LINES, predict=predict, scale=np.ones(len(value)),
+        reads=LAG | DARK_CURRENT | {"signal.offset_dn", "codes.codes"}, scattered_by=LINES, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 

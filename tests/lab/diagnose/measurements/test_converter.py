@@ -12,6 +12,7 @@ from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.code_density import code_block
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
 from lab.diagnose.measurements.study import Study
@@ -105,3 +106,21 @@ def test_codes_are_averaged_over_noise_in_a_mean() -> None:
         electrons = np.array([(level - camera.black_level_dn) / camera.conversion_gain_dn_per_e])
         plain, coded = (Uniform(camera, acting).mean_dn({"Y": electrons})["Y"] for acting in ((), (one,)))
         assert coded - plain == pytest.approx(wanted, abs=0.1)  # 48 values stand for the noise: 4 DN / 48
+
+
+def test_what_the_converter_does_at_black_moves_darks_as_all_other_levels() -> None:
+    """A ripple of 16 times the range is nearly an offset: of darks and flats alike, so that the black level takes it up. One of a
+    quarter of the range moves darks by its value there, averaged over their noise."""
+    study = _study(7)
+    white, wide = study.camera.white_level_dn, AdcRipple(cosine_dn=0.5, period_dn=65536.0)
+    for make in (dark_level_block, linearity_block):
+        block = make(study)
+        before = block.predict(()).mean
+        wanted = 0.5 * np.cos(2.0 * np.pi * before / wide.period_dn)
+        np.testing.assert_allclose(block.predict((wide,)).mean - before, wanted, atol=2e-3)
+    dark, short = dark_level_block(study), AdcRipple(sine_dn=0.4, cosine_dn=0.3, period_dn=0.25 * white)
+    before = dark.predict(()).mean
+    turn = 2.0 * np.pi * before / short.period_dn
+    blurred = np.exp(-0.5 * (2.0 * np.pi * study.noise.gain * study.camera.read_noise_e / short.period_dn) ** 2)
+    wanted = blurred * (0.4 * np.sin(turn) + 0.3 * np.cos(turn))
+    np.testing.assert_allclose(dark.predict((short,)).mean - before, wanted, atol=1e-3)
