@@ -13,7 +13,7 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import Block, Label, Prediction
-from lab.diagnose.outcome.candidate_captures import Hypothesis, designs
+from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.outcome.next_capture import next_sentence, proposals
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
@@ -63,14 +63,14 @@ def _undecided(one: Effect, *others: tuple[str, float]) -> Verdict:
 
 
 def _best(*hypotheses: Effect) -> str:
-    """The words of the design in which two effects lie furthest apart."""
+    """The words of the candidate capture in which two effects lie furthest apart."""
     held = [Hypothesis(e.name, (e,), CAMERA) for e in hypotheses]
 
     def distance(predict: object, covariance: np.ndarray) -> float:
         apart = predict(held[0]) - predict(held[1])  # type: ignore[operator]
         return float(apart @ np.linalg.solve(covariance, apart))
 
-    found = list(designs(SET, "left", _model()))
+    found = list(candidate_captures(SET, "left", _model()))
     return max(found, key=lambda d: distance(d.predict, d.covariance)).words
 
 
@@ -94,9 +94,9 @@ def test_distance_is_what_decides() -> None:
     first, second = (
         Hypothesis("a", (InfraredCutFilter(cut_wavelength_nm=nm, width_nm=4.0),), CAMERA) for nm in (650.0, 650.02)
     )
-    design = next(d for d in designs(SET, "left", _model()) if d.words == "narrowband light at 650 nm")
-    a, b = design.predict(first), design.predict(second)
-    lower = np.linalg.cholesky(design.covariance)
+    candidate = next(d for d in candidate_captures(SET, "left", _model()) if d.words == "narrowband light at 650 nm")
+    a, b = candidate.predict(first), candidate.predict(second)
+    lower = np.linalg.cholesky(candidate.covariance)
     apart = np.linalg.solve(lower, a - b)
     d = 0.5 * float(apart @ apart)
     assert 0.02 < d < 4.0  # else nothing is tested
@@ -201,7 +201,7 @@ def test_more_darks_are_asked_for_where_they_are_few(repeats: int, told: bool) -
     """Eight times as many repeats have an eighth of the variance."""
     recordings = _dark_set(repeats)
     model = _dark_model(recordings)
-    again = [d for d in designs(recordings, "left", model) if "again" in d.words]
+    again = [d for d in candidate_captures(recordings, "left", model) if "again" in d.words]
     assert len(again) == 1
     assert ("16 at each setting in place of 2" in again[0].words) == told
     assert again[0].covariance[0, 0] == pytest.approx(repeats / 16 if told else 1.0)
