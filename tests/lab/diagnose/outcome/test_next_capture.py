@@ -216,7 +216,7 @@ def _left(measurement: str, axis: str, captures: tuple[str, ...], check: str = "
 
 
 @pytest.mark.parametrize(
-    ("repeats", "words"), [(2, "16 dark frames at each setting (there are 2)"), (12, "temperature of the sensor")]
+    ("repeats", "words"), [(2, "16 dark frames at each setting (there are 2)"), (12, "another sensor temperature")]
 )
 def test_a_mismatch_in_darks_asks_for_darks(repeats: int, words: str) -> None:
     recordings = _dark_set(repeats)
