@@ -1,4 +1,4 @@
-"""Dark frames: black level, read noise, DSNU, and the dark current from a ladder of exposures."""
+"""Dark frames: black level, read noise, DSNU, and the dark current from a series of exposures."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class CapTarget(Target):
 
 
 class DarkSequence(Sequence):
-    """`frames` dark frames at each of `exposures_s`.
+    """`frames` dark frames at each exposure time `exposures_s`.
 
-    The ladder is taken upwards and downwards in turn, so that a linear drift of the temperature isn't taken for dark current.
+    The series of exposures is taken upwards and downwards in turn, so that a linear drift of the temperature doesn't bias the dark current.
     """
 
     name: ClassVar[str] = "dark"
