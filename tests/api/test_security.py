@@ -1,4 +1,4 @@
-"""What keeps others out: scopes, cookies, Host, Origin, caps, headers."""
+"""Protection of the service: scopes, cookies, Host, Origin, size limits, headers."""
 
 from __future__ import annotations
 

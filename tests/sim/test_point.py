@@ -1,3 +1,5 @@
+"""The transfer at a place, edge profiles and kernels against their definitions."""
+
 from __future__ import annotations
 
 import numpy as np

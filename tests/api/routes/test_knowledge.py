@@ -1,4 +1,4 @@
-"""What the models declare is what the service tells."""
+"""The service describes what the models declare: parameters and effects."""
 
 from __future__ import annotations
 

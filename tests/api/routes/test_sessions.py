@@ -1,4 +1,4 @@
-"""Stations, sessions and captures over REST, on instruments that are not there."""
+"""Stations, sessions and captures over REST, on fake instruments."""
 
 from __future__ import annotations
 

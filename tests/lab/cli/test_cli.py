@@ -41,7 +41,7 @@ from sim.effects.library import effects
 
 @pytest.fixture(autouse=True)
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """No test touches the data folder of the working directory."""
+    """Keep tests away from the data folder of the working directory."""
     folder = tmp_path / "data"
     monkeypatch.setenv("CALIBENCH_DATA", str(folder))
     return folder
@@ -54,7 +54,7 @@ def folder(small_set: Callable[..., RecordingSet], tmp_path: Path) -> Path:
 
 @pytest.fixture
 def flats(tmp_path: Path) -> Path:
-    """A MONO camera of 0.5 DN/e: darks and a ladder of flats, small and quick to fit."""
+    """A MONO camera of 0.5 DN/e: darks and a series of flats, small and quick to fit."""
     rng = np.random.default_rng(7)
     frames, captures = {}, []
     for number, (kind, photons) in enumerate(
@@ -232,7 +232,7 @@ def test_diagnosis_with_a_stored_fit(
 
 
 def test_a_result_is_on_disk_before_anything_is_printed(tmp_path: Path) -> None:
-    """A pipe that nobody reads from, as of `| head -0`: the JSON is whole all the same."""
+    """Output to a closed pipe, as of `| head -0`: the JSON is complete all the same."""
     file = tmp_path / "effects.json"
     read_end, write_end = os.pipe()
     os.close(read_end)

@@ -1,4 +1,4 @@
-"""Diagnoses of recordings of a second image former that hold little."""
+"""Diagnoses of small recording sets of the second image former."""
 
 from __future__ import annotations
 

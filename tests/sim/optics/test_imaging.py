@@ -1,3 +1,5 @@
+"""Imaging models of a lens: transfer functions with the right symmetry, and against closed forms."""
+
 from __future__ import annotations
 
 import tomllib

@@ -1,3 +1,5 @@
+"""From electrons to codes: moments of clipped and rounded noise, dark current, fixed patterns."""
+
 from __future__ import annotations
 
 import numpy as np

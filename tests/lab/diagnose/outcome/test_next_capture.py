@@ -1,4 +1,4 @@
-"""The next capture: as far apart as it says, the best one first, and taken by a station where it can."""
+"""The next capture: distances are as predicted, the best one comes first, and a station takes it where it can."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _best(*hypotheses: Effect) -> str:
     return max(found, key=lambda d: distance(d.predict, d.covariance)).words
 
 
-def test_the_design_follows_what_the_rivals_differ_in() -> None:
+def test_the_proposed_capture_varies_what_the_rivals_differ_in() -> None:
     drift, bend = SourceDrift(), Nonlinearity()
     quantity = next(iter(SourceDrift.quantities()))
     drift = SourceDrift(**{quantity: 0.3})
@@ -88,7 +88,7 @@ def test_the_design_follows_what_the_rivals_differ_in() -> None:
     assert "dark frames" in _best(level, BlackLevelDrift())
 
 
-def test_distance_is_what_decides() -> None:
+def test_the_stated_probability_of_deciding_rightly_holds() -> None:
     """Numbers drawn under one rival are nearer to it than to the other with the probability that is stated: Phi(sqrt(D
     / 2)); 3 sigma of a binomial of 4000 draws are 3 sqrt(p (1 - p) / 4000) < 0.024."""
     first, second = (
@@ -115,7 +115,7 @@ def test_proposals_are_sorted_and_name_their_nearest_rivals() -> None:
     assert all(c.told_apart == pytest.approx(norm.cdf(np.sqrt(0.5 * c.distance))) for c in found)
 
 
-def test_nothing_undecided_needs_no_capture() -> None:
+def test_without_rivals_no_capture_is_proposed() -> None:
     assert proposals(SET, "left", _undecided(Nonlinearity(), ("unknown", 0.02)), DecisionPolicy()) == ()
     assert next_sentence((), None, DecisionPolicy()) is None
 
@@ -123,7 +123,7 @@ def test_nothing_undecided_needs_no_capture() -> None:
 @pytest.mark.parametrize(
     ("distance", "words"), [(8.0, "would tell defocus from vibration_blur"), (0.5, "may tell them apart")]
 )
-def test_the_sentence_says_what_can_be_hoped(distance: float, words: str) -> None:
+def test_the_sentence_states_how_often_the_capture_decides_rightly(distance: float, words: str) -> None:
     told = float(norm.cdf(np.sqrt(0.5 * distance)))
     capture = NextCapture(
         side="left",

@@ -1,4 +1,4 @@
-"""What is told of a named family: its identifier, its members, the nearest law's parameters, and what tells the members apart."""
+"""A named family in the result: its identifier, members, the nearest law's parameters, and the capture that tells members apart."""
 
 from __future__ import annotations
 

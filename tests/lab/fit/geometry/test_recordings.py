@@ -98,7 +98,7 @@ def edited(recordings: RecordingSet, frames=None, **keys) -> RecordingSet:
         ({"dictionary": "DICT_NO"}, "OpenCV knows no dictionary"),
     ],
 )
-def test_wrong_words_about_the_board_are_refused(boards, keys, reason):
+def test_wrong_metadata_of_the_board_are_refused(boards, keys, reason):
     with pytest.raises(NotDetermined, match=reason):
         fit_geometry(edited(boards(poses=1, sides=("left",)), **keys), "left")
 
