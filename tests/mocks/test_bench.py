@@ -1,4 +1,4 @@
-"""The bench's light path, its cameras' statistics, and that what a lab is told fits what the cameras see."""
+"""The bench: its light path, the statistics of its cameras, and the agreement of its station file with its frames."""
 
 from __future__ import annotations
 

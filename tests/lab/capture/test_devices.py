@@ -1,4 +1,4 @@
-"""Blocking calls behind a time-out, and the level of a frame."""
+"""Blocking calls with a time-out, and the level of a frame."""
 
 import threading
 import time

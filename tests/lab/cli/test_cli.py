@@ -205,7 +205,7 @@ def test_a_failure_while_writing_leaves_the_old_file(
 
 
 @pytest.mark.parametrize(("passed", "code"), [(True, 0), (False, 4)])
-def test_a_check_that_falls_short(
+def test_a_failed_check_exits_with_4(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passed: bool, code: int
 ) -> None:
     check = Check(name="mtf", side="left", capture="edge-1", n=10, chi2=11.0, rms_relative_percent=1.0, passed=passed)

@@ -30,7 +30,7 @@ def test_measurements_fit_with_the_truth_and_not_without() -> None:
     assert fit.chi2_after < stats.chi2.ppf(0.999, 36) < fit.chi2_before
 
 
-def test_every_place_is_told_before_and_after() -> None:
+def test_every_place_has_its_chi2_before_and_after() -> None:
     found = list(places("left", filtered_edges((TRUTH,)), DecisionPolicy()))
     assert {p.axis for p in found} == {"spatial_frequency", "orientation"}
     assert max(p.sigma_before for p in found) > 5.0

@@ -81,7 +81,7 @@ def test_too_few_views_are_not_determined(boards):
 
 
 def edited(recordings: RecordingSet, frames=None, **keys) -> RecordingSet:
-    """The same recordings with other words about the board, or other frames."""
+    """The same recordings with other metadata of the board, or other frames."""
     captures = tuple(capture.model_copy(update=keys) for capture in recordings.manifest.captures)
     pictures = {
         c.frame: recordings.frame(c) if frames is None else np.ascontiguousarray(frames(recordings.frame(c)))
