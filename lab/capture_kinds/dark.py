@@ -45,8 +45,8 @@ class DarkSequence(Sequence):
         cap = station.one(CapTarget)
         made: list[Step] = []
         for frame in range(1, self.frames + 1):
-            ladder = self.exposures_s if frame % 2 else self.exposures_s[::-1]
-            for exposure_s in ladder:
+            series = self.exposures_s if frame % 2 else self.exposures_s[::-1]
+            for exposure_s in series:
                 id = f"dark/{exposure_s:g}s/{frame}"
                 made.append(
                     Step(

@@ -64,7 +64,7 @@ def candidate_captures(recordings: RecordingSet, side: Side, model: MeasurementM
     lamp = _lamp(recordings, side)
     yield from _narrowband(camera)
     yield from _edges(camera, model, lamp)
-    yield from _ladders(camera, lamp)
+    yield from _exposure_series(camera, lamp)
     yield from _steady(camera, lamp)
     yield from _darks(camera)
     yield from _again(recordings, side, model)
@@ -155,7 +155,7 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
                 yield CandidateCapture(words, predict, np.diag(np.square(np.tile(std, n // len(std)))), plan)
 
 
-def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
+def _exposure_series(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
     """Flats at many levels: by the exposure, or by the light at one exposure. Means and variances. Nuisance parameters:
     gain, read noise, black level, and the light in each channel."""
     shares = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92]) / FILLED
@@ -163,13 +163,13 @@ def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
     if full <= 0:
         return
     dimmed = [Spectrum.of(*(lamp.arrays[0], share * lamp.arrays[1])) for share in shares]
-    ladders = {
+    series = {
         "flats at ten exposures, from 1 to 92 % of the full well": [(lamp, share * full) for share in shares],
         "flats at one exposure and ten levels of the light, from 1 to 92 % of the full well": [
             (d, full) for d in dimmed
         ],
     }
-    for words, steps in ladders.items():
+    for words, steps in series.items():
 
         def predict(h: Hypothesis, steps: list[tuple[Spectrum, float]] = steps) -> FloatArray:
             levels = [list(_means(h, light, "flat", seconds).values()) for light, seconds in steps]
@@ -222,14 +222,14 @@ def _darks(camera: CameraModel) -> Iterator[CandidateCapture]:
     """Dark frames by exposure, by time and by temperature; black level and dark current are nuisance parameters."""
     gain, reference = camera.conversion_gain_dn_per_e, camera.dark_current_reference_c
     times = np.linspace(0.0, SESSION_S, 13)
-    ladders = {
+    series = {
         "dark frames every five minutes for an hour": [(0.01, t, reference) for t in times],
         "dark frames with the sensor 10 and 20 degrees warmer": [
             (s, 0.0, reference + c) for c in (0, 10, 20) for s in (0.01, 1.0, 5.0)
         ],
         "dark frames from 1 ms to 20 s": [(s, 0.0, reference) for s in np.geomspace(0.001, 20.0, 10)],
     }
-    for words, steps in ladders.items():
+    for words, steps in series.items():
 
         def predict(h: Hypothesis, steps: list[tuple[float, float, float]] = steps) -> FloatArray:
             found = []
