@@ -29,7 +29,7 @@ BENT_SCATTER = 0.8
 #: Relative difference of two lights below which they are one level: readings of a light scatter.
 SAME_LIGHT = 0.01
 #: Least share of the flat's signal that these levels must predict for it. Below 1, as lamps and sensors aren't exactly linear.
-LADDER_REACH = 0.85
+LEAST_PREDICTED = 0.85
 
 
 @dataclass(frozen=True)
@@ -115,18 +115,18 @@ def _why_not_series_end(level: ClippedLevel, channel: str, levels: list[ClippedL
     if len({other.light for other in below}) < SERIES_LEVELS:
         return f"expose shorter, or add {SERIES_LEVELS} unsaturated levels below it"
     slope = float(np.median([(other.mean_dn[channel] - black) / other.light for other in below[-SERIES_LEVELS:]]))
-    if slope * level.light < LADDER_REACH * (level.mean_dn[channel] - black):
+    if slope * level.light < LEAST_PREDICTED * (level.mean_dn[channel] - black):
         return f"but the flats below it predict {black + slope * level.light:.0f} DN; recapture it"
     return None
 
 
 def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: float) -> list[ClippedLevel]:
-    """Unclipped flats of one gain and light whose stated light contradicts the others by more than `WRONG_FACTOR`.
+    """Unclipped flats of one gain and light whose stated light contradicts that of the others by more than `WRONG_FACTOR`.
 
-    The median slope of signal against light tells which: it holds while fewer than half of the levels are wrong. None where more
-    than `WRONG_SHARE` of the levels are off: then no majority says what the light is. `black`: DN; where it isn't known, the
-    offset of a line through the levels (Theil and Sen) stands for it. Levels at the full well, or where the response bends at its
-    top, say nothing about the slope, and having less signal than it says is no contradiction there.
+    The reference is the median slope of signal against light, which holds while fewer than half of the levels are wrong. Empty where more
+    than `WRONG_SHARE` of the levels contradict it: then no majority says what the light is. `black`: DN; if unknown, the offset of a robust
+    line through the levels (Theil and Sen). Levels at the full well or in the bend at the top of the response don't count for the slope,
+    and less signal than the slope predicts is no contradiction there.
     """
     bent = _bent_levels(unclipped, channel)
     signals: dict[float, float] = {}
@@ -222,7 +222,7 @@ def _misplaced(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[tuple[
 
 
 def _forgiven(misplaced: list[tuple[ClippedLevel, str, str]], levels: list[ClippedLevel]) -> set[int]:
-    """Ids of the misplaced flats that state photons, where few enough levels do: a statement may be wrong, unlike a shutter."""
+    """Ids of misplaced flats that state photon numbers, if they are few enough: a stated number may be wrong, unlike an exposure."""
     photons = [level for level, *_ in misplaced if level.scale.startswith(PHOTONS)]
     lights = {level.light for level in levels if level.scale.startswith(PHOTONS)}
     few = len({level.light for level in photons}) <= WRONG_SHARE * len(lights)
