@@ -6,7 +6,7 @@ chi2 that an effect's signature promises: twice its log odds.
 
 Values marked `TUNED` have no derivation. They were set on tuning seeds of the challenge. `calibench challenge calibrate
 --rule NAME=VALUE` scores tuning cases under another value beside the default: healthy cases for false alarms, concealed
-effects for names and rivals, siblings outside the library for false names. docs/reference/decision-policy.md is
+effects for names and rivals, similar laws outside the library for false names. docs/reference/decision-policy.md is
 generated from this module by docs/write_tables.py.
 """
 
