@@ -26,9 +26,9 @@ Folder = Annotated[
     Path | None, typer.Option("--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
 ]
 FIRST_KEY = "first"
-#: How long (s) the stations of sessions that ended without a word are waited for before the service is loaded.
+#: Longest wait (s), before the service is loaded, for the stations of sessions whose process died to be made safe.
 RESCUE_FIRST_S = 4.0
-#: How long (s) a thread computes while others wait, at most: a session's steps and the answers hand over to each other often.
+#: Switch interval (s) of Python's threads: short, as a session's steps and the service's answers alternate often.
 SWITCH_S = 0.001
 _ANY = ("0.0.0.0", "::", "")  # addresses that listen everywhere and name no computer
 
@@ -136,7 +136,7 @@ def serve(
 
 @key.command("create")
 def create(
-    name: Annotated[str, typer.Argument(help="whose key it is")],
+    name: Annotated[str, typer.Argument(help="name of the key's owner")],
     scope: Annotated[Permission, typer.Option(help="what it allows; each includes read")] = Permission.READ,
     data: Folder = None,
 ) -> None:

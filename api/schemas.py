@@ -82,7 +82,7 @@ class StationState(Schema):
     """A station file of the data folder; `problem` says why it can't be used."""
 
     name: str = Field(description="what `POST /sessions` takes: the station file's name without `.toml`")
-    title: str = Field(description="what the station calls itself")
+    title: str = Field(description="name of the station, from its file")
     cameras: tuple[Side, ...] = ()
     instruments: dict[str, str] = Field(default={}, description="family of the instrument -> its driver")
     targets: tuple[str, ...] = ()

@@ -121,7 +121,7 @@ def command_page() -> str:
         "| 1 | a defect of calibench; `CALIBENCH_DEBUG=1` shows where |",
         "| 2 | the input can't be used: one line on stderr for each problem, what, where and how to mend it |",
         "| 3 | a device failed |",
-        "| 4 | a check fell short |",
+        "| 4 | a check failed |",
         "| 130 | interrupted |",
         "",
         "SOURCE is the folder of a [recording set](recording-set.md), or the id of a stored session. The data folder is the option's, else that",

@@ -329,7 +329,9 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
 
 
 @dataclass
-class _Urb:
+class _PendingUrb:
+    """A transfer that was submitted to the server, and its answer."""
+
     incoming: bool
     done: threading.Event = field(default_factory=threading.Event)
     status: int = 0
@@ -357,7 +359,7 @@ class TcpPipe(Pipe):
         self._socket = connection
         self._device_id = device_id
         self._sequence = itertools.count(1)
-        self._pending: dict[int, _Urb] = {}
+        self._pending: dict[int, _PendingUrb] = {}
         self._unlinking: dict[int, int] = {}  # sequence number of the unlink -> that of what it cancels
         self._lock = threading.Lock()
         self._closed = False
@@ -366,7 +368,7 @@ class TcpPipe(Pipe):
 
     def submit(self, endpoint: int, setup: bytes, data: bytes | None, length: int, timeout_ms: int) -> bytes:
         incoming = data is None
-        urb = _Urb(incoming)
+        urb = _PendingUrb(incoming)
         with self._lock:
             if self._closed:
                 raise failed(errno.ENODEV, "the USB/IP connection is closed")
@@ -393,7 +395,7 @@ class TcpPipe(Pipe):
             raise failed(errno.EOVERFLOW, f"USB transfer on endpoint {endpoint:#04x}")
         return urb.data
 
-    def _unlink(self, number: int, urb: _Urb) -> None:
+    def _unlink(self, number: int, urb: _PendingUrb) -> None:
         """Cancel a request; its answer counts if it ended in the meantime."""
         with self._lock:
             if urb.done.is_set() or self._closed:

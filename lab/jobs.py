@@ -92,7 +92,7 @@ class _Reporter:
 def run_job(
     root: str, database_url: str | None, job_id: str, resolve: bool = False, capturer: Capturer | None = None
 ) -> None:
-    """Do a job, wherever this runs; what it finds goes to the registry. Never raises."""
+    """Carry out a job, in this process or on a worker; its result goes to the registry. Never raises."""
     store = Store(root, database_url)
     try:
         with store.transaction() as db:
@@ -162,10 +162,9 @@ def check_scheduler(address: str) -> None:
 
 
 class JobRunner:
-    """Takes jobs and has them done. One per process; `close` it, or use it in `with`, so that no job is left behind.
+    """Queues jobs and has them carried out. One per process; `close` it, or use it in `with`, so that no job is left running.
 
-    A runner holds a lock as long as it lives. Jobs of a runner whose process ended are marked as failed by the next runner
-    that starts.
+    A runner holds a lock as long as it lives. Jobs of a runner whose process ended are marked as failed by the next runner that starts.
     """
 
     def __init__(
@@ -271,8 +270,8 @@ class JobRunner:
         return job_id
 
     def _left(self, job_id: str) -> None:
-        """No worker has the job any more. Where it isn't over, its worker died (kill -9, out of memory): another one that Dask gave it to
-        doesn't begin a job that had begun."""
+        """Fail a job that no worker holds any more and that isn't over: its worker died (kill -9, out of memory). Dask may give it to
+        another worker, which refuses a job that had begun."""
         with contextlib.suppress(InputError, sa.exc.SQLAlchemyError):
             if not self.job(job_id).is_over:
                 why = "the worker that did this job ended before it was done (kill -9, or memory was short); start the job again"

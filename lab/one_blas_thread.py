@@ -19,8 +19,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _Limit:
-    """One thread from when the first of those inside enters until the last of them leaves, in whatever order."""
+class _ThreadLimit:
+    """Reentrant context: BLAS uses one thread from the first entry until the last exit, whatever threads enter and in which order they leave."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -47,7 +47,7 @@ class _Limit:
                 self._limiter.restore_original_limits()
 
 
-_LIMIT = _Limit()
+_LIMIT = _ThreadLimit()
 
 
 def one_blas_thread(work: Callable[P, R]) -> Callable[P, R]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lab.capture.station import Drivers, Station
     from lab.capture.store import Store
     from lab.diagnose import Diagnosis
-    from lab.diagnose.outcome.next_capture import Proposal
+    from lab.diagnose.outcome.next_capture import CaptureProposal
     from lab.diagnose.policy import DecisionPolicy
     from lab.formats.camera_file import CameraFile
     from lab.formats.recording_set import RecordingSet
@@ -516,7 +516,7 @@ class _Ties:
         self._taken.add((capture.side, capture.capture))
         self._open[tie] = self._open.get(tie, 1.0) * (1.0 - capture.told_apart)
 
-    def _may_settle(self, proposal: Proposal) -> bool:
+    def _may_settle(self, proposal: CaptureProposal) -> bool:
         """Whether a station can take the capture, it is worth taking, and the tie isn't given up."""
         capture = proposal.capture
         return (
@@ -526,11 +526,11 @@ class _Ties:
             and self._open.get((capture.side, frozenset(capture.rivals)), 1.0) >= self._policy.resolve_open_probability
         )
 
-    def next_to_take(self, proposals: tuple[Proposal, ...]) -> Proposal | None:
+    def next_to_take(self, proposals: tuple[CaptureProposal, ...]) -> CaptureProposal | None:
         """The best capture that may settle a tie; None where there is none. `proposals`: best first."""
         return next((proposal for proposal in proposals if self._may_settle(proposal)), None)
 
-    def verdict(self, proposals: tuple[Proposal, ...]) -> str:
+    def verdict(self, proposals: tuple[CaptureProposal, ...]) -> str:
         """Why nothing more is captured."""
         if not proposals:
             return "resolve: no rivals are left"

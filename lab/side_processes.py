@@ -38,8 +38,8 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 
 @dataclass(frozen=True)
-class _Found(Generic[F]):
-    """The end of a task, told apart from its progress."""
+class _TaskResult(Generic[F]):
+    """The last message of a task, after those of its progress: what the task returned."""
 
     findings: F
 
@@ -83,7 +83,7 @@ def in_processes(
                 continue
             if isinstance(what, BaseException):
                 raise what
-            if isinstance(what, _Found):
+            if isinstance(what, _TaskResult):
                 found[side] = what.findings
             else:
                 report(side, what)
@@ -115,7 +115,7 @@ class _Process:
             while True:
                 what = pickle.load(self._process.stdout)
                 say(what)
-                if isinstance(what, _Found | BaseException):
+                if isinstance(what, _TaskResult | BaseException):
                     return
         except (EOFError, pickle.UnpicklingError):
             ended = self._process.wait()
@@ -207,7 +207,7 @@ def _carried_out(say: Callable[[Any], None]) -> bool:
     except pickle.UnpicklingError:
         os._exit(1)  # the caller was interrupted while it sent the task
     try:
-        say(_Found(task(say)))
+        say(_TaskResult(task(say)))
     except BrokenPipeError:
         os._exit(1)  # the caller is gone
     except Exception as error:

@@ -100,7 +100,9 @@ def mock(
             "a camera's frames also torn repeated missed."
         ),
     ] = "",
-    real_time: Annotated[float, typer.Option(help="Real seconds for each of the instrument's (0: no waiting).")] = 0.0,
+    real_time: Annotated[
+        float, typer.Option(help="Real seconds for each second of the instrument (0: no waiting).")
+    ] = 0.0,
     dialect: Annotated[
         str,
         typer.Option(help="Which of an instrument's public dialects it speaks (pr655, pr670: two-lines, one-line)."),
@@ -200,12 +202,12 @@ def _serve_usb(
 def bench(
     station: Annotated[Path | None, typer.Option(help="Write the station file of this bench here.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the hidden truth and of the noise.")] = 1,
-    real_time: Annotated[float, typer.Option(help="Real seconds for each of the bench's (0: no waiting).")] = 0.0,
+    real_time: Annotated[float, typer.Option(help="Real seconds for each second of the bench (0: no waiting).")] = 0.0,
     fault: Annotated[
         list[str] | None, typer.Option(help="INSTRUMENT:SPEC, as in spectroradiometer:half@3; may be repeated.")
     ] = None,
     host: Annotated[str, typer.Option(help="Where the stage and the cameras listen.")] = "127.0.0.1",
-    advertise: Annotated[str, typer.Option(help="How other machines call this one; as --host if not given.")] = "",
+    advertise: Annotated[str, typer.Option(help="Name of this computer for others; as --host if not given.")] = "",
     serial_over_tcp: Annotated[
         bool, typer.Option("--serial-over-tcp", help="The serial instruments listen at --host, too.")
     ] = False,
@@ -214,8 +216,8 @@ def bench(
     conceal: Annotated[
         list[str] | None,
         typer.Option(
-            help="SIDE:EFFECT:PARAMETER=VALUE[,...], as in left:nonlinearity:quadratic_percent=2, in place of what the bench "
-            "conceals by itself; may be repeated (or CALIBENCH_CONCEAL, with a ; between)."
+            help="SIDE:EFFECT:PARAMETER=VALUE[,...], as in left:nonlinearity:quadratic_percent=2, in place of the bench's "
+            "default effects; may be repeated (or CALIBENCH_CONCEAL, with a ; between)."
         ),
     ] = None,
     healthy: Annotated[
@@ -271,7 +273,7 @@ class _BenchLine:
 
 
 def _concealed(specs: list[str], healthy: bool) -> Concealed | None:
-    """What the command line, or without that the environment, says is to be concealed; None: what the bench conceals by itself."""
+    """The effects to conceal, from the command line, else from the environment; None: the bench's default ones."""
     from mocks.conceal import ConcealError, parse
 
     told = specs or [part for part in os.environ.get(CONCEAL_VARIABLE, "").split(";") if part.strip()]

@@ -37,7 +37,9 @@ class _Grating:
         return 30.0 / self.lines_per_mm
 
 
-class _Refusal(Exception):
+class _Cs260Refusal(Exception):
+    """An error code of the instrument."""
+
     def __init__(self, code: int) -> None:
         self.code = code
 
@@ -121,7 +123,7 @@ class MockCornerstone260(Grammar):
             statement = self._waiting.popleft()
             try:
                 done = self._execute(" ".join(statement.upper().split()), statement)
-            except _Refusal as refusal:
+            except _Cs260Refusal as refusal:
                 self._status, self._error = 0x20, refusal.code
                 out += self._answer(None)
                 continue
@@ -157,18 +159,18 @@ class MockCornerstone260(Grammar):
     def _execute(self, statement: str, as_sent: str) -> _Done:
         code = None if statement in {"ERROR?", "STB?"} else self._failure()
         if code is not None:
-            raise _Refusal(code)
+            raise _Cs260Refusal(code)
         for pattern, action in self._grammar:
             found = re.fullmatch(pattern, statement)
             if found:
                 return action(self, *found.groups())
         name = re.match(r"[A-Z]+\d?[A-Z]*", statement)
         if name and name[0] in self._known:
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         label = re.fullmatch(r"(?i)\s*FILTER([1-6])LABEL\s+(.*\S)\s*", as_sent)
         if label:
             return self._set_label(int(label[1]), label[2])
-        raise _Refusal(NOT_UNDERSTOOD)
+        raise _Cs260Refusal(NOT_UNDERSTOOD)
 
     _known = (
         *("GOWAVE", "CALIBRATE", "STEP", "UNITS", "GRAT", "FILTER", "SHUTTER", "OUTPORT", "HANDSHAKE"),
@@ -179,10 +181,10 @@ class MockCornerstone260(Grammar):
     def _nm(self, text: str) -> float:
         value = float(text)
         if not math.isfinite(value):
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         if self._units == "WN":
             if value <= 0:
-                raise _Refusal(BAD_PARAMETER)
+                raise _Cs260Refusal(BAD_PARAMETER)
             return 1e7 / value
         return value * 1000.0 if self._units == "UM" else value
 
@@ -201,7 +203,7 @@ class MockCornerstone260(Grammar):
     def _go_wave(self, text: str) -> _Done:
         wanted = self._nm(text)
         if not 0.0 <= wanted <= _UPPER_NM:
-            raise _Refusal(NOT_ALLOWED)
+            raise _Cs260Refusal(NOT_ALLOWED)
         return self._go_to_steps(round((wanted - self._calibration_nm) / self._gratings[self._grating].nm_per_step))
 
     def _wave(self) -> _Done:
@@ -214,16 +216,16 @@ class MockCornerstone260(Grammar):
 
     def _step(self, text: str) -> _Done:
         if len(text) > 9:
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         steps = self._steps + int(text)
         if not 0.0 <= self._position_nm(steps) <= _UPPER_NM:
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         return self._go_to_steps(steps)
 
     def _calibrate(self, text: str) -> _Done:
         wanted = self._nm(text)
         if abs(wanted - self._position_nm(self._steps)) > 50.0:
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         self._calibration_nm += wanted - self._position_nm(self._steps)
         return _Done()
 
@@ -234,7 +236,7 @@ class MockCornerstone260(Grammar):
     def _set_grating(self, text: str) -> _Done:
         number = int(text)
         if number not in self._gratings:
-            raise _Refusal(NOT_PRESENT if number == 3 else BAD_PARAMETER)
+            raise _Cs260Refusal(NOT_PRESENT if number == 3 else BAD_PARAMETER)
         nm = self._position_nm(self._steps)
 
         def arrive() -> None:
@@ -257,7 +259,7 @@ class MockCornerstone260(Grammar):
         grating = self._grating_at(number)
         value = float(text)
         if not math.isfinite(value) or (what == "LINES" and not 50 <= value <= 3600):
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         if what == "LINES":
             grating.lines_per_mm = int(value)
         else:
@@ -266,15 +268,15 @@ class MockCornerstone260(Grammar):
 
     def _grating_at(self, number: str) -> _Grating:
         if int(number) not in self._gratings:
-            raise _Refusal(NOT_PRESENT)
+            raise _Cs260Refusal(NOT_PRESENT)
         return self._gratings[int(number)]
 
     def _set_filter(self, text: str) -> _Done:
         place = int(text)
         if not 1 <= place <= 6:
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         if place == self._filter:
-            raise _Refusal(ALREADY_THERE)
+            raise _Cs260Refusal(ALREADY_THERE)
         turns = min((place - self._filter) % 6, (self._filter - place) % 6)
 
         def arrive() -> None:
@@ -288,7 +290,7 @@ class MockCornerstone260(Grammar):
 
     def _set_label(self, place: int, label: str) -> _Done:
         if len(label) > 8:
-            raise _Refusal(LABEL_TOO_LONG)
+            raise _Cs260Refusal(LABEL_TOO_LONG)
         self._filter_labels[place] = label
         return _Done()
 
@@ -302,9 +304,9 @@ class MockCornerstone260(Grammar):
     def _set_outport(self, text: str) -> _Done:
         port = int(text)
         if port not in (1, 2):
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         if port == self._outport:
-            raise _Refusal(ALREADY_THERE)
+            raise _Cs260Refusal(ALREADY_THERE)
 
         def arrive() -> None:
             self._outport = port
@@ -318,7 +320,7 @@ class MockCornerstone260(Grammar):
         self._slit_at(number)
         width_um = float(text)
         if not 4.0 <= width_um <= 3000.0:
-            raise _Refusal(BAD_PARAMETER)
+            raise _Cs260Refusal(BAD_PARAMETER)
         before = self._slits_um[int(number)]
 
         def arrive() -> None:
@@ -330,7 +332,7 @@ class MockCornerstone260(Grammar):
 
     def _slit_at(self, number: str) -> int:
         if int(number) not in self._slits_um:
-            raise _Refusal(NOT_PRESENT)
+            raise _Cs260Refusal(NOT_PRESENT)
         return self._slits_um[int(number)]
 
     def _set_handshake(self, text: str) -> _Done:

@@ -39,7 +39,7 @@ class _Command:
     aborts: int
 
 
-class _Refusal(Exception):
+class _Cs260bRefusal(Exception):
     """An entry of the error queue."""
 
 
@@ -190,7 +190,7 @@ class MockCornerstone260B(UsbDevice):
     def _obey(self, command: str) -> None:
         try:
             answer = self._execute(command)
-        except _Refusal as refusal:
+        except _Cs260bRefusal as refusal:
             with self.changed:
                 self._errors.append(str(refusal))
                 self._events |= 0x20 if str(refusal).startswith("-11") else 0x10
@@ -212,7 +212,7 @@ class MockCornerstone260B(UsbDevice):
             self._move_to(self._nanometres(_number(argument)))
         elif word == "UNITS":
             if argument not in (*_UNITS, "WN"):
-                raise _Refusal(_OUT_OF_RANGE)
+                raise _Cs260bRefusal(_OUT_OF_RANGE)
             self._units = argument
         elif word == "SHUTTER" and argument in ("O", "C"):
             self._set(word, float(argument == "O"))
@@ -221,10 +221,10 @@ class MockCornerstone260B(UsbDevice):
         elif found := re.fullmatch(r"SLIT([123])MICRONS", word):
             width_um = _number(argument)
             if not 4.0 <= width_um <= 3000.0:
-                raise _Refusal(_OUT_OF_RANGE)
+                raise _Cs260bRefusal(_OUT_OF_RANGE)
             self._begin_motion(0.5, lambda: self._set_slit(int(found[1]), width_um))
         elif word not in ("*CLS", "*RST", "*OPC", "*WAI"):
-            raise _Refusal(_UNKNOWN)
+            raise _Cs260bRefusal(_UNKNOWN)
         if word == "*CLS":
             self._errors.clear()
         return None
@@ -256,7 +256,7 @@ class MockCornerstone260B(UsbDevice):
             return f"FILTER{found[1]}"
         if what in self._settings:
             return f"{self._settings[what]:.0f}"
-        raise _Refusal(_UNKNOWN)
+        raise _Cs260bRefusal(_UNKNOWN)
 
     def _status(self, what: str) -> str:
         """`error?` and `stb?` as the RS-232 port has them, the event register of IEEE 488.2; reading clears."""
@@ -286,7 +286,7 @@ class MockCornerstone260B(UsbDevice):
 
     def _move_to(self, nm: float) -> None:
         if not 0 <= nm <= _UPPER_NM:
-            raise _Refusal(_OUT_OF_RANGE)
+            raise _Cs260bRefusal(_OUT_OF_RANGE)
 
         def arrive() -> None:
             self._nm = nm
@@ -297,7 +297,7 @@ class MockCornerstone260B(UsbDevice):
     def _set(self, what: str, value: float) -> None:
         most = {"GRATING": 2, "FILTER": 6, "OUTPORT": 2, "SHUTTER": 1}[what]
         if value != int(value) or not (0 if what == "SHUTTER" else 1) <= value <= most:
-            raise _Refusal(_OUT_OF_RANGE)
+            raise _Cs260bRefusal(_OUT_OF_RANGE)
         if what == "SHUTTER":
             self._light.set_shutter(bool(value))
             self._settings[what] = value
@@ -315,4 +315,4 @@ def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError as error:
-        raise _Refusal(_BAD_DATA) from error
+        raise _Cs260bRefusal(_BAD_DATA) from error

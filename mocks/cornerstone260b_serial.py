@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mocks.cornerstone260 import ALREADY_THERE, MockCornerstone260, _Done, _Refusal
+from mocks.cornerstone260 import ALREADY_THERE, MockCornerstone260, _Cs260Refusal, _Done
 from mocks.wire import LONGEST_LINE, MeasuredLight
 
 
@@ -66,7 +66,7 @@ class MockCornerstone260BSerial(MockCornerstone260):
             upper = " ".join(statement.upper().split())
             try:
                 done = _Done("0" if self._motions else "1") if upper == "IDLE?" else self._execute(upper, statement)
-            except _Refusal as refusal:
+            except _Cs260Refusal as refusal:
                 if refusal.code != ALREADY_THERE:
                     self._status, self._error = 0x20, refusal.code
                 out += self._answer(None)

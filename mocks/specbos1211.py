@@ -40,7 +40,9 @@ _SETTINGS: dict[str, tuple[float, float, float]] = {
 }
 
 
-class _Refusal(Exception):
+class _SpecbosRefusal(Exception):
+    """An error code of the instrument."""
+
     def __init__(self, code: int) -> None:
         self.code = code
 
@@ -114,7 +116,7 @@ class MockSpecbos1211(Grammar):
         try:
             self._look()
             answer = Reply(BEL)
-        except _Refusal as refusal:
+        except _SpecbosRefusal as refusal:
             self._error = refusal.code
             answer = Reply(NAK)
         return [answer, *self.receive(bytes(self._take_later()))]
@@ -130,7 +132,7 @@ class MockSpecbos1211(Grammar):
                 found = re.fullmatch(pattern, words)
                 if found:
                     return [Reply(self._answer(words, action, found.groups()))]
-        except _Refusal as refusal:
+        except _SpecbosRefusal as refusal:
             self._error = refusal.code
             return [Reply(NAK)]
         self._error = COMMAND
@@ -140,7 +142,7 @@ class MockSpecbos1211(Grammar):
         if words != "*stat:err?" and not words.startswith(("*init", "*meas")):
             code = self._failure()
             if code is not None:
-                raise _Refusal(code)
+                raise _SpecbosRefusal(code)
         return action(self, *arguments)
 
     # --- commands ---------------------------------------------------------------------------------------------------
@@ -176,20 +178,20 @@ class MockSpecbos1211(Grammar):
         if name == "wran":
             numbers = [_number(word, wrong) for word in text.split()]
             if len(numbers) != 3 or not 0 < numbers[0] < numbers[1] or not 0.5 <= numbers[2] <= 100:
-                raise _Refusal(wrong)
+                raise _SpecbosRefusal(wrong)
             self._range_nm = (numbers[0], numbers[1], numbers[2])
             return ACK
         if name == "maxtint" and self._model == "spectraval 1501":
             name = "maxtin"
         # Firmware of the 1201 up to 1.8.3 doesn't know maxtin; a spectraval has its settings under para alone.
         if name not in _SETTINGS or (name == "maxtin" and self._model == "specbos 1201"):
-            raise _Refusal(COMMAND)
+            raise _SpecbosRefusal(COMMAND)
         if self._model == "spectraval 1501" and tree.startswith("conf"):
-            raise _Refusal(COMMAND)
+            raise _SpecbosRefusal(COMMAND)
         lower, upper, _ = _SETTINGS[name]
         value = _number(text, wrong)
         if not lower <= value <= upper:
-            raise _Refusal(wrong)
+            raise _SpecbosRefusal(wrong)
         self._settings[name] = value
         return ACK
 
@@ -206,7 +208,7 @@ class MockSpecbos1211(Grammar):
             return b"%s%.0f %.0f %.0f\r" % (b"" if bare else b"wran: ", first_nm, last_nm, step_nm)
         if name in _SETTINGS:
             return f"{name}: {self._settings[name]:g}\r".encode("ascii")
-        raise _Refusal(COMMAND)
+        raise _SpecbosRefusal(COMMAND)
 
     def _head(self) -> bytes:
         return b"mhead: 0\r"
@@ -237,17 +239,17 @@ class MockSpecbos1211(Grammar):
 
     def _look(self) -> None:
         if self._planned_failure is not None:
-            raise _Refusal(self._planned_failure)
+            raise _SpecbosRefusal(self._planned_failure)
         first_nm, last_nm, step_nm = self._range_nm
         if first_nm < self._calibrated_nm[0] or last_nm > self._calibrated_nm[1]:
-            raise _Refusal(OUT_OF_RANGE)
+            raise _SpecbosRefusal(OUT_OF_RANGE)
         tint_ms = self._integration_ms()
         radiance = self._light.radiance()
         filled = max(radiance.value) * tint_ms * 1e-3 / _FULL
         if filled > 1.0:
-            raise _Refusal(OVER_EXPOSED)
+            raise _SpecbosRefusal(OVER_EXPOSED)
         if self._settings["expo"] != 1 and filled < 1e-4:
-            raise _Refusal(UNDER_EXPOSED)
+            raise _SpecbosRefusal(UNDER_EXPOSED)
         wavelength_nm = np.arange(first_nm, last_nm + step_nm / 1000.0, step_nm)
         self._measured = Spectrum.of(wavelength_nm, radiance.at(wavelength_nm))
         # A later measurement without adaptation integrates as long as this one.
@@ -255,21 +257,21 @@ class MockSpecbos1211(Grammar):
 
     def _spectrum(self) -> Spectrum:
         if self._measured is None:
-            raise _Refusal(NOTHING_MEASURED)
+            raise _SpecbosRefusal(NOTHING_MEASURED)
         return self._measured
 
     def _calculate_spectrum(self) -> bytes:
         """A spectraval's: wavelength and value a line, if it was told to speak text."""
         spectrum = self._spectrum()
         if self._model != "spectraval 1501" or self._settings["form"] != 2:
-            raise _Refusal(COMMAND)
+            raise _SpecbosRefusal(COMMAND)
         lines = [f"{w:.1f} {v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
         return "\r".join([*lines, ""]).encode("ascii")
 
     def _fetch_spectrum(self, form: str | None) -> bytes:
         spectrum = self._spectrum()
         if self._model == "spectraval 1501":
-            raise _Refusal(COMMAND)
+            raise _SpecbosRefusal(COMMAND)
         number = int(form) if form else int(self._settings["form"])
         if number in (7, 10):  # for a terminal: wavelength and value, blocks ended by an empty line
             lines = [f"{w:.0f}\t{v:.6e}" for w, v in zip(spectrum.wavelength_nm, spectrum.value, strict=True)]
@@ -332,9 +334,9 @@ def _number(text: str, code: int) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise _Refusal(code) from None
+        raise _SpecbosRefusal(code) from None
     if not math.isfinite(value):
-        raise _Refusal(code)
+        raise _SpecbosRefusal(code)
     return value
 
 

@@ -152,7 +152,7 @@ class TriggerLine:
                 device.line_pulse(start_s)
 
 
-class _Refusal(Exception):
+class _GenCpRefusal(Exception):
     """A GenCP status other than success."""
 
     def __init__(self, status: int) -> None:
@@ -312,11 +312,11 @@ class U3vDevice(UsbDevice):
         for region in self._memory.values():
             if region.holds(address, count):
                 return region
-        raise _Refusal(0x8003)
+        raise _GenCpRefusal(0x8003)
 
     def _read(self, address: int, count: int) -> bytes:
         if not 0 < count <= MAX_ACK - 12:
-            raise _Refusal(0x8002)
+            raise _GenCpRefusal(0x8002)
         region = self._region(address, count)
         if region.start == FEATURES:
             celsius = self._bench.sensor_temperature_c(self.side)
@@ -327,11 +327,11 @@ class U3vDevice(UsbDevice):
     def _write(self, address: int, data: bytes) -> None:
         region = self._region(address, len(data))
         if not region.writable:
-            raise _Refusal(0x8004)
+            raise _GenCpRefusal(0x8004)
         if region.start == SIRM:
             self._write_stream(address, data)
         elif len(data) != 4 or address % 4:
-            raise _Refusal(0x8005)
+            raise _GenCpRefusal(0x8005)
         else:
             self._write_feature(address, data)
 
@@ -339,13 +339,13 @@ class U3vDevice(UsbDevice):
         region = self._memory["sirm"]
         at = address - SIRM
         if at < 4 or 0x08 <= at < 0x18:
-            raise _Refusal(0x8004)
+            raise _GenCpRefusal(0x8004)
         if at == 0x04 and data[0] & 1:
             size, count, final_1, final_2 = struct.unpack_from("<IIII", region.data, 0x1C)
             if size * count + final_1 + final_2 < self._get(PAYLOAD_SIZE):
-                raise _Refusal(0xA004)
+                raise _GenCpRefusal(0xA004)
             if any(part % 4 for part in (size, final_1, final_2)):
-                raise _Refusal(0xA003)
+                raise _GenCpRefusal(0xA003)
         region.data[at : at + len(data)] = data
         if at == 0x04 and not data[0] & 1:
             with self.changed:
@@ -354,10 +354,10 @@ class U3vDevice(UsbDevice):
     def _write_feature(self, register: int, data: bytes) -> None:
         value = int.from_bytes(data, "little")
         if register in (SENSOR_WIDTH, SENSOR_HEIGHT, PAYLOAD_SIZE, TEMPERATURE, PIXEL_PITCH, BINNING, LINE_MODE):
-            raise _Refusal(0x8004)
+            raise _GenCpRefusal(0x8004)
         if register in (WIDTH, HEIGHT, OFFSET_X, OFFSET_Y, PIXEL_FORMAT):
             if self._acquiring:
-                raise _Refusal(0x8006)
+                raise _GenCpRefusal(0x8006)
             self._check_window(register, value)
             self._put(register, value)
             self._update_payload()
@@ -375,21 +375,21 @@ class U3vDevice(UsbDevice):
     def _check_window(self, register: int, value: int) -> None:
         if register == PIXEL_FORMAT:
             if value not in (BAYER_RG8, BAYER_RG12, BAYER_RG12P):
-                raise _Refusal(0x8002)
+                raise _GenCpRefusal(0x8002)
             return
         window = {name: self._get(name) for name in (WIDTH, HEIGHT, OFFSET_X, OFFSET_Y)} | {register: value}
         fits = window[WIDTH] + window[OFFSET_X] <= self._cols and window[HEIGHT] + window[OFFSET_Y] <= self._rows
         if value % 2 or not fits or min(window[WIDTH], window[HEIGHT]) < 16:
-            raise _Refusal(0x8002)
+            raise _GenCpRefusal(0x8002)
 
     @staticmethod
     def _check_value(register: int, value: int) -> None:
         if register == EXPOSURE_TICKS and not 10 * TICKS_PER_US <= value <= MOST_EXPOSURE_US * TICKS_PER_US:
-            raise _Refusal(0x8002)
+            raise _GenCpRefusal(0x8002)
         if register == GAIN:
             (gain_db,) = struct.unpack("<f", struct.pack("<I", value))
             if not (math.isfinite(gain_db) and 0 <= gain_db <= MOST_GAIN_DB):
-                raise _Refusal(0x8002)
+                raise _GenCpRefusal(0x8002)
         highest = {
             LINE_SELECTOR: 1,
             LINE_MODE_1: 1,
@@ -399,9 +399,9 @@ class U3vDevice(UsbDevice):
             PARAMS_LOCKED: 1,
         }
         if register in highest and value > highest[register]:
-            raise _Refusal(0x8002)
+            raise _GenCpRefusal(0x8002)
         if register == TRIGGER_CONTROL and (value >> SOURCE_SHIFT) & 0xF not in (SOURCE_SOFTWARE, SOURCE_LINE):
-            raise _Refusal(0x8002)
+            raise _GenCpRefusal(0x8002)
 
     @property
     def gives_pulses(self) -> bool:
@@ -428,7 +428,7 @@ class U3vDevice(UsbDevice):
         else:
             try:
                 body = self._command(command, data[12:])
-            except _Refusal as refusal:
+            except _GenCpRefusal as refusal:
                 status = refusal.status
         if not flags & 0x4000 or fault == "lost-ack":
             return
@@ -442,15 +442,15 @@ class U3vDevice(UsbDevice):
     def _command(self, command: int, body: bytes) -> bytes:
         if command == 0x0800:
             if len(body) != 12:
-                raise _Refusal(0x800E)
+                raise _GenCpRefusal(0x800E)
             address, _, count = struct.unpack("<QHH", body)
             return self._read(address, count)
         if command == 0x0802:
             if len(body) <= 8:
-                raise _Refusal(0x800E)
+                raise _GenCpRefusal(0x800E)
             self._write(struct.unpack_from("<Q", body)[0], body[8:])
             return struct.pack("<HH", 0, len(body) - 8)
-        raise _Refusal(0x8001)
+        raise _GenCpRefusal(0x8001)
 
     # --- stream -------------------------------------------------------------------------------------------------------
 

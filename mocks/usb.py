@@ -124,7 +124,9 @@ def _usb_device_bytes(bus_id: str, number: int, device: UsbDevice) -> bytes:
 
 
 @dataclass
-class _Urb:
+class _ReceivedUrb:
+    """A transfer that a client submitted."""
+
     number: int
     endpoint: int  # with its direction bit
     setup: bytes
@@ -142,9 +144,9 @@ class _Session:
         self._device = device
         self._send_lock = threading.Lock()
         self._lock = threading.Lock()
-        self._queues: dict[int, queue.Queue[_Urb | None]] = {}
+        self._queues: dict[int, queue.Queue[_ReceivedUrb | None]] = {}
         self._workers: list[threading.Thread] = []
-        self._pending: dict[int, _Urb] = {}
+        self._pending: dict[int, _ReceivedUrb] = {}
 
     def run(self) -> None:
         """Serve until the client leaves."""
@@ -176,7 +178,7 @@ class _Session:
         data = None if direction else _receive(self._connection, length)
         if not direction and data is None:
             raise ConnectionError("a request broke off")
-        urb = _Urb(number, endpoint | direction << 7, setup, data, length)
+        urb = _ReceivedUrb(number, endpoint | direction << 7, setup, data, length)
         with self._lock:
             self._pending[number] = urb
         where = 0 if endpoint == 0 else urb.endpoint
@@ -189,7 +191,7 @@ class _Session:
             worker.start()
         self._queues[where].put(urb)
 
-    def _work(self, waiting: queue.Queue[_Urb | None]) -> None:
+    def _work(self, waiting: queue.Queue[_ReceivedUrb | None]) -> None:
         while (urb := waiting.get()) is not None:
             status, came, abandoned = 0, b"", urb.unlinked.is_set()
             try:

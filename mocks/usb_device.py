@@ -88,7 +88,9 @@ class UsbInterface:
 
 
 @dataclass
-class _State:
+class _UsbDeviceState:
+    """What a reset of the device undoes: its configuration, and which endpoints (with direction bit) are halted."""
+
     configuration: int = 1
     halted: set[int] = field(default_factory=set)
 
@@ -107,7 +109,7 @@ class UsbDevice:
         self.plugged = True
         self.changed = threading.Condition()
         self._association = association
-        self._state = _State()
+        self._state = _UsbDeviceState()
         self._strings = ["", identity.maker, identity.product, identity.serial_number]
         self._line_faults: tuple[Fault, ...] = ()
         self.answers = 0
@@ -220,7 +222,7 @@ class UsbDevice:
         """Put the cable back; the device has forgotten what it was doing."""
         with self.changed:
             self.plugged = True
-            self._state = _State()
+            self._state = _UsbDeviceState()
         self.on_reset()
 
     # --- faults -------------------------------------------------------------------------------------------------------

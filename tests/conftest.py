@@ -1,4 +1,4 @@
-"""What holds for the whole suite."""
+"""Order of the whole suite's tests."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Those that state how long they may take come first: one alone at the end would keep the other worker waiting."""
+    """Run tests with a stated time limit first: a long one at the end would keep the other worker waiting."""
     items.sort(key=lambda item: item.get_closest_marker("timeout") is None)

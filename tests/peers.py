@@ -1,4 +1,4 @@
-"""Programs and libraries of others that tests need: a browser, a maker's library, a camera's stand-in."""
+"""Other programs and libraries that tests need: a browser, a maker's library, a mock of a camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 
 def missing(reason: str) -> NoReturn:
-    """What to do where one isn't there: on a desk the test is skipped, in CI, which installs all of them, it fails."""
+    """Skip the test if the program isn't there; in CI, which installs all of them, fail."""
     if os.environ.get("CI"):
         pytest.fail(f"in CI there has to be one: {reason}")
     pytest.skip(reason)

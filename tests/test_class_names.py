@@ -1,4 +1,4 @@
-"""Two public classes never share a name, in whatever package they stand."""
+"""Two classes never share a name, in whatever package they stand, whether public or private."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def test_two_classes_never_share_a_name() -> None:
     for package in ("sim", "drivers", "mocks", "lab", "api"):
         for path in sorted((ROOT / package).rglob("*.py")):
             for node in ast.parse(path.read_text(encoding="utf-8")).body:
-                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                if isinstance(node, ast.ClassDef):
                     found[node.name].append(str(path.relative_to(ROOT)))
     assert len(found) > 400
     assert {name: files for name, files in found.items() if len(files) > 1} == {}

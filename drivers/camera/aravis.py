@@ -84,7 +84,7 @@ def _error_of(error: Exception, who: str, doing: str) -> InstrumentError:
     return Disconnected(f"{who}: {doing} failed ({said}); plug it in again, the next call reconnects")
 
 
-class _Nodes:
+class _AravisFeatures:
     """A camera's features through Aravis."""
 
     def __init__(self, camera: Any, who: str) -> None:
@@ -157,7 +157,7 @@ class AravisCamera(LibraryCamera):
             )
             yield library.get_device_id(index), f"{' '.join(filter(None, told))} ({library.get_device_protocol(index)})"
 
-    def _open(self) -> tuple[_Nodes, Identity]:
+    def _open(self) -> tuple[_AravisFeatures, Identity]:
         library = _library()
         try:
             self._camera = library.Camera.new(self.address)
@@ -165,7 +165,7 @@ class AravisCamera(LibraryCamera):
             raise Disconnected(
                 f"camera {self.address}: Aravis finds no such camera ({getattr(error, 'message', error)}); check the cable, the power and the network"
             ) from error
-        nodes = _Nodes(self._camera, f"camera {self.address}")
+        nodes = _AravisFeatures(self._camera, f"camera {self.address}")
         device = self._camera.get_device()
         if hasattr(device, "is_controller") and not device.is_controller():
             raise InUse(f"camera {self.address}: another program controls it; close that one")

@@ -37,7 +37,7 @@ def _said(error: Exception) -> str:
     return " ".join(str(error).split(" : ")[0].split())
 
 
-class _Nodes:
+class _PylonNodes:
     """A camera's features through pypylon."""
 
     def __init__(self, nodes: Any, who: str) -> None:
@@ -84,7 +84,7 @@ class BaslerCamera(LibraryCamera):
         for info in pylon_library().TlFactory.GetInstance().EnumerateDevices():
             yield info.GetSerialNumber(), f"Basler {info.GetModelName()} {info.GetSerialNumber()}"
 
-    def _open(self) -> tuple[_Nodes, Identity]:
+    def _open(self) -> tuple[_PylonNodes, Identity]:
         pylon = pylon_library()
         from pypylon import genicam
 
@@ -107,7 +107,7 @@ class BaslerCamera(LibraryCamera):
             raise kind(f"camera {self.address}: can't be opened ({said}); close other programs that use it") from error
         firmware = info.GetDeviceVersion() if info.IsDeviceVersionAvailable() else ""
         identity = Identity(info.GetVendorName(), info.GetModelName(), info.GetSerialNumber(), firmware)
-        nodes = _Nodes(self._camera.GetNodeMap(), f"camera {self.address}")
+        nodes = _PylonNodes(self._camera.GetNodeMap(), f"camera {self.address}")
         if nodes.has("GevTimestampTickFrequency"):
             self._tick_ns = 1e9 / float(nodes.get("GevTimestampTickFrequency"))
         return nodes, identity

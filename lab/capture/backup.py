@@ -21,14 +21,14 @@ from lab.capture.store import Store
 from lab.errors import InputError
 
 REGISTRY = "registry.sqlite"
-#: Times that the registry and the files are taken together, before it is given up.
+#: Most attempts at copies of registry and files that agree.
 TRIES = 5
 _COMPARED_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class BackupCount:
-    """What a backup holds, and what it copied."""
+    """Sessions and files that a backup holds; files and bytes that this call copied."""
 
     sessions: int
     files: int
@@ -39,9 +39,9 @@ class BackupCount:
 def back_up(store: Store, folder: Path) -> BackupCount:
     """Bring the backup in `folder` up to date, or make it.
 
-    What is in the backup and no longer in the data folder stays there, unless it is a frame that was packed. Raises InputError where
-    the registry isn't SQLite, where the folder lies in the data folder or is another data folder's, and where files that the registry
-    names are missing or damaged.
+    Files that were deleted from the data folder stay in the backup, except frames that were packed. Raises InputError where the
+    registry isn't SQLite, where `folder` lies in the data folder or holds anything but a backup of it, where files can't be written,
+    and where files that the registry names are missing or damaged.
     """
     target = folder.resolve()
     if store.settings.database_url is not None:
@@ -61,7 +61,7 @@ def back_up(store: Store, folder: Path) -> BackupCount:
 
 
 def _same_store(root: Path, target: Path) -> None:
-    """A folder that holds something else isn't written to."""
+    """Mark an empty folder as this data folder's backup. Raises InputError for a folder that holds anything else."""
     mark = target / ".backup-of"
     if not mark.exists():
         if any(target.iterdir()):
@@ -96,7 +96,7 @@ def _taken(store: Store, target: Path) -> BackupCount:
 
 
 def _files(root: Path) -> Iterator[Path]:
-    """Files to copy, relative to `root`: not the registry, not what is unfinished, no locks, no links."""
+    """Files to copy, relative to `root`: without registry, unfinished files, locks and links."""
     for folder, folders, names in os.walk(root):
         folders[:] = [
             name for name in folders if not name.startswith(".") and (Path(folder) != root or name != "runners")
@@ -113,7 +113,8 @@ def _files(root: Path) -> Iterator[Path]:
 
 
 def _copied(source: Path, made: Path) -> int | None:
-    """Copy a file unless the backup has it; its size if it was copied. One that vanished isn't there any more, or was packed."""
+    """Copy a file, unless the backup has one of the same size and time. Returns the bytes copied; None if nothing was, also where the
+    file vanished meanwhile (deleted or packed)."""
     try:
         there = source.stat()
         if made.exists() and (made.stat().st_size, made.stat().st_mtime_ns) == (there.st_size, there.st_mtime_ns):
@@ -128,8 +129,11 @@ def _copied(source: Path, made: Path) -> int | None:
 
 
 def _checked(registry: Path, target: Path) -> tuple[int, int, list[str]]:
-    """Number of sessions and of linked files, and the files that the backup lacks. Small files are compared by their hash: what is
-    packed carries its own, which is checked whenever a frame is read."""
+    """Number of sessions and of linked files in a copied registry, and the files that the backup lacks.
+
+    A file must exist with the registered size, one of at most `_COMPARED_BYTES` also with the registered SHA-256. Of packed frames only
+    the pack must exist: their SHA-256 is checked whenever one is read.
+    """
     asked = "SELECT session_id, path, sha256, bytes, pack_index FROM files"
     with contextlib.closing(sqlite3.connect(registry)) as copy:
         rows = copy.execute(asked).fetchall()

@@ -1,7 +1,4 @@
-"""An instrument's blocking calls in threads of their own, each with a time-out.
-
-A driver that never returns can't hang a session then.
-"""
+"""An instrument's blocking calls in threads of their own, each with a time-out: a driver that never returns can't hang a session."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from typing import Any, TypeVar
 from drivers.errors import NoAnswer
 
 T = TypeVar("T")
-#: Longest time (s) that an instrument is given to stop.
+#: Time-out (s) of an instrument's stop.
 STOP_S = 15.0
 
 
@@ -51,7 +48,7 @@ class Status:
         in_thread(call).add_done_callback(lambda future: self._finish(future.exception()))
 
     def _late(self, who: str, timeout_s: float) -> None:
-        self._finish(NoAnswer(f"{who}: not back after {timeout_s:g} s; check its power and its cable"))
+        self._finish(NoAnswer(f"{who}: no answer within {timeout_s:g} s; check its power and its cable"))
 
     def _finish(self, error: BaseException | None) -> None:
         with self._lock:
@@ -87,8 +84,8 @@ class Status:
 
 
 async def bounded(who: str, call: Callable[[], object], timeout_s: float = STOP_S) -> None:
-    """Await a blocking call for `timeout_s` at most. Raises NoAnswer then."""
+    """Await a blocking call. Raises NoAnswer after `timeout_s`, and what the call raises."""
     try:
         await asyncio.wait_for(asyncio.wrap_future(in_thread(call)), timeout_s)
     except TimeoutError as error:
-        raise NoAnswer(f"{who}: not back after {timeout_s:g} s; check its power and its cable") from error
+        raise NoAnswer(f"{who}: no answer within {timeout_s:g} s; check its power and its cable") from error

@@ -1,7 +1,7 @@
-"""A station's instruments as bluesky's devices.
+"""A station's instruments as bluesky's devices: plain classes with the methods of `bluesky.protocols`.
 
-Plain classes after `bluesky.protocols`. A driver's calls block, so each runs in a thread of its own, behind a status with a
-time-out. On pause and stop, bluesky closes the shutter and darkens the screen through them.
+A driver's calls block. Each runs in a thread of its own and is represented by a `Status` with a time-out. On pause and stop, bluesky
+calls the devices' `pause` and `stop`, which close the shutter and darken the screen.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from sim.spectrum import Spectrum
 WriteFrame = Callable[[str, Side, NDArray[np.uint16]], StoredFile]
 WriteSpectrum = Callable[[str, Spectrum], StoredFile]
 
-#: Longest times (s) for an instrument to come back. The drivers' own time-outs are shorter and say more.
+#: Time-outs (s) of a move, of placing a target (a person may do it), of a measurement of light, and of a camera's readout. The
+#: drivers' own time-outs are shorter, and their messages say more.
 MOVE_S, PLACE_S, MEASURE_S, READOUT_S = 90.0, 660.0, 180.0, 30.0
 
 
 class Device:
-    """What bluesky asks of every device: a name, no parent, and readings under its own name."""
+    """Base of the devices. bluesky asks for a name, a parent (none here), and readings by key."""
 
     parent = None
 
@@ -45,7 +46,7 @@ class Device:
         self.name = name
 
     def readings(self) -> dict[str, float | str]:
-        """What the device adds to an event, by key. A key's value always has the same type."""
+        """The device's values in an event, by key. A key's value always has the same type."""
         raise NotImplementedError
 
     def read(self) -> dict[str, Any]:
@@ -62,7 +63,7 @@ class Device:
 
 
 class TargetDevice(Device):
-    """The stage: which target stands in front of the cameras. Movable to a target's name."""
+    """The stage: which target stands before the cameras. Movable to a target's name."""
 
     def __init__(self, stage: Stage) -> None:
         super().__init__("target")
@@ -150,7 +151,7 @@ class ShutterDevice(Device):
         await self.stop()
 
     def resume(self) -> None:
-        """Nothing: after a pause, each step sets the bench and opens the shutter if it needs light."""
+        """Do nothing: after a pause, each step sets the bench and opens the shutter if it needs light."""
 
     def readings(self) -> dict[str, float | str]:
         return {"shutter_open": float(bool(self.value))}
@@ -158,7 +159,7 @@ class ShutterDevice(Device):
 
 @dataclass(frozen=True)
 class ShownPattern:
-    """The pattern on the screen, by its path in the session; None: the screen is dark."""
+    """The pattern on the screen, by its path in the session (None: the screen is dark), and its screen pixels per cell."""
 
     path: str | None = None
     cell_px: int = 1
@@ -189,14 +190,14 @@ class ScreenDevice(Device):
         await self.stop()
 
     def resume(self) -> None:
-        """Nothing: after a pause, each step shows its pattern."""
+        """Do nothing: after a pause, each step shows its pattern."""
 
     def readings(self) -> dict[str, float | str]:
         return {"pattern": (self.value.path or "") if self.value else ""}
 
 
 class RadiometerDevice(Device):
-    """The spectroradiometer. Prepared with the path of the next spectrum, and triggered to measure it."""
+    """The spectroradiometer: prepared with the path of the next spectrum, triggered to measure and write it."""
 
     def __init__(self, radiometer: Spectroradiometer, write: WriteSpectrum) -> None:
         super().__init__("spectroradiometer")
@@ -225,8 +226,10 @@ class RadiometerDevice(Device):
 
 
 class PhotodiodeDevice(Device):
-    """The reference photodiode. Prepared with the wavelength (nm) of the light, and triggered to measure its irradiance; prepared with
-    None, its dark current."""
+    """The reference photodiode: prepared with the wavelength (nm) of the light, triggered to measure its irradiance (W m^-2).
+
+    Prepared with None, it measures its dark current (A).
+    """
 
     def __init__(self, photodiode: Photodiode) -> None:
         super().__init__("photodiode")
@@ -259,10 +262,10 @@ class PhotodiodeDevice(Device):
 
 @dataclass(frozen=True)
 class Shot:
-    """One trigger of all cameras: exposures (s), gain (dB), and where the frames go; a side without a path isn't kept.
+    """One trigger of all cameras: exposures (s), gain (dB), and paths of the frames; the frame of a side without a path isn't kept.
 
-    `repeats`: shots with the same exposures and gain that follow at once, nothing else being moved; cameras that stream take them as
-    one series.
+    `repeats`: number of following shots with the same exposures and gain, with nothing moved in between; cameras that stream take them
+    as one series.
     """
 
     exposure_s: Mapping[Side, float]
@@ -276,10 +279,11 @@ class Shot:
 
 
 def level_of(frame: NDArray[np.uint16], sheet: DataSheet) -> float:
-    """The share of its range that a frame fills: the 99.5th percentile of the brightest channel above black, over the range.
+    """Level of a frame (rows, cols), a share of its range: (p - black level) / range, where p is the brightest channel's 99.5th percentile.
 
-    The range ends at the white level, or at the data sheet's full well where that is lower. A percentile, because a hot
-    pixel must not set the exposure; channel by channel, because a chart's white patch is a few percent of the frame.
+    The range (DN) goes from the black level to the code of saturation, or to the data sheet's full well where that is lower. A
+    percentile, because a hot pixel must not set the exposure; channel by channel, because a chart's white patch is a few percent of
+    the frame.
     """
     black = sheet.black_level_dn or 0.0
     top = sheet.saturation_dn
@@ -291,7 +295,7 @@ def level_of(frame: NDArray[np.uint16], sheet: DataSheet) -> float:
 
 
 def _percentile(codes: NDArray[np.uint16], percent: float) -> float:
-    """As `numpy.percentile`, by the counts of the codes: in a tenth of its time."""
+    """`numpy.percentile` of codes, from their histogram: in a tenth of its time."""
     below = np.cumsum(np.bincount(codes.ravel()))
     rank = percent / 100.0 * (codes.size - 1)
     low, high = np.searchsorted(below, (np.floor(rank), np.ceil(rank)), side="right")
@@ -299,7 +303,7 @@ def _percentile(codes: NDArray[np.uint16], percent: float) -> float:
 
 
 class CamerasDevice(Device):
-    """All cameras, exposed by one trigger. Prepared with a `Shot`."""
+    """All cameras, exposed by one trigger: prepared with a `Shot`, triggered to take it and to write its frames."""
 
     def __init__(
         self, cameras: Mapping[Side, CameraDriver], sheets: Mapping[Side, DataSheet], write: WriteFrame
@@ -310,9 +314,9 @@ class CamerasDevice(Device):
         self.frames: dict[Side, Frame] = {}
         self.levels: dict[Side, float] = dict.fromkeys(self.cameras, 0.0)
         self.stored: dict[Side, StoredFile] = {}
-        self.retaken: list[str] = []  # what got lost of the present shot and was taken again, a line each
+        self.retaken: list[str] = []  # a line for each lost frame of the present shot that was taken again
         self._stream: FrameStream | None = None  # the series under way
-        self.in_series = False  # whether the frame before is kept and nothing has moved since
+        self.in_series = False  # whether the previous frame was kept and nothing has moved since
 
     def prepare(self, shot: Shot) -> Status:
         goes_on = self._stream is not None and self._stream.left > 0 and shot.same_settings(self.shot)
@@ -328,7 +332,7 @@ class CamerasDevice(Device):
         return Status("cameras", configure, READOUT_S)
 
     def _expose(self, shot: Shot) -> Sequence[Frame]:
-        """A frame of each camera, the next of the series under way if there is one. A lost or torn frame is taken again."""
+        """A frame of each camera, the next of the series under way if there is one. A lost or incomplete frame is taken again."""
         if self._stream is None and shot.repeats:
             streaming = [camera for camera in self.cameras.values() if isinstance(camera, StreamingCamera)]
             if len(streaming) == len(self.cameras):
@@ -341,15 +345,15 @@ class CamerasDevice(Device):
         try:
             return capture_together(list(self.cameras.values()))
         except (NoAnswer, Garbled) as error:
-            # Nothing of it was kept, so a second try is safe.
+            # Nothing of the first try was kept, so a second one is safe.
             self.retaken.append(f"{error}; it is taken again")
             return capture_together(list(self.cameras.values()))
 
     def _note_loss(self, line: str) -> None:
-        self.retaken.append(line)  # of whatever shot is the present one
+        self.retaken.append(line)  # counts to the present shot
 
     def end_stream(self) -> None:
-        """Drop what a series has triggered and nobody asked for."""
+        """End the series under way; frames that it triggered and no shot asked for are dropped."""
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.close()
@@ -383,7 +387,7 @@ class CamerasDevice(Device):
         await bounded("cameras", self.end_stream)
 
     def resume(self) -> None:
-        """Nothing: after a pause, each step prepares the cameras."""
+        """Do nothing: after a pause, each step prepares the cameras."""
 
     async def stop(self, success: bool = True) -> None:
         self._stream = None

@@ -1,4 +1,4 @@
-"""A station's devices, connected, and how they are brought into a safe state: shutter closed, screen dark, all motion ended."""
+"""A station's devices, connected, and their safe state: shutter closed, screen dark, all motion stopped."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from sim.parameters import Frozen
 
 
 class BenchState(Frozen):
-    """How the bench stands in a run. `wavelength_nm` 0: white light. None: there is no such instrument, or it moves."""
+    """State of the bench in a run. `wavelength_nm` 0: white light. None: there is no such instrument, or it moves."""
 
     shutter_open: bool | None = None
     wavelength_nm: float | None = None
@@ -74,7 +74,7 @@ class Instruments:
         return tuple(device for device in every if device is not None)
 
     def state(self) -> BenchState:
-        """How the bench stands, as the devices last said; the temperature is that of the frames."""
+        """State of the bench as the devices last reported it; the temperatures are those of the last frames."""
         taken = {side: frame.temperature_c for side, frame in self.cameras.frames.items()}
         return BenchState(
             shutter_open=self.shutter.value if self.shutter is not None else None,
@@ -83,7 +83,10 @@ class Instruments:
         )
 
     def connect(self) -> dict[str, Identity]:
-        """Connect to every instrument and bring it into its safe state; the identities by name. Raises DeviceError."""
+        """Connect to every instrument and bring it into its safe state. Returns the identities by name.
+
+        Raises DeviceError where an instrument doesn't answer, and where a camera's pixels or colour filters contradict its data sheet.
+        """
         found: dict[str, Identity] = {}
         for name, driver in self.drivers.all.items():
             try:
@@ -109,7 +112,7 @@ class Instruments:
     def make_safe(self) -> list[str]:
         """Close the shutter, darken the screen, stop all motion: every instrument at once, within `STOP_S`.
 
-        Returns one line for each instrument that failed to.
+        Returns one line for each instrument that failed to stop.
         """
         return stop_complaints({name: in_thread(driver.stop) for name, driver in self.drivers.all.items()})
 
@@ -125,7 +128,7 @@ class Instruments:
 
 
 def stop_complaints(stopping: Mapping[str, Future[None]]) -> list[str]:
-    """Wait for instruments that are being stopped, `STOP_S` for all together; one line for each that failed to."""
+    """Wait for instruments that are being stopped, `STOP_S` for all together. Returns one line for each that failed to stop."""
     complaints, until = [], time.monotonic() + STOP_S
     for name, future in stopping.items():
         try:
@@ -138,6 +141,6 @@ def stop_complaints(stopping: Mapping[str, Future[None]]) -> list[str]:
 
 
 def named_complaint(name: str, error: Exception) -> str:
-    """What an instrument complains of, as a line that names it."""
+    """An instrument's error as a line that names the instrument."""
     text = str(error)
     return text if name.split(maxsplit=1)[0] in text.lower() else f"{name}: {text}"

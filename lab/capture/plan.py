@@ -1,4 +1,4 @@
-"""What a session captures: which sequences, in which order, and how much of each."""
+"""What a session captures: its sequences, in their order, with their parameters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class CapturePlan:
         return tuple(step for sequence in self.sequences for step in sequence.steps(station))
 
     def patterns(self, station: Equipment) -> dict[str, Cells]:
-        """All patterns that the screen is to show, by path in the session."""
+        """The cells (rows, cols) of all patterns that the screen is to show, by path in the session."""
         return {path: cells for sequence in self.sequences for path, cells in sequence.patterns(station).items()}
 
     def document(self) -> dict[str, Any]:

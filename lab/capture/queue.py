@@ -1,8 +1,8 @@
-"""Sessions that wait for their instruments: registered in an order, so that the queue survives the service.
+"""The queue of sessions that wait for their instruments. It is kept in the registry, so it survives a restart of the service.
 
-A queued session starts when its turn has come, its instruments are free and its time (`not_before`) is reached. A run that ended badly (aborted,
-failed, its process killed) holds the sessions that wait for the same instruments: nothing opens a shutter again that somebody just closed.
-They go on when they are released, or when the run that held them is resumed and finishes.
+A queued session starts when its turn has come, its instruments are free and its time (`not_before`) is reached. A run that was aborted, failed or
+was killed holds the queued sessions that need one of its instruments: no shutter that somebody just closed opens by itself. They start after
+somebody releases them, or after the run that held them is resumed and finishes.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 #: States from which a session may be queued.
 STARTABLE = ("created", "interrupted", "failed", "queued")
-#: How the reason of a hold begins.
+#: Prefix of the reason of a hold in the registry.
 HELD = "held: "
 
 
 class QueuedSession(Frozen):
-    """A session in the queue. `place`: 1 is first; `held`: why it doesn't start, None where its turn is enough."""
+    """A session in the queue. `place`: 1 is first; `held`: why it doesn't start, None if it isn't held."""
 
     id: str
     name: str
@@ -39,7 +39,7 @@ class QueuedSession(Frozen):
 
 
 def queue(store: Store) -> list[QueuedSession]:
-    """The sessions that wait, in their order."""
+    """The queued sessions in their order."""
     with store.reading() as db:
         return [
             QueuedSession(
@@ -57,9 +57,9 @@ def queue(store: Store) -> list[QueuedSession]:
 def put_into_queue(
     store: Store, session_id: str, not_before: datetime | None = None, place: int | None = None, held: str | None = None
 ) -> None:
-    """Let a session wait, or move one that does to another place (None: last, or where it is), and release it unless `held` says why not.
+    """Queue a session, or move a queued one to `place` (1 is first; None: last, or its present place).
 
-    Raises InputError for a session that runs or is finished.
+    It is held for the reason `held`, or released where that is None. Raises InputError for a session that is unknown, runs or is finished.
     """
     with store.transaction() as db:
         row = db.get(SessionRow, session_id)
@@ -75,7 +75,7 @@ def put_into_queue(
 
 
 def leave_queue(store: Store, session_id: str) -> None:
-    """Take a session out of the queue: it can be started by hand. Raises InputError where it doesn't wait."""
+    """Take a session out of the queue, so that it can be started by hand. Raises InputError where it isn't queued."""
     with store.transaction() as db:
         row = db.get(SessionRow, session_id)
         if row is None or row.state != "queued":
@@ -86,7 +86,7 @@ def leave_queue(store: Store, session_id: str) -> None:
 
 
 def hold_queue(db: Session, why: str, station: dict[str, Any] | None = None) -> None:
-    """Hold the sessions that wait for an instrument of `station`, a station as the registry has it; None: all that wait."""
+    """Hold the queued sessions that need an instrument of `station` (as the registry has it); None: all queued sessions."""
     addresses = None if station is None else Station.model_validate(station).addresses
     for row in _waiting(db):
         if addresses is None or addresses & Station.model_validate(row.station).addresses:
@@ -94,7 +94,7 @@ def hold_queue(db: Session, why: str, station: dict[str, Any] | None = None) -> 
 
 
 def release_held_by(db: Session, session_id: str) -> None:
-    """Release the sessions that this one held, as it has finished after all."""
+    """Release the sessions that this one held, once it has finished."""
     for row in _waiting(db):
         if row.error is not None and row.error.startswith(f"{HELD}session {session_id} "):
             row.error = None

@@ -38,7 +38,7 @@ class SessionInfo(_Record):
 
 
 class CaptureInfo(_Record):
-    """A capture as the registry has it; `document` is its entry in a manifest."""
+    """A capture as the registry has it; `document`: its entry in a manifest."""
 
     id: int
     session_id: str
@@ -49,7 +49,7 @@ class CaptureInfo(_Record):
 
 
 class ResultInfo(_Record):
-    """A stored result; `document` as `docs/reference/results.md` has it."""
+    """A stored result; `document`: as in `docs/reference/results.md`."""
 
     id: str
     job_id: str | None
@@ -70,7 +70,7 @@ class RunRecord(Frozen):
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file that is on the disk and not linked yet."""
+    """A file of a session on the disk: its path in the session, SHA-256 and size; `side`: of a frame."""
 
     role: Role
     path: str

@@ -1,4 +1,4 @@
-"""What becomes of a session whose process ended without a word: kill -9, a power cut, a crash.
+"""Recovery of sessions whose process died: kill -9, a power cut, a crash.
 
 Such a session may have left the shutter open. Its station is made safe (shutter closed, screen dark, motion stopped), the reason
 is recorded, and the session is resumed where its station says so (`resume_automatically`) or where only packing is left.
@@ -21,7 +21,7 @@ from lab.capture.store import Store
 from lab.errors import DeviceError, InputError
 
 log = logging.getLogger(__name__)
-#: How often (s) the registry is searched for sessions whose process ended, and the longest pause between two tries to reach
+#: Interval (s) between searches of the registry for sessions whose process died, and longest interval between attempts to reach
 #: instruments that didn't answer.
 LOOK_S, LONGEST_PAUSE_S = 5.0, 60.0
 
@@ -55,16 +55,16 @@ def make_station_safe(station: Station, connect: Callable[[Station], Drivers] = 
 
 
 def ended_without_progress_twice(store: Store, session_id: str) -> bool:
-    """Whether the last two runs of a session finished no step: resuming by itself would go on for ever."""
+    """Whether the last two runs of a session finished no step: resuming it automatically could repeat for ever."""
     done, runs = store.session(session_id).steps_done, store.runs(session_id)
     return len(runs) >= 2 and all(run.steps_done == done for run in runs[-2:])
 
 
 class Recovery:
-    """Looks for sessions whose process ended, makes their stations safe, and resumes those that may go on by themselves.
+    """Looks for sessions whose process died, makes their stations safe, and resumes those that may be resumed automatically.
 
     It works in a thread from `start` to `close`. `connect` makes a station's drivers. An instrument that doesn't answer is tried
-    again until it does: its session keeps the reason until then.
+    again until it does; meanwhile the session's `error` says so.
     """
 
     def __init__(
@@ -75,26 +75,26 @@ class Recovery:
     ) -> None:
         self._store, self._connect, self._clock = store, connect, clock
         self._resume: Callable[[str], None] | None = None
-        self._waiting: list[str] = []  # sessions that are safe and go on by themselves
+        self._waiting: list[str] = []  # sessions that are safe and will be resumed automatically
         self._next_try_s: dict[str, tuple[float, float]] = {}  # session -> (when, the pause before it)
         self._looked, self._ended = threading.Event(), threading.Event()
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._work, name="recovery", daemon=True)
 
     def start(self, patience_s: float = 0.0) -> None:
-        """Begin, if that isn't done yet, and wait until the first stations are safe, for `patience_s` at most."""
+        """Start the thread if it doesn't run yet, and wait for its first search to end, for `patience_s` at most."""
         if self._thread.ident is None:
             self._thread.start()
         self._looked.wait(patience_s)
 
     def resume_with(self, resume: Callable[[str], None]) -> None:
-        """How a session is resumed; those that wait for it are resumed now."""
+        """Set the function that resumes a session; sessions that waited for it are resumed now."""
         self._resume = resume
         self._wake.set()
 
     @property
     def settled(self) -> bool:
-        """Whether the first look is over, and no session waits to go on by itself."""
+        """Whether the first search is over and no session waits to be resumed."""
         return self._looked.is_set() and not self._waiting
 
     def close(self) -> None:
@@ -115,7 +115,7 @@ class Recovery:
             self._wake.clear()
 
     def look(self) -> None:
-        """Make the stations of all sessions safe whose process ended, and resume those that may go on by themselves."""
+        """Make the stations of all sessions safe whose process died, and resume those that may be resumed automatically."""
         for session_id in self._store.under_way():
             at, _ = self._next_try_s.get(session_id, (0.0, 0.0))
             if self._clock() >= at and not self._ended.is_set():
@@ -135,7 +135,7 @@ class Recovery:
             if session_id not in self._store.under_way():
                 return  # it ended in good order, just now
             station = self._store.station(session_id)
-            began = f"the process that ran it ended without a word (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
+            began = f"the process that ran it died (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
             complaints = make_station_safe(station, self._connect)
             if complaints:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
@@ -155,7 +155,7 @@ class Recovery:
             lock.release()
 
     def _what_next(self, session_id: str, station: Station) -> tuple[str, bool]:
-        """What becomes of the session, as the end of a sentence, and whether it is resumed."""
+        """What happens next to the session, as the end of a sentence, and whether it is resumed."""
         info = self._store.session(session_id)
         if info.steps_done == info.steps:
             return "only packing was left, which goes on by itself", True

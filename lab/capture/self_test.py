@@ -1,4 +1,4 @@
-"""Self-tests of a station's instruments, and the station file that what is connected suggests."""
+"""Self-tests of a station's instruments, and a station file drafted from the instruments that are connected."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ TEST_S = 300.0
 
 @dataclass(frozen=True)
 class SelfTest:
-    """One instrument's: its name in the station, who it is, and whether it works; in words if it doesn't."""
+    """Result of one instrument's self-test: its name in the station, its identity (maker, model, serial number, firmware), whether it works,
+    and the finding in words."""
 
     name: str
     identity: str
@@ -33,7 +34,7 @@ class SelfTest:
 
 
 def self_tests(drivers: Drivers) -> Iterator[SelfTest]:
-    """Connect to each instrument, bring it into its safe state, let it do what it is for once, and let it go."""
+    """Connect to each instrument, bring it into its safe state, use it once for its purpose, check that it is safe, and disconnect."""
     for name, instrument in drivers.all.items():
         yield _self_test(name, instrument)
 
@@ -45,7 +46,7 @@ def self_test(station: Station, name: str, connect: Callable[[Station], Drivers]
 
 
 def _said(name: str) -> str:
-    """A device's name as messages use it: `camera left`."""
+    """A device's name in messages: `camera left` for `cameras.left`."""
     family, _, side = name.partition(".")
     return f"camera {side}" if side else family
 
@@ -85,7 +86,7 @@ def _self_test(name: str, instrument: Instrument) -> SelfTest:
 
 
 def record_transcript(station: Station, name: str, file: Path) -> SelfTest:
-    """A self-test of one instrument (`monochromator`, `cameras.left`, ...) with all that goes over its wire in a file.
+    """A self-test of one instrument (`monochromator`, `cameras.left`, ...), with a transcript of its messages in a file.
 
     Raises InputError if the station has no such instrument or the file can't be written.
     """
@@ -113,8 +114,8 @@ def check_station(station: Station) -> list[SelfTest]:
 
 
 def station_text(found: Iterable[Found]) -> str:
-    """A station file (TOML) of what is connected. Cameras are asked for their size, filters and bits; what they don't tell stands as a
-    remark. Raises DeviceError where there is no camera."""
+    """A station file (TOML) of the instruments that are connected. Cameras are asked for their pixels, colour filters and bit depth; what
+    they don't tell becomes a comment. Raises DeviceError where there is no camera or one doesn't answer."""
     lines = [
         "# Written by `calibench station init` from what is connected. Data sheets hold what the makers say: complete them."
     ]

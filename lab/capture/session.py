@@ -55,8 +55,8 @@ PACKAGES = ("calibench", "numpy", "bluesky", "pyserial", "pyusb", "h5py")
 
 
 class Progress(Frozen):
-    """Progress of a session: `done` of `total` steps are in the journal, `what` is the current one; times in s. `bench`: how the instruments
-    stood after the step before."""
+    """Progress of a session: `done` of `total` steps are finished, `what` is the current one; times in s. `bench`: state of the instruments
+    after the previous step."""
 
     session: str
     state: Literal["connecting", "running", "paused", "packing", "interrupted", "failed", "finished"]
@@ -71,7 +71,7 @@ class Progress(Frozen):
 
 
 class _Pace:
-    """Estimates the time left from how long the steps of each sequence took in this run."""
+    """Estimates the time left (s) from the mean duration of this run's steps, sequence by sequence."""
 
     def __init__(self) -> None:
         self.spent: dict[str, list[float]] = defaultdict(list)
@@ -92,7 +92,7 @@ class _Pace:
 class _Writes:
     """Allows writes until the run is over.
 
-    An abort doesn't end the threads that wait for instruments. One that returns late must not write into the next run's files.
+    An abort doesn't end the threads that wait for instruments. A thread that returns late must not write into the next run's files.
     """
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ class _Writes:
 class CaptureSession:
     """One session on its station. `run` blocks; `pause`, `resume` and `abort` may be called from other threads.
 
-    `station`: None for the station of its last run, or that it began on; another one where its instruments have new addresses.
+    `station`: None for the station of its last run, or that it was registered with; another one where instruments have new addresses.
     `on_progress` is called from a thread of the run. An exception that it raises ends the run.
     """
 
@@ -286,7 +286,7 @@ class CaptureSession:
             raise DeviceError("; ".join(complaints))
 
     def _check_identities(self, identities: dict[str, Identity]) -> None:
-        """A session has one set of instruments. Raises InputError if one was exchanged since the run before."""
+        """Check that the session's instruments are the same. Raises InputError if one was exchanged since the previous run."""
         for run in self.store.runs(self.id)[-1:]:
             for name, identity in identities.items():
                 before = run.instruments.get(name, {}).get("serial_number", "")
@@ -430,7 +430,7 @@ class CaptureSession:
 
 
 class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
-    """Waits for a plan's end and wakes every `WAKE_S`.
+    """Waits for the end of a plan and wakes every `WAKE_S`.
 
     Python runs signal handlers in the main thread only. A signal that the kernel delivers to another thread doesn't wake the main
     thread from an unlimited wait.
@@ -446,13 +446,13 @@ async def _awaited(call: Callable[[], Any]) -> Any:
 
 
 def _append(file: Path, name: str, document: dict[str, Any]) -> None:
-    """One of bluesky's documents as a line of JSON."""
+    """Append one of bluesky's documents to a file, as a line of JSON."""
     with file.open("a", encoding="utf-8") as lines:
         lines.write(json.dumps([name, document], default=str) + "\n")
 
 
 def _plain(error: BaseException, complaints: list[str]) -> BaseException:
-    """The error as an InputError or a DeviceError, with the instruments that didn't reach their safe state."""
+    """The error as an InputError or a DeviceError where its kind is known, with the instruments that didn't reach their safe state."""
     while isinstance(error, FailedStatus) and error.__cause__ is not None:
         error = error.__cause__
     unsafe = [line for line in complaints if line not in str(error)]

@@ -18,7 +18,7 @@ from lab.formats.recording_set import DataSheet
 from lab.formats.spectrum_csv import parse_spectrum
 from sim.spectrum import Spectrum
 
-#: Name of a packed session.
+#: Name of a packed session's file.
 PACK = "session.nxs"
 
 

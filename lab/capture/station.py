@@ -79,7 +79,7 @@ class StationCamera(Address):
 class Station(Frozen):
     """The content of a station file. `cameras` has a left one at least. None: the station has no such instrument.
 
-    resume_automatically : whether the service goes on with a session by itself whose process ended without a word
+    resume_automatically : whether the service resumes a session whose process died
     """
 
     name: str = ""
@@ -110,7 +110,7 @@ class Station(Frozen):
 
     @property
     def addresses(self) -> frozenset[str]:
-        """The addresses of its instruments; one without an address (a person at a prompt) is nobody else's."""
+        """The addresses of its instruments, without those that have none (a person at a prompt) and so can't be shared."""
         entries = [*(getattr(self, family) for family in _FAMILIES), *self.cameras.values()]
         return frozenset(entry.address for entry in entries if entry is not None and entry.address)
 
@@ -138,7 +138,7 @@ class Station(Frozen):
         raise InputError(f"station: no target of kind {wanted!r}; add one under [targets] of the station file")
 
     def lacks(self, *families: str) -> tuple[str, ...]:
-        """Those of the instrument families that the station hasn't."""
+        """Those of the instrument families that the station doesn't have."""
         return tuple(family for family in families if getattr(self, family) is None)
 
 

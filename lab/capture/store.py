@@ -238,7 +238,7 @@ class Store:
             return {state: number for state, number in counted}  # noqa: C416  (rows, not pairs, to a type checker)
 
     def under_way(self) -> list[str]:
-        """Ids of the sessions that are recorded as running or paused, also where their process ended without a word."""
+        """Ids of the sessions that are recorded as running or paused, also where their process died."""
         with self.reading() as db:
             return list(db.scalars(sa.select(SessionRow.id).where(SessionRow.state.in_(("running", "paused")))))
 
@@ -253,7 +253,7 @@ class Store:
             return Station.model_validate(self._row(db, session_id).station)
 
     def station_name(self, session_id: str) -> str:
-        """What the station of a session calls itself."""
+        """Name of a session's station, from its station file."""
         with self.reading() as db:
             return str(self._row(db, session_id).station.get("name", ""))
 
@@ -270,8 +270,10 @@ class Store:
         run: RunRecord | None = None,
         station: Station | None = None,
     ) -> None:
-        """Record the state of a session; `run` is added to its provenance, `station` is where it runs now. A run that ended badly holds the
-        sessions that wait for the same instruments."""
+        """Record the state of a session and take it out of the queue. `run` is added to its provenance; `station`: where it runs now.
+
+        A session that is interrupted or failed holds the queued sessions that need one of its instruments.
+        """
         with self.transaction() as db:
             row = self._row(db, session_id)
             row.state, row.error = state, error

@@ -118,7 +118,8 @@ class ResultRow(Base):
 
 
 class CalibrationRow(Base):
-    """The life of a fit of a session; `id` is the fit's result. `rig`: its cameras, by side. Without `certified` it is a candidate."""
+    """A calibration: a session's fit, from candidate to superseded. `id`: of the fit's result. `rig`: its cameras, by side. `certified`: when;
+    None for a candidate."""
 
     __tablename__ = "calibrations"
 
@@ -137,7 +138,8 @@ class CalibrationRow(Base):
 
 
 class FigureRow(Base):
-    """A figure of a calibration, so that a history needs no document. `camera`: its name, or the rig of a figure of the pair."""
+    """A figure of a calibration, in a table of its own so that a history reads no documents. `camera`: its name, or the rig for a figure of
+    the pair."""
 
     __tablename__ = "figures"
     __table_args__ = (sa.Index("ix_figures_history", "camera", "name", "place"),)
@@ -153,7 +155,7 @@ class FigureRow(Base):
 
 
 class KeyRow(Base):
-    """An API key: only its hash (see `api.security`)."""
+    """The hash of an API key (see `api.security`)."""
 
     __tablename__ = "api_keys"
 

@@ -21,19 +21,19 @@ from sim.camera import Side
 T = TypeVar("T")
 Plan = Generator[Msg, Any, T]
 
-#: Levels above SATURATED and below UNLIT, shares of the range, tell only in which direction to search. SATURATED is 10 % below
-#: the data sheet's full well, because a sensor may saturate below its data sheet.
+#: A level above SATURATED or below UNLIT (shares of the range) tells only the direction of the search. SATURATED is 10 % below the
+#: data sheet's full well, because a sensor may saturate below its data sheet.
 SATURATED, UNLIT = 0.9, 0.01
-TRIES = 14
+TRIES = 14  # test exposures at most
 
-#: Frames that are read and not kept before a capture in new light, or after a test exposure. What a camera of image lag q holds of
-#: the light before falls to q^3.
+#: Frames that are read and not kept before a capture in new light or after a test exposure. In a camera with image lag q (the share
+#: of a frame's signal that is added to the next), earlier light then adds the share q^3 to the capture.
 DUMMY_FRAMES = 2
 
 
 @dataclass(frozen=True)
 class Taken:
-    """What a step gave: its result for the journal, its files, and its completed captures."""
+    """The outcome of a step: its result for the journal, its files, and its completed captures."""
 
     result: dict[str, Any]
     files: tuple[StoredFile, ...] = ()
@@ -78,10 +78,10 @@ def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
 def find_exposure(
     wanted: FindExposure, instruments: Instruments, start_s: Mapping[Side, float]
 ) -> Plan[tuple[dict[Side, float], dict[Side, float]]]:
-    """Exposures (s) and their levels, camera by camera, from test frames that aren't kept.
+    """Search each camera's exposure (s) for the wanted level, with at most `TRIES` test frames that aren't kept. Returns exposures and levels.
 
-    After a saturated or unlit frame, the exposure is divided by 5 or multiplied by 10; after any other, it is scaled to the wanted
-    level. A camera that reaches a limit of the station stays there.
+    After a saturated or unlit frame, the exposure is divided by 5 or multiplied by 10; after any other, it is multiplied by wanted level
+    / level. Exposures stay within the station's limits. The last exposures are returned also where a camera missed the level.
     """
     limits = instruments.limits
 
@@ -117,7 +117,7 @@ def _stuck(
     exposure_s: Mapping[Side, float],
     levels: Mapping[Side, float],
 ) -> bool:
-    """Whether a shorter exposure left a bright frame as bright: then it is saturated, below the data sheet's range."""
+    """Whether a frame is saturated below the data sheet's range: a shorter exposure hardly lowered its level."""
     if before is None or levels[side] < 0.3:
         return False
     shortened = exposure_s[side] / before[0][side]
@@ -125,7 +125,7 @@ def _stuck(
 
 
 def repeats_of(step: Step, following: Iterable[Step]) -> int:
-    """How many of the steps that follow at once only repeat a step's exposure."""
+    """Number of steps directly after `step` that repeat its setting and exposure without a measurement of the light."""
     same = itertools.takewhile(
         lambda other: (
             bool(step.captures and other.captures)
@@ -144,11 +144,11 @@ def take(
     """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`:
     `repeats_of` the step.
 
-    A step with captures whose light the spectroradiometer refuses to measure is left out, with the reason in its result. In a step
-    without captures the refusal is a DeviceError, as later steps use the spectrum.
+    If the spectroradiometer refuses to measure the light (too dark, too bright), a step with captures is skipped, with the reason in its
+    result; in a step without captures this raises DeviceError, as later steps need the spectrum. Raises InputError for a missing instrument.
     """
     wavelength_nm = step.setting.wavelength_nm or 0.0
-    # One responsivity: light of one wavelength.
+    # The photodiode's responsivity is known for light of one wavelength only.
     photodiode = instruments.photodiode if step.radiance and step.captures and wavelength_nm > 0.0 else None
     if photodiode is not None and photodiode.dark_a is None:
         yield from _dark_current(instruments)
@@ -202,14 +202,14 @@ def take(
 
 
 def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | None) -> Plan[None]:
-    """Irradiance of light of a wavelength; of None, the dark current."""
+    """Measure the irradiance of light of one wavelength; with None, the photodiode's dark current."""
     yield Msg("prepare", photodiode, wavelength_nm, group="irradiance")
     yield from bps.trigger(photodiode, group="irradiance")
     yield from bps.wait(group="irradiance")
 
 
 def _dark_current(instruments: Instruments) -> Plan[None]:
-    """The photodiode's dark current, with the shutter closed."""
+    """Close the shutter and measure the photodiode's dark current."""
     assert instruments.photodiode is not None
     if instruments.shutter is not None and instruments.shutter.value is not False:
         yield from bps.abs_set(instruments.shutter, False, wait=True)
@@ -217,7 +217,7 @@ def _dark_current(instruments: Instruments) -> Plan[None]:
 
 
 def _start(instruments: Instruments, results: Mapping[str, Mapping[str, Any]]) -> dict[Side, float]:
-    """Start of a search for an exposure: the result of the latest search, else 10 ms."""
+    """Initial exposures (s) of a search: the result of the latest search, else 10 ms."""
     found = [result["exposure_s"] for result in results.values() if "exposure_s" in result]
     return {side: float(found[-1][side]) if found else 0.01 for side in instruments.cameras.cameras}
 
@@ -236,7 +236,7 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
 
 
 def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
-    """The step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
+    """The step's captures, completed by what the frames, the number of dummy frames and the instruments' readings tell."""
     readings = {key: value for device in instruments.devices for key, value in device.readings().items()}
     completed = []
     for capture in step.captures:

@@ -1,4 +1,4 @@
-"""The kinds of capture: one file each, which holds all that the rest of `lab` and `api` has to know of the kind.
+"""The kinds of capture: one file each, with all that the rest of `lab` and `api` needs of the kind.
 
 The list below is the only one. A new kind is a file here and a line in that list: see
 `docs/how-to/add-a-capture-kind.md`.

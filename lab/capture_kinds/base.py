@@ -1,9 +1,9 @@
-"""What the file of a capture kind is written with.
+"""Base classes of capture kinds.
 
-A kind's file declares, as far as the kind needs its own:
+The file of a kind declares, where the kind needs its own:
 
 - a `Capture`: the kind's entry in a recording set's manifest;
-- a `Target`: what the station file says of the thing that stands before the cameras;
+- a `Target`: the station file's description of the object before the cameras;
 - a `Sequence`: the steps in which a station takes such captures.
 
 `register` makes them known. Everything else (formats, store, sessions, service, command line, reports) reads `CAPTURES`,
@@ -37,7 +37,7 @@ Cells = NDArray[np.uint8]
 
 
 class Open(BaseModel):
-    """Base of the manifest's objects: immutable. An unknown key is kept, as the format asks."""
+    """Base of the manifest's objects: immutable. Unknown keys are kept, as the format demands."""
 
     model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
 
@@ -65,7 +65,7 @@ PoseName = Annotated[str, Names.POSE]
 
 @dataclass(frozen=True)
 class Reading:
-    """Marks a capture's key whose value an instrument tells when the frame is taken; `key`: that of `Device.readings`."""
+    """Marks a capture's key whose value is read from an instrument when the frame is taken; `key`: in `Device.readings`."""
 
     key: str
 
@@ -73,8 +73,10 @@ class Reading:
 class Capture(Open):
     """The keys that every capture has. A kind adds its own, and overrides what differs for it."""
 
-    shows: ClassVar[str]  # what stands before the camera, in words
-    sequence: ClassVar[type[Sequence] | None] = None  # what takes it on a station; None: it only comes from elsewhere
+    shows: ClassVar[str]  # the scene, in words
+    sequence: ClassVar[type[Sequence] | None] = (
+        None  # the sequence that takes it on a station; None: it can only be imported
+    )
     shares_frame: ClassVar[bool] = False  # several captures may describe one frame
     clipping_matters: ClassVar[bool] = True  # a clipped channel is worth a warning
 
@@ -90,21 +92,21 @@ class Capture(Open):
 
     @classmethod
     def unsupported(cls, document: dict[str, Any]) -> str | None:
-        """Why this version skips a capture that is right by the format; None where it is supported."""
+        """Why this version skips a capture that the format allows; None if it is supported."""
         return None
 
     def problems(self, rows: int, cols: int) -> Iterator[str]:
-        """What is wrong with the keys of a capture from a camera of `rows` x `cols` pixels: value, limit, remedy."""
+        """Errors in the keys of a capture from a camera of `rows` x `cols` pixels: value, limit, remedy."""
         return iter(())
 
     def remarks(self) -> Iterator[str]:
-        """What is odd about the keys, and how to mend it. The capture is used nevertheless."""
+        """Warnings about the keys, with a remedy. The capture is used nevertheless."""
         return iter(())
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
-        """What the forward model puts before the camera; None where the manifest doesn't tell it.
+        """The scene for the forward model; None where the manifest doesn't determine it.
 
-        `spectrum` gives the spectrum at a path of the manifest.
+        `spectrum` returns the spectrum at a path of the manifest.
         """
         return None
 
@@ -132,7 +134,7 @@ O = TypeVar("O", bound=Open)  # noqa: E741
 
 
 def in_folder(item: O, folder: str) -> O:
-    """The same object with `folder/` before all that it names."""
+    """The same object, each name and path in it prefixed by `folder/`."""
     own = {key: f"{folder}/{name}" for key, _, name in names_in(item) if "." not in key}
     nested = {key: in_folder(value, folder) for key, value in item if isinstance(value, Open)}
     return item.model_copy(update=own | nested)
@@ -145,13 +147,13 @@ AnyCapture = Annotated[Capture, CAPTURES]
 
 
 class Target(Frozen):
-    """Something that can be put before the cameras, as `[targets.NAME]` of the station file describes it."""
+    """An object that can be put before the cameras, described by `[targets.NAME]` of the station file."""
 
     kind: str
 
     @property
     def instruction(self) -> str:
-        """What an operator does to put it there."""
+        """What an operator has to do to put it there."""
         raise NotImplementedError
 
 
@@ -163,7 +165,7 @@ AnyTarget = Annotated[Target, TARGETS]
 
 
 class CaptureLimits(Frozen):
-    """The exposures, the gain and the slits that sequences keep to."""
+    """Limits of the exposure (s), the gain (dB) and the slit width (um) of all sequences."""
 
     exposure_min_s: float = Field(default=20e-6, gt=0)
     exposure_max_s: float = Field(default=10.0, gt=0)
@@ -172,7 +174,7 @@ class CaptureLimits(Frozen):
 
 
 class Equipment(Protocol):
-    """What a sequence may ask of a station: cameras, limits, targets, instruments."""
+    """The part of a station that sequences use: sides, limits, targets, instruments."""
 
     @property
     def sides(self) -> tuple[Side, ...]: ...
@@ -184,7 +186,7 @@ class Equipment(Protocol):
 
 
 class Setting(Frozen):
-    """How the bench is set for a step. None: it doesn't matter.
+    """The bench's setting for a step. `target`, `slit_um` None: left as it is.
 
     `wavelength_nm`: of the monochromator; 0 is zero order (white light), None keeps its shutter closed. `pattern`: path in
     the session of what the screen shows; None leaves the screen dark. `cell_px`: screen pixels per cell of the pattern.
@@ -224,10 +226,10 @@ class FindExposure(Frozen):
 
 
 class Step(Frozen):
-    """The unit of the journal: all of it is kept, or none. Its `id` is stable, so that a session can be resumed.
+    """The unit of the journal: all its files are kept, or none. Its `id` is stable, so that a session can be resumed.
 
-    `radiance`: path at which the step's measurement by the spectroradiometer is kept; None: no measurement. `captures`: what
-    one trigger of all cameras gives, without the keys that the trigger tells (exposure, gain, temperature, time).
+    `radiance`: path of the spectrum that the spectroradiometer measures in the step; None: no measurement. `captures`: the captures of
+    one trigger of all cameras, without the keys that are known only then (exposure, gain, temperature, time).
     """
 
     id: str
@@ -264,19 +266,19 @@ class Sequence(Frozen):
     @classmethod
     @abstractmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        """What a full calibration takes on this station; `quick`: fewer frames. None where the station can't take it."""
+        """The sequence in a full calibration on this station; `quick`: with fewer frames. None where the station can't take it."""
 
     @abstractmethod
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         """The steps in the order in which they are taken. Raises InputError if the station lacks what they need."""
 
     def patterns(self, station: Equipment) -> dict[str, Cells]:
-        """What the screen shows, cells of 0 (dark) and 1 (lit), by path in the session."""
+        """The patterns on the screen, arrays (rows, cols) of cells 0 (dark) or 1 (lit), by path in the session."""
         return {}
 
     @classmethod
     def check_instruments(cls, station: Equipment) -> None:
-        """Raises InputError that names an instrument which the station lacks."""
+        """Raise InputError if the station lacks an instrument of the sequence."""
         if missing := station.lacks(*cls.instruments):
             raise InputError(
                 f"station: the sequence {cls.name!r} needs a {' and a '.join(missing)}; "
@@ -288,7 +290,7 @@ SEQUENCES: dict[str, type[Sequence]] = {}
 
 
 def name_of(step_id: str) -> str:
-    """A step's id as the stem of a file's name."""
+    """A step's id as the stem of a file name."""
     return step_id.replace("/", "-")
 
 
@@ -308,10 +310,8 @@ def planned_keys(step_id: str, side: Side) -> dict[str, Any]:
 
 
 def exposure_step(stem: str, what: str, setting: Setting, level: float, *, measures_light: bool = True) -> Step:
-    """The step `STEM/exposure`, which finds the exposure for `level` and, with `measures_light`, measures the radiance first.
-
-    Its spectrum lies at `spectrum_path` of its id.
-    """
+    """The step `STEM/exposure`: with `measures_light` it measures the radiance (at `spectrum_path` of its id), then finds the exposure for
+    `level`."""
     id = f"{stem}/exposure"
     return Step(
         id=id,
@@ -341,7 +341,7 @@ def register(kind: type[Capture]) -> None:
 
 @contextmanager
 def registered(kind: type[Capture]) -> Iterator[None]:
-    """Within the block, the kind is known, too."""
+    """Context in which the kind is registered, too."""
     tables: tuple[dict[str, Any], ...] = (CAPTURES.models, TARGETS.models, SEQUENCES)
     before = [dict(table) for table in tables]
     try:

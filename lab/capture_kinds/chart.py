@@ -30,7 +30,7 @@ KNOWN_CHART = "ColorChecker24"
 
 
 class ChartLayout(Frozen):
-    """Where the patch grid lies in one camera's frame, nominally: [row, col] of dark skin, bluish green, black, white."""
+    """Nominal place of the patch grid in one camera's frame: [row, col] (px) of its corners dark skin, bluish green, black, white."""
 
     corners: Corners
 
@@ -49,7 +49,7 @@ class ChartTarget(Target):
 
 
 class ChartSequence(Sequence):
-    """`frames` of the chart in white light, with the radiance of its white diffuser."""
+    """`frames` of the chart in white light, after a measurement of the radiance of a white diffuser."""
 
     name: ClassVar[str] = "chart"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")

@@ -1,4 +1,4 @@
-"""Dark frames: black level, read noise, DSNU, and the dark current from a ladder of exposures."""
+"""Dark frames: black level, read noise, DSNU, and the dark current from a series of exposures."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class CapTarget(Target):
 
 
 class DarkSequence(Sequence):
-    """`frames` dark frames at each of `exposures_s`.
+    """`frames` dark frames at each exposure time `exposures_s`.
 
-    The ladder is taken upwards and downwards in turn, so that a linear drift of the temperature isn't taken for dark current.
+    The series of exposures is taken upwards and downwards in turn, so that a linear drift of the temperature doesn't bias the dark current.
     """
 
     name: ClassVar[str] = "dark"
@@ -45,8 +45,8 @@ class DarkSequence(Sequence):
         cap = station.one(CapTarget)
         made: list[Step] = []
         for frame in range(1, self.frames + 1):
-            ladder = self.exposures_s if frame % 2 else self.exposures_s[::-1]
-            for exposure_s in ladder:
+            series = self.exposures_s if frame % 2 else self.exposures_s[::-1]
+            for exposure_s in series:
                 id = f"dark/{exposure_s:g}s/{frame}"
                 made.append(
                     Step(

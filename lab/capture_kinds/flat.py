@@ -23,8 +23,8 @@ from lab.capture_kinds.base import (
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
 
-#: Shares of the brightest channel's saturation. Dense where the photon transfer bends. Beyond saturation for the full well:
-#: the corners of a frame and the channels that the lamp lights less need it.
+#: Levels, shares of the brightest channel's saturation: dense where the photon transfer curve bends, and beyond 1 so that the frame's
+#: corners and the darker channels saturate, too.
 LEVELS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.15, 1.4, 1.8, 2.3)
 QUICK_LEVELS = (0.03, 0.1, 0.25, 0.4, 0.55, 0.7, 0.87, 1.2, 1.6)
 
@@ -42,8 +42,8 @@ class SphereTarget(Target):
 class FlatSequence(Sequence):
     """`frames` flats at each of `levels`, shares of the exposure at which the brightest channel saturates.
 
-    Each camera has exposures of its own, found at `level_found`. The ladder is taken upwards and downwards in turn, and the
-    radiance is measured before each turn: a drift of the lamp is a difference between the turns.
+    Each camera has exposures of its own, scaled from that found for `level_found`. The series of levels is taken upwards and downwards in
+    turn. The radiance is measured before each turn, so that a drift of the lamp shows as a difference between turns.
     """
 
     name: ClassVar[str] = "flat"
@@ -101,7 +101,7 @@ class FlatCapture(Capture):
 
     def remarks(self) -> Iterator[str]:
         if self.radiance is None and self.photons_per_pixel is None:
-            yield "neither radiance nor photons_per_pixel: it tells of noise, not of sensitivity; add what is known"
+            yield "neither radiance nor photons_per_pixel: it determines noise, but no sensitivity; add what is known"
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
         return None if self.radiance is None else UniformField(spectrum(self.radiance), self.kind)

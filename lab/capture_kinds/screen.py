@@ -1,4 +1,4 @@
-"""Patterns on a screen: what all of them share, and the sequence that shows them one after another.
+"""Patterns on a screen: their base classes, and the sequence that shows them one after another.
 
 A pattern is a kind of its own (`white`, `black`, `checkerboard`, `bernoulli`): a subclass of `ScreenCapture` that says
 which cells are lit. `ScreenSequence` takes every pattern that is registered, in the order of registration.
@@ -38,7 +38,7 @@ SQUARE_CELLS = 8
 
 
 class ScreenLayout(Frozen):
-    """How one camera sees the screen; `visible`: rectangle in screen px that surely lies inside the frame."""
+    """Nominal view of the screen by one camera; `visible`: rectangle (row0, col0, row1, col1) in screen px that lies inside the frame."""
 
     camera_px_per_screen_px: float = Field(gt=0)
     visible: tuple[int, int, int, int]
@@ -70,8 +70,8 @@ class CellGrid(Frozen):
 class ScreenSequence(Sequence):
     """`frames` of every pattern on the screen, with nothing moved in between.
 
-    A cell covers about `cell_camera_px` camera pixels: a whole number of screen pixels. The pattern is centred on the screen
-    and lies inside what all cameras see. `seed`: of patterns that are drawn at random.
+    The side of a cell is a whole number of screen pixels, about `cell_camera_px` camera pixels. The pattern is centred on the screen
+    and lies inside what all cameras see. `seed`: of random patterns.
     """
 
     name: ClassVar[str] = "screen"
@@ -94,7 +94,8 @@ class ScreenSequence(Sequence):
         return {name: kind for name, kind in CAPTURES.models.items() if issubclass(kind, ScreenCapture)}
 
     def grid(self, station: Equipment) -> CellGrid:
-        """The cells that fit. Raises InputError if fewer than two squares of the checkerboard do."""
+        """The largest grid of whole checkerboard squares that all cameras see. Raises InputError if that is less than 2 x 2 squares, and
+        where no camera's view of the screen is given."""
         name = station.one(ScreenTarget)
         screen = station.having(ScreenTarget)[name]
         layouts = [layout for side in station.sides if (layout := getattr(screen, side)) is not None]
@@ -173,7 +174,7 @@ def pattern_path(kind: str) -> str:
 
 
 def whole_screen(screen: ScreenTarget) -> CellGrid:
-    """The screen in the largest square cells that fill it exactly."""
+    """The whole screen in the largest square cells that fill it exactly."""
     cell_px = math.gcd(screen.rows, screen.cols)
     return CellGrid(rows=screen.rows // cell_px, cols=screen.cols // cell_px, cell_px=cell_px)
 

@@ -1,4 +1,4 @@
-"""Slanted edges (ISO 12233): the modulation transfer function over the field and over orientations."""
+"""Slanted edges (ISO 12233): the modulation transfer function by field position and orientation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from sim.parameters import Frozen
 
 
 class EdgeLayout(Frozen):
-    """Where one edge lies in a frame, nominally; `field_mm`: [row, col] of its centre from the optical axis, at the sensor."""
+    """Nominal place of one edge in a frame: `region` (row0, col0, row1, col1) in px, end excluded; `angle_deg` from the vertical; `field_mm`:
+    [row, col] of its centre from the optical axis, at the sensor."""
 
     name: str
     region: tuple[int, int, int, int]
@@ -52,7 +53,7 @@ class EdgeTarget(Target):
 
 
 class EdgeSequence(Sequence):
-    """`frames` of every knife edge at hand. A frame has an edge in several regions, and one capture for each region."""
+    """`frames` of every knife edge of the station. A frame shows the edge in several regions; each region is a capture of its own."""
 
     name: ClassVar[str] = "edge"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")

@@ -1,4 +1,4 @@
-"""Blind proof of the diagnosis: sealed recordings with concealed truths, and the score of what the diagnosis said of them.
+"""The challenge: a blind test of the diagnosis on recordings whose concealed effects are sealed until it has answered.
 
-A second image former (`mocks.former`) makes the recordings: it shares no code with `sim`, by which the diagnosis predicts.
+The recordings are made by a second image former (`mocks.former`), which shares no code with `sim`, by which the diagnosis predicts.
 """

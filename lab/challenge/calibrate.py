@@ -44,7 +44,7 @@ def changed_policy(rules: Sequence[str]) -> DecisionPolicy:
 
 
 def refuse_proof(truths: Truths) -> None:
-    """Raise InputError for a proof's cases: rules that were tuned on them would prove nothing."""
+    """Raise InputError for the cases of a proof: rules tuned on them would invalidate it."""
     if truths.purpose == "proof":
         raise InputError(
             f"seed {truths.seed}: a proof's cases aren't for tuning; make others with a seed below 1000000"

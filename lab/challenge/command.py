@@ -53,7 +53,7 @@ def make_command(
     cases: Annotated[int, typer.Option("--cases", min=1, metavar="N", help="how many recording sets")] = 40,
     seed: Annotated[
         int | None,
-        typer.Option("--seed", min=0, metavar="S", help="what the cases are drawn from (without: a fresh one)"),
+        typer.Option("--seed", min=0, metavar="S", help="seed of the cases (without: a new one)"),
     ] = None,
     truths: Annotated[
         Path | None, typer.Option("--truths", metavar="FILE", help="where the truths go (DIR.truths.json beside DIR)")
@@ -71,7 +71,7 @@ def make_command(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Write sealed recording sets with concealed truths. An interrupted one goes on where it stopped."""
+    """Write sealed recording sets with concealed truths. Run it again to continue after an interruption."""
     from lab.challenge.make import make
     from lab.challenge.proof import refuse_scored
     from lab.challenge.truth import FIRST_FRESH_SEED, FIRST_PROOF_SEED, purpose_of
@@ -97,7 +97,7 @@ def make_command(
 
 @commands.command("score")
 def score_command(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what `challenge make` wrote")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="the folder that `challenge make` wrote")],
     truths: Annotated[Path, typer.Option("--truths", metavar="FILE", help="the truths that `challenge make` wrote")],
     json: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="write the result as JSON ('-': to stdout)")
@@ -108,7 +108,7 @@ def score_command(
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Diagnose what has no result yet, open the seals, and score. Exit code 4 where a goal is missed."""
+    """Diagnose the cases without a result, open the seals, and score. Exit code 4 if a goal is missed."""
     from lab.challenge.proof import table, write_page
     from lab.challenge.run import run_all
     from lab.challenge.score import broken_seals, score
@@ -130,19 +130,19 @@ def score_command(
 
 @commands.command("calibrate")
 def calibrate_command(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what `challenge make` wrote")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="the folder that `challenge make` wrote")],
     truths: Annotated[Path, typer.Option("--truths", metavar="FILE", help="the truths that `challenge make` wrote")],
     rules: Annotated[
         list[str] | None,
-        typer.Option("--rule", metavar="NAME=VALUE", help="a rule of decision at another value; repeatable"),
+        typer.Option("--rule", metavar="NAME=VALUE", help="another value of a decision rule; may be repeated"),
     ] = None,
     each: Annotated[
-        bool, typer.Option("--each", help="take out the rules without a derivation one by one, and print a table")
+        bool, typer.Option("--each", help="remove each rule that has no derivation in turn, and print a table")
     ] = False,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Score tuning cases under other rules of decision, beside the default ones; results stay in DIR for the next time."""
+    """Score tuning cases under changed decision rules and under the default ones; results are kept in DIR."""
     from lab.challenge.calibrate import answers, changed_policy, comparison, policies_without, refuse_proof, rule_table
     from lab.challenge.run import run_all
     from lab.challenge.score import broken_seals, score

@@ -1,4 +1,4 @@
-"""The mix of a challenge: cameras, what they conceal and how strongly, and what is stated wrongly of them."""
+"""The cases of a challenge: drawn cameras, the laws that they conceal, at which strength, and faults of metadata or rig."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ SIZES: dict[str, tuple[int, int] | None] = {
 #: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
 SHARES: tuple[tuple[Kind, int], ...] = (("healthy", 6), ("single", 7), ("compound", 3), ("outside", 4))
 FOREIGN_FRAMES = ((24, 32), (48, 64), (96, 128), (192, 256), (384, 512))
-FOREIGN_SHARES = (0.1, 0.2, 0.35, 0.25, 0.1)
+FOREIGN_SHARES = (0.1, 0.2, 0.35, 0.25, 0.1)  # probabilities of these frames
 FOREIGN_BITS = (8, 10, 12, 14, 16)
-WEAK, STRONG = (10.0, 50.0), (50.0, 2000.0)  # non-centralities aimed at, half of the cases each
-INVISIBLE = 1.0  # a non-centrality below which no strength is searched
-SIZING_ROUNDS, SIZING_FACTOR = 3, 1.6  # attempts to reach the non-centrality aimed at, and how near is near enough
-FAULT_SHARE = 0.35  # of the cases outside the library
+WEAK, STRONG = (10.0, 50.0), (50.0, 2000.0)  # ranges of the target non-centrality, each in half of the cases
+INVISIBLE = 1.0  # non-centrality below which the strength isn't adjusted
+SIZING_ROUNDS, SIZING_FACTOR = 3, 1.6  # most adjustments of the strength; tolerated factor to the target non-centrality
+FAULT_SHARE = 0.35  # share of faults among the cases outside the library
 Sizing = Literal["aimed", "nominal", "unmeasured"]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A recording set and what it conceals."""
+    """A recording set and its concealed truth."""
 
     recordings: RecordingSet
     truth: CaseTruth
@@ -56,8 +56,10 @@ class DrawnFrame:
 
     @staticmethod
     def drawn(rng: np.random.Generator) -> DrawnFrame:
-        """One that the tool was not tuned on: tiny and large frames, 8 to 16 bit, screens of 2 to 6 px a cell, turned by 0 to 2 degrees; cells of
-        integral numbers of pixels that stand straight, as a careful laboratory sets a screen up, in a third of the cases."""
+        """A frame unlike those of tuning: 24 to 384 rows, 8 to 16 bit, screen cells of 2 to 6 px, rotated by 0 to 2 degrees.
+
+        In a third of the cases cells are a whole number of pixels and aren't rotated, as a careful laboratory sets a screen up.
+        """
         rows, cols = FOREIGN_FRAMES[int(rng.choice(len(FOREIGN_FRAMES), p=FOREIGN_SHARES))]
         aligned = rng.random() < 1.0 / 3.0
         return DrawnFrame(
@@ -75,8 +77,9 @@ def draw(
     """Case number `index` of a challenge; the same arguments give the same case.
 
     cfa, kind, law    None: drawn
-    sizing            "aimed": laws get the strength that gives a drawn non-centrality. "nominal": the nominal strength, and a non-centrality from
-                      one draw of the noise, which is quick and too high. "unmeasured": the nominal strength, and 0 for the non-centrality
+    sizing            "aimed": laws get the strength that gives a drawn non-centrality. "nominal": they have their nominal strength, and the
+                      non-centrality is taken from one draw of the noise, which is quick and too high. "unmeasured": they have their
+                      nominal strength, and 0 stands for the non-centrality
     """
     rng = np.random.default_rng([seed, index])
     what = kind or kind_of(seed, index)
@@ -110,7 +113,7 @@ def draw(
     kinds = tuple(k for k in plan.kinds if k != drop)
     plan = replace(plan, kinds=kinds, warm=plan.warm or any(one.needs == "temperature" for one in laws))
 
-    @lru_cache(maxsize=4)  # what was measured last is what is handed out
+    @lru_cache(maxsize=4)  # the session that was measured last is the one returned
     def take(present: tuple[Law, ...], noise_draw: int) -> DrawnSession:
         camera = ConcealedCamera(
             camera_seed, present, cfa=cfa, rows=rows, cols=cols, noise_draw=noise_draw, bit_depth=frame.bit_depth
@@ -150,12 +153,12 @@ def kind_of(seed: int, index: int) -> Kind:
 
 
 def _card(seed: int, which: int, index: int, count: int) -> int:
-    """Card number `index` of shuffled decks of `count`, one after the other: every card comes before one comes twice."""
+    """Item number `index` of a sequence of random permutations of `count` items: all occur before one occurs again."""
     return int(np.random.default_rng([seed, 2000 + which, index // count]).permutation(count)[index % count])
 
 
 class _Dealer:
-    """Deals laws that a case's camera can have."""
+    """Chooses the laws of a case among those that its camera can have, each equally often over the cases of a kind."""
 
     def __init__(self, seed: int, index: int, rng: np.random.Generator, cfa: str) -> None:
         self.rng, self.mono, self.seed = rng, cfa == "MONO", seed
@@ -174,18 +177,19 @@ class _Dealer:
 
 
 def _resized(law: Law, strength: float) -> Law:
+    """The law at another strength, within its limits."""
     low, high = law.limits
     return type(law)(float(np.clip(strength, low, high)), law.variant, law.seed)
 
 
 @dataclass(frozen=True)
 class _Sized:
-    """Laws at their strengths, and how strongly and how distinctly each shows."""
+    """Concealed laws at their strengths."""
 
     laws: list[Law]
-    noncentrality: list[float]
-    fair: list[FairStrength]
-    oracle_share: float | None
+    noncentrality: list[float]  # of each
+    fair: list[FairStrength]  # of each
+    oracle_share: float | None  # of the case
 
 
 def _sized(
@@ -195,8 +199,11 @@ def _sized(
     draws: tuple[int, int],
     against: tuple[Collection[str], np.random.Generator] | None,
 ) -> _Sized:
-    """Laws at the strengths that come near the non-centralities aimed at; of two, near the conditional ones. `against`: names that are no rivals, and
-    the noise of the oracle; None: only the non-centralities are measured."""
+    """Laws at strengths near the target non-centralities; of two laws, near target conditional non-centralities.
+
+    `take`: draws the session with given laws and a number of the draw of the noise; `draws`: the two numbers. `against`: names that are
+    no rivals, and the oracle's random numbers; None: only the non-centralities are measured.
+    """
     if not laws:
         return _Sized([], [], [], None)
 
@@ -224,7 +231,7 @@ def _sized(
         library = library_changes(none[0])
         fair, oracle = fair_strengths(whole, without, library, effects, accepts, rng)
         ratios = [t / max(f.conditional or t, INVISIBLE) for t, f in zip(targets, fair, strict=True)]
-        if max(ratios) > SIZING_FACTOR:  # what one imitates of the other doesn't count
+        if max(ratios) > SIZING_FACTOR:  # stronger by the part that the other law imitates
             laws = [
                 _resized(one, one.strength * min(max(ratio, 1.0) ** (0.5 / one.power), 10.0))
                 for one, ratio in zip(laws, ratios, strict=True)

@@ -1,14 +1,14 @@
-"""How well concealed laws could be told at all: the linear Gaussian problem of one case.
+"""How well the concealed laws of one case can be identified at best: a linear Gaussian problem.
 
-All vectors are whitened changes of the summaries (n,): the noise is of unit variance, nuisance parameters are marginalised. With P the projection
-on what is orthogonal to some directions J, and d the change by the concealed law i,
+All vectors are changes of the summaries (the measured numbers), (n,), whitened: noise has unit variance, and nuisance parameters are
+marginalised. P[J] is the projection orthogonal to directions J, and d the change by the concealed law i:
 
-    conditional non-centrality   lambda(i | j) = |P[J_j] d|^2               what the other concealed law can't imitate
-    separability                 min over rivals k of |P[J_j, J_k] d|^2     what no rival beside it can imitate, either
+    conditional non-centrality   lambda(i | j) = |P[J_j] d|^2               the part that the other concealed law can't imitate
+    separability                 min over rivals k of |P[J_j, J_k] d|^2     the part that no rival beside it can imitate, either
 
-(the minimal detectable and the minimal identifiable bias of geodesy: Baarda 1968; Teunissen 2018, J Geod 92:59). The oracle knows all
-directions and has only to choose: its share of right answers is the best that a method can reach on these summaries, but for what the signs
-of parameters tell. It is found by Monte Carlo.
+They are the minimal detectable and the minimal identifiable bias of geodesy (Baarda 1968; Teunissen 2018, J Geod 92:59). The oracle
+knows all directions and only has to choose among them. Its share of right answers, found by Monte Carlo, is the best that a method can
+reach on these summaries, except for the information in the signs of parameters.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from scipy.stats import chi2
 
 from sim.spectrum import FloatArray
 
-#: Singular value of unit vectors, of the largest, below which a direction isn't one of its own: two instances of an effect differ by curvature.
+#: Ratio to the largest singular value below which a direction isn't counted: two instances of one effect differ by curvature.
 DISTINCT = 0.1
-#: Share of healthy cameras on which one of the oracle's candidates alone is worth its price, and the draws of the noise that set it: it is
-#: known to 1 / sqrt(FALSE_ALARMS * NOISE_DRAWS) = 10 % of itself.
+#: The oracle's rate of false alarms on healthy cameras, and the draws of the noise that set its thresholds: the rate is known to
+#: 1 / sqrt(FALSE_ALARMS * NOISE_DRAWS) = 10 %.
 FALSE_ALARMS, NOISE_DRAWS = 0.01, 10000
 
 
 @dataclass(frozen=True)
 class Directions:
-    """What one kind of effect can change: an orthonormal basis (n, m). A name may have several, of which one applies."""
+    """Orthonormal basis (n, m) of the changes that an effect can make. A name may have several, of which one applies."""
 
     name: str
     basis: FloatArray
 
 
 def span(vectors: FloatArray) -> FloatArray:
-    """Orthonormal basis (n, m) of the distinct directions of `vectors` (n, k); those of no length have none."""
+    """Orthonormal basis (n, m) of the distinct directions of `vectors` (n, k), without those of length 0."""
     size = np.linalg.norm(vectors, axis=0)
     unit = vectors[:, size > 0.0] / size[size > 0.0]
     if not unit.shape[1]:
@@ -48,14 +48,15 @@ def span(vectors: FloatArray) -> FloatArray:
 
 
 def joined(*bases: FloatArray) -> FloatArray:
-    """Orthonormal basis of what several bases span together."""
+    """Orthonormal basis of the space that several bases span together."""
     table = np.concatenate(bases, axis=1)
     left, values, _ = np.linalg.svd(table, full_matrices=False)
     return np.asarray(left[:, values > 1e-6 * max(float(values.max(initial=0.0)), 1e-300)])
 
 
 def with_direction(basis: FloatArray, change: FloatArray) -> FloatArray:
-    """The basis (n, m) of an effect whose law is known: the direction in it that is nearest to `change` (n,) becomes that of `change`."""
+    """The basis (n, m) of an effect whose concealed law changes the summaries by `change` (n,): its direction nearest to that of `change`
+    is replaced by that of `change`."""
     unit = change[:, None] / max(float(np.linalg.norm(change)), 1e-300)
     if not basis.shape[1]:
         return unit
@@ -64,16 +65,17 @@ def with_direction(basis: FloatArray, change: FloatArray) -> FloatArray:
 
 
 def beyond(first: FloatArray, second: FloatArray, basis: FloatArray) -> float:
-    """d1' P d2, at least 0: the squared length of a change orthogonal to `basis` (n, m), from its measurements with two draws of the noise."""
+    """d1' P d2, at least 0: squared length of a change's part orthogonal to `basis` (n, m). d1 and d2 (n,) are measured with two draws of
+    the noise."""
     return max(float(first @ second - (first @ basis) @ (second @ basis)), 0.0)
 
 
 def separability(
     first: FloatArray, second: FloatArray, beside: FloatArray, rivals: Sequence[Directions]
 ) -> tuple[float, str | None]:
-    """The least squared length of a change that is left beside any rival, and that rival; the whole one and None without rivals.
+    """The least squared length of a change orthogonal to `beside` and to any one rival, and that rival; without rivals None.
 
-    `beside` (n, m): the directions of what else is concealed.
+    `beside` (n, m): the directions of the other concealed laws.
     """
     left = [(beyond(first, second, joined(beside, rival.basis)), rival.name) for rival in rivals]
     return min(left, default=(beyond(first, second, beside), None))
@@ -82,10 +84,10 @@ def separability(
 def oracle_share(
     mean: FloatArray, candidates: Sequence[Directions], truth: Sequence[str], rng: np.random.Generator, draws: int = 400
 ) -> float:
-    """Share of draws of the noise in which the oracle answers rightly: of one true name, it comes first; of two, both are named and no other.
+    """Share of draws of the noise in which the oracle is right: one true name comes first; of two, exactly both are named.
 
-    `mean` (n,): change by all concealed laws together. The oracle takes none, one or two candidates, whichever gain most chi2 after a price for
-    each (`_prices`). Raises ValueError for more than two true names, and where one of them isn't a candidate.
+    `mean` (n,): change by all concealed laws together. The oracle names none, one or two candidates, those with the largest gain in chi2
+    less a threshold for each (`_prices`). Raises ValueError for more than two true names, and where one of them isn't a candidate.
     """
     if not 1 <= len(truth) <= 2 or not {c.name for c in candidates} >= set(truth):
         raise ValueError(f"{', '.join(truth)}: the oracle tells one or two of its candidates")
@@ -113,8 +115,10 @@ def oracle_share(
 
 
 def _prices(bases: Sequence[FloatArray], rng: np.random.Generator) -> list[float]:
-    """The chi2 that each candidate has to gain: the same quantile of chi2 with as many degrees of freedom as it has directions, such that pure noise
-    pays the price of any in a share FALSE_ALARMS of draws."""
+    """The chi2 that each candidate has to gain: a quantile of chi2 with as many degrees of freedom as the candidate has directions.
+
+    The quantile is the same for all, such that pure noise exceeds the threshold of any candidate in `FALSE_ALARMS` of the draws.
+    """
     noise = rng.standard_normal((NOISE_DRAWS, len(bases[0])))
     freedom = [basis.shape[1] for basis in bases]
     most = {m: np.zeros(NOISE_DRAWS) for m in freedom}

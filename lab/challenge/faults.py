@@ -1,4 +1,4 @@
-"""Faults of a sound camera's metadata or rig: mismatches that no effect explains."""
+"""Faults of metadata or rig around a healthy camera: mismatches that no effect explains."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Spoil = Callable[[dict[str, Any], dict[str, Any], dict[str, Any], np.random.Gene
 
 @dataclass(frozen=True)
 class CaseFault:
-    """One fault. `spoil` changes manifest, frames and spectra in place; `accepts`: effects that describe it rightly."""
+    """One fault. `spoil` changes manifest, frames and spectra in place; `accepts`: effects whose name is right for it."""
 
     name: str
     spoil: Spoil
@@ -25,7 +25,7 @@ class CaseFault:
 
 
 def spoilt(session: DrawnSession, fault: CaseFault, rng: np.random.Generator) -> DrawnSession:
-    """A session with a fault."""
+    """A copy of a session with the fault."""
     manifest, frames, spectra = deepcopy(session.manifest), dict(session.frames), dict(session.spectra)
     fault.spoil(manifest, frames, spectra, rng)
     return replace(session, manifest=manifest, frames=frames, spectra=spectra)

@@ -1,4 +1,4 @@
-"""The live proof: benches that conceal one thing each, a whole session over the wire, and what the diagnosis makes of it.
+"""The live proof: mock benches that conceal effects, a whole session over the wire, and its diagnosis.
 
 `python -m lab.challenge.live --out DIR`. Every case starts `calibench bench` as an OS process, captures a quick session from its
 station file, fits and diagnoses it, and leaves DIR/results/CASE.json; a case whose result is there is not run again.
@@ -112,8 +112,8 @@ FIRST_SESSION = ("dark", "flat", "screen")
 #: By how much the sensors get warmer (C) where the effect needs that.
 WARM_UP_C = {"dark_current_temperature": 6.0}
 
-#: Effects that a diagnosis doesn't look for: it is right with no name, or with the name of what does the same. The discrepancy's typical
-#: instance is a transfer that falls with the frequency alike in all directions: that family's name is right.
+#: Effects that a diagnosis doesn't look for, and the names that are right for them, besides no name: those of effects or families that
+#: change recordings alike. The model discrepancy's typical instance is an isotropic loss of contrast.
 NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
     "cover_glass": frozenset({"spherical_aberration"}),
     "model_discrepancy": frozenset({"isotropic_contrast_loss"}),
@@ -123,29 +123,28 @@ NOT_LOOKED_FOR: dict[str, frozenset[str]] = {
 #: Effects that the mock bench can't show, and refuses to conceal.
 NOT_SHOWN_BY_BENCH = frozenset({"second_order_light", "stereo_time_offset"})
 
-#: Effects that one session can't show: its own boards give the distortion, so that only an earlier calibration tells that it changed.
+#: Effects that one session can't show: distortion is fitted to its boards, so that only an earlier calibration shows a change.
 NOT_IN_ONE_SESSION = frozenset({"distortion", "decentre"})
 
 
 class LiveCase(Frozen):
-    """One bench: what it conceals (`--conceal`), its seed, the sequences that are taken (empty: all), and whether `run --resolve` is
-    asked for."""
+    """One mock bench and its session."""
 
     name: str
-    concealed: tuple[str, ...] = ()
+    concealed: tuple[str, ...] = ()  # values of `--conceal`
     seed: int = 1
-    warm_up_c: float = 0.0
-    only: tuple[str, ...] = ()
-    resolve: bool = False
+    warm_up_c: float = 0.0  # by how much the sensors get warmer
+    only: tuple[str, ...] = ()  # sequences to capture; empty: all
+    resolve: bool = False  # `run --resolve`
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of what is concealed."""
+        """Names of the concealed effects."""
         return tuple(spec.split(":")[1] for spec in self.concealed)
 
 
 class FoundParameter(Frozen):
-    """A parameter that was concealed and named: truth against what was found, with its standard deviation."""
+    """A parameter of a concealed effect that was named: true and estimated value, with standard deviation."""
 
     effect: str
     parameter: str
@@ -156,7 +155,7 @@ class FoundParameter(Frozen):
 
 
 class LiveRun(Frozen):
-    """What came of a case. `named`: effects with their sides; `first_named`, `first_rivals`: what was said before `--resolve` took
+    """The outcome of a case. `named`: effects with their sides; `first_named`, `first_rivals`: names and rivals before `--resolve` took
     its `captures`."""
 
     case: LiveCase
@@ -209,8 +208,8 @@ def every_case() -> dict[str, LiveCase]:
 
 
 def drawn(seed: int, count: int = 3) -> tuple[LiveCase, ...]:
-    """Some single effects at random, for a day's tests: of the session only darks, flats, and the sequences whose captures can show the
-    effect."""
+    """Random cases of single effects, for everyday tests. Of the session, only darks, flats, and the sequences that can show the effect
+    are captured."""
     single = [case for name, case in every_case().items() if name in library() and name not in NOT_IN_ONE_SESSION]
     return tuple(
         case.model_copy(update={"only": _showing(case.effects[0])})
@@ -322,12 +321,12 @@ def names_of(effect: str) -> frozenset[str]:
 
 
 def _reaches(name: str, sides: tuple[Side, ...], wanted: dict[str, frozenset[Side]]) -> bool:
-    """Whether an effect was named on sides that have it alone."""
+    """Whether an effect was named only on sides that conceal it."""
     return name not in wanted or set(sides) <= wanted[name]
 
 
 def run_all(cases: dict[str, LiveCase], out: Path) -> dict[str, LiveRun]:
-    """Results by case: those in OUT/results, and the others as they are run, in order."""
+    """Case -> result: from OUT/results where it exists, else run now, in order."""
     runs = {}
     for name, case in cases.items():
         file = out / "results" / f"{name}.json"
@@ -352,7 +351,7 @@ def main(
     ] = None,
     cases: Annotated[bool, typer.Option("--cases", help="list the cases as JSON, and end")] = False,
 ) -> None:
-    """Conceal every effect on the mock bench, capture, diagnose, and say what was found. Goes on where it stopped."""
+    """Conceal every effect on the mock bench, capture, diagnose, and report. Continues where an earlier run stopped."""
     from lab.challenge.live_page import write_page
 
     every = every_case()
@@ -363,7 +362,7 @@ def main(
     if unknown:
         raise InputError(f"--only {unknown[0]}: no such case; there are {', '.join(every)}")
     runs = run_all({name: case for name, case in every.items() if not only or name in only}, out)
-    if page is not None:  # with what earlier runs left there
+    if page is not None:  # with the results of earlier runs
         there = {name: out / "results" / f"{name}.json" for name in every}
         write_page({name: load(LiveRun, file) for name, file in there.items() if file.exists()}, page)
     right = sum(run.outcome in ("named", "healthy") for run in runs.values())

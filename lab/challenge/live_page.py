@@ -1,4 +1,4 @@
-"""The page on the live proof: a table of what was concealed and what was said, and a picture of the parameters found."""
+"""The page on the live proof: a table of concealed and named effects, and a picture of their parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COLOURS = {"named": RIGHT, "healthy": RIGHT, "among rivals": ABSTAINED, "not nam
 
 
 def write_page(runs: Mapping[str, LiveRun], page: Path) -> None:
-    """Put the section into the page, and its picture beside it."""
+    """Write the section into the page, and its picture beside the page."""
     text = page.read_text(encoding="utf-8") if page.is_file() else "# Proof\n"
     picture = page.with_name(f"{page.stem}-live.svg")
     section = f"{summary(runs)}\n\n{table(runs)}\n\n![Parameters found over concealed ones]({picture.name})"
@@ -27,7 +27,7 @@ def write_page(runs: Mapping[str, LiveRun], page: Path) -> None:
 
 
 def summary(runs: Mapping[str, LiveRun]) -> str:
-    """How many cases came out how."""
+    """Number of cases by outcome, as Markdown."""
     groups = {
         "single effects": [run for run in runs.values() if len(run.case.concealed) == 1 and not run.case.resolve],
         "pairs": [run for run in runs.values() if len(run.case.concealed) > 1],
@@ -45,7 +45,7 @@ def summary(runs: Mapping[str, LiveRun]) -> str:
 
 
 def table(runs: Mapping[str, LiveRun]) -> str:
-    """One row a case."""
+    """Markdown table with a row for each case."""
     lines = [
         "| concealed | outcome | named (sides) | rivals | parameter: found, concealed | held-out chi2 / n, before | after |",
         "| --- | --- | --- | --- | --- | --- | --- |",

@@ -1,4 +1,4 @@
-"""Writing a challenge: sealed recording sets in a folder, their truths elsewhere."""
+"""Write a challenge: sealed recording sets in a folder, and their truths outside it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def make(
         there = load(Truths, truths_file)
         if (there.seed, there.size, there.cases) != (seed, size, cases):
             raise InputError(
-                f"{truths_file}: of {there.cases} cases of size {there.size} and another seed or number than asked for; give another file, or take it away"
+                f"{truths_file}: holds a challenge of {there.cases} cases of size {there.size}, of another seed, size or number than asked for; give another file, or remove it"
             )
         held = there
     elif out.exists() and any(out.iterdir()):

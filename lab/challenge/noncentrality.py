@@ -1,8 +1,9 @@
-"""How strongly a concealed law shows: the non-centrality of its change of the diagnosis's summaries, and how well it could be told.
+"""The strength of a concealed law: the non-centrality of its change of the summaries, and how well it can be identified.
 
-The library of effects has no part in the non-centrality. Recordings with and without the law are of the same camera with the same noise, so that
-their difference is the law's. The covariance is that of the recordings with it, nuisance parameters marginalised. What else could look like
-it is what the library's effects change about the healthy camera (`lab.challenge.fair_strength`).
+Summaries are the measured numbers of a diagnosis. Recordings with and without the law are of the same camera with the same noise, so
+that their difference is the law's change. Its covariance is that of the recordings with the law, nuisance parameters marginalised. The
+library of effects has no part in the non-centrality. It enters as rivals, by its effects' changes of the healthy camera
+(`lab.challenge.fair_strength`).
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from lab.predict.camera_model import camera_model
 from sim.effects.library import candidates
 from sim.spectrum import FloatArray
 
-#: Summaries with two draws of the noise.
+#: Measurement models of one camera with two draws of the noise.
 TwoDraws = Sequence[MeasurementModel | None]
 
 
 def summaries(recordings: RecordingSet) -> MeasurementModel | None:
-    """The summaries of a single camera's recordings; None where nothing can be summarised."""
+    """The summaries of a single camera's recordings; None where no measurement is determined."""
     study = Study(recordings, "left", camera_model(recordings, "left", None, maker_curves=True))
     blocks = []
     for measurement in measurements():
@@ -41,7 +42,7 @@ def summaries(recordings: RecordingSet) -> MeasurementModel | None:
 
 
 def _keys(found: MeasurementModel) -> list[Hashable]:
-    """Identity of each summary: the same in all recordings of one session."""
+    """A key for each summary, the same in all recordings of one session."""
     count: Counter[Hashable] = Counter()
     keys: list[Hashable] = []
     for block in found.blocks:
@@ -53,17 +54,18 @@ def _keys(found: MeasurementModel) -> list[Hashable]:
 
 
 def _change(present: MeasurementModel, absent: MeasurementModel) -> dict[Hashable, float]:
-    """Change by the law of every summary that both have and that may be used for the choice."""
+    """Key -> change by the law, of every summary that both have and that isn't held out."""
     other = dict(zip(_keys(absent), absent.value, strict=True))
     seen = zip(_keys(present), present.value, present.seen, strict=True)
     return {key: value - other[key] for key, value, use in seen if use and key in other}
 
 
 def noncentrality(pairs: Sequence[tuple[MeasurementModel | None, MeasurementModel | None]]) -> float:
-    """d1' C^-1 d2 of two pairs (with the law, without it), never below 0; each pair is of another draw of the noise.
+    """d1' C^-1 d2, at least 0, of two pairs (with the law, without it), each with its own draw of the noise.
 
-    d is the change of the summaries, C their covariance under the baseline in the first pair's recordings with the law. A law that moves
-    an edge moves it over other noise. That noise is independent in d1 and d2 and cancels on average; |d|^2 of one pair would count it twice.
+    d is the change of the summaries, C their covariance under the baseline, from the first recordings with the law. A law that moves an
+    edge changes the noise under it, too. That part is independent in d1 and d2 and cancels on average; |d|^2 of one pair would be biased by
+    it.
     """
     (present, absent), (again, without) = pairs
     if present is None or absent is None or again is None or without is None:
@@ -80,23 +82,23 @@ def noncentrality(pairs: Sequence[tuple[MeasurementModel | None, MeasurementMode
 
 @dataclass(frozen=True)
 class FairStrength:
-    """How well one concealed law could be told. `conditional`: None where no other is concealed; `rival`: what comes nearest to it beside that."""
+    """How well one concealed law can be identified (`lab.challenge.fair_strength`)."""
 
-    conditional: float | None
+    conditional: float | None  # conditional non-centrality; None where no other law is concealed
     separability: float | None
-    rival: str | None
+    rival: str | None  # that is nearest to it
 
 
 @dataclass(frozen=True)
 class LibraryChanges:
-    """What the candidates of the library change about one camera: name and changes (n, prototypes) of each set of prototypes; `row` of each summary."""
+    """The changes of one camera's n summaries by the candidates of the library."""
 
-    row: dict[Hashable, int]
-    changes: tuple[tuple[str, FloatArray], ...]
+    row: dict[Hashable, int]  # of each summary
+    changes: tuple[tuple[str, FloatArray], ...]  # name and changes (n, prototypes) of each set of prototypes
 
 
 def library_changes(healthy: MeasurementModel | None) -> LibraryChanges:
-    """The changes by every candidate about the healthy camera; none where nothing can be summarised."""
+    """The changes by every candidate about the healthy camera; none where no measurement is determined."""
     if healthy is None:
         return LibraryChanges({}, ())
     base = healthy.mean()
@@ -119,9 +121,9 @@ def fair_strengths(
 ) -> tuple[list[FairStrength], float | None]:
     """Conditional non-centrality and separability of each concealed law, and the oracle's share of right answers on the case.
 
-    `whole`: summaries of the recordings; `without`: of those without each law; `effects`: the laws' names in the list of effects. What
-    `accepts` names is no rival. Of an effect that is concealed, its law's own change is one direction. The share is None where a law isn't in
-    the list, or its effect changes no summary.
+    `whole`: summaries with all laws; `without`: without each law in turn; `effects`: the laws' names in the library, None outside it;
+    `accepts`: names that are no rivals. Of a concealed effect, the law's measured change replaces one direction. The share is None where a
+    law isn't in the library, or its effect changes no summary.
     """
     present, again = whole
     absent = [(one, other) for one, other in without if one is not None and other is not None]

@@ -1,4 +1,4 @@
-"""The proof's curves as a picture: the share of right answers over strength, of the diagnosis and of the oracle."""
+"""Power curves of the proof as a picture: share of right answers against separability, of the diagnosis and of the oracle."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from lab.challenge.score import CaseScore, ChallengeScore, Rate
 
-#: Borders of the classes of separability; what is beyond the last ones counts in the outermost class.
+#: Borders of the classes of separability; values beyond them count in the first and the last class.
 BORDERS = (1.0, 5.0, 10.0, 15.0, 25.0, 50.0, 100.0, 300.0, 2000.0)
 WIDTH_PX, HEIGHT_PX, LEFT_PX, TOP_PX, GAP_PX = 330.0, 210.0, 62.0, 44.0, 66.0
 MEASURED, ORACLE = "#1f5fa8", "#8a8f98"
 
 
 def power_curves(found: ChallengeScore) -> str:
-    """Both curves as SVG, single effects at the left and compounds at the right. Classes of separability, at the mean of its logarithm: the
-    diagnosis's share with its interval of 95 % and the number of cases, the mean of the oracle's shares of the same cases."""
+    """SVG with single effects at the left and compounds at the right. For each class of separability, at its geometric mean: the share of
+    right diagnoses with its 95 % interval and the number of cases, and the mean share of the oracle on the same cases."""
     width, height = LEFT_PX + 2 * WIDTH_PX + GAP_PX + 24, TOP_PX + HEIGHT_PX + 92
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" font-family="sans-serif" font-size="12">',

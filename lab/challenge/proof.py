@@ -33,8 +33,8 @@ def _share(share: float | None) -> str:
 
 
 def table(found: ChallengeScore) -> str:
-    """The scores as Markdown tables; intervals are Clopper-Pearson's of 95 %."""
-    verdict = {True: "met", False: "missed", None: "none to tell"}
+    """The scores as Markdown tables, with 95 % intervals (Clopper-Pearson)."""
+    verdict = {True: "met", False: "missed", None: "no case"}
     lines = ["| goal | wanted | reached | oracle | |", "| --- | --- | --- | --- | --- |"]
     for goal in found.goals:
         doubt = "" if goal.sure or goal.sure is None or goal.met is None else ", too few cases to be sure"
@@ -117,7 +117,7 @@ def write_page(found: ChallengeScore, page: Path) -> None:
 
 
 def placed(text: str, name: str, section: str) -> str:
-    """A page's text with a section between its marks, or added at the end."""
+    """A page's text with the section `name` between its marks replaced, or added at the end."""
     begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     if begin not in text:
         return f"{text.rstrip()}\n\n## Results, {name}\n\n{begin}\n{section}\n{end}\n"
@@ -135,8 +135,8 @@ def _row(case: CaseScore) -> str:
 
 
 def confusion(found: ChallengeScore) -> str:
-    """Confusion matrix as SVG: rows are concealed (single effects above 50, healthy, outside the library), columns
-    diagnosed; numbers of cases."""
+    """Confusion matrix as SVG: numbers of cases by what was concealed (rows: single effects of non-centrality above 50, healthy, outside
+    the library) and by the first name or the verdict (columns)."""
     shown = [
         s
         for s in found.case_scores

@@ -8,12 +8,12 @@ from sim.spectrum import Spectrum
 
 
 def recordings_of(camera: ConcealedCamera, plan: Plan = WHOLE_SESSION) -> RecordingSet:
-    """What a camera records."""
+    """The recording set of one camera."""
     return recording_set(record(camera, plan))
 
 
 def recordings_of_pair(left: ConcealedCamera, right: ConcealedCamera, plan: Plan) -> RecordingSet:
-    """What the two cameras of a pair record."""
+    """The recording set of a stereo pair."""
     return recording_set(record_pair(left, right, plan))
 
 

@@ -18,8 +18,7 @@ from sim.parameters import Frozen
 
 
 class CaseRun(Frozen):
-    """A diagnosis (without its curves) with its cost, or the reason why there is none. `memory_mib`: peak of the
-    process."""
+    """The diagnosis of one case, without its curves, and its cost; `error`: why there is none. `memory_mib`: peak of the process."""
 
     case: str
     wall_s: float
@@ -38,7 +37,7 @@ def _peak_mib() -> float:
 
 
 def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
-    """Diagnose one recording set as `lab.diagnose` does; None: by the default policy."""
+    """Diagnose the recording set in `folder`. `policy`: the rules of decision; None: the default ones. An exception becomes `error`."""
     from lab.diagnose import examine
     from lab.formats import recording_set as recording
 
@@ -49,7 +48,7 @@ def run_case(folder: Path, policy: DecisionPolicy | None = None) -> CaseRun:
     try:
         result = examine(recording.read(folder), at_once=False, policy=policy).result
         found = result.model_copy(update={"curves": (), "source": folder.name})
-    except Exception as caught:  # whatever it is, it is this case's result
+    except Exception as caught:  # any error is the result of its case
         at = traceback.extract_tb(caught.__traceback__)[-1]
         error = f"{type(caught).__name__}: {' '.join(str(caught).split())} ({Path(at.filename).name}:{at.lineno})"
     return CaseRun(
@@ -66,7 +65,7 @@ def run_all(
     policy: DecisionPolicy | None = None,
     results: str = "results",
 ) -> dict[str, CaseRun]:
-    """Results by case: from DIR/RESULTS/CASE.json where it exists, else diagnosed and written there."""
+    """Case -> result: from FOLDER/RESULTS/CASE.json where it exists, else diagnosed now and written there."""
     file = {case: folder / results / f"{case}.json" for case in cases}
     runs = {case: load(CaseRun, file[case]) for case in cases if file[case].exists()}
     missing = [case for case in cases if case not in runs]

@@ -1,4 +1,4 @@
-"""Opening the seals, and scoring what a diagnosis said against what was concealed."""
+"""Open the seals, and score the diagnoses against the concealed truths."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from sim.parameters import Frozen
 CONFIDENCE = 0.95
 #: Half width of a parameter's 95 % interval, standard deviations.
 INTERVAL_SIGMAS = 1.959964
-STRONG, SEEN = 50.0, 25.0
-#: Classes of separability: what it is called, above, at most.
+STRONG, SEEN = 50.0, 25.0  # limits of non-centrality, and of separability, between the classes
+#: Classes of separability: (name, above, at most).
 CLASSES = (("above 50", STRONG, inf), ("25 to 50", SEEN, STRONG), ("below 25", -1.0, SEEN))
 CPU_GOAL_S, MEMORY_GOAL_MIB = 120.0, 3072.0  # 60 s on two cores
 #: Smallest excess of held-out chi2 whose removal is scored, standard deviations of chi2.
@@ -31,7 +31,7 @@ EXCESS_SIGMAS = 3.0
 
 
 class Rate(Frozen):
-    """`count` of `of` with its Clopper-Pearson interval of 95 %; None where `of` is 0."""
+    """`count` of `of` cases, the share, and its 95 % interval (Clopper-Pearson); None where `of` is 0."""
 
     count: int
     of: int
@@ -41,6 +41,7 @@ class Rate(Frozen):
 
     @classmethod
     def over(cls, hits: Iterable[bool]) -> Rate:
+        """The rate of hits."""
         seen = list(hits)
         count, of = sum(seen), len(seen)
         if of == 0:
@@ -52,19 +53,18 @@ class Rate(Frozen):
 
 
 class Goal(Frozen):
-    """A goal of the proof. `met`: None where no case applies. `sure`: whether the 95 % interval lies entirely on one
-    side of the limit. `oracle`: the share that the oracle reaches on the same cases, as far as it was asked; None: it wasn't."""
+    """A goal of the proof."""
 
     name: str
     wanted: str
     reached: str
-    met: bool | None
-    sure: bool | None = None
-    oracle: float | None = None
+    met: bool | None  # None where no case applies
+    sure: bool | None = None  # whether the 95 % interval lies entirely on one side of the limit
+    oracle: float | None = None  # mean share of the oracle on the same cases; None where it wasn't computed
 
 
 class CaseScore(Frozen):
-    """One case: what it concealed, and the diagnosis of it."""
+    """One case: the concealed truth, and the diagnosis."""
 
     case: str
     kind: str
@@ -72,31 +72,30 @@ class CaseScore(Frozen):
     variants: tuple[int, ...]
     noncentrality: tuple[float, ...]
     separability: float | None  # the least of its concealed laws; None: not measured
-    oracle_share: float | None  # of draws of the noise in which the oracle answers rightly
+    oracle_share: float | None  # share of draws of the noise in which the oracle is right
     fault: str | None
     verdict: str
     named: tuple[str, ...]
     rivals: tuple[str, ...]
     unexplained: tuple[str, ...]
     right: bool
-    effects: tuple[str, ...]  # that are concealed, as the results' list calls them
+    effects: tuple[str, ...]  # concealed effects, by their names in the library
     true_families: tuple[
         tuple[str, ...], ...
-    ]  # by concealed law, any of which describes it; none for what no family has
-    families: tuple[str, ...]  # of all that was named
-    right_family: bool  # of everything that was concealed, the family or the effect is named
-    wrong_family: bool  # something of another family is named
+    ]  # families that are right for each concealed law; empty where no family has it
+    families: tuple[str, ...]  # of the named effects
+    right_family: bool  # whether the effect or the family of every concealed law is named
+    wrong_family: bool  # whether an effect or a family is named that is right for none
     set_holds: (
         bool | None
-    )  # the sets of models that hold 95 % have what is concealed; None: no set of listed effects is the truth
+    )  # whether the 95 % sets of effects contain the truth; None where no set of listed effects is the truth
     excess_removed: float | None
     cpu_s: float
     memory_mib: float
 
 
 class SinglesScore(Frozen):
-    """Single effects of one class of non-centrality: shares with the right first name, with only that name, and
-    without a name."""
+    """Single effects of one class of non-centrality: rates of the right first name, of only that name, and of no name."""
 
     noncentrality: str
     top_1: Rate
@@ -105,30 +104,25 @@ class SinglesScore(Frozen):
 
 
 class FairScore(Frozen):
-    """Cases of one class of separability (`lab.challenge.fair_strength`) for which the oracle was asked: the share of right answers, a single
-    effect's name first or both of a compound, and the mean of the oracle's. `of_oracle`: the one over the other."""
+    """Cases of one class of separability (`lab.challenge.fair_strength`) for which the oracle was computed."""
 
     kind: Literal["single", "compound"]
     separability: str
-    right: Rate
-    oracle: float | None
-    of_oracle: float | None
+    right: Rate  # a single effect is named first, or both of a compound are named
+    oracle: float | None  # mean share of the oracle
+    of_oracle: float | None  # share of right answers over that of the oracle
 
 
 class FamiliesScore(Frozen):
-    """What was said of concealed laws above a non-centrality of 25, listed or not, that belong to a family; each share is of cases.
+    """Names of effects and families, as rates of cases whose concealed laws have a family and a non-centrality above 25."""
 
-    `right_effects`: of cases of listed effects, every one is named as such. `right_families`: every one by its effect or its family.
-    `wrong_families`: of all cases, healthy ones among them, something of another family is named.
-    """
-
-    right_effects: Rate
-    right_families: Rate
-    wrong_families: Rate
+    right_effects: Rate  # of cases of listed effects: every effect is named
+    right_families: Rate  # every concealed law is named by its effect or its family
+    wrong_families: Rate  # of all cases, healthy ones included: something of another family is named
 
 
 class EffectScore(Frozen):
-    """All single cases of one effect: how often its name came first, and what came instead."""
+    """All cases of one single effect: how often its name came first, and which names or verdicts came instead."""
 
     effect: str
     top_1: Rate
@@ -137,6 +131,8 @@ class EffectScore(Frozen):
 
 
 class ChallengeScore(Frozen):
+    """All scores of a challenge: what `calibench challenge score --json FILE` writes."""
+
     format: Literal["calibench-challenge-score"] = "calibench-challenge-score"
     version: Literal[1] = 1
     purpose: Purpose
@@ -179,7 +175,7 @@ class ChallengeScore(Frozen):
 
 
 def broken_seals(folder: Path, seals: Seals, truths: Truths) -> tuple[str, ...]:
-    """Cases whose truth or recordings differ from what was sealed, or of which either is missing."""
+    """Cases whose truth or recordings differ from the sealed ones or are missing."""
     broken = []
     for case in sorted({*seals.seals, *truths.truths}):
         salted = truths.truths.get(case)
@@ -202,7 +198,7 @@ def seals_sha256(seals: Seals) -> str:
 
 
 def score(truths: Truths, seals: Seals, runs: dict[str, CaseRun], broken: Sequence[str] = ()) -> ChallengeScore:
-    """All figures. Cases with a broken seal are left out; cases that failed count as without a verdict."""
+    """All scores. Cases with a broken seal are left out; cases that failed have no verdict and no name."""
     cases = [
         (case, truths.truths[case].truth, runs[case])
         for case in sorted(runs)
@@ -334,7 +330,7 @@ def _is_listed(truth: CaseTruth) -> bool:
 
 
 def _model_sets(found: DiagnosisResult | None) -> set[frozenset[str]]:
-    """The sets of effects that the smallest set of models has; that of no effect alone where there was nothing to search for."""
+    """The credible sets of effects of a diagnosis; only the empty one where nothing was searched for."""
     if found is None:
         return set()
     sets = {frozenset(one.effects) for models in found.models for one in models.sets}
@@ -347,7 +343,7 @@ def _least_separability(truth: CaseTruth) -> float | None:
 
 
 def families_of(concealed: Concealed) -> frozenset[str]:
-    """Families that describe a concealed law rightly: its effect's, or those that the second former declares; none for what no family has."""
+    """Families that are right for a concealed law: its effect's, or those that the second former declares; empty where no family has it."""
     if concealed.effect is not None:
         return frozenset({library()[concealed.effect].family.value})
     return next((law.families for law in OUTSIDE if law.name == concealed.name), frozenset())
@@ -366,7 +362,7 @@ def _removed(truth: CaseTruth, found: DiagnosisResult | None) -> float | None:
 
 
 def _covered(truth: CaseTruth, found: DiagnosisResult | None) -> Iterable[bool]:
-    """For every parameter that has the same meaning in the library: whether its 95 % interval contains the truth."""
+    """Of every parameter that has the same meaning in the library: whether its 95 % interval contains the true value."""
     named = {e.name: e for e in found.effects} if found is not None else {}
     for hidden in truth.concealed:
         effect = named.get(hidden.effect or "")
@@ -389,7 +385,7 @@ def _singles(what: str, cases: Sequence[CaseScore]) -> SinglesScore:
 
 
 def _oracle(cases: Iterable[CaseScore]) -> float | None:
-    """Mean of the oracle's shares, of the cases for which it was asked."""
+    """Mean share of the oracle over the cases for which it was computed."""
     shares = [s.oracle_share for s in cases if s.oracle_share is not None]
     return fmean(shares) if shares else None
 
@@ -428,18 +424,18 @@ def _by_effect(singles: Sequence[CaseScore]) -> tuple[EffectScore, ...]:
 
 
 def _percent(share: float | None) -> str:
-    return "none to tell" if share is None else f"{100 * share:.1f} %"
+    return "no case" if share is None else f"{100 * share:.1f} %"
 
 
 def _said(rate: Rate) -> str:
     if rate.share is None or rate.low is None or rate.high is None:
-        return "none to tell"
+        return "no case"
     return f"{rate.count} of {rate.of}: {100 * rate.share:.1f} % ({100 * rate.low:.1f}..{100 * rate.high:.1f})"
 
 
 def _judged(name: str, wanted: str, rate: Rate, good: Callable[[float], bool], low: float, high: float) -> Goal:
     if rate.share is None or rate.low is None or rate.high is None:
-        return Goal(name=name, wanted=wanted, reached="none to tell", met=None)
+        return Goal(name=name, wanted=wanted, reached="no case", met=None)
     inside = low <= rate.low and rate.high <= high
     beyond = rate.high < low or rate.low > high
     return Goal(name=name, wanted=wanted, reached=_said(rate), met=good(rate.share), sure=inside or beyond)
@@ -458,5 +454,5 @@ def _between(name: str, rate: Rate, low: float, high: float) -> Goal:
 
 
 def _limit(name: str, value: float | None, limit: float, unit: str) -> Goal:
-    reached = "none to tell" if value is None else f"{value:.3g}{unit}"
+    reached = "no case" if value is None else f"{value:.3g}{unit}"
     return Goal(name=name, wanted=f"<= {limit:g}{unit}", reached=reached, met=None if value is None else value <= limit)

@@ -1,4 +1,4 @@
-"""The truth of a concealed camera, and its seal: a salted hash that fixes the truth before anything is diagnosed."""
+"""The truth of a challenge's case, and its seal: a salted hash that fixes the truth before the diagnosis."""
 
 from __future__ import annotations
 
@@ -24,53 +24,46 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class Concealed(Frozen):
-    """One concealed law.
-
-    `effect`: its name in the list of effects, None outside it. `parameters`: true values of the library's parameters,
-    where they have the same meaning. `noncentrality`: size of its change of the summaries, see
-    `lab.challenge.noncentrality`. `conditional`: what of it the other concealed law can't imitate; `separability`: what no rival beside that
-    can, and `nearest_rival` the one that can most (`lab.challenge.fair_strength`). None: not measured.
-    """
+    """One concealed law. Measures of its strength that are None weren't computed."""
 
     name: str
-    effect: str | None = None
+    effect: str | None = None  # its name in the library; None outside it
     variant: int = 0
     strength: float
     unit: str = "1"
-    parameters: dict[str, float] = {}
-    noncentrality: float
-    conditional: float | None = None
-    separability: float | None = None
-    nearest_rival: str | None = None
+    parameters: dict[str, float] = {}  # true values of the library's parameters that have the same meaning
+    noncentrality: float  # of its change of the summaries (`lab.challenge.noncentrality`)
+    conditional: float | None = (
+        None  # the part that the other concealed law can't imitate (`lab.challenge.fair_strength`)
+    )
+    separability: float | None = None  # the part that no rival can imitate, either
+    nearest_rival: str | None = None  # the rival that can imitate most of it
 
 
 class CaseTruth(Frozen):
-    """The truth of one case.
-
-    `fault`: what is stated wrongly, or went wrong on the rig. `accepts`: effects that describe the case rightly
-    besides the concealed ones. `oracle_share`: of draws of the noise in which the oracle that knows all laws answers rightly; None: not
-    measured. `recordings_sha256`: over all files of the set, so that the seal fixes these, too.
-    """
+    """The truth of one case."""
 
     kind: Kind
     concealed: tuple[Concealed, ...] = ()
-    fault: str | None = None
-    accepts: tuple[str, ...] = ()
-    oracle_share: float | None = None
+    fault: str | None = None  # name of the fault of metadata or rig
+    accepts: tuple[str, ...] = ()  # effects whose names are right besides the concealed ones
+    oracle_share: float | None = None  # share of draws of the noise in which the oracle is right; None: not computed
     cfa: str
     f_number: float
     frames: int
     rows: int
     cols: int
-    recordings_sha256: str = ""
+    recordings_sha256: str = ""  # over all files of the recording set, so that the seal fixes these, too
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Effects of the results' list that are concealed."""
+        """Names in the library of the concealed effects."""
         return tuple(c.effect for c in self.concealed if c.effect is not None)
 
 
 class SaltedTruth(Frozen):
+    """A truth with the salt of its seal."""
+
     salt: str
     truth: CaseTruth
 
@@ -96,8 +89,8 @@ class Seals(Frozen):
 
 
 def canonical(truth: CaseTruth) -> str:
-    """JSON with sorted keys and no blanks, the same text for the same truth. What wasn't measured of its strengths is left out, so that seals
-    from before there were such keep."""
+    """JSON with sorted keys and no blanks, the same text for the same truth. Measures of strength that are None are left out, so that
+    seals of older challenges, which had none, still hold."""
     content = truth.model_dump(mode="json")
     for part in (content, *content["concealed"]):
         for name in ("oracle_share", "conditional", "separability", "nearest_rival"):
@@ -126,11 +119,12 @@ def digest(folder: Path) -> str:
 
 
 def purpose_of(seed: int) -> Purpose:
+    """What cases of a seed are for: tuning, a proof, or everyday tests (fresh)."""
     return "tuning" if seed < FIRST_PROOF_SEED else "proof" if seed < FIRST_FRESH_SEED else "fresh"
 
 
 def load(model: type[Model], file: Path) -> Model:
-    """A model from a JSON file; raises InputError that names the fault."""
+    """A model from a JSON file. Raises InputError where it can't be read or isn't valid."""
     try:
         return model.model_validate_json(file.read_text(encoding="utf-8"))
     except OSError as error:

@@ -1,6 +1,6 @@
 """The command line: `calibench COMMAND`. Parses, calls one verb of `lab`, prints, and turns errors into exit codes.
 
-0 done; 2 the input can't be used; 3 a device failed; 4 a check fell short; 1 a defect of calibench; 130 interrupted.
+0 done; 2 the input can't be used; 3 a device failed; 4 a check failed; 1 a defect of calibench; 130 interrupted.
 An error is one line on stderr (one for each problem of a folder), never a traceback; CALIBENCH_DEBUG=1 shows that too.
 """
 

@@ -66,7 +66,7 @@ def list_calibrations(data: StoreFolder = None) -> None:
 
 @calibrations.command()
 def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder = None) -> None:
-    """One calibration: its state, and its figures by the limits. Exit code 4 where a figure is bad or missing."""
+    """One calibration: its state, and its figures against the limits. Exit code 4 if a figure is bad or missing."""
     from lab.calibration.life import calibration, figures
     from lab.calibration.limits import judged
 

@@ -30,8 +30,8 @@ Quick = Annotated[bool, typer.Option("--quick", help="fewer exposures and repeat
 DataFolder = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
 ]
-Name = Annotated[str, typer.Option(help="what the session is called")]
-Resume = Annotated[str, typer.Option(metavar="SESSION", help="go on with this session")]
+Name = Annotated[str, typer.Option(help="name of the session")]
+Resume = Annotated[str, typer.Option(metavar="SESSION", help="resume this session")]
 Only = Annotated[
     list[str] | None,
     typer.Option(metavar="SEQUENCE", help="take this sequence only (dark, flat, ...); may be repeated"),
@@ -59,7 +59,7 @@ def capture(
     certified: Certified = False,
     conceal: Conceal = None,
 ) -> None:
-    """Run the sequences of a station and keep what was captured. Without a station file: on the mock bench."""
+    """Run the sequences of a station and store the captures. Without a station file: on the mock bench."""
     store = open_store(out_folder)
     request = PipelineRequest(
         "capture",

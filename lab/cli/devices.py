@@ -67,7 +67,7 @@ def listed(
 
 @devices.command()
 def check(station_file: StationFile) -> None:
-    """Connect to each instrument of a station, let it work once, and say how that went. Exit code 3 if one doesn't work."""
+    """Connect to each instrument of a station, use it once, and report whether it works. Exit code 3 if one doesn't."""
     from lab.capture.self_test import self_tests
     from lab.capture.station import drivers_of, read_station
 
@@ -91,7 +91,7 @@ def transcript(
     name: Annotated[str, typer.Argument(metavar="INSTRUMENT", help="monochromator, cameras.left, ...")],
     file: Annotated[Path, typer.Option("--out", metavar="FILE", help="the transcript to write")],
 ) -> None:
-    """Record what goes over an instrument's wire while it is identified and works once."""
+    """Record the messages to and from an instrument while it is identified and used once."""
     from lab.capture.self_test import record_transcript
     from lab.capture.station import read_station
 
@@ -105,11 +105,9 @@ def transcript(
 
 @devices.command()
 def contract(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="which drivers, and what stands at their other ends (TOML)")
-    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="the drivers and their peers (TOML)")],
 ) -> None:
-    """Hold drivers to their family's contract. Exit code 4 if one doesn't keep it.
+    """Check that drivers keep their family's contract. Exit code 4 if one doesn't.
 
     FILE has a table [[instrument]] a driver: `driver` ("family.name"), and either `peer` ("module:callable", a mock) or `address` and
     the driver's settings (a real instrument).
@@ -142,7 +140,7 @@ def init(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="the station file to write")],
     usbip: UsbIp = "",
 ) -> None:
-    """Write a station file from what is connected: cameras with their size, filters and bits, instruments with their addresses."""
+    """Write a station file of the connected instruments: cameras with pixels, colour filters and bit depth, others with their addresses."""
     from drivers import discovery
     from drivers.errors import InstrumentError
     from lab.capture.self_test import station_text

@@ -34,7 +34,7 @@ commands = typer.Typer()
 
 @commands.command()
 def validate(source: Source, json: Json = None, fit_file: FitFile = None, model: Model = None) -> None:
-    """Predicted against measured, for what the fit didn't use. Exit code 4 where a check falls short."""
+    """Compare predictions with measurements that the fit didn't use. Exit code 4 if a check fails."""
     check_writable(json)
     recordings = recordings_of(source)
     models = read_models(recordings, model)
@@ -55,14 +55,14 @@ def diagnose(
     fit_file: FitFile = None,
     save: Annotated[
         Path | None,
-        typer.Option("--save", metavar="DIR", help="write each camera with what was found as DIR/SIDE.toml"),
+        typer.Option("--save", metavar="DIR", help="write each camera with the named effects as DIR/SIDE.toml"),
     ] = None,
     model: Model = None,
     bootstrap: Annotated[
         int,
         typer.Option(
             metavar="N",
-            help=f"draw N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
+            help=f"simulate N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
         ),
     ] = 0,
     scheduler: Annotated[
@@ -74,7 +74,7 @@ def diagnose(
         ),
     ] = None,
 ) -> None:
-    """Name the physics that the model left out, where the recordings show any. Exit code 2 where nothing could be judged."""
+    """Name the physics that the camera model lacks and the recordings show. Exit code 2 if they determine no measurement."""
     if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
         raise InputError(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
@@ -106,7 +106,7 @@ def diagnose(
 
 
 def _save_models(found: PipelineResult, path: Path) -> None:
-    """Write each camera with what was found, and say on stderr what it has that the baseline hasn't."""
+    """Write each camera with its named effects and corrections, and list these on stderr."""
     from lab.formats.camera_file import write_camera
 
     assert found.diagnosis is not None

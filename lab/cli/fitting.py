@@ -104,7 +104,7 @@ def compare(
         Path | None, typer.Option("--report", metavar="DIR", help="write DIR/compare.html, one page with pictures")
     ] = None,
 ) -> None:
-    """Two calibrations: what changed beyond its uncertainty."""
+    """Compare two calibrations: figures that changed beyond their uncertainty."""
     from lab.fit.changes_that_fail import FailRule, failing
     from lab.fit.compare import compare as compared
 

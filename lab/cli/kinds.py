@@ -21,7 +21,7 @@ def kinds(
         str, typer.Argument(metavar="[SOURCE]", help="count the captures in a recording set or a stored session")
     ] = "",
 ) -> None:
-    """The kinds of capture: what stands before the camera, and which sequence takes them."""
+    """The kinds of capture: the scene, and the sequence that takes them."""
     from lab.capture_kinds.base import CAPTURES
 
     counted = Counter(capture.kind for capture in recordings_of(source).captures()) if source else None

@@ -49,7 +49,10 @@ def import_(
     ] = None,
     exposure_s: Annotated[float | None, typer.Option(help="a picture's exposure")] = None,
     transfer: Annotated[
-        str, typer.Option(metavar="linear|srgb", help="what the codes of a PNG, TIFF or JPEG picture are")
+        str,
+        typer.Option(
+            metavar="linear|srgb", help="whether a PNG, TIFF or JPEG picture's codes are linear in the light or sRGB"
+        ),
     ] = "",
     channel: Annotated[str, typer.Option(metavar="R|G|B", help="slanted-edge: the channel of a colour picture")] = "",
     corners: Annotated[
@@ -149,7 +152,7 @@ def backup(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="the backup: new, or one of this data folder")],
     data: StoreFolder = None,
 ) -> None:
-    """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in the other's place."""
+    """Copy the data folder while it is in use. The copy is a data folder itself: to restore, use it in place of the other."""
     from lab.capture.backup import back_up
 
     made = back_up(open_store(data), folder)

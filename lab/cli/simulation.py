@@ -45,7 +45,7 @@ def lens(
         ),
     ] = None,
 ) -> None:
-    """What a lens prescription amounts to: first-order quantities, illumination, distortion, MTF, PSF."""
+    """Evaluate a lens prescription: first-order quantities, illumination, distortion, MTF, PSF."""
     from lab.predict.lens import parse_glasses, trace_prescription
     from lab.workers import Workers
 

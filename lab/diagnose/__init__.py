@@ -1,11 +1,13 @@
-"""Diagnosis: where recordings and the baseline differ, which effect was left out, and what naming it gains.
+"""Diagnosis: where recordings depart from the baseline camera, which effect the baseline lacks, and how much better the camera with that
+effect predicts.
 
 policy.py       every number by which a diagnosis decides
-measurements/   what is looked at: numbers with covariance, and how a model predicts them
+metadata/       statements about camera and captures that the recordings contradict
+measurements/   measured numbers with their covariance, and their prediction by a camera model
 inference/      the measurement model; locate, score, search, weigh, name
-outcome/        what is told: result, improved model, next capture
+outcome/        what is reported: result, improved model, next capture
 visibility.py   which measurements show each effect, and which effects are rivals
-side.py         the chain for one side; lab/side_processes.py runs the sides at the same time
+side.py         all of it for one side; lab/side_processes.py runs the sides at the same time
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from lab.diagnose.outcome.merge_sides import merged
-from lab.diagnose.outcome.next_capture import Proposal
+from lab.diagnose.outcome.next_capture import CaptureProposal
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import diagnose_side
 from lab.formats.camera_file import CameraFile
@@ -28,17 +30,17 @@ from sim.camera import Side
 
 __all__ = ["DecisionPolicy", "Diagnosis", "Progress", "diagnose", "examine"]
 
-#: Called with what is being done and the share of the work that is done, 0..1.
+#: Called with the current step in words, and the share of the work that is done, 0..1.
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The result; the improved model of every side that could be judged; and what to capture next, best first."""
+    """The result, the improved model of every side that could be judged, and proposals for the next capture, best first."""
 
     result: DiagnosisResult
     improved: dict[Side, CameraFile]
-    proposals: tuple[Proposal, ...] = ()
+    proposals: tuple[CaptureProposal, ...] = ()
 
 
 def diagnose(
@@ -48,7 +50,7 @@ def diagnose(
     *,
     at_once: bool = True,
 ) -> DiagnosisResult:
-    """What `examine` finds, without the improved models."""
+    """The result of `examine`, without improved models and proposals."""
     return examine(recordings, fit, progress, at_once=at_once).result
 
 
@@ -65,15 +67,14 @@ def examine(
     workers: Workers | None = None,
     policy: DecisionPolicy | None = None,
 ) -> Diagnosis:
-    """Diagnose every side.
+    """Diagnose every side of the recordings. Measurements that they don't determine are listed in the result's `skipped`.
 
-    fit         gives geometry and sensitivities; None: neither, where the maker states none. Noise and levels are nuisance parameters
-                of the measurement model. What the recordings don't determine stands in `skipped`.
-    progress    is called in the caller's thread with a text and the share of the work that is done.
-    baseline    cameras with their effects, by side, in place of the maker's word and the fit.
-    at_once     several sides run at the same time, each in a process of its own; else one after the other in this one.
+    fit         the fit of the recordings: geometry and sensitivity of the baseline camera. None: as the data sheet states them.
+    progress    called in the caller's thread with the current step and the share of the work that is done.
+    baseline    camera files by side, effects included, in place of data sheet and fit.
+    at_once     diagnose several sides at the same time, each in a process of its own; else one after the other in this one.
     pictures    draw residual pictures, for the report.
-    bootstrap   healthy cameras like the baseline that are drawn frame by frame; the threshold is at least what their scores say.
+    bootstrap   number of healthy cameras, drawn frame by frame, whose scores may raise the threshold.
     workers     where these are drawn; None: in the side's process.
     policy      the rules of decision; None: `DecisionPolicy()`.
     """

@@ -51,13 +51,13 @@ class ParameterDescription(Frozen):
 class EffectDescription(Frozen):
     """An effect of the library.
 
-    family : the physics that it is one law of: named where no law of it holds exactly, or several fit alike
+    family : the physics that it is one law of; named in its place where no law holds exactly, or several fit equally well
     stages : the stages of the forward model in which it acts, in the order of the light
-    sentence : what physics a model without it leaves out
-    reference : where its law comes from
-    measurements, capture_kinds : measurements of a diagnosis that can show it, and the captures that they rest on; derived
-    rivals : effects that look the same in some part of a session; derived
-    invariances : what it doesn't depend on
+    sentence : the physics that a model without it lacks
+    reference : source of its law
+    measurements, capture_kinds : the measurements that can show it, and the captures that these need; derived
+    rivals : effects that change some part of a session alike; derived
+    invariances : conditions that it doesn't depend on
     remark : why a diagnosis never names it; None for an effect that can be named
     """
 
@@ -77,10 +77,10 @@ class EffectDescription(Frozen):
 class FamilyDescription(Frozen):
     """A family of effects.
 
-    words : the physics, as a noun
+    words : the physics, as a noun phrase
     sentence : what recordings show where it is named
-    members : effects of it that a diagnosis looks for
-    told_apart_by : the capture that tells these apart; empty where there is one
+    members : its effects that a diagnosis looks for
+    told_apart_by : the capture that tells these apart; empty where there is only one
     """
 
     name: str
@@ -91,7 +91,7 @@ class FamilyDescription(Frozen):
 
 
 class EffectList(Frozen):
-    """What `calibench effects --json FILE` writes."""
+    """The document that `calibench effects --json FILE` writes."""
 
     format: Literal["calibench-effects"] = "calibench-effects"
     version: Literal[1] = 1

@@ -34,19 +34,22 @@ from sim.uniform import electron_rate
 ROWS, COLS, PITCH_UM, FOCAL_LENGTH_MM = 240, 320, 4.0, 3.0
 WAVELENGTH_NM = np.arange(380.0, 1001.0)
 BEGIN = datetime(2026, 3, 2, 9, tzinfo=UTC)
-#: Time between captures (s), no multiple of a mains period; and between boards, which move while both cameras look.
+#: Time between captures (s), no multiple of a mains period; and between boards, which move meanwhile.
 STEP_S, BOARD_STEP_S = 20.0137, 0.31
 DARKS = ((0.001, 25.0), (0.5, 25.0), (2.0, 25.0), (2.0, 35.0), (2.0, 45.0))  # exposure (s), temperature (C)
-LEVELS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8, 0.92)  # of the full well
+LEVELS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.65, 0.8, 0.92)  # share of the full well
 ANGLES_DEG = (5.0, 50.0, 95.0, 140.0)
-EDGE_SIDE_PX, EDGE_PLACES = 120, ((0.5, 0.5), (0.25, 0.2))  # side of a region; its middle, of the frame
-DARK_SIDE, SCREEN_BLACK = 0.08, 0.0035  # over the lit side
-CELL_PX = 4.0
+EDGE_SIDE_PX, EDGE_PLACES = (
+    120,
+    ((0.5, 0.5), (0.25, 0.2)),
+)  # side of a region; its middle (row, column), as shares of the frame
+DARK_SIDE, SCREEN_BLACK = 0.08, 0.0035  # radiance of an edge's dark side, and of the dark screen, over the lit one
+CELL_PX = 4.0  # side of a screen's cells
 TILTS_DEG = ((0, 0, 0), (30, 0, 3), (-30, 0, -4), (0, 30, 5), (0, -30, 2), (20, 20, -6), (-20, 20, 4), (20, -20, 8), (-20, -20, -3), (8, -12, 20))  # fmt: skip
 
 
 def reference_study(seed: int = 1) -> RecordingSet:
-    """The session, drawn anew."""
+    """The recording set of the session, of both sides. `seed`: of its noise and of the random pattern."""
     rig = _rig()
     frames: dict[str, Any] = {}
     spectra: dict[str, Spectrum] = {}
@@ -58,7 +61,7 @@ def reference_study(seed: int = 1) -> RecordingSet:
     pair: tuple[tuple[Side, CameraModel], ...] = (("left", rig.left), ("right", rig.right))
     cameras = {}
     for side, camera in pair:
-        drawn = _Drawing(rig, camera, side, np.random.default_rng([seed, side == "right"]))
+        drawn = _SideSession(rig, camera, side, np.random.default_rng([seed, side == "right"]))
         drawn.session(targets)
         cameras[side] = drawn.stated()
         frames |= drawn.frames
@@ -89,8 +92,8 @@ def _rig() -> StereoRig:
     return StereoRig(left=camera, right=camera, rotation=straight, translation_mm=(-10.0, 0.0, 0.0))
 
 
-class _Drawing:
-    """One side's captures, in the order in which they are taken."""
+class _SideSession:
+    """One side's captures, drawn in the order in which a session takes them."""
 
     def __init__(self, rig: StereoRig, camera: CameraModel, side: Side, rng: np.random.Generator) -> None:
         self.rig, self.camera, self.side, self.rng = rig, camera, side, rng
@@ -123,7 +126,7 @@ class _Drawing:
         }
 
     def session(self, targets: dict[str, Any]) -> None:
-        """All captures."""
+        """Draw all captures."""
         for exposure_s, temperature_c in DARKS:
             self.take("dark", Darkness(), exposure_s, 3, temperature_c)
         lamp = self.noted(self.lamp)
@@ -218,7 +221,7 @@ class _Drawing:
     def take(
         self, kind: str, scene: Scene, exposure_s: float, repeats: int, temperature_c: float = 25.0, **more: Any
     ) -> None:  # fmt: skip
-        """Draw and note `repeats` frames; `more`: what this kind of capture states besides."""
+        """Draw `repeats` captures of a scene. `more`: further keys of this kind of capture."""
         exposure = Exposure(scene, exposure_s, temperature_c=temperature_c, placed="image")
         electrons = expected_electrons(self.camera, exposure)
         for _ in range(repeats):
@@ -235,13 +238,13 @@ class _Drawing:
             self.elapsed_s += BOARD_STEP_S if kind == "charuco" else STEP_S
 
     def noted(self, spectrum: Spectrum) -> str:
-        """The file in which a spectrum is kept."""
+        """Store a spectrum; its path in the recording set."""
         path = f"spectra/{self.side}-{len(self.spectra):03d}.csv"
         self.spectra[path] = spectrum
         return path
 
     def exposure_for(self, light: Spectrum, level: float) -> float:
-        """Exposure (s) that fills the brightest channel to a share of the full well."""
+        """Exposure (s) that fills the brightest channel to the share `level` of the full well."""
         return level * self.camera.full_well_e / max(electron_rate(self.camera, c, light) for c in self.camera.channels)
 
 

@@ -1,4 +1,4 @@
-"""The diagnosis of one side: the chain of `inference/decide.py` on its measurement model, and what is told of it.
+"""The diagnosis of one side: its metadata, its measurement model, the decision (`inference/decide.py`), and the findings.
 
 `SideFindings` can be sent between processes; a measurement model, which holds functions, can't.
 """
@@ -21,7 +21,7 @@ from lab.diagnose.outcome.goodness_of_fit import held_out, measurement_fits, pla
 from lab.diagnose.outcome.improved_model import improved_model
 from lab.diagnose.outcome.mismatches import family_corrections, located, shown_in, unexplained, vetoed_names
 from lab.diagnose.outcome.misstated_light import misstated_light
-from lab.diagnose.outcome.next_capture import Proposal, proposals
+from lab.diagnose.outcome.next_capture import CaptureProposal, proposals
 from lab.diagnose.outcome.residual_pictures import residual_pictures
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
@@ -44,7 +44,7 @@ from lab.formats.results import (
 from lab.workers import Workers
 from sim.camera import Side
 
-#: Called with what is being done.
+#: Called with the current step in words.
 Report = Callable[[str], None]
 #: Seed of the draws behind the threshold: the same recordings give the same diagnosis.
 SEED = 1288
@@ -52,18 +52,22 @@ SEED = 1288
 
 @dataclass(frozen=True)
 class NamedCandidate:
-    """A named effect or family, the measurements in which its change stands out of the noise, and what stands in the improved model
-    beside a family's nearest law."""
+    """A named effect or family."""
 
     candidate: Candidate
-    shown_in: tuple[str, ...]
-    corrections: tuple[str, ...] = ()
+    shown_in: tuple[str, ...]  # measurements in which its change exceeds the noise
+    corrections: tuple[str, ...] = ()  # corrections of the improved model beside a family's nearest law, in words
 
 
 @dataclass(frozen=True)
 class SideFindings:
-    """What one side shows. `is_judged`: anything could be looked at; `threshold` is None where no effect acts on it.
-    `improved`: the model with what was found. `settling`: what to capture for what is left without a name."""
+    """The findings on one side.
+
+    is_judged  whether any measurement is determined
+    threshold  of an effect's score; None where no effect acts on the measurements
+    improved   the improved model
+    settling   what to capture for a mismatch without a name, as a sentence
+    """
 
     side: Side
     skipped: tuple[Skipped, ...]
@@ -78,7 +82,7 @@ class SideFindings:
     held_out: HeldOut | None = None
     curves: tuple[ResidualCurve, ...] = ()
     improved: CameraFile | None = None
-    proposals: tuple[Proposal, ...] = ()
+    proposals: tuple[CaptureProposal, ...] = ()
     settling: str | None = None
     places: tuple[ExaminedPlace, ...] = ()
     measurements: tuple[MeasurementFit, ...] = ()
@@ -98,11 +102,8 @@ def diagnose_side(
     bootstrap: int = 0,
     workers: Workers | None = None,
 ) -> SideFindings:
-    """Everything that is told of one side.
-
-    `pictures`: draw residual pictures, which takes the forward model some seconds. `bootstrap`: healthy recording sets
-    that are drawn frame by frame for the threshold, each as long as summarising takes; `workers`: where, None: in this process.
-    """
+    """Diagnose one side; arguments as of `lab.diagnose.examine`. Residual pictures take some seconds. Each draw of the bootstrap takes as
+    long as summarising the recordings."""
     policy = policy or DecisionPolicy()
     report("checking what is stated")
     stated = recordings.camera(side)

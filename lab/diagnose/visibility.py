@@ -37,8 +37,7 @@ LEAST_NUMBERS = 8
 
 @dataclass(frozen=True)
 class EffectVisibility:
-    """What shows one effect: measurements and the kinds of capture that they come from, none where nothing does; and
-    its rivals."""
+    """The measurements that show one effect, the kinds of capture that they need, and the effect's rivals."""
 
     effect: str
     measurements: tuple[str, ...]
@@ -48,7 +47,7 @@ class EffectVisibility:
 
 @cache
 def visibility() -> dict[str, EffectVisibility]:
-    """The kept table, by effect. An effect that was added since it was written isn't in it."""
+    """Effect -> its entry in visibility.toml. An effect that was added after the file was written is missing."""
     content = tomllib.loads(TABLE.read_text(encoding="utf-8"))
     return {
         name: EffectVisibility(

@@ -18,21 +18,21 @@ from lab.one_blas_thread import one_blas_thread
 from lab.side_processes import in_processes
 from sim.camera import Side
 
-#: Called with what was just done and the share of the work that is done, 0..1; from any thread, one call at a time.
+#: Called with the step that was just done and the share of the work that is done, 0..1; from any thread, one call at a time.
 Progress = Callable[[str, float], None]
 T = TypeVar("T")
-#: What is fitted of a side, in the order of a result, and of the pair.
+#: The fits of a side, in the order of a result, and that of the pair.
 Step = Literal["noise", "spectral", "mtf", "psf", "geometry", "stereo"]
 STEPS: tuple[Step, ...] = get_args(Step)
-#: What a diagnosis rests on: it looks at edges and screens itself.
+#: The fits that a diagnosis uses. It measures edges and screens by itself.
 FOR_DIAGNOSIS: tuple[Step, ...] = ("noise", "spectral", "geometry")
-#: Pixels of all frames from which on a process a side is worth its start, which takes 1.5 s: the fits of so many take some 6 s.
+#: Pixels of all frames from which on each side gets a process, which takes 1.5 s to start. Fits of so many take some 6 s.
 WORTH_PROCESSES_PX = 2e7
 
 
 @dataclass(frozen=True)
 class SideFit:
-    """What was fitted of one side, and the steps that its recordings don't determine."""
+    """The fits of one side, and the steps that its recordings don't determine."""
 
     camera: CameraFit
     skipped: tuple[Skipped, ...]
@@ -42,8 +42,8 @@ class SideFit:
 def fit_recording_set(
     recordings: RecordingSet, progress: Progress | None = None, steps: Collection[Step] = STEPS
 ) -> FitResult:
-    """Run the fits of `steps`, by default all, on every side and on the stereo pair. What the recordings don't determine is in
-    `skipped`, with the reason.
+    """Run the fits of `steps`, by default all, on every side and on the stereo pair. Steps that the recordings don't determine are listed
+    in `skipped`, with the reason.
 
     Several sides with many frames are fitted at the same time, each in a process of its own. `progress` is called after each step.
     """
@@ -87,8 +87,7 @@ def fit_recording_set(
 
 
 def fit_side(recordings: RecordingSet, side: Side, steps: Collection[Step], told: Callable[[Step], None]) -> SideFit:
-    """The fits of `steps` of one side; geometry beside radiometry, in a thread of its own. `told` is called with each step that was
-    done."""
+    """The fits of `steps` of one side. Geometry runs in a thread of its own. `told` is called with each step that was done."""
     from lab.fit.geometry.recordings import fit_geometry
     from lab.fit.mtf.recordings import fit_mtf
     from lab.fit.noise.recordings import fit_noise
@@ -135,7 +134,7 @@ def _step(work: Callable[[], T], side: Side | None) -> tuple[T | None, tuple[Ski
 
 
 def _pixels(recordings: RecordingSet) -> float:
-    """Of all frames; of a side whose size isn't stated, none."""
+    """Number of pixels of all frames; a side whose frame size isn't stated counts 0."""
     return float(
         sum(
             len(recordings.captures(side=side))

@@ -1,4 +1,4 @@
-"""Which changes of a comparison fail a check: figures by their names, and how far they have to be apart.
+"""Rules by which changes between two fits fail a check (`calibench compare --fail-on`): the name of a figure, and a tolerance.
 
 A rule is `FIGURE`, or `FIGURE>AMOUNT` with the amount in the figure's own unit or in percent of A (`left:noise read_noise_e>5%`).
 `*` in FIGURE stands for any text; `SIDE:` before it confines it to a camera. A change fails a rule where it is significant, as the
@@ -22,7 +22,7 @@ _RULE = re.compile(r"(?:(?P<side>left|right):)?(?P<figure>[^>]+?)\s*(?:>\s*(?P<a
 
 @dataclass(frozen=True)
 class FailRule:
-    """One rule. `amount`: a smaller difference passes; of the figure's unit, or a share of A where `relative`."""
+    """One rule. `amount`: the largest difference that passes, in the figure's unit, or as a share of A's value where `relative`."""
 
     figure: str
     side: str | None = None
@@ -31,7 +31,7 @@ class FailRule:
 
     @classmethod
     def parse(cls, text: str) -> FailRule:
-        """The rule of a text. Raises InputError."""
+        """The rule that a text states. Raises InputError."""
         refused = InputError(f"--fail-on {text!r}: give FIGURE, or FIGURE>AMOUNT with an optional %, SIDE: before it")
         found = _RULE.fullmatch(text.strip())
         if found is None:
@@ -75,8 +75,8 @@ class FailRule:
 
 
 def failing(comparison: ComparisonResult, rules: Sequence[FailRule]) -> list[str]:
-    """The changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the comparison: a name that
-    is misspelt, or a figure that one of the two fits lacks, would never fail."""
+    """The changes that fail any rule, by name. Raises InputError for a rule that concerns no figure of the comparison: a misspelt name,
+    or a figure that one of the two fits lacks, would never fail."""
     for rule in rules:
         if not rule.concerns(comparison):
             raise InputError(

@@ -38,11 +38,11 @@ from sim.parameters import Frozen
 Array = NDArray[np.floating[Any]]
 
 FALSE_ALARM_RATE = 0.01
-MIN_SEEN = 20  # corners, below which no implied motion is determined
-ROUNDING = 1e-9  # of a value: a smaller uncertainty is none
-FEW = 9  # numbers with a row each; more are a curve
-POINTS = (PhotonTransfer, Emva1288Points)  # points of plots: properties of the recordings, not of the camera
-OF_THE_SET_UP = {"angle_deg"}  # the angle of an edge isn't a property of the camera
+MIN_SEEN = 20  # fewest corners that determine an implied motion
+ROUNDING = 1e-9  # relative standard deviation below which a value counts as exact
+FEW = 9  # most numbers under one name with a row each; more are a curve
+POINTS = (PhotonTransfer, Emva1288Points)  # points of plots, which aren't compared
+OF_THE_SET_UP = {"angle_deg"}  # properties of the set-up, which aren't compared
 AXES = ("wavelength_nm", "frequency_cy_per_px", "radius_px")
 
 

@@ -36,7 +36,7 @@ D65 = 21
 
 
 class RawMetadata(Frozen):
-    """What a file tells of its frame, besides the camera's parameters.
+    """Metadata of a frame in a file, besides the camera's parameters.
 
     `neutral`: codes above black of a white surface by channel, up to a common factor; empty: those in daylight (D65).
     """
@@ -93,7 +93,7 @@ def write_raw(file: Path, frame: Frame, camera: CameraModel, metadata: RawMetada
 
 
 def writer_of(file: Path) -> Callable[[Path, Frame, CameraModel, RawMetadata], None]:
-    """What writes files of this ending; InputError for an ending that isn't known."""
+    """The function that writes files of this ending. Raises InputError for an ending that isn't known."""
     known = {".npy": _write_npy, ".tif": _write_tiff, ".tiff": _write_tiff, ".dng": _write_dng}
     if file.suffix.lower() not in known:
         raise InputError(

@@ -1,1 +1,1 @@
-"""What a camera model says of a capture: baseline models, replayed and simulated frames, validation."""
+"""Predictions by a camera model: baseline models, replayed and simulated frames, traced lenses, validation."""

@@ -1,4 +1,4 @@
-"""From what a maker says and a fit found to a camera model."""
+"""The baseline camera model, from the data sheet and the fit."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from lab.formats.results import CameraFit
 from sim.camera import CameraModel, Geometry, Lens, Side
 from sim.spectrum import Spectrum
 
-#: Where the maker doesn't say it.
-USUAL_PITCH_UM = 3.5
-#: Where neither fit nor maker gives a sensitivity: (peak, standard deviation in nm), for the colour of edges and screens only.
+USUAL_PITCH_UM = 3.5  # where the pixel pitch isn't stated
+#: Gaussian sensitivity curves where neither fit nor data sheet has one, for the colour of edges and screens only: (wavelength of the
+#: peak, standard deviation), nm.
 TYPICAL_SENSITIVITY_NM = {"R": (600.0, 40.0), "G": (535.0, 40.0), "B": (460.0, 30.0), "Y": (550.0, 90.0)}
 
 
 @dataclass(frozen=True)
 class Assumed:
-    """What a model takes for lack of a statement or a fit."""
+    """A quantity that is neither stated nor fitted, and the value that the model takes."""
 
     quantity: str
     value: str
@@ -28,10 +28,9 @@ class Assumed:
 def camera_model(
     recordings: RecordingSet, side: Side, fit: CameraFit | None = None, *, maker_curves: bool = False
 ) -> CameraModel:
-    """The baseline model of one camera: fitted where the fit has it, else the maker's word, else a typical value.
+    """The baseline model of one camera. Each quantity is the fitted one, else the stated one, else a typical value (`assumptions`).
 
-    `maker_curves`: keep the maker's sensitivity curves although the fit has its own (what a diagnosis tests). `assumptions`
-    says what was neither fitted nor stated.
+    `maker_curves`: take the stated sensitivity curves even where they were fitted, as a diagnosis tests them.
     """
     camera = recordings.camera(side)
     noise = fit.noise if fit is not None else None
@@ -77,7 +76,7 @@ def camera_model(
 
 
 def assumptions(camera: DataSheet, fit: CameraFit | None = None) -> tuple[Assumed, ...]:
-    """What `camera_model` has to assume of this camera, with what the fit found."""
+    """The quantities for which `camera_model` takes typical values, given this data sheet and fit."""
     found = []
     if camera.f_number is None:
         found.append(Assumed("f_number", "8"))
@@ -102,6 +101,7 @@ def assumptions(camera: DataSheet, fit: CameraFit | None = None) -> tuple[Assume
 def _curves(
     recordings: RecordingSet, side: Side, fit: CameraFit | None, maker_curves: bool
 ) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
+    """Quantum efficiency by channel, and its standard deviation where it was fitted."""
     camera = recordings.camera(side)
     fitted = fit.spectral if fit is not None else None
     channels = ("Y",) if camera.cfa == "MONO" else ("R", "G", "B")
@@ -128,7 +128,7 @@ def _curves(
 
 
 def _measured_efficiency(fit: CameraFit | None) -> tuple[float, float] | None:
-    """Wavelength (nm) and quantum efficiency of a MONO camera by photon numbers; None where either isn't known."""
+    """Wavelength (nm) and quantum efficiency that the noise fit measured by stated photon numbers; None where it has none."""
     noise = fit.noise if fit is not None else None
     if noise is None or noise.quantum_efficiency is None or noise.quantum_efficiency_wavelength_nm is None:
         return None
@@ -136,9 +136,9 @@ def _measured_efficiency(fit: CameraFit | None) -> tuple[float, float] | None:
 
 
 def _continued(fitted: Spectrum, stated: Spectrum) -> Spectrum:
-    """A fitted sensitivity, continued beyond the wavelengths of its lights by the maker's curve at the level of its ends.
+    """A fitted sensitivity, continued beyond the sweep's wavelengths by the maker's curve, scaled to join at both ends.
 
-    A lamp shines beyond the sweep too: without this, 10 nm of it at the red end can miss 8 % of a red channel's signal.
+    A lamp emits beyond the sweep, too: without this, the last 10 nm at the red end can lack 8 % of a red channel's signal.
     """
     wavelength_nm, value = np.array(fitted.wavelength_nm), np.array(fitted.value)
     outer = np.array(stated.wavelength_nm)

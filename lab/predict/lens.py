@@ -24,7 +24,7 @@ Progress = Callable[[str, float], None]
 
 MTF_LP_PER_MM = (30.0, 60.0, 100.0)
 MTF_WAVELENGTHS_NM = (450.0, 650.0)  # and the reference wavelength
-#: The part of the computing time that the MTFs take, for the progress bar.
+#: Share of the computing time that the MTFs take, for the progress bar.
 _MTF_SHARE = 0.3
 
 
@@ -139,9 +139,7 @@ def trace_prescription(
 ) -> TracedPrescription:
     """Read and trace a prescription: results at 33 wavelengths and 21 field points.
 
-    `workers`: where the field points are traced, None: in this process.
-
-    Raises InputError, in one line, for a file that can't be read or traced.
+    `workers`: where the field points are traced; None: in this process. Raises InputError for a file that can't be read or traced.
     """
     from sim.optics.system import OpticalSystem  # imports compiled code, which takes a second
     from sim.optics.traced_table import OpticalTable, TableSettings

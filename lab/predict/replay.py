@@ -1,8 +1,7 @@
-"""Predicts and draws the captures of a recording set by a camera model: mean frames, and whole recording sets.
+"""Replay: the captures of a recording set as a camera model predicts (mean frames) or draws them (whole recording sets).
 
-The forward model of `sim` computes every frame. This module gives it the scene, which follows from the manifest and the
-recordings. Two things are taken from the recording itself, because no model predicts them: where an edge lies, and the levels of
-its two sides.
+The forward model of `sim` computes every frame. This module gives it the scene that manifest and recordings determine. Position of an
+edge and levels of its two sides are taken from the recorded frame, as no model predicts them.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class Replay:
         return tuple(c for c in self.recordings.captures(side=self.side) if self._tells_its_scene(c))
 
     def _tells_its_scene(self, capture: Capture) -> bool:
-        """Whether manifest and recordings determine the scene. For screens and boards they don't: their pose is unknown."""
+        """Whether manifest and recordings determine the scene. Of screens and boards they don't tell the pose."""
         return isinstance(capture, SlantedEdgeCapture) or capture.scene(lambda path: _EQUAL) is not None
 
     @cached_property
@@ -57,7 +56,7 @@ class Replay:
         return sensor.dn_moments(electrons, self.camera, exposure.gain_db, read_out(self.camera, exposure, effects))[0]
 
     def drawn(self, rng: np.random.Generator, effects: Sequence[Effect] = ()) -> RecordingSet:
-        """The recordings with every frame of `captures` drawn from the model, all by one camera with one drawn fixed pattern."""
+        """The recordings with the frames of `captures` drawn from the model, with one fixed pattern for all."""
         pattern = sensor.FixedPattern.draw(self.camera, rng)
         frames = {}
         mean: dict[object, tuple[Exposure, FloatArray]] = {}
@@ -98,7 +97,7 @@ class Replay:
         return scene
 
     def _edge(self, capture: SlantedEdgeCapture) -> EdgeMtf:
-        """The edge as the estimator finds it in the channel with most pixels."""
+        """The edge that the slanted-edge estimator finds in the green (or only) channel."""
         channel = "G" if "G" in self.camera.channels else self.camera.channels[0]
         return measure_edge(self.recordings, [capture], channel)
 
@@ -108,7 +107,8 @@ class Replay:
     def _levelled(
         self, capture: SlantedEdgeCapture, exposure: Exposure, electrons: FloatArray, effects: Sequence[Effect]
     ) -> FloatArray:
-        """Scale an edge's two levels, channel by channel, to the recording: a line, fitted by least squares to model and recorded electrons."""
+        """Electrons with an edge's two levels matched to the recording, channel by channel, by a least squares line between predicted and
+        recorded electrons."""
         dark = np.broadcast_to(np.asarray(dark_electrons(self.camera, exposure, effects), float), electrons.shape)
         gain = sensor.gain_dn_per_e(self.camera, exposure.gain_db)
         recorded = (self.recordings.frame(capture).astype(float) - self.camera.black_level_dn) / gain

@@ -319,10 +319,12 @@ def write(simulation: Simulation, file: Path) -> SimulationRecord:
 
 
 def preview_file(file: Path) -> Path:
+    """NAME.preview.png beside the frame."""
     return file.with_name(f"{file.stem}.preview.png")
 
 
 def record_file(file: Path) -> Path:
+    """NAME.json beside the frame."""
     return file.with_name(f"{file.stem}.json")
 
 

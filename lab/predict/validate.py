@@ -1,4 +1,4 @@
-"""Predicted against measured, for what the fits did not use: chart patches, edges' MTFs, and point spread functions.
+"""Validation: chart patches, MTFs of edges and point spread functions, predicted by the fitted camera and measured.
 
 The model is the fitted camera, or a camera file with its effects. Nothing is fitted here.
 """
@@ -45,12 +45,12 @@ from sim.spectrum import FloatArray
 from sim.uniform import Uniform, electron_rate
 
 PASSED_QUANTILE = 0.999
-#: Systematic relative uncertainties (one standard deviation) that the fits' uncertainties don't include.
-LIGHT_STD = 0.01  # the chart's light: the radiometer at the chart against the radiometer at the sphere, and geometry
+# Standard deviations that the fits' uncertainties don't include.
+LIGHT_STD = 0.01  # relative, of the light on the chart: radiometer and geometry
 MTF_FREQUENCIES = np.arange(1, 26) * 0.02
-MTF_FLOOR = 0.002
-CELL_PX = 4.0  # of a cell of the random pattern on a screen, where the recordings don't state it
-KERNEL_FLOOR = 0.002  # of the kernel's maximum
+MTF_FLOOR = 0.002  # of an MTF
+CELL_PX = 4.0  # side of a screen's cell where the recordings don't state it
+KERNEL_FLOOR = 0.002  # of a kernel's element, over the kernel's maximum
 _Checking = Callable[
     [RecordingSet, Side, CameraFit, CameraModel, Sequence[Effect], Callable[[str], None]],
     list[Check],
@@ -64,10 +64,10 @@ def validate(
     models: Mapping[Side, CameraFile] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> ValidationResult:
-    """Checks of every side: `colorchecker`, `mtf`, `psf`. `models`: cameras with their effects, in place of the fitted ones.
+    """Checks of every side: `colorchecker`, `mtf`, `psf`. `models`: camera files in place of the fitted cameras.
 
-    A check passes where chi2 lies within its 99.9 % quantile. What the recordings don't allow stands in `skipped`. `progress` is
-    called with what is under way and the share (0..1) that is done, before each edge and kernel; what it raises ends the work.
+    A check passes where chi2 is below its 99.9 % quantile. Checks that the recordings don't determine are listed in `skipped`. `progress`
+    is called before each edge and kernel with the step and the share (0..1) that is done; an exception that it raises ends the work.
     """
     kinds: tuple[tuple[str, _Checking], ...] = (("colorchecker", _charts), ("mtf", _edges), ("psf", _kernels))
     begun = 0
@@ -164,7 +164,7 @@ def _chart(
     measured = np.array([p.level for p in points]) - black
     covariance = patch_covariance(study, points, np.maximum(measured - dark * gain, 0.1))
     channel = np.array([p.channel for p in points])
-    # The error of a fitted curve is common to all patches of a channel, that of the light to all patches.
+    # the error of a fitted curve is common to all patches of a channel, that of the light to all patches
     covariance += (channel[:, None] == channel) * np.outer(spread, spread) + LIGHT_STD**2 * np.outer(
         predicted, predicted
     )

@@ -1,4 +1,4 @@
-"""The report's first screen: what was found, how sure that is, what it means, what to do; and the two charts that prove it."""
+"""The first screen of the report: what was found, how sure that is, what it means, what to do; and two charts that show it."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from lab.report.figures import KeyFigure, camera_figures, measured
 from sim.camera import Side
 from sim.effects.library import effects as library
 
-#: A parameter within so many standard deviations of zero isn't told on the first screen.
+#: Parameters within so many standard deviations of 0 aren't on the first screen.
 TOLD_SIGMA = 2.0
-PROOFS = 2
-#: Effects that the first screen names; the others follow in the diagnosis.
+PROOFS = 2  # charts
+#: Most effects that the first screen describes; the others follow in the diagnosis.
 NAMED = 4
-#: Prefixes of the key figures that the first screen has.
+#: Prefixes of the names of the key figures on the first screen.
 STRIP = ("system gain", "temporal dark noise", "saturation capacity", "dark current", "DSNU", "PRNU")
 
 
 @dataclass(frozen=True)
 class Proof:
-    """A chart of the first screen with what it shows."""
+    """A chart of the first screen with title and caption."""
 
     title: str
     caption: str
@@ -53,7 +53,7 @@ def effect_line(effect: NamedEffect) -> str:
 
 
 def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """The named effects, what has no name, and the cameras without a mismatch."""
+    """Sentences: the named effects, mismatches without a name, and cameras without a mismatch."""
     if diagnosis is None:
         return
     yield from (effect_line(effect) for effect in diagnosis.effects[:NAMED])
@@ -78,7 +78,7 @@ def _sure_of(effect: NamedEffect) -> str:
 
 
 def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
-    """Probabilities and rivals, the held-out captures, and the rate of false alarms."""
+    """Sentences: probabilities and rivals, chi2 on held-out captures, and the false-alarm rate."""
     if diagnosis is None:
         yield "The fits' own standard deviations; nothing was compared with a model."
         return
@@ -90,11 +90,11 @@ def certainty(diagnosis: DiagnosisResult | None) -> Iterator[str]:
             f"{_short(held.chi2_after / held.n)} (noise alone: 1)."
         )
     if diagnosis.false_alarm_rate is not None:
-        yield f"A healthy camera is told a mismatch in {100 * diagnosis.false_alarm_rate:.2g} % of all diagnoses."
+        yield f"False-alarm rate: {100 * diagnosis.false_alarm_rate:.2g} % of healthy cameras are reported with a mismatch."
 
 
 def meaning(diagnosis: DiagnosisResult | None, validation: ValidationResult | None) -> Iterator[str]:
-    """What the effects do to the light and the signal, and by how much the baseline's predictions are off."""
+    """Sentences: what the effects do to light and signal, and by how much the baseline's predictions are off."""
     for effect in diagnosis.effects[:NAMED] if diagnosis is not None else ():
         yield effect.statement.split(" Seen in ")[0]
     for side, worst in _worst(validation.checks if validation is not None else ()).items():
@@ -121,7 +121,7 @@ def _worst(checks: Iterable[Check]) -> dict[Side, list[Check]]:
 
 
 def to_do(diagnosis: DiagnosisResult | None, left_out: int, warnings: int) -> Iterator[str]:
-    """The next capture, the checks that the mismatches ask for, and which model to predict with."""
+    """Sentences: the next capture, what to check, and which model to predict with."""
     if diagnosis is None:
         yield "Diagnose the recordings: calibench diagnose."
     else:
@@ -131,9 +131,9 @@ def to_do(diagnosis: DiagnosisResult | None, left_out: int, warnings: int) -> It
         if diagnosis.effects:
             yield "Predict with the improved camera model, which holds the named effects; not with the baseline."
         if diagnosis.verdict == "no_mismatch":
-            yield "Nothing: the calibration stands. Compare the next one with it: calibench compare."
+            yield "Nothing: the baseline holds. Compare the next calibration with this one: calibench compare."
         if diagnosis.verdict == "nothing_judged":
-            yield "Capture what the steps that were left out ask for."
+            yield "Take the captures that the steps under Left out ask for."
     if warnings:
         yield f"Look at the {warnings} warning{'s' if warnings > 1 else ''} about the recordings, under Left out."
     if left_out:
@@ -146,8 +146,8 @@ def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
 
 
 def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
-    """The two measurements that the baseline fits worst, with both models; of a healthy or an undiagnosed camera, the photon
-    transfer of each."""
+    """Charts: the two measurements that the baseline fits worst, with both models; of a healthy or an undiagnosed camera, its photon
+    transfer."""
     shown = []
     if diagnosis is not None and diagnosis.effects:
         curves = [curve for curve in diagnosis.curves if len(curve.x) > 3]
@@ -171,7 +171,7 @@ def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
 
 
 def strip(fit: FitResult) -> list[tuple[str, list[KeyFigure]]]:
-    """The key figures of the first screen, by side, then the stereo baseline."""
+    """The key figures of the first screen: by side, then those of the stereo pair."""
     rows = [
         (str(side), [figure for figure in camera_figures(camera) if figure.name.startswith(STRIP)])
         for side, camera in fit.cameras.items()
@@ -189,7 +189,8 @@ def answers(
     left_out: int = 0,
     warnings: int = 0,
 ) -> list[tuple[str, list[str]]]:
-    """The four questions with their answers, a sentence each. `left_out`: steps, `warnings`: about the recordings."""
+    """The four questions, each with its answers in sentences. `left_out`: number of skipped steps; `warnings`: number of warnings about the
+    recordings."""
     return [
         ("What was found", list(found(fit, diagnosis))),
         ("How sure", list(certainty(diagnosis))),

@@ -1,4 +1,4 @@
-"""What a page's charts need: the figures as typed arrays, and plotly.js with Cartesian traces only, both compressed.
+"""The data of a page's charts: the figures as typed arrays, and plotly.js with Cartesian traces only, both compressed.
 
 `plotly-cartesian.min.js.gz` is a third of the full build. It was made by
 

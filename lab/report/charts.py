@@ -164,8 +164,8 @@ def linearity(noise: NoiseFit) -> Figure | None:
 
 
 def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Shapes and annotations of the bands in which a curve differs from the maker's: a strip along the top for each channel, with the
-    difference in per cent."""
+    """Shapes and annotations for the wavelength bands in which a curve differs from the maker's: a strip along the top for each channel,
+    labelled with the difference in per cent."""
     shapes: list[dict[str, Any]] = []
     notes: list[dict[str, Any]] = []
     channels = list(spectral.quantum_efficiency)
@@ -194,8 +194,8 @@ def _departures(spectral: SpectralFit) -> tuple[list[dict[str, Any]], list[dict[
 
 
 def quantum_efficiency(spectral: SpectralFit, recordings: RecordingSet, side: Side) -> Figure:
-    """Quantum efficiency with its band (standard deviation times the fit's coverage factor), the maker's curve, times the fitted factor between
-    the two where there is one, and the bands in which they differ."""
+    """Quantum efficiency with its band (standard deviation times the fit's coverage factor); the maker's curve, scaled by the fitted factor
+    where there is one; and the wavelength bands in which the two differ."""
     data: list[Trace] = []
     scale = spectral.maker_scale or 1.0
     for channel, values in spectral.quantum_efficiency.items():
@@ -463,7 +463,8 @@ def mismatch_map(diagnosis: DiagnosisResult) -> Figure | None:
 
 
 def _range(curve: ResidualCurve) -> list[float]:
-    """Range of the ordinate: all of the measurement and of the improved model; the baseline is cut off where it would compress these."""
+    """Range of the ordinate: it shows all of the measurement and of the improved model. The baseline is cut off where it would compress
+    these."""
     seen = np.concatenate([curve.measured, curve.after])
     low, high = float(seen.min()), float(seen.max())
     span = max(high - low, 1e-12 * max(abs(high), 1.0))

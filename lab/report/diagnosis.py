@@ -1,4 +1,4 @@
-"""The diagnosis on the page: heat maps of all places looked at, residual images, smallest detectable effects."""
+"""The diagnosis on the page: heat maps of all slices, residual images, smallest detectable effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the data sheet's plots share: a plot with its caption, markers, lines."""
+"""Parts of the data sheet's plots: a plot with its caption, markers, lines."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ class EmvaPlot:
 
 
 def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **more: Any) -> Trace:
+    """A trace of markers; `more`: further keys of the trace."""
     return {
         "type": "scatter",
         "mode": "markers",
@@ -34,6 +35,7 @@ def markers(name: str, x: Sequence[float], y: Sequence[float], colour: str, **mo
 
 
 def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: str = "solid", **more: Any) -> Trace:
+    """A trace of lines; `more`: further keys of the trace."""
     return {
         "type": "scatter",
         "mode": "lines",
@@ -45,4 +47,5 @@ def curve(name: str, x: Sequence[float], y: Sequence[float], colour: str, dash: 
 
 
 def floats(values: NDArray[np.floating[Any]]) -> list[float]:
+    """An array (n,) as a list."""
     return [float(value) for value in values]

@@ -27,16 +27,17 @@ HIGH_PASS_PX = 5  # side of the box whose mean is subtracted from the bright ima
 
 @dataclass(frozen=True)
 class _MeanImages:
-    """Mean images of one plane's stacks, DN, and the temporal variance that remains in each."""
+    """Mean images of the stacks of one plane of the mosaic."""
 
-    dark: FloatArray
-    bright: FloatArray | None
-    dark_left_dn2: float
-    bright_left_dn2: float
-    dark_step_dn: float  # step between possible values of the dark stack's mean
+    dark: FloatArray  # DN
+    bright: FloatArray | None  # DN
+    dark_left_dn2: float  # temporal variance that remains in the mean dark image
+    bright_left_dn2: float  # the same of the mean bright image
+    dark_step_dn: float  # between possible values of the mean dark image
 
 
 def spatial_plots(recordings: RecordingSet, side: Side, own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
+    """The spatial plots of one plane, whose figures are `own`; none where its stacks aren't in the recordings."""
     images = _stacks(recordings, side, own.points, plane)
     if images is None:
         return
@@ -88,8 +89,8 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
 
 
 def spectrogram(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (cycles/px) and rms amplitude of an image's rows: the root of the mean power spectrum over the rows, scaled so
-    that a white pattern of standard deviation s has s at every frequency. Frequency 0 is left out."""
+    """Frequencies (cycles/px) and rms amplitude along the rows of an image: the root of the mean power spectrum of its rows, scaled so
+    that a white pattern of standard deviation s has the amplitude s at every frequency. Frequency 0 is left out."""
     length = image.shape[1]
     power = np.mean(np.abs(np.fft.rfft(image - image.mean(), axis=1)) ** 2, axis=0) / length
     return np.asarray(np.fft.rfftfreq(length)[1:], float), np.asarray(np.sqrt(power[1:]), float)

@@ -1,4 +1,4 @@
-"""The data sheet's temporal plots: photon transfer, responsivity, SNR, linearity, dark current, and what the joint fit adds."""
+"""The data sheet's temporal plots: photon transfer, responsivity, SNR, linearity, dark current; and those of the joint fit."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ def _light_axis(points: Emva1288Points) -> str:
 
 
 def temporal_plots(own: Emva1288, plane: str) -> Iterator[EmvaPlot]:
+    """The temporal plots of one plane, whose figures are `own`."""
     points, colour = own.points, CHANNEL.get(plane, "#888888")
     signal = np.array(points.mean_dn) - np.array(points.dark_mean_dn)
     excess = np.array(points.variance_dn2) - np.array(points.dark_variance_dn2)

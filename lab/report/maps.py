@@ -1,4 +1,4 @@
-"""Maps of single pixels as files: arrays to correct frames by, and pictures of them to look at."""
+"""Maps of single pixels as files: arrays for the correction of frames, and pictures of them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _npy(values: NDArray[Any]) -> bytes:
 
 
 def _files(maps: PixelMaps) -> Iterator[tuple[str, bytes]]:
-    """Names and contents: arrays in single precision, pictures of as many pixels, and what the pictures' colours mean."""
+    """(name, content) of each file: arrays in single precision, pictures of the same size, and the range of the pictures' colours."""
     stated: dict[str, dict[str, object]] = {}
     for name, (title, unit) in MAPS.items():
         values = getattr(maps, name)
@@ -51,8 +51,11 @@ def _files(maps: PixelMaps) -> Iterator[tuple[str, bytes]]:
 
 
 def write_maps(folder: Path, maps: PixelMaps) -> tuple[str, ...]:
-    """Write `offset_dn`, `dark_dn_per_s`, `gain`, each with `_std`, as .npy (rows, cols) and as .png, `defective` likewise, and what
-    they are as maps.json, into `folder`; what isn't determined is left out. The names written. InputError where that can't be."""
+    """Write the maps into `folder`; returns the names of the files written.
+
+    They are `offset_dn`, `dark_dn_per_s`, `gain`, each with `_std`, and `defective`, as .npy (rows, cols) and as .png; and their
+    description as maps.json. Maps that aren't determined are left out. Raises InputError where a file can't be written.
+    """
     names = []
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -71,7 +71,7 @@ def difference_picture(difference: ArrayLike, limit: float, margin: int = 0) -> 
 
 
 def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> int:
-    """How many border cells all `kernels` have in common that stay below `share` of the highest value."""
+    """Width of the border, in cells, in which all `kernels` stay below `share` of their highest value; at least 7 cells are left."""
     highest = max(float(kernel.max()) for kernel in kernels)
     size = min(min(kernel.shape) for kernel in kernels)
     margin = 0
@@ -86,7 +86,7 @@ def trimmed_margin(kernels: list[NDArray[np.float64]], share: float = 0.02) -> i
 def patch_colours(patches: tuple[PatchComparison, ...]) -> dict[str, tuple[str, str]]:
     """Patch -> (measured, predicted) as CSS colours: camera R, G, B balanced on the measured white patch, gamma 2.2.
 
-    Camera colours, not colorimetry: both go through the same balance, so what differs on the page differs in the recording.
+    These are camera colours, not colorimetry. Both get the same balance, so that a difference on the page is one in the recording.
     """
     measured: dict[str, dict[str, float]] = {}
     predicted: dict[str, dict[str, float]] = {}

@@ -16,12 +16,10 @@ DISTRIBUTIONS = ("calibench", "numpy", "scipy", "opencv-contrib-python-headless"
 
 
 class Provenance(Frozen):
-    """What a calibration was made of and with."""
+    """The origin of a calibration: instruments, software, and digests of the recordings."""
 
     made: datetime
-    instruments: dict[
-        str, dict[str, str]
-    ] = {}  # role -> what the instrument says of itself (maker, model, serial, ...)
+    instruments: dict[str, dict[str, str]] = {}  # role -> identification by the instrument (maker, model, serial, ...)
     versions: dict[str, str] = {}
     manifest_sha256: str
     frame_sha256: dict[str, str]  # capture id -> SHA-256 of the frame's values (little-endian uint16, row by row)

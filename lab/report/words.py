@@ -1,4 +1,4 @@
-"""The report's sentences: the verdict in plain words, and what the checks say."""
+"""Sentences of the report: the verdict, and the results of the checks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from sim.effects.families import Family
 #: Verdict -> (what stands on the badge, its mood, the headline).
 VERDICTS = {
     "no_mismatch": ("no mismatch", "good", "The baseline model explains these recordings."),
-    "nothing_judged": ("nothing judged", "open", "No measurement of these recordings could be looked at."),
+    "nothing_judged": ("nothing judged", "open", "These recordings determine no measurement."),
     "explained": ("explained", "told", "The baseline model leaves physics out; the named effects account for it."),
     "partly_explained": (
         "partly explained",

@@ -45,7 +45,7 @@ class AdcRipple(Effect):
         Quantity("DN", "amplitude of the cosine from code 0 on", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0),
     ] = 0.0
     period_dn: Annotated[
-        float, Quantity("DN", "codes after which it repeats", lower=SHORTEST_DN, upper=65536.0, absent=512.0)
+        float, Quantity("DN", "period of the ripple, in codes", lower=SHORTEST_DN, upper=65536.0, absent=512.0)
     ] = 512.0
 
     @classmethod

@@ -34,12 +34,12 @@ class AxialChromaticAberration(Effect):
 
     slope_um: Annotated[
         float,
-        Quantity("um", "distance of sensor and focus 100 nm to the red of 550 nm, where it grows in proportion", lower=-100.0,
+        Quantity("um", "distance of sensor and focus at 650 nm, of the part that is linear in wavelength less 550 nm", lower=-100.0,
                  upper=100.0, prior=(0.0, 10.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     curvature_um: Annotated[
         float,
-        Quantity("um", "the same where it grows as the square", lower=-100.0, upper=100.0, prior=(0.0, 10.0), absent=0.0,
+        Quantity("um", "the same, of the part that is quadratic", lower=-100.0, upper=100.0, prior=(0.0, 10.0), absent=0.0,
                  linear_power=2),
     ] = 0.0  # fmt: skip
 

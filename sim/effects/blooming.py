@@ -23,12 +23,19 @@ class Blooming(Effect):
     form_tolerance: ClassVar[float] = 0.2
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "time"})
     sentence: ClassVar[str] = (
-        "Overfull pixels run over: bright streaks stand above and below saturated places, along the columns alone."
+        "Pixels beyond their full well overflow: bright streaks stand above and below saturated places, along the columns alone."
     )
 
     share_percent: Annotated[
         float,
-        Quantity("%", "share of the excess that runs over", lower=0.0, upper=100.0, prior=(0.0, 10.0), absent=0.0),
+        Quantity(
+            "%",
+            "share of the charge beyond the full well that overflows",
+            lower=0.0,
+            upper=100.0,
+            prior=(0.0, 10.0),
+            absent=0.0,
+        ),
     ] = 0.0
 
     def on_charge(self, charge: Charge) -> Charge:

@@ -37,7 +37,7 @@ class BrighterFatter(Effect):
         {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
     )
     sentence: ClassVar[str] = (
-        "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is on its line, and what is missing is common to neighbours."
+        "Full pixels repel charge: the noise of bright flats is lower than photon statistics say while their mean is on its line, and the missing variance appears as covariance of neighbours."
     )
 
     loss_percent: Annotated[
@@ -56,7 +56,7 @@ class BrighterFatter(Effect):
         float,
         Quantity(
             "%",
-            "covariance with the four next pixels together at full well, of the shot noise's variance",
+            "sum of the covariances with the four neighbours at full well, over the shot noise's variance",
             lower=0.0,
             upper=80.0,
             prior=(0.0, 5.0),
@@ -68,7 +68,7 @@ class BrighterFatter(Effect):
         float,
         Quantity(
             "%",
-            "mean charge that a full pixel loses to its four next ones where these are empty",
+            "mean charge that a full pixel loses to its four neighbours if these are empty",
             lower=0.0,
             upper=40.0,
             prior=(0.0, 2.5),

@@ -29,7 +29,7 @@ class ChargeDiffusion(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "field", "level", "orientation", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"wavelength_power"})
     sentence: ClassVar[str] = (
-        "Charge diffuses to neighbouring pixels before it is collected: contrast falls as a bell curve of spatial frequency, "
+        "Charge diffuses to neighbouring pixels before it is collected: contrast falls as a Gaussian of spatial frequency, "
         "alike in all directions, at all f-numbers, and never less in red than in blue."
     )
 

@@ -26,7 +26,7 @@ class Crosstalk(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"exposure", "level", "time", "field"})
     shapes: ClassVar[frozenset[str]] = frozenset({"row_excess", "corner_share"})
     sentence: ClassVar[str] = (
-        "Charge or light leaks into neighbouring pixels: each colour answers where only its neighbours should, and contrast falls."
+        "Charge or light leaks into neighbouring pixels: each colour responds where only its neighbours should, and contrast falls."
     )
 
     share_percent: Annotated[

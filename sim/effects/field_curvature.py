@@ -30,12 +30,12 @@ class FieldCurvature(Effect):
 
     curvature_um: Annotated[
         float,
-        Quantity("um", "distance of sensor and focus half a diagonal from the centre, where it grows as the square", lower=-200.0,
+        Quantity("um", "distance of sensor and focus half a diagonal from the centre, of the part that is quadratic in the radius", lower=-200.0,
                  upper=200.0, prior=(0.0, 20.0), absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     tilt_x_um: Annotated[
         float,
-        Quantity("um", "the same along columns, where it grows in proportion", lower=-200.0, upper=200.0, prior=(0.0, 20.0),
+        Quantity("um", "the same along columns, of the part that is linear", lower=-200.0, upper=200.0, prior=(0.0, 20.0),
                  absent=0.0, linear_power=2),
     ] = 0.0  # fmt: skip
     tilt_y_um: Annotated[

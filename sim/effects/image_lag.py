@@ -24,7 +24,7 @@ class ImageLag(Effect):
         {"f_number", "exposure", "wavelength", "field", "level", "orientation"}
     )
     sentence: ClassVar[str] = (
-        "Charge stays behind: a frame holds a share of the one before it, so that a dark frame after a bright one shows its ghost."
+        "Image lag: a share of a frame's charge is read with the next frame, so that a dark frame after a bright one shows a faint copy of it."
     )
 
     lag_percent: Annotated[

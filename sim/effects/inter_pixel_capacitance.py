@@ -19,7 +19,7 @@ class InterPixelCapacitance(Crosstalk):
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "A. C. Moore, Z. Ninkov, W. J. Forrest, Optical Engineering 45, 076402 (2006)"
     sentence: ClassVar[str] = (
-        "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is common to neighbours at all levels of light, but not in the dark."
+        "Neighbouring pixels share their voltages: contrast falls, colours mix, and shot noise is correlated between neighbours at all levels of light, but read noise isn't."
     )
 
     def log_prior(self) -> float:

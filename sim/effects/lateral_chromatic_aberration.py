@@ -33,12 +33,12 @@ class LateralChromaticAberration(Effect):
 
     slope_um: Annotated[
         float,
-        Quantity("um", "shift in the frame's corner 100 nm to the red of 550 nm, where it grows in proportion", lower=-50.0,
+        Quantity("um", "shift in the frame's corner at 650 nm, of the part that is linear in wavelength less 550 nm", lower=-50.0,
                  upper=50.0, prior=(0.0, 2.0), absent=0.0),
     ] = 0.0  # fmt: skip
     curvature_um: Annotated[
         float,
-        Quantity("um", "the same where it grows as the square", lower=-50.0, upper=50.0, prior=(0.0, 2.0), absent=0.0),
+        Quantity("um", "the same, of the part that is quadratic", lower=-50.0, upper=50.0, prior=(0.0, 2.0), absent=0.0),
     ] = 0.0  # fmt: skip
 
     def on_image(self, image: Image) -> Image:

@@ -18,7 +18,7 @@ class OnChipSharpening(OnChipFilter):
     family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 12233:2023, annex on sharpening"
     sentence: ClassVar[str] = (
-        "The camera sharpens on the chip: contrast rises above what optics and pixel allow, and the noise of neighbouring pixels is opposed, bright or dark."
+        "The camera sharpens on the chip: contrast rises above what optics and pixel allow, and the noise of neighbouring pixels is anticorrelated, in light and in the dark."
     )
 
     strength: Annotated[

@@ -18,7 +18,7 @@ class OnChipSmoothing(OnChipFilter):
     family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 15739:2023, annex on noise filtering"
     sentence: ClassVar[str] = (
-        "The camera smooths on the chip: contrast falls alike at all apertures, and neighbouring pixels have noise in common, bright or dark."
+        "The camera smooths on the chip: contrast falls alike at all apertures, and the noise of neighbouring pixels is correlated, in light and in the dark."
     )
 
     strength: Annotated[

@@ -18,7 +18,7 @@ RIGHT_AT = 0.01
 
 
 class RadiometerNonlinearity(Effect):
-    """What was read as narrowband radiance L of peak P is L exp(a (p^q - 1) / q), p = P / 0.01: a power of the level, p^a, for q = 0, and
+    """The true radiance of narrowband light that was read as L, of peak P, is L exp(a (p^q - 1) / q), p = P / 0.01: a power of the level, p^a, for q = 0, and
     for q = 1 an error in proportion to the level, as of a detector that begins to saturate."""
 
     name: ClassVar[str] = "radiometer_nonlinearity"
@@ -35,7 +35,7 @@ class RadiometerNonlinearity(Effect):
         float,
         Quantity(
             "%",
-            "true light grows with the reading, about a peak of 0.01, to the power of 1 + this",
+            "exponent less 1 of the true light as a power of the reading, about a peak of 0.01 W sr^-1 m^-2 nm^-1",
             lower=-30.0,
             upper=30.0,
             prior=(0.0, 1.0),

@@ -23,7 +23,7 @@ class RowNoise(Effect):
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "wavelength", "field", "level", "time"})
     shapes: ClassVar[frozenset[str]] = frozenset({"correlation"})
     sentence: ClassVar[str] = (
-        "Rows are read with a disturbance of their own: row means scatter far more than single pixels would make them."
+        "Each row is read with a disturbance of its own: row means scatter far more than the noise of single pixels explains."
     )
 
     noise_e: Annotated[
@@ -40,7 +40,9 @@ class RowNoise(Effect):
     ] = 0.0
     correlation: Annotated[
         float,
-        Quantity("1", "of a row's noise with the next row's", lower=-0.95, upper=0.95, prior=(0.0, 0.3), absent=0.0),
+        Quantity(
+            "1", "correlation of the noise of neighbouring rows", lower=-0.95, upper=0.95, prior=(0.0, 0.3), absent=0.0
+        ),
     ] = 0.0
     offset_e: Annotated[
         float,

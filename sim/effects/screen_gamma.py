@@ -1,4 +1,4 @@
-"""A screen's gamma: greys between dark and lit are shown darker, or lighter, than asked for."""
+"""A screen's gamma: grey levels between dark and lit are shown darker, or lighter, than they should be."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sim.parameters import Quantity
 from sim.spectrum import FloatArray
 from sim.stages import Light
 
-#: Nats by which rims that are only wider, with greys as asked for, are less likely than a gamma's: that is a blurred screen.
-BLURRED_NATS = 20.0
-SURE_POWER = 0.3  # |logarithm of the exponent| from which on greys are off without a doubt
+#: Log prior odds against borders that are only wider, with an exponent of 1: that is a blurred screen, not a gamma.
+BLURRED_LOG_ODDS = 20.0
+SURE_POWER = 0.3  # |ln exponent| from which on these odds are 0
 
 
 class ScreenGamma(Effect):
-    """light = (share about its place, by a Gaussian of `rim_px`) ** exponent of the lit state. A pattern of lit and dark cells has
-    greys only at their rims, where the screen resamples it: the steeper the power and the wider the rims, the smaller are lit cells.
-    How wide rims are isn't stated, and drawings take a sample: the exponent is good to tens of per cent."""
+    """Light = (drive blurred by a Gaussian of `rim_px`) ** exponent, as a share of the lit state. A pattern of lit and dark cells has
+    grey levels only at the borders of cells, where the screen resamples it: the larger the exponent and the wider the borders, the
+    smaller are lit cells. The width of the borders isn't stated, and drawings assume one sample: the exponent is good to tens of per cent."""
 
     name: ClassVar[str] = "screen_gamma"
     family: ClassVar[Family] = Family.SCREEN
@@ -33,18 +33,21 @@ class ScreenGamma(Effect):
     )
     shapes: ClassVar[frozenset[str]] = frozenset({"rim_px"})
     sentence: ClassVar[str] = (
-        "The screen's light isn't in proportion to what it is asked for: the greys at the rims of cells are off, and lit cells look "
+        "The screen's light isn't in proportion to its drive: the grey levels at the borders of cells are wrong, and lit cells look "
         "smaller or larger than drawn."
     )
 
     exponent: Annotated[
-        float, Quantity("1", "power of what is asked for", lower=0.2, upper=5.0, prior=(1.0, 1.0), absent=1.0)
+        float,
+        Quantity(
+            "1", "exponent of the light as a power of the drive", lower=0.2, upper=5.0, prior=(1.0, 1.0), absent=1.0
+        ),
     ] = 1.0
     rim_px: Annotated[
         float,
         Quantity(
             "px",
-            "standard deviation of the rims between cells, as the screen resamples its picture, in the camera's pixels",
+            "standard deviation of the blur at the borders of cells, as the screen resamples its picture, in the camera's pixels",
             lower=0.0,
             upper=1.5,
             prior=(0.0, 0.3),
@@ -62,7 +65,7 @@ class ScreenGamma(Effect):
     def log_prior(self) -> float:
         if self.rim_px == 0.0:
             return 0.0
-        return -BLURRED_NATS * max(1.0 - abs(float(np.log(self.exponent))) / SURE_POWER, 0.0)
+        return -BLURRED_LOG_ODDS * max(1.0 - abs(float(np.log(self.exponent))) / SURE_POWER, 0.0)
 
     def on_light(self, light: Light) -> Light:
         if self.exponent == 1.0:

@@ -29,7 +29,14 @@ class ScreenPixelStructure(Effect):
 
     amplitude_percent: Annotated[
         float,
-        Quantity("%", "amplitude before the lens", lower=0.0, upper=100.0, prior=(0.0, 10.0), absent=0.0),
+        Quantity(
+            "%",
+            "amplitude of the grid's modulation, before the blur of the lens",
+            lower=0.0,
+            upper=100.0,
+            prior=(0.0, 10.0),
+            absent=0.0,
+        ),
     ] = 0.0
     period_px: float = 3.5
 

@@ -22,7 +22,7 @@ class SecondOrderLight(Effect):
     form_tolerance: ClassVar[float] = 0.15
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation", "time"})
     sentence: ClassVar[str] = (
-        "The monochromator lets its second order through: from twice the shortest wavelength on, channels that see half of it answer."
+        "The monochromator lets its second order through: from twice the shortest wavelength on, channels that are sensitive at half the wavelength respond."
     )
 
     share_percent: Annotated[

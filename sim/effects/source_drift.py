@@ -44,7 +44,7 @@ class SourceDrift(Effect):
         float,
         Quantity(
             "min",
-            "time after which a warm-up has settled by 63 %; none: it goes on",
+            "time constant of an exponential warm-up; none: a linear drift",
             lower=0.5,
             upper=SETTLES_NEVER_MIN,
             absent=SETTLES_NEVER_MIN,

@@ -25,8 +25,8 @@ class StereoGainMismatch(Effect):
         {"exposure", "wavelength", "field", "level", "orientation", "time"}
     )
     sentence: ClassVar[str] = (
-        "In the same scene the right camera answers otherwise, beside the left one, than both do to uniform light: by one factor "
-        "over the whole scene."
+        "The ratio of the right camera's signal to the left one's in the same scene differs from that in uniform light, "
+        "by one factor over the whole scene."
     )
 
     gain_percent: Annotated[

@@ -24,7 +24,7 @@ class VibrationBlur(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "wavelength", "field", "level"})
     sentence: ClassVar[str] = (
-        "The image moved during the exposure: contrast falls along one direction and is whole across it."
+        "The image moved during the exposure: contrast falls along one direction and is unchanged across it."
     )
 
     amplitude_x_um: Annotated[

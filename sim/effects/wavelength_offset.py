@@ -21,7 +21,7 @@ class WavelengthOffset(Effect):
     form_tolerance: ClassVar[float] = 0.05
     invariances: ClassVar[frozenset[str]] = frozenset({"f_number", "exposure", "level", "field", "orientation"})
     sentence: ClassVar[str] = (
-        "The wavelength scale is shifted: the measured sensitivities follow the maker's curves beside themselves, on rising and falling slopes with opposite sign."
+        "The wavelength scale is shifted: the measured sensitivities differ from the maker's curves, with opposite signs on rising and falling slopes."
     )
 
     offset_nm: Annotated[

@@ -52,8 +52,8 @@ _HARMLESS_SURFACE = frozenset([
 
 
 @dataclass
-class _Block:
-    """One SURF block of a file: keyword -> rest of its line, as often as it stands there."""
+class _SurfaceBlock:
+    """One SURF block of a file: (keyword, rest of the line) of each line in order."""
 
     number: int
     lines: list[tuple[str, str]] = field(default_factory=list)
@@ -98,11 +98,11 @@ def parse_zmx(text: str, *, fallback_name: str = "lens") -> Prescription:
     return _Reader(header, blocks, tail, fallback_name).prescription()
 
 
-def _split(text: str) -> tuple[list[tuple[str, str]], list[_Block], list[tuple[str, str]]]:
+def _split(text: str) -> tuple[list[tuple[str, str]], list[_SurfaceBlock], list[tuple[str, str]]]:
     """Header, surfaces, and what follows them (merit function, tolerances, configurations), as (keyword, rest) each."""
     header: list[tuple[str, str]] = []
     tail: list[tuple[str, str]] = []
-    blocks: list[_Block] = []
+    blocks: list[_SurfaceBlock] = []
     inside = False
     for line in text.splitlines():
         stripped = line.strip().strip("\0")
@@ -113,7 +113,7 @@ def _split(text: str) -> tuple[list[tuple[str, str]], list[_Block], list[tuple[s
         if keyword == "SURF":
             if len(blocks) >= _MAXIMUM_SURFACES:
                 raise PrescriptionError(f"more than {_MAXIMUM_SURFACES} surfaces; is this a lens?")
-            blocks.append(_Block(int(_number(rest, "SURF", "number", "header"))))
+            blocks.append(_SurfaceBlock(int(_number(rest, "SURF", "number", "header"))))
             inside = True
         elif inside and line[:1] in (" ", "\t"):
             blocks[-1].lines.append((keyword, rest))
@@ -170,7 +170,11 @@ class _Reader:
     """Turns the lines of a file into a prescription, and collects what isn't understood."""
 
     def __init__(
-        self, header: list[tuple[str, str]], blocks: list[_Block], tail: list[tuple[str, str]], fallback_name: str
+        self,
+        header: list[tuple[str, str]],
+        blocks: list[_SurfaceBlock],
+        tail: list[tuple[str, str]],
+        fallback_name: str,
     ) -> None:
         self.header, self.blocks, self.tail, self.fallback_name = header, blocks, tail, fallback_name
         self.warnings: list[str] = []
@@ -334,7 +338,7 @@ class _Reader:
                     return target * self.scale
         return None
 
-    def _stated_stop(self, stop: _Block) -> float | None:
+    def _stated_stop(self, stop: _SurfaceBlock) -> float | None:
         """The stop's semi-diameter where it is fixed or was found by aiming rays at the stop: else it is the beams' extent."""
         stated = stop.last("DIAM") or ""
         aimed = int(_optional(self._header("RAIM") or "", 1)) != 0
@@ -343,7 +347,7 @@ class _Reader:
 
     # --- surfaces -----------------------------------------------------------------------------------------------------
 
-    def _object_distance(self, block: _Block, surface: Surface) -> float | None:
+    def _object_distance(self, block: _SurfaceBlock, surface: Surface) -> float | None:
         where = f"surface {block.number} (object)"
         if surface.kind != "standard" or surface.curvature_per_mm:
             raise PrescriptionError(f"{where}: the object isn't a plane; make it one")
@@ -359,7 +363,7 @@ class _Reader:
             )
         return distance * self.scale
 
-    def _surface(self, block: _Block) -> Surface:
+    def _surface(self, block: _SurfaceBlock) -> Surface:
         is_object = block is self.blocks[0]
         where = f"surface {block.number}"
         stated_kind = (block.last("TYPE") or "STANDARD").split()[0].upper()
@@ -411,11 +415,11 @@ class _Reader:
                 tilt_first=kind == "coordinate_break" and parameters.get(6, 0.0) != 0.0,
             )
 
-    def _length(self, block: _Block, keyword: str, meaning: str, where: str) -> float:
+    def _length(self, block: _SurfaceBlock, keyword: str, meaning: str, where: str) -> float:
         stated = block.last(keyword)
         return 0.0 if stated is None else _number(stated, keyword, meaning, where) * self.scale
 
-    def _parameters(self, block: _Block, where: str) -> dict[int, float]:
+    def _parameters(self, block: _SurfaceBlock, where: str) -> dict[int, float]:
         found: dict[int, float] = {}
         for keyword, rest in block.lines:
             if keyword == "PARM":
@@ -425,7 +429,7 @@ class _Reader:
                 found[int(_number(rest, "PARM", "number", where))] = value
         return found
 
-    def _glass(self, block: _Block, where: str) -> GlassName | None:
+    def _glass(self, block: _SurfaceBlock, where: str) -> GlassName | None:
         stated = block.last("GLAS")
         if not stated:
             return None
@@ -449,7 +453,7 @@ class _Reader:
             )
         return GlassName(name=name)
 
-    def _surface_aperture(self, block: _Block, semi_diameter: float, where: str) -> Aperture | None:
+    def _surface_aperture(self, block: _SurfaceBlock, semi_diameter: float, where: str) -> Aperture | None:
         shift = block.last("OBDC") or ""
         centre = (_optional(shift, 0) * self.scale, _optional(shift, 1) * self.scale)
         for refused, meaning in (
@@ -486,7 +490,7 @@ class _Reader:
             return Aperture(shape="circle", half_width_mm=radius, half_height_mm=radius, centre_mm=centre)
         return None
 
-    def _check_keywords(self, block: _Block, where: str) -> None:
+    def _check_keywords(self, block: _SurfaceBlock, where: str) -> None:
         understood = ["TYPE", "CURV", "DISZ", "DIAM", "CONI", "GLAS", "PARM", "STOP", "FLAP", "CLAP", "SQAP", "OBDC"]
         for keyword, rest in block.lines:
             if keyword == "COAT":

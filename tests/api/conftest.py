@@ -1,4 +1,4 @@
-"""The service on a real socket, with instruments that are not there."""
+"""The service on a real socket, on fake instruments."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ kind = "sphere"
 
 @dataclass
 class Running:
-    """A service under test: its address, its keys by scope, and what stands behind it."""
+    """A service under test: its address, its keys by scope, its store and instruments."""
 
     url: str
     keys: dict[str, str]

@@ -47,7 +47,7 @@ def test_keys_are_made_listed_and_taken_away(tmp_path: Path) -> None:
         (["key", "create", "a b"], "a b"),
     ],
 )
-def test_what_cannot_be_is_one_line_and_exit_2(
+def test_wrong_use_is_one_line_and_exit_2(
     tmp_path: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*arguments, "--data", str(tmp_path)]) == 2

@@ -142,7 +142,7 @@ class Watched:
 
 
 @pytest.mark.parametrize(("scheme", "viewport"), [("light", PHONE), ("dark", DESK)])
-def test_everyone_can_read_and_use_it(browser: Any, lab: Running, scheme: str, viewport: dict[str, int]) -> None:
+def test_the_page_is_accessible(browser: Any, lab: Running, scheme: str, viewport: dict[str, int]) -> None:
     """axe finds nothing serious in the log-in, the desk with all it can show, and the certificate; nothing runs off the screen."""
     watched = Watched(browser, lab, scheme, viewport)
     assert watched.serious() == [] and watched.sideways_px() == 0
@@ -272,7 +272,7 @@ def test_a_calibration_is_certified_and_a_drift_is_seen(browser: Any, lab: Runni
     watched.close()
 
 
-def test_who_may_only_read_is_offered_no_halt(browser: Any, lab: Running) -> None:
+def test_a_key_that_may_only_read_gets_no_halt_button(browser: Any, lab: Running) -> None:
     watched = Watched(browser, lab)
     watched.log_in(lab, "read")
     assert not watched.page.is_visible("#halt")

@@ -1,4 +1,4 @@
-"""What keeps others out: scopes, cookies, Host, Origin, caps, headers."""
+"""Protection of the service: scopes, cookies, Host, Origin, size limits, headers."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_logins_end_after_twelve_hours() -> None:
     assert len(logins._tokens) == 1  # what has run out isn't kept
 
 
-def test_an_address_has_so_many_failures_and_gets_them_back() -> None:
+def test_an_address_is_blocked_after_too_many_failures_and_recovers() -> None:
     clock = [0.0]
     failed = FailedKeys(most=3, per_s=0.5, clock=lambda: clock[0])
     for _ in range(3):
@@ -192,7 +192,7 @@ def test_a_client_with_a_whole_network_is_one_address() -> None:
     assert len(failed._left) == ADDRESSES  # no amount of addresses takes more memory
 
 
-def test_guessing_is_slowed_down_and_those_who_work_are_not(running: Running) -> None:
+def test_guessing_is_slowed_down_and_valid_keys_are_not(running: Running) -> None:
     running.app.state.gate.failures = FailedKeys(most=5, per_s=0.01)
     with running.client("read") as client, running.client(None) as other:
         assert client.get("/api/v1/me").status_code == 200
@@ -296,13 +296,13 @@ def test_a_foreign_host_is_refused(shared: Running, host: str, path: str) -> Non
 
 
 @pytest.mark.parametrize("hosts", [["127.0.0.1", "evil.example"], ["evil.example", "127.0.0.1"], []])
-def test_one_host_is_named_and_no_more(shared: Running, hosts: list[str]) -> None:
+def test_a_request_names_exactly_one_host(shared: Running, hosts: list[str]) -> None:
     lines = "".join(f"Host: {host}\r\n" for host in hosts)
     assert raw(shared, f"GET /health HTTP/1.1\r\n{lines}Connection: close\r\n\r\n").startswith("HTTP/1.1 400")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:9", "localhost", "LOCALHOST:1", "[::1]:80"])
-def test_our_own_names_pass(shared: Running, host: str) -> None:
+def test_names_of_this_computer_pass(shared: Running, host: str) -> None:
     assert raw(shared, f"GET /health HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").startswith("HTTP/1.1 200")
 
 

@@ -1,4 +1,4 @@
-"""The line itself: time-outs, what is left over, the transcript, and a line that breaks."""
+"""The serial line: time-outs, left-over bytes, the transcript, and a line that breaks."""
 
 from __future__ import annotations
 

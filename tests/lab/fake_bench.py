@@ -69,7 +69,7 @@ def station(**changes: Any) -> Station:
 
 
 class Bench:
-    """What the fake instruments share, and what a test looks at or breaks."""
+    """State that the fake instruments share, and that tests read or break."""
 
     def __init__(self, delay_s: float = 0.0) -> None:
         self.target, self.wavelength_nm, self.opened, self.lit = "", 0.0, True, True

@@ -1,4 +1,4 @@
-"""Jobs: what the table says of them, from queue to result, through failures, cancelling and the end of a process."""
+"""Jobs: their rows in the table, from the queue to the result, through failures, cancelling and the end of a process."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_failure_is_said_and_the_runner_goes_on(
         assert runner.wait(runner.submit("fit", session), 20).state == "done"
 
 
-def test_cancelling_ends_a_job_at_its_next_word_and_the_next_one_starts(
+def test_cancelling_ends_a_job_at_its_next_progress_and_the_next_one_starts(
     store: Store, session: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     began, calls = threading.Event(), []

@@ -19,7 +19,7 @@ def blas_threads() -> set[int]:
 
 @pytest.fixture(autouse=True)
 def two_threads():
-    """What a user has who set nothing."""
+    """The default of a user's environment: BLAS with two threads."""
     with threadpool_limits(2, user_api="blas"):
         for library in (
             ThreadpoolController().select(internal_api="openblas").lib_controllers

@@ -19,7 +19,7 @@ from lab.capture.store import Store
 from lab.capture.take_step import DUMMY_FRAMES
 from lab.capture_kinds.dark import DarkSequence
 from lab.diagnose import Diagnosis
-from lab.diagnose.outcome.next_capture import Proposal
+from lab.diagnose.outcome.next_capture import CaptureProposal
 from lab.diagnose.policy import DecisionPolicy
 from lab.errors import Cancelled, InputError
 from lab.formats import recording_set
@@ -255,11 +255,11 @@ def test_only_with_a_station_is_anything_captured(store: Store) -> None:
 # --- resolving -----------------------------------------------------------------------------------------------------------
 
 
-def proposal(capture: str, distance: float = 9.0, told_apart: float = 0.98, can_take: bool = True) -> Proposal:
+def proposal(capture: str, distance: float = 9.0, told_apart: float = 0.98, can_take: bool = True) -> CaptureProposal:
     wanted = NextCapture(
         side="left", capture=capture, rivals=("defocus", "coma"), distance=distance, told_apart=told_apart
     )
-    return Proposal(wanted, DARKS if can_take else None)
+    return CaptureProposal(wanted, DARKS if can_take else None)
 
 
 TIE = "partly_explained"
@@ -297,7 +297,7 @@ TIE = "partly_explained"
     ],
 )
 def test_resolving_captures_and_diagnoses_until_nothing_can_settle_the_tie(
-    proposed: list[list[Proposal]],
+    proposed: list[list[CaptureProposal]],
     taken: list[str],
     said: str,
     store: Store,

@@ -1,4 +1,4 @@
-"""The sides in processes: the same findings as in one, and a good end whatever happens."""
+"""The sides in processes: the same findings as in one process, and a clean end in all cases."""
 
 from __future__ import annotations
 

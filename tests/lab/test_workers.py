@@ -47,7 +47,7 @@ def test_every_item_has_its_result(where: str, cluster: Workers) -> None:
 
 
 def test_the_work_is_done_elsewhere(cluster: Workers) -> None:
-    """`/proc/self` is the process that asks."""
+    """`/proc/self` names the process that runs the work."""
     others = {Path(found).name for _, found in cluster.done(os.path.realpath, ["/proc/self"] * 8)}
     assert str(os.getpid()) not in others
     assert 1 <= len(others) <= 2

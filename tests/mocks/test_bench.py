@@ -1,4 +1,4 @@
-"""The bench's light path, its cameras' statistics, and that what a lab is told fits what the cameras see."""
+"""The bench: its light path, the statistics of its cameras, and the agreement of its station file with its frames."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ class TestFrames:
             bench.expose("middle", 0.1)  # type: ignore[arg-type]
 
     def test_threads(self, bench: Bench) -> None:
-        """Settings change while both cameras expose: every frame is one of the states, none is torn."""
+        """Settings change while both cameras expose: every frame belongs to one setting, none mixes two."""
         failures: list[BaseException] = []
 
         def work(side: Side) -> None:

@@ -1,7 +1,7 @@
-"""Every effect of the library is concealed on the bench, and what the bench then gives is what the forward model predicts.
+"""Every effect of the library is concealed on the bench, and the bench's frames are those that the forward model predicts.
 
-Predictions start from what stands in front and from what the radiometer says, and take `sim.frame.expected_sequence`; the
-bench takes its frames one by one, from its own settings, clock and temperature.
+Predictions start from the scene and the radiometer's readings and use `sim.frame.expected_sequence`; the bench exposes frame by frame, with
+its own settings, clock and temperature.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def set_up(bench: Bench, take: Take) -> ShownCells:
 
 
 def read_by(bench: Bench, kind: str) -> UniformField:
-    """What a session knows of the sphere: the mean of some readings of the radiometer."""
+    """The radiance of the sphere as a session knows it: the mean of some readings of the radiometer."""
     readings = [bench.radiance() for _ in range(8)]
     mean = np.mean([reading.value for reading in readings], axis=0)
     return UniformField(Spectrum.of(readings[0].arrays[0], mean), kind=kind)
@@ -178,7 +178,7 @@ def predicted(
 
 @cache
 def healthy(take: Take, side: Side) -> tuple[FloatArray, FloatArray]:
-    """What a camera with nothing to conceal would give."""
+    """The frames of a camera that conceals nothing."""
     bench = Bench(1, concealed={}, shape=SHAPE)
     camera = bench._truth.cameras[side]
     seen = scene(camera, take.target, take.light, set_up(bench, take))

@@ -1,4 +1,4 @@
-"""The second image former against analytic limits, so that what it conceals is what its truths say."""
+"""The second image former against analytic limits, so that its truths are right."""
 
 from __future__ import annotations
 

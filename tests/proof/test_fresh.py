@@ -1,7 +1,7 @@
-"""A dozen concealed cases of a seed that nobody has seen: drawn from the commit and the day, printed, repeatable by CALIBENCH_SEED.
+"""A dozen concealed cases with a new seed, drawn from the commit and the date; CALIBENCH_SEED repeats it.
 
-What is asserted holds for any seed with a probability above 99.9 %, by binomial limits given beside it: weaker than the proof's
-goals, which a dozen cases can't judge.
+The assertions hold for any seed with a probability above 99.9 %, by the binomial limits given beside them. They are weaker than the goals
+of the proof, which a dozen cases can't judge.
 """
 
 from __future__ import annotations

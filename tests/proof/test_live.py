@@ -1,4 +1,4 @@
-"""The live proof's own parts, and three of its cases that nobody chose: drawn from the commit and the day, over the wire."""
+"""The parts of the live proof, and three randomly drawn cases of it, over the wire; the seed is drawn from the commit and the date."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_every_effect_that_the_bench_shows_has_a_case() -> None:
 
 @pytest.mark.parametrize("effect", sorted(set(library()) - set(NOT_SHOWN)))
 def test_the_bench_takes_every_effect_at_its_typical_size(effect: str) -> None:
-    """An effect that `SIZES` doesn't list is concealed so."""
+    """Effects that `SIZES` doesn't list are concealed at their typical size."""
     concealed = parse([typical_spec(effect)])
     assert concealed["left"] == (typical(library()[effect]),)
 
@@ -129,7 +129,7 @@ def test_a_bench_that_refuses_is_a_failed_case(tmp_path: Path) -> None:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("index", range(3))
 def test_one_of_the_day_gets_no_wrong_name(index: int, tmp_path: Path) -> None:
-    """Each of three cases of typical size: the concealed effect is named, or no effect is."""
+    """Three randomly drawn cases of typical size: the concealed effect is named, or no effect is."""
     seed = day_seed()
     case = drawn(seed)[index]
     run: LiveRun = run_case(case, tmp_path / case.name)

@@ -55,7 +55,7 @@ def noise_is_recovered(folder: Path, side: str) -> None:
 
 
 def quantum_efficiency_is_recovered(folder: Path, side: str, channel: str) -> None:
-    """Wanted: within 2 % rms of the peak; what the sweep sees of the left camera includes its concealed filter."""
+    """Wanted: within 2 % rms of the peak. The sweep of the left camera includes its concealed filter."""
     spectral = _result(folder, "fit")["cameras"][side]["spectral"]
     body = TRUTH.cameras[side]
     wavelength_nm = np.array(spectral["wavelength_nm"])

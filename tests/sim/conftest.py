@@ -1,3 +1,5 @@
+"""A lens in closed form, as a traced table, for the tests of `sim`."""
+
 from __future__ import annotations
 
 from functools import lru_cache

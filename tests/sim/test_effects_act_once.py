@@ -1,3 +1,5 @@
+"""An effect acts exactly once in a frame, whatever the way in which the frame is computed."""
+
 from __future__ import annotations
 
 import numpy as np

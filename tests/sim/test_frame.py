@@ -1,3 +1,5 @@
+"""Whole frames: means, moments, reproducibility, and the baseline without effects."""
+
 from __future__ import annotations
 
 from typing import ClassVar

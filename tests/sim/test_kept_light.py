@@ -1,4 +1,4 @@
-"""The steps of an exposure one by one, as a bench takes them that keeps a scene's light."""
+"""The steps of an exposure one by one, as a bench that keeps a scene's light takes them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_one_light_serves_many_exposures(colour_camera: CameraModel, lamp: Spect
         )
 
 
-def test_the_room_keeps_its_light_when_the_source_changes(colour_camera: CameraModel, lamp: Spectrum) -> None:
+def test_ambient_light_stays_when_the_source_changes(colour_camera: CameraModel, lamp: Spectrum) -> None:
     effects = (AmbientLight(rate_e_per_s=500.0),)
     light = scene_light(colour_camera, UniformField(lamp), effects)
     exposure = Exposure(UniformField(lamp), 0.01)
@@ -79,7 +79,7 @@ def test_transfers_are_made_once_a_light() -> None:
     assert len(made) == 4  # b fell out when c came
 
 
-def test_what_is_read_and_what_stays_is_what_was_held(colour_camera: CameraModel, lamp: Spectrum) -> None:
+def test_read_and_lagging_charge_add_up_to_the_charge_held(colour_camera: CameraModel, lamp: Spectrum) -> None:
     effects = (ImageLag(lag_percent=4.0),)
     exposures = [Exposure(UniformField(lamp), 0.01), Exposure(Darkness(), 0.01)]
     left: np.ndarray[tuple[int, ...], np.dtype[np.float64]] | float = 0.0
@@ -90,7 +90,7 @@ def test_what_is_read_and_what_stays_is_what_was_held(colour_camera: CameraModel
         assert np.allclose(read + left, held)
 
 
-def test_what_the_radiometer_says_and_what_is_there(colour_camera: CameraModel, lamp: Spectrum) -> None:
+def test_effects_of_the_rig_act_outside_a_frame(colour_camera: CameraModel, lamp: Spectrum) -> None:
     there = radiance_at_lens(colour_camera, lamp, (WavelengthOffset(offset_nm=5.0),), "flat")
     wavelength_nm = np.arange(450.0, 650.0, 5.0)
     assert np.allclose(there.at(wavelength_nm), lamp.at(wavelength_nm - 5.0))

@@ -1,4 +1,4 @@
-"""Where light lands off: the lens's geometry acts on the scene, and what blurs acts after it; wavelengths that land apart blur."""
+"""Displaced light: the lens's geometry acts on the scene before the blur; wavelengths that are displaced differently blur."""
 
 from __future__ import annotations
 

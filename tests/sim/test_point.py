@@ -1,3 +1,5 @@
+"""The transfer at a place, edge profiles and kernels against their definitions."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -120,7 +122,7 @@ def test_a_coarse_kernel_convolves_pixel_aligned_cells(mono_camera: CameraModel,
     assert frame[35, 48] > frame[35, 46]  # moved to the right
 
 
-def test_wavelengths_share_a_sight_s_light(colour_camera: CameraModel, lamp: Spectrum) -> None:
+def test_wavelength_weights_are_shares_of_the_detected_light(colour_camera: CameraModel, lamp: Spectrum) -> None:
     """Means of what is linear in the wavelength are those of the detected light, and an effect on its colour is in them."""
     grid = np.linspace(380.0, 780.0, 90)
     sights = [(channel, light) for channel in "RGB" for light in (lamp, None)]

@@ -1,3 +1,5 @@
+"""Frames of multispectral images against sums band by band."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Spectra: resampling, integrals, quadrature rules."""
+
 from __future__ import annotations
 
 import numpy as np

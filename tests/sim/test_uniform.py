@@ -1,3 +1,5 @@
+"""Electrons and codes of a pixel in uniform light against closed forms."""
+
 from __future__ import annotations
 
 from typing import ClassVar

@@ -1,7 +1,7 @@
 """What a measurement is: its declaration, its numbers with their covariance, and how a camera model predicts them.
 
-The prediction goes through the estimator that made the numbers. Nuisance parameters (levels, gain, a smooth few per cent of the
-maker's curves) enter by the Jacobian and a normal prior; the measurement model marginalises them.
+A prediction goes through the same estimator as the recording. Nuisance parameters (levels, gain, smooth errors of the
+maker's sensitivity curves) enter by their Jacobian and a normal prior. The measurement model marginalises them.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
 Effects = Sequence[Effect]
-LEVEL_REACH = 0.8  # of a level's logarithm: over a factor of 2 a smooth departure from a line may change
+#: `Block.reach` of measurements by ln(level): a departure from linearity may change over a factor of exp(0.8) = 2.2 in level.
+LEVEL_REACH = 0.8
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a module of this package declares of a measurement; `lab.diagnose.measurements.library` finds it there.
+    """The declaration of a measurement in its module, where `lab.diagnose.measurements.library` finds it.
 
-    `make` takes a side's `Study` and returns the numbers. It raises NotDetermined where the recordings don't allow them.
+    `make` takes the `Study` of a side and returns the measured numbers. It raises NotDetermined where the recordings don't
+    determine them.
     """
 
     name: str  # identifier in results: lower case and underscores
-    title: str  # in reports: a noun phrase in a lab's words
+    title: str  # in reports: a noun phrase in a laboratory's words
     order: int  # in reports, ascending: 100 dark frames, 200 uniform light, 300 charts and edges, 400 screens, 500 boards, 600 pairs
     axis: str  # quantity of `Label.x`
     unit: str  # of the axis
@@ -39,17 +41,17 @@ class Measurement:
     quantity: str  # what the numbers are, with their unit: the ordinate of the report's curves
     #: Whether the numbers are levels of frames, which lie between 0 and the white level.
     is_level: bool = False
-    #: Quantity that conditions are values of ("orientation"): slices and curves are by condition, too. "": none.
+    #: The quantity of `Label.condition` ("orientation"). Mismatches are located, and curves drawn, by its values. "": it has none.
     conditions: str = ""
     #: Words before the conditions where the report lists them ("edges at"); "": `conditions`.
     conditions_words: str = ""
-    #: Name of the points where x only numbers them and conditions name them ("patches"); "": x is a quantity.
+    #: What the points are ("patches") where x only numbers them and the condition names them; "": x is a quantity.
     places: str = ""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Mean (n,) and the Jacobian: its derivatives (n,) by every nuisance parameter, per prior standard deviation."""
+    """Predicted mean (n,), and its Jacobian: name of a nuisance parameter -> derivative (n,) per prior standard deviation."""
 
     mean: FloatArray
     jacobian: dict[str, FloatArray]
@@ -57,41 +59,41 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Label:
-    """Where a number stands: for slices, held-out captures and pictures."""
+    """What one measured number belongs to."""
 
-    x: float
+    x: float  # in `Measurement.unit`
     channel: str
-    condition: str
-    captures: tuple[str, ...]
-    held_out: bool
+    condition: str  # value of `Measurement.conditions`, in words
+    captures: tuple[str, ...]  # ids of the captures that it was measured from
+    held_out: bool  # whether neither the choice nor the fit of effects may use it
 
 
 @dataclass(frozen=True)
 class Block:
-    """The numbers of one measurement, (n,): their noise's covariance (n, n), labels, and the model's prediction with given effects."""
+    """The n numbers of one measurement: values, covariance of their noise, labels, and the prediction for given effects."""
 
     measurement: Measurement
-    reach: float  # along `position`, over which a smooth discrepancy may change
-    value: FloatArray
-    covariance: FloatArray
-    labels: tuple[Label, ...]
-    reads: frozenset[str]  # quantities of the stages (`sim.stages`) that the prediction depends on
+    reach: float  # correlation length of a model discrepancy and of a law's error, in the unit of `position`
+    value: FloatArray  # (n,)
+    covariance: FloatArray  # (n, n), without nuisance parameters
+    labels: tuple[Label, ...]  # n
+    reads: frozenset[str]  # quantities of the stages (`sim.stages`) that the predicted mean depends on
     predict: Callable[[Effects], Prediction]
-    scale: FloatArray  # size of a discrepancy of 1, (n,)
-    along: FloatArray | None = (
-        None  # where smoothness isn't along x: logarithms of levels (n,), places on the sensor (n, 2)
-    )
-    scattered_by: frozenset[str] = frozenset()  # quantities of the stages that only the covariance depends on
+    scale: FloatArray  # (n,): a model discrepancy is stated as a share of it
+    along: FloatArray | None = None  # `position` where it isn't x: ln(level) (n,), place on the sensor (n, 2)
+    scattered_by: frozenset[str] = (
+        frozenset()
+    )  # quantities of the stages that only the scatter of the numbers depends on
 
     @property
     def position(self) -> FloatArray:
-        """Along which errors of laws and unknown discrepancies are smooth, (n,) or (n, d)."""
+        """Coordinate in which model discrepancies and errors of laws are smooth, (n,) or (n, d)."""
         return np.array([label.x for label in self.labels]) if self.along is None else self.along
 
     def touched_by(self, effect: type[Effect]) -> bool:
-        """Whether the effect acts on anything that this measurement sees."""
+        """Whether the effect may change the predicted mean."""
         return not self.reads.isdisjoint(may_change(effect))
 
     def scatters_by(self, effect: type[Effect]) -> bool:
-        """Whether the effect makes the numbers scatter."""
+        """Whether the effect may add scatter to the numbers."""
         return not self.scattered_by.isdisjoint(may_change(effect))

@@ -1,4 +1,4 @@
-"""The measurement model of one side: every measurement that its recordings allow, against its baseline."""
+"""Make the measurement model of one side: all measurements that its recordings determine, and the baseline camera."""
 
 from __future__ import annotations
 
@@ -19,20 +19,22 @@ from sim.camera import Side
 from sim.effects.pixel_aperture import PixelAperture
 from sim.spectrum import FloatArray
 
-#: Apertures that a pixel may have whose fill factor nobody states: the least side (px), how many are tried, what they are told by.
+#: Where the fill factor isn't stated: least side of the pixel's aperture (px), number of sides tried between it and 1, and number of
+#: principal components that stand for their changes.
 LEAST_SIDE, APERTURES, APERTURE_DIRECTIONS = 0.5, 10, 4
-#: What a nuisance parameter covers of a quantity that had to be assumed.
+#: Remark on an assumed quantity that has nuisance parameters.
 FREE_BESIDE = {"fill_factor": ", but contrast may be that of any aperture"}
-#: Of the full well: from here on pixels of a noisy level are cut off.
+#: Share of the fitted full well from which on a pixel counts as clipped, as noise takes some pixels of that level to the full well.
 _NEAR_FULL = 0.985
 
 
 def measurement_model(
     recordings: RecordingSet, side: Side, fit: FitResult | None = None, baseline: CameraFile | None = None
 ) -> tuple[MeasurementModel | None, tuple[Skipped, ...]]:
-    """One side's measurements against its baseline, and what couldn't be looked at; None where nothing could.
+    """The measurement model of one side (None where no measurement is determined), and what was skipped or assumed.
 
-    `baseline`: a camera with its effects in place of the maker's word and the fit.
+    The baseline camera is made of the data sheet and of the side's `fit`. `baseline` stands in place of both: a camera file,
+    whose effects are then part of the baseline.
     """
     camera_fit = fit.cameras.get(side) if fit is not None else None
     camera = baseline.camera if baseline else camera_model(recordings, side, camera_fit, maker_curves=True)
@@ -64,7 +66,11 @@ def measurement_model(
 
 
 def _any_aperture(model: MeasurementModel) -> dict[str, FloatArray]:
-    """Jacobian by an unstated pixel aperture: the principal components of the changes that apertures of evenly spaced sides make."""
+    """Jacobian by an unstated pixel aperture: name -> (n,) per prior standard deviation.
+
+    The changes of the predicted mean by `APERTURES` sides, evenly spaced from `LEAST_SIDE` to 1 px, are divided by
+    sqrt(`APERTURES`). The columns are the principal components of these, each times its singular value.
+    """
     camera, sides = model.camera, np.linspace(LEAST_SIDE, 1.0, APERTURES, endpoint=False)
     lowest = PixelAperture.quantities()["side_change_um"].lower or -np.inf
     effects = [PixelAperture(side_change_um=max(lowest, (s - 1.0) * camera.pixel_pitch_um)) for s in sides]
@@ -74,6 +80,7 @@ def _any_aperture(model: MeasurementModel) -> dict[str, FloatArray]:
 
 
 def _saturation_dn(fit: CameraFit | None) -> float | None:
+    """Code (DN) from which on a pixel counts as clipped, by the fitted full well; None where it isn't fitted."""
     noise = fit.noise if fit is not None else None
     if noise is None or noise.full_well_e is None or noise.conversion_gain_dn_per_e is None:
         return None

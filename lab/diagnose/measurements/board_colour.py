@@ -1,4 +1,4 @@
-"""Lateral colour of boards: how far red and blue corners lie from green's."""
+"""Lateral colour of boards: displacement of the corners in red and blue from those in green."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import channel_corners
 from sim.spectrum import FloatArray
 
-COLOUR_VIEWS = 8  # evenly over the views: a colour's corners cost a fit each
-COLOUR_RINGS = (0.3, 0.6, 1.0)  # half diagonals
+COLOUR_VIEWS = 8  # of more views, evenly spaced ones are used, at least as many: every corner is fitted once a channel
+COLOUR_RINGS = (0.3, 0.6, 1.0)  # outer radii of the rings, half diagonals; the last ring has no end
 
 
 def board_colour_block(study: Study) -> Block:
-    """Radial displacement of red and blue corners of boards from green's, px, by distance from the frame's middle."""
+    """Radial displacement (px) of the corners in red and blue from those in green, by rings about the frame's middle.
+
+    Raises NotDetermined for a camera without a green channel, without charuco captures, and with too few corners.
+    """
     if "G" not in study.channels:
         raise NotDetermined("board_colour", "one channel: nothing to hold it against")
     views, missed = views_of(study, study.side)
@@ -69,11 +72,17 @@ def board_colour_block(study: Study) -> Block:
 
 
 def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
-    """Mean distance, outward shift and its variance in rings of corners; a shift that the whole frame shares is a prism's, and out."""
+    """Of each ring with corners enough: mean distance (half diagonals), outward displacement (px) and its variance (px^2).
+
+    `table` (corners, 6): distance, outward unit vector (x, y), displacement (x, y) in px, number of the view. Least squares of
+    displacement = common shift + outward unit vector x displacement of the ring. The common shift, as of a prism, is no lateral
+    colour and isn't returned. Outliers beyond 6 robust standard deviations are left out. The variance is the larger of that of
+    independent corners and of the sandwich estimate clustered by view.
+    """
     if len(table) < 4 * FEWEST_CORNERS:
         return []
     radius, unit, gap, view = table[:, 0], table[:, 1:3], table[:, 3:5], table[:, 5]
-    # together: gap = shared + unit s(r), s in steps of the rings
+
     edges = (0.0, *COLOUR_RINGS[:-1], np.inf)
     which = np.digitize(radius, edges[1:-1])
     used = [k for k in range(len(COLOUR_RINGS)) if (which == k).sum() >= FEWEST_CORNERS]
@@ -91,7 +100,7 @@ def _rings(table: FloatArray) -> list[tuple[float, float, float]]:
     solution, *_ = np.linalg.lstsq(design[inside], seen[inside], rcond=None)
     rest = np.where(inside, seen - design @ solution, 0.0)
     inverse = np.linalg.pinv(design[inside].T @ design[inside])
-    # corners of one view share its errors: covariance clustered by view
+    # corners of one view share errors
     groups = np.repeat(view[keep], 2)
     meat = np.zeros_like(inverse)
     for k in np.unique(groups):

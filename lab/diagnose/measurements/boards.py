@@ -1,12 +1,11 @@
-"""Boards: where a camera's corners lie off its geometry, by place in the frame.
+"""Boards: reprojection residuals of the corners of boards, averaged over cells of the frame.
 
-Focal length, principal point, the boards' poses and their warp are fitted: they are never a finding. So is Brown's distortion
-(k1 k2 p1 p2 k3) where nothing states it: a distorting lens isn't a fault. It is judged where a camera that was calibrated before is
-held against its boards: that distortion is then the baseline, and what the boards show beyond it is `distortion` along the radius
-and `decentre` across it. A fit of the very same boards explains them within noise, and leaves nothing to find.
+Focal length, principal point, the boards' poses and their warp are always fitted, and never a finding. Brown's distortion
+(k1 k2 p1 p2 k3) is fitted, too, where it isn't known: a lens that distorts isn't at fault. Where the camera was calibrated before,
+its distortion is the baseline and isn't fitted. Departures from it are then findings (`distortion` along the radius, `decentre`
+across it).
 
-The residuals of the corners are averaged over cells of the frame. An effect's shifts go through the same fit: the part that poses
-and focal length take up doesn't count.
+An effect's shifts of the corners are projected like the residuals: the part that the fitted parameters could take up is removed.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ from sim.spectrum import FloatArray
 ROWS, COLS = 3, 4  # cells of the frame
 FEWEST_CORNERS = 6  # of a cell
 CELL_FLOOR_PX = 0.006
-#: What a distortion that was calibrated before may have changed by, at the frame's corner and by each term.
+#: Prior standard deviation of a known distortion, at the frame's corner, of each of its terms.
 CALIBRATED_STD_PX = 0.05
-HELD_OUT_FROM = 6  # views: of as many or more, every third is held out
+HELD_OUT_FROM = 6  # views; of as many or more, every third is held out
 REFERENCE_NM = 550.0
 
 
 def views_of(study: Study, side: Side) -> tuple[list[BoardView], list[Skipped]]:
-    """The boards in the charuco captures of a side, found once, and those that couldn't be found."""
+    """The boards found in the charuco captures of a side, and the captures in which none was found. Computed once a study."""
     kept: dict[Side, tuple[list[BoardView], list[Skipped]]] = study.once(_no_views)
     if side not in kept:
         kept[side] = find_boards(study.recordings, side)
@@ -52,7 +51,7 @@ def _no_views(_: Study) -> dict[Side, tuple[list[BoardView], list[Skipped]]]:
 
 
 def calibration_of(study: Study) -> Calibration:
-    """The side's camera by its own boards."""
+    """The side's camera, calibrated by its boards. Raises NotDetermined where they don't determine it."""
     views, missed = views_of(study, study.side)
     if not views and not missed:
         raise NotDetermined("boards", "no charuco captures")
@@ -64,13 +63,13 @@ def calibration_of(study: Study) -> Calibration:
 
 @dataclass(frozen=True)
 class _Corners:
-    """All corners of a calibrated camera about its solution: residuals (n, 2), and what the fit takes up of any shifts."""
+    """The n corners of all views, linearised about the solution of the bundle adjustment."""
 
     place: FloatArray  # (n, 2), (x, y) px
-    left: FloatArray  # (n, 2), seen less predicted
-    taken: FloatArray  # (2 n, k), orthonormal: shifts in its span are the fit's
-    noise_px: float
-    view: FloatArray  # (n,) number of its view
+    left: FloatArray  # (n, 2), residuals: measured less predicted, px
+    taken: FloatArray  # (2 n, k), orthonormal: spans the shifts that the fitted parameters can make
+    noise_px: float  # standard deviation of a coordinate
+    view: FloatArray  # (n,) number of the corner's view
 
     @staticmethod
     def of(views: Sequence[BoardView], solution: Solution, bundle: BundleAdjustment) -> _Corners:
@@ -93,7 +92,11 @@ class _Corners:
 
 
 def board_block(study: Study) -> Block:
-    """Mean shift of corners off the fitted camera, along and across the radius, by cell of the frame."""
+    """Mean residual of the corners (px), along and across the radius, by cell of the frame.
+
+    Raises NotDetermined without charuco captures, where they don't determine the camera, and where no cell holds
+    `FEWEST_CORNERS` corners.
+    """
     found = calibration_of(study)
     known = study.camera.geometry
     views, state, shape = found.views, found.solution.state, found.shape
@@ -101,7 +104,7 @@ def board_block(study: Study) -> Block:
         free = found.solution.free[0] | free_intrinsics(MODELS[-1])
     else:
         free = free_intrinsics(())
-        # the optical axis and the focal length are the boards', the distortion that of the calibration before
+        # focal length and principal point as of these boards, distortion as of the earlier calibration
         fixed = intrinsics_of(known.camera_matrix, known.distortion)
         start = np.array([np.concatenate([state.intrinsics[0, :4], fixed[4:]])])
         state = replace(state, intrinsics=start)
@@ -133,7 +136,7 @@ def board_block(study: Study) -> Block:
 
 
 def shifts_px(study: Study, place: FloatArray, effects: Effects) -> FloatArray:
-    """By how much light at `place` (n, 2), (x, y) px, lands off the baseline's place, px: (n, 2)."""
+    """Displacement (n, 2) of the image by the effects, px, at `place` (n, 2), (x, y) px, at `REFERENCE_NM`."""
     camera = study.camera
     pitch = camera.pixel_pitch_um
     x, y = ((place[:, k] - 0.5 * (n - 1)) * pitch for k, n in ((0, camera.cols), (1, camera.rows)))
@@ -142,7 +145,7 @@ def shifts_px(study: Study, place: FloatArray, effects: Effects) -> FloatArray:
 
 
 def _cells(study: Study, corners: _Corners, views: int) -> list[tuple[np.ndarray, bool]]:
-    """Corners (n,) of each cell of the frame, of views that choice may see and of those held out."""
+    """(mask of its corners (n,), whether held out) of each cell of the frame with corners enough, seen and held-out views apart."""
     camera = study.camera
     row = np.clip((corners.place[:, 1] + 0.5) / camera.rows * ROWS, 0, ROWS - 1e-9).astype(int)
     col = np.clip((corners.place[:, 0] + 0.5) / camera.cols * COLS, 0, COLS - 1e-9).astype(int)
@@ -159,7 +162,8 @@ def _cells(study: Study, corners: _Corners, views: int) -> list[tuple[np.ndarray
 def _averages(
     study: Study, corners: _Corners, cells: Sequence[tuple[np.ndarray, bool]]
 ) -> tuple[FloatArray, list[tuple[float, str, list[int], bool]], FloatArray]:
-    """Weights (cells x 2, 2 n) that average shifts along and across the radius; labels; views in each."""
+    """Weights (2 cells, 2 n) that average shifts along and across the radius; (radius, direction, views, held out) and the number
+    of views of each."""
     camera = study.camera
     away = corners.place - 0.5 * (np.array([camera.cols, camera.rows]) - 1.0)
     radius = np.hypot(*away.T)
@@ -176,7 +180,10 @@ def _averages(
 
 
 def _between_views(corners: _Corners, mean: FloatArray, noise_px: float) -> float:
-    """Variance of a view's mean over a cell beyond its corners' noise: imperfect prints, motion, shading."""
+    """Variance (px^2) of a view's mean residual over a cell beyond that of independent corners: imperfect prints, motion, shading.
+
+    The mean over views of (mean residual)^2 - noise^2 / n, of views with n >= 4 corners in the cell; at least 0.
+    """
     excess, count = 0.0, 0
     for weight in mean:
         members = weight.reshape(-1, 2)
@@ -193,7 +200,8 @@ def _between_views(corners: _Corners, mean: FloatArray, noise_px: float) -> floa
 def _calibrated(
     corners: _Corners, projected: FloatArray, solution: Solution, shape: tuple[int, int]
 ) -> dict[str, FloatArray]:
-    """Jacobian by the terms of a distortion that was calibrated before, each as large as `CALIBRATED_STD_PX` at the frame's corner."""
+    """Jacobian by the terms of a known distortion, as nuisance parameters: name -> (2 cells,), px per `CALIBRATED_STD_PX` at the
+    frame's corner."""
     intrinsics = solution.state.intrinsics[0]
     focal = float(intrinsics[0])
     x, y = ((corners.place[:, k] - intrinsics[2 + k]) / focal for k in (0, 1))

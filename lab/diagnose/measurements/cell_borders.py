@@ -1,4 +1,4 @@
-"""Grey levels at the borders between the lit and dark cells of a pattern."""
+"""Excess of light at the borders between lit and dark cells of a random pattern, where grey levels are seen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ BORDER_FLOOR = 0.0015
 
 
 def cell_border_block(study: Study) -> Block:
-    """Coefficient of P (1 - P): the excess of light at borders between lit and dark cells, where screen and camera show greys."""
+    """Coefficient of P (1 - P) in the fit of the pattern P, which is 0 on dark and 1 on lit cells (`pattern_fit`).
+
+    It is the excess of light where the blurred picture is grey: at borders of cells. A nonlinear response of the camera and the
+    grey levels of the screen change it.
+    """
     found = patterns(study)
     points = [(g, p, len(p.bands) + BORDER) for g, group in enumerate(found) for p in group]
     value = np.array([p.value[b] for _, p, b in points])
@@ -27,7 +31,7 @@ def cell_border_block(study: Study) -> Block:
             if not model.is_linear:
                 low, high = p.levels_e
                 out = model.response(np.array([low, 0.5 * (low + high), high]))
-                # a bend a y (1 - y) lifts the middle by a / 4
+                # a term a y (1 - y) of the response lifts its middle, y = 1/2, by a / 4
                 mean[k] += 4.0 * float((out[1] - out[0]) / (out[2] - out[0]) - 0.5)
         return Prediction(mean, {})
 

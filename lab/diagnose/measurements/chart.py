@@ -1,4 +1,4 @@
-"""Patches of a reflectance chart."""
+"""Mean levels of the patches of a ColorChecker chart, against its published reflectances and the maker's sensitivity curves."""
 
 from __future__ import annotations
 
@@ -23,33 +23,38 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL, SPECTRAL, FieldPoints, Uniform
 
-PATCH_STD = 0.01  # of a patch's reflectance, common to the channels
-PATCH_COLOUR_STD = 0.004  # of a patch's reflectance, each channel by itself
-PATCH_LEVEL_STD = 4.0e-4  # of a perfect diffuser: gloss and the dark patches' own errors
+PATCH_STD = 0.01  # relative standard deviation of a patch's reflectance, common to the channels
+PATCH_COLOUR_STD = 0.004  # the same, independent in each channel
+PATCH_LEVEL_STD = (
+    4.0e-4  # standard deviation of a patch's reflectance (perfect diffuser: 1): gloss, errors of dark patches
+)
+#: Prior standard deviation of the light's level on the chart, and of its gradient from the middle to a side of the frame, relative.
 CHART_SCALE_STD, CHART_GRADIENT_STD = 0.05, 0.005
 
 
 @dataclass(frozen=True)
 class Patch:
-    """One patch in one channel, averaged over a capture's repeats; DN."""
+    """One patch in one channel, averaged over the repeats of a capture; levels in DN."""
 
     captures: tuple[ChartCapture, ...]
     name: str
     channel: str
-    level: float
+    level: float  # mean of the patch's inner part
     pixels: int
     row: float
     col: float
     frame: float  # mean of the whole frame in this channel
-    around: Surroundings  # of the patch in one of its planes, less what no light makes
-    tail: float  # what the point spread adds from the surroundings
+    around: Surroundings  # of the patch in one plane of the mosaic, above the dark level
+    tail: float  # change of the patch's mean by the point spread function of the baseline
     held_out: bool
 
 
 def chart_block(study: Study) -> Block:
-    """Mean of every patch of a chart by channel, DN.
+    """Mean level (DN) of every patch of a ColorChecker24 by channel.
 
-    Nuisance parameters: level and gradient of the light. The patches' tolerance is in the covariance.
+    Nuisance parameters: level and gradient of the light, the maker's sensitivity curves, black level and dark current. Tolerances of
+    the reflectances are in the covariance. Raises NotDetermined where the sensitivity curves aren't stated, and with fewer than
+    twelve unclipped patches.
     """
     if not study.stated.quantum_efficiency:
         raise NotDetermined(
@@ -65,7 +70,7 @@ def chart_block(study: Study) -> Block:
     tail = np.array([p.tail for p in points])
     offset = noise.black + noise.dark_dn_per_s * exposures
     signal = np.maximum(value - offset, 0.1)
-    surround = np.array([p.frame for p in points]) - offset  # what a veil carries
+    surround = np.array([p.frame for p in points]) - offset  # the mean light, of which a veil adds a share
     place = FieldPoints.at(camera, row, col)
     known = reflectances(points[0].captures[0].chart)
     curves = CurveJacobian(
@@ -113,6 +118,7 @@ def chart_block(study: Study) -> Block:
 
 
 def patch_levels(study: Study) -> list[Patch]:
+    """The unclipped patches of all ColorChecker24 captures, by channel, seen and held-out repeats apart."""
     groups = study.groups(ChartCapture, lambda c: (c.chart, c.exposure_s, c.radiance, c.corners))
     groups = [g for g in groups if g[0].chart == "ColorChecker24"]
     step = mosaic.step(study.camera.cfa)
@@ -145,8 +151,11 @@ def patch_levels(study: Study) -> list[Patch]:
 
 
 def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> FloatArray:
-    """Noise, the patches' tolerance (one for all repeats and channels, and one a channel), the point spread's, and the lamp's
-    repeatability (common to all patches of the frames whose mean is taken)."""
+    """Covariance (n, n), DN^2, of the levels of n patches.
+
+    It is the sum of shot and read noise and PRNU, tolerances of the reflectance (one common to repeats and channels, one for each
+    channel), of the point spread function's tail, rounding, and the lamp's repeatability, common to all patches of a capture.
+    """
     noise = study.noise
     pixels = np.array([p.pixels for p in points])
     repeats = np.array([len(p.captures) for p in points])
@@ -171,9 +180,9 @@ def patch_covariance(study: Study, points: list[Patch], signal: FloatArray) -> F
 
 
 def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatArray:
-    """What the baseline's own point spread adds to each place of a plane from its surroundings (DN, on the plane's grid).
+    """Change (DN) of a plane of the mosaic by the baseline's point spread function: plane convolved with it, less the plane.
 
-    The recording stands for the scene: well inside a patch both differ only by what is sought, a fraction of a per cent.
+    The recording stands for the scene, as well inside a patch blur changes it by a fraction of a per cent.
     """
     step = mosaic.step(study.camera.cfa)
     picture = np.pad(plane, [(0, n) for n in plane.shape], mode="symmetric")
@@ -185,7 +194,7 @@ def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatA
 
 
 def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:
-    """Factors on the patches by effects that move charge between the channels of a uniform patch."""
+    """Factors (n,) on the patches' electrons by effects that move charge between neighbouring pixels of different channels."""
     factor = np.ones(len(points))
     by_patch: dict[tuple[str, str], dict[str, int]] = {}
     for i, p in enumerate(points):
@@ -199,7 +208,7 @@ def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uni
 
 
 def patch_boxes(capture: ChartCapture) -> list[tuple[str, tuple[int, int], tuple[int, int], float, float]]:
-    """Patches' inner halves: name, rows, cols, centre."""
+    """(name, rows, columns, centre row, centre column) of the inner part of each patch: a square of 0.44 of the patch's side."""
     corners = np.array(capture.corners, float)
     found = []
     names = list(reflectances(capture.chart))

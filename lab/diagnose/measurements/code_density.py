@@ -1,8 +1,7 @@
 """The code-density test of the converter: the histogram of codes in uniform light.
 
-Frames of uniform light, taken together, are spread over their codes as smoothly as their noise and shading make them: over more than
-the noise's standard deviation at that level. A departure from a smooth curve over that distance is the converter's, or of a
-component that handled the codes after it.
+Noise and shading make the histogram of many frames smooth on the scale of the noise's standard deviation at each level. Structure on
+a finer scale comes from the converter (differential nonlinearity), or from processing of the codes after it.
 """
 
 from __future__ import annotations
@@ -26,8 +25,9 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-SHIFTED_FROM = 4  # steps of codes that no fault of a converter makes: one bit may be stuck, two are a shift
-LEAST_NOISE = 3.0  # codes; below, a smooth curve can't be told from steps
+#: Common divisor of all codes from which on the codes were shifted: one stuck bit gives 2, two stuck bits are taken as a shift.
+SHIFTED_FROM = 4
+LEAST_NOISE = 3.0  # standard deviation of the light's noise, codes; below, noise doesn't smooth the histogram
 LEAST_COUNT = 30.0  # of a code that is looked at
 WIDEST = 24  # codes on either side of a smooth curve
 DEGREE = 4
@@ -41,26 +41,26 @@ NEAR, FAR = (
 STEP_FLOOR = 0.02
 COMB_FLOOR = 3e-4
 VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
-#: Periods of combs that are looked at, in cycles a code.
+#: Frequencies of the combs, cycles a code.
 COMBS = (1 / 2, 3 / 8, 1 / 4, 1 / 8)
-AROUND = 9  # pixels a side of a colour's plane, whose mean is the light's own course
-#: Width of the levels whose pixels are spread together, over the standard deviation of the noise.
+AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light at a pixel, px
+#: Width of the levels whose pixels share one normal distribution, over the standard deviation of the noise.
 STEP_OF_LEVELS = 0.2
-PARTS = 4  # of the range of codes; each has a variance about the smooth curve of its own
-FINE = 8  # samples a code of the converter's law
+PARTS = 4  # of the range of codes, each with a chi2 of its own
+FINE = 8  # samples a code at which the converter's law is evaluated
 
 
 @dataclass(frozen=True)
 class _Codes:
-    """Codes that can be looked at, how often each came, how often by the light alone, and what a smooth curve makes of it."""
+    """The histogram over the codes that can be tested; arrays are (codes,)."""
 
-    first: int
-    count: FloatArray
-    expected: FloatArray
-    smooth: FloatArray
-    rough: sparse.csr_array  # identity less smoothing
+    first: int  # the lowest code
+    count: FloatArray  # of pixels
+    expected: FloatArray  # counts by the light and its noise, for an ideal converter
+    smooth: FloatArray  # smoothed counts
+    rough: sparse.csr_array  # (codes, codes): counts -> residuals, the identity less the smoothing filter
     noise: FloatArray  # standard deviation of the light's noise, codes
-    used: np.ndarray  # codes that come often enough, and whose neighbours are all there
+    used: np.ndarray  # mask: counted often enough, and all neighbours of the filter present
 
 
 def code_block(study: Study) -> Block:
@@ -104,7 +104,7 @@ def code_block(study: Study) -> Block:
         for p in parts:
             low, high = codes.first + p.at.start, codes.first + p.at.stop - 1
             labels.append(Label(0.5 * (low + high), "variance", f"codes {low} to {high}", members, held_out))
-        # combs of other periods and phases have nothing in common, one of the same is the same everywhere
+        # discrepancies of combs: independent between periods and phases, the same for seen and held-out frames
         far = 10.0 * study.camera.white_level_dn
         places += [(float(codes.first + b), 0.0) for b in boundaries]
         places += [(0.0, far * k) for k in range(len(names))]
@@ -132,13 +132,14 @@ def code_block(study: Study) -> Block:
 
 @dataclass(frozen=True)
 class _Counts:
-    """Counts of each code in some frames, and the counts expected from the light's own course and noise."""
+    """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal converter."""
 
     count: FloatArray
     expected: FloatArray
     captures: list[str]
 
     def take(self, study: Study, capture: Any) -> None:
+        """Add a capture's frame."""
         frame = study.recordings.frame(capture)
         self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
         for plane in mosaic.planes(frame, study.camera.cfa).values():
@@ -147,13 +148,16 @@ class _Counts:
 
 
 def _expect(plane: Any, study: Study, expected: FloatArray) -> None:
-    """Add a plane's pixels, spread normally about the mean over those around: by what they depart from it, in proportion to the root of
-    the signal."""
+    """Add the expected counts of a plane's pixels to `expected`.
+
+    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels. Its variance is proportional to the signal above
+    black, and scaled so that its mean is the measured mean square of the departures from the local mean.
+    """
     surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
     own = AROUND**2 / (AROUND**2 - 1.0)
     signal = max(float(surface.mean()) - study.noise.black, 1.0)
     variance = own * float(np.mean(np.square(plane - surface), dtype=float))
-    # pixels of about one level together, in steps that are narrow beside the noise: their mean, and their variance on top of it
+    # pixels are binned by level, in steps narrow beside the noise; the variance of the levels within a bin is added
     step = max(STEP_OF_LEVELS * np.sqrt(variance), 1.0)
     above = surface.ravel().astype(float) - float(surface.min())
     group = (above / step).astype(int)
@@ -172,7 +176,7 @@ def _expect(plane: Any, study: Study, expected: FloatArray) -> None:
 
 
 def _counted(study: Study) -> dict[bool, _Counts]:
-    """Of frames of even light, seen (False) and held out."""
+    """Counts of all flat and narrowband frames without gain in dB: seen (False) and held out (True)."""
     size = int(study.camera.white_level_dn) + 1
     counts = {out: _Counts(np.zeros(size), np.zeros(size), []) for out in (False, True)}
     out = set(study.once(held_out_flats))
@@ -186,7 +190,7 @@ def _counted(study: Study) -> dict[bool, _Counts]:
 
 
 def _prepared(study: Study, counts: _Counts) -> _Codes | None:
-    """The codes to look at, None where they are too few."""
+    """The histogram over the usable codes, None where they are too few."""
     level = np.arange(len(counts.count), dtype=float)
     noise = np.sqrt(np.maximum(study.noise.gain * (level - study.noise.black), 0.0) + study.noise.read_dn**2)
     high = min(float(study.saturation_dn), float(len(level) - 1))
@@ -220,13 +224,17 @@ def _prepared(study: Study, counts: _Counts) -> _Codes | None:
 
 @cache
 def _smoothing(half: int) -> FloatArray:
-    """Weights of the value in the middle of the polynomial nearest to 2 `half` + 1 values."""
+    """Weights (2 half + 1,) of the Savitzky-Golay filter: the value in the middle of the polynomial of degree `DEGREE` that least
+    squares fit to 2 half + 1 values."""
     x = np.arange(-half, half + 1) / half
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
 def _combs(codes: _Codes) -> tuple[FloatArray, list[tuple[float, str]]]:
-    """Weights of the counts that give the amplitudes of combs, relative to a smooth curve, and (code, words) of each."""
+    """Weights (combs, codes) of the counts that give the combs' amplitudes relative to the mean count, and (mean code, words) of each.
+
+    For every frequency of `COMBS`: the cosine and, below 1/2 cycle a code, the sine part of the residuals' Fourier sum.
+    """
     index = np.arange(len(codes.count))
     table, names = [], []
     for f in COMBS:
@@ -271,20 +279,20 @@ def _steps(study: Study, codes: _Codes) -> tuple[FloatArray, list[int]]:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of the range: its codes, how many of them count, each residual's variance (infinite where it doesn't count), and the
-    standard deviation of the residuals' chi2."""
+    """A part of the range of codes, whose residuals have one chi2."""
 
-    at: slice
-    number: int
-    variance: FloatArray
-    chi2_std: float
+    at: slice  # its codes
+    number: int  # of codes used
+    variance: FloatArray  # of the residuals; infinite at codes that aren't used
+    chi2_std: float  # standard deviation of the residuals' chi2
 
     def excess(self, residual: FloatArray) -> float:
-        """chi2 in its own standard deviations."""
+        """chi2 of the residuals (codes,) over its standard deviation."""
         return float(np.sum(np.square(residual[self.at]) / self.variance)) / self.chi2_std
 
 
 def _parts(codes: _Codes) -> list[_Part]:
+    """The parts with codes enough. Var(chi2) = 2 n sum_k r_k^2 with the residuals' autocorrelation r of the smoothing filter."""
     variance = np.asarray(codes.rough.power(2) @ np.maximum(codes.smooth, 1.0))
     found = []
     for part in np.array_split(np.flatnonzero(codes.used), PARTS):
@@ -303,12 +311,12 @@ def _parts(codes: _Codes) -> list[_Part]:
 
 
 def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
-    """How much of the converter's input each code takes, 1 of an even one."""
+    """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter."""
     margin = 64
     size = len(codes.count)
     x = (np.arange((size + 2 * margin) * FINE) + 0.5) / FINE - 0.5 + codes.first - margin
     x = Uniform(study.camera, effects).codes(x)
-    # each sample stands for an interval of its output, which may lie across the border of two codes
+    # a sample stands for an interval of 1 / FINE of a code, which may be shared by two codes
     top = x + 0.5 / FINE - codes.first
     code = np.rint(top).astype(int)
     above = np.clip((top - code + 0.5) * FINE, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Nuisance parameters of the maker's sensitivity curves: scale, tilt, bend, a smooth few per mille, and a constant leak."""
+"""Nuisance parameters of the maker's sensitivity curves: scale, tilt, bend, smooth errors of a few per mille, and a constant leak."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from sim.effects.base import Effect
 from sim.spectrum import FloatArray, Spectrum, linear_shares
 from sim.uniform import SPECTRAL, Uniform, electron_rate
 
-LEAK_STD = 2.0e-4  # of the curve's peak, the same at all wavelengths: sensitivity where the maker states none
-MOST_DECIMALS = 6  # of a curve's values; with fewer they are rounded
-CURVE_SCALE_STD = 0.2  # of the sensitivity: holds gain, aperture and lens too
+# Relative prior standard deviations.
+LEAK_STD = 2.0e-4  # of the curve's peak, at all wavelengths: sensitivity where the maker states none
+CURVE_SCALE_STD = 0.2  # errors of gain, aperture and lens included
 LEVEL_STD = 0.5  # of all signals where gain, f-number or pitch aren't known
 CURVE_TILT_STD = 0.05  # per 100 nm
 CURVE_BEND_STD = 0.01  # per (100 nm)^2
-CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0
-CURVE_STEP_NM = 2.5  # of a curve that is written out
+CURVE_ROUGH_STD, CURVE_ROUGH_NM = 0.003, 60.0  # of the smooth errors, and their correlation length
+MOST_DECIMALS = 6  # of a curve's values; with fewer, rounding is counted
+CURVE_STEP_NM = 2.5  # of a curve that `freed_curve` returns
 
 
 class CurveJacobian:
-    """Electron rates of a list of (light, channel), and their Jacobian by nuisance parameters of the maker's curves.
+    """Electron rates of n pairs of light and channel, and their Jacobian by nuisance parameters of the maker's curves.
 
-    Per channel: scale, tilt, bend, a rough part on knots with a squared-exponential prior, a leak, and what the curve does between
-    the samples that the maker gives. The slope by a factor
-    (1 + d(w)) on the curve is the rate with the curve times d: exact, as the rate is linear in the curve. The baseline's rates
-    are `sim.frame`'s; effects enter as ratios of sums at 1 nm, in which the sums' own error cancels.
+    Parameters of a channel: scale, tilt, bend, smooth errors (squared-exponential prior on knots), a leak, and the unknown course
+    between the maker's samples. The derivative of the rate by a factor 1 + d(w) on the curve is the rate with the curve times d(w):
+    exact, as the rate is linear in the curve. The baseline's rates are those of `sim.uniform.electron_rate`. Effects enter as ratios of sums over
+    1 nm, in which the sums' discretisation error cancels.
     """
 
     def __init__(
@@ -41,8 +42,9 @@ class CurveJacobian:
         measured_e_per_s: FloatArray | None = None,
         scale: float = 1.0,
     ) -> None:
-        """`measured_e_per_s` (n,): where gain, f-number or pitch aren't known, the rates are scaled to these and their level is a nuisance
-        parameter. `scale`: a factor on all rates."""
+        """`items`: n of (path of the radiance, channel, exposure in s, kind of capture, reflectance). `measured_e_per_s` (n,): where
+        gain, f-number or pitch aren't known, the rates are scaled to their sum, and the common level is a nuisance parameter.
+        `scale`: a factor on all rates."""
         self.study, self.items = study, items
         self.kind = items[0][3]
         lights = {path: study.spectrum(path) for path in {item[0] for item in items}}
@@ -55,7 +57,7 @@ class CurveJacobian:
         ones = np.ones_like(self.wavelength)
         photons = np.array([self.wavelength * (r.at(self.wavelength) if r is not None else ones) for *_, r in items])
         self._curve = photons * np.array([curve[c] for _, c, *_ in items])
-        # of a sensitivity that is the same at all wavelengths
+        # the leak: a sensitivity that is the same at all wavelengths
         self._level = photons * np.array([[LEAK_STD * max(camera.quantum_efficiency[c].value)] for _, c, *_ in items])
         radiance = np.array([self.radiance[path] for path, *_ in items])
         self._weight, self._all_level = radiance * self._curve, radiance * self._level
@@ -63,7 +65,7 @@ class CurveJacobian:
         self._rate = np.array(
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
         )
-        #: Factor on the rates: the unknown part of the way from light to codes.
+        #: Factor on the rates, for the unknown gain, aperture or pixel area.
         self.scale, self._is_free = scale, measured_e_per_s is not None and not study.level_is_known
         if measured_e_per_s is not None and self._is_free:
             self.scale = max(float(measured_e_per_s.sum()), 1e-9) / max(float(self._rate.sum()), 1e-300)
@@ -86,7 +88,7 @@ class CurveJacobian:
 
     @cached_property
     def rounding(self) -> FloatArray:
-        """Standard deviation of the electrons a second that the rounding of the curves' values leaves open, (n,): each value by itself."""
+        """Standard deviation (n,) of the rates, e/s, by the rounding of the curves' values, each independent."""
         found = []
         for i, (path, channel, *_) in enumerate(self.items):
             samples, value = self.study.camera.quantum_efficiency[channel].arrays
@@ -99,11 +101,12 @@ class CurveJacobian:
 
     @cached_property
     def sample_shares(self) -> FloatArray:
-        """Derivatives d ln(rate) / d ln(light) of the baseline's rates by the light in each nanometre, (n, wavelengths): rows sum to 1."""
+        """Derivatives d ln(rate) / d ln(radiance) of the baseline's rates by the radiance in each nanometre, (n, wavelengths). Rows
+        sum to 1."""
         return np.asarray(self._weight / np.maximum(self._total, 1e-300)[:, None])
 
     def _under(self, effects: Effects) -> tuple[FloatArray, FloatArray]:
-        """Rates (n,) and the modes' shares in them (n, modes)."""
+        """Rates (n,) and their derivatives (n, modes) by the modes of the curves, e/s per prior standard deviation."""
         spectral = acting(effects, SPECTRAL)
         if spectral not in self._kept:
             weight, level = self._weight, self._all_level
@@ -128,7 +131,7 @@ class CurveJacobian:
         return self._under(effects)[0]
 
     def jacobian(self, effects: Effects) -> dict[str, FloatArray]:
-        """Derivatives of the rates by the nuisance parameters, per prior standard deviation: name -> (n,), e/s."""
+        """Name of a nuisance parameter -> derivative (n,) of the rates, e/s per prior standard deviation."""
         table = self._under(effects)[1]
         named = {}
         for channel in self.study.channels:
@@ -142,7 +145,8 @@ class CurveJacobian:
 
 
 def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
-    """Relative changes of a curve by its nuisance parameters, one prior standard deviation each, (modes, wavelengths)."""
+    """Relative changes (modes, wavelengths) of a curve by its nuisance parameters, one prior standard deviation each: scale, tilt,
+    bend, and the principal components of the smooth errors."""
     knots = np.arange(380.0, 781.0, 20.0)
     cov = CURVE_ROUGH_STD**2 * np.exp(-0.5 * ((knots[:, None] - knots) / CURVE_ROUGH_NM) ** 2)
     size, vector = np.linalg.eigh(cov)
@@ -157,8 +161,8 @@ def curve_modes(wavelength_nm: FloatArray) -> FloatArray:
 
 
 def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) -> Spectrum:
-    """A maker's curve at nuisance parameters `quantities` (names of `CurveJacobian.jacobian`, values in prior standard deviations). The
-    same curve where none of them is the channel's."""
+    """A maker's curve, corrected by fitted nuisance parameters. `quantities`: names as of `CurveJacobian.jacobian`, values in prior
+    standard deviations. The curve itself where none is of this channel. Values are limited to 0..1."""
     names = [name for name in quantities if name.startswith(f"curve:{channel}:")]
     if not names:
         return curve
@@ -171,7 +175,7 @@ def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) 
 
 
 def _last_place(value: FloatArray) -> float:
-    """The step in which a curve's values are given: 10^-d for d decimals."""
+    """The unit in the last decimal of a curve's values: 10^-d for d decimals, d <= `MOST_DECIMALS`."""
     for decimals in range(1, MOST_DECIMALS):
         if np.all(np.abs(value * 10**decimals - np.round(value * 10**decimals)) < 1e-3):
             return float(10.0**-decimals)
@@ -179,9 +183,9 @@ def _last_place(value: FloatArray) -> float:
 
 
 def _between_samples(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:
-    """Relative difference of a cubic spline through a curve's samples from the straight lines between them.
+    """Relative difference of a cubic spline through a curve's samples from linear interpolation, limited to +-0.2.
 
-    A data sheet in steps of 5 nm doesn't say which it is; at a colour filter's foot they differ by some per cent.
+    A data sheet's samples, 5 nm apart, don't say which is right. At the foot of a colour filter they differ by some per cent.
     """
     if len(curve.wavelength_nm) < 4:
         return np.zeros_like(wavelength_nm)

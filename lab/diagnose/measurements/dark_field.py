@@ -1,4 +1,4 @@
-"""The dark signal by place in the frame."""
+"""The dark signal by place in the frame: glow of the read-out and other dark current that isn't uniform."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ CELL_PX = 4  # the least side of a cell
 
 
 def dark_field_block(study: Study) -> Block:
-    """Means over cells of the mean dark frame by exposure, DN. Each frame's level is a nuisance parameter."""
+    """Means over 4 x 6 cells of the mean dark frame of each condition, less the frame's mean, DN.
+
+    The level of each mean frame is a nuisance parameter. Raises NotDetermined where cells are narrower than `CELL_PX`.
+    """
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
     rows, cols = CELLS

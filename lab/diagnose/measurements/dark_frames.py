@@ -1,8 +1,8 @@
-"""Statistics of dark frames: each is read once, and every measurement of dark frames takes its numbers from here.
+"""Statistics of dark frames, from which all measurements of dark frames take their numbers. Each frame is read once.
 
-The baseline's dark frame is black level + dark current x exposure, the same at every temperature, with normal noise and a normal
-fixed pattern of independent pixels. Powers and counts, whose size may be of any order of magnitude, are kept as logarithms or
-square roots: their noise then hardly depends on their size.
+The baseline's dark frame has the mean black level + dark current x exposure at every temperature, and normal noise and a normal fixed
+pattern of independent pixels. The measurements state powers as logarithms and counts as square roots, whose variance hardly depends
+on their size.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from lab.errors import NotDetermined
 from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 
-TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures are that close are repeats
+TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures differ by no more are repeats
 CELLS = 4, 6  # of a frame: rows, columns
-LEAST_CELL_PX = 2  # a side of the smallest frame's cells
-CELL_FLOOR_DN = 0.005
-MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
-#: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
+LEAST_CELL_PX = 2  # least side of a cell
+CELL_FLOOR_DN = 0.005  # standard deviation of a cell's mean beside noise
+MOST_CONDITIONS = 3  # conditions whose fixed pattern is measured: the shortest, the longest, the warmest
+#: Lower edges of the bins in which outlying pixels are counted, in standard deviations of a pixel's fixed pattern. The first two count
+#: dark pixels as well, below their negatives.
 TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
 
 
@@ -62,59 +63,59 @@ class DarkCondition:
 
 @dataclass(frozen=True)
 class DarkPattern:
-    """Statistics of what frames of one condition have in common: of their mean, and of the lower median of some, each frame's level
-    subtracted."""
+    """The fixed pattern of one condition: statistics of the mean frame, and of the lower median of up to `MEDIAN_OF` frames. Each
+    frame's mean is subtracted first."""
 
-    frames: int
-    of_median: int
+    frames: int  # of the mean
+    of_median: int  # frames of the median
     captures: tuple[str, ...]
-    cells: FloatArray  # CELLS, DN
+    cells: FloatArray  # means over `CELLS`, DN
     lines: dict[
         Lines, tuple[FloatArray, FloatArray, float]
-    ]  # frequency, power over the white level's, number of its modes
-    white_dn2: float  # variance of independent pixels
+    ]  # frequency (cy/px), power of the lines' means over that of white noise, modes of the latter
+    white_dn2: float  # variance of a pixel by the part of the spectrum that is white
     parity_dn: dict[Lines, float]  # mean of odd lines less that of even ones
-    line_dn2: dict[Lines, float]  # variance of the lines' means beyond the pixels' own
-    counts: FloatArray  # of TAIL_EDGES, upwards, then the two downwards
-    spread_dn: float  # of single pixels of the median
-    skewness: float  # of the bulk of these, by its quantiles at 0.5 %: z_p + z_(1 - p) = g (z_p^2 - 1) / 3
+    line_dn2: dict[Lines, float]  # variance of the lines' means beyond that of independent pixels
+    counts: FloatArray  # pixels in the bins of TAIL_EDGES, then in the two dark bins
+    spread_dn: float  # standard deviation of single pixels of the median
+    skewness: float  # g of these, by their quantiles z_p at p = 0.5 % and 99.5 %: z_p + z_(1 - p) = g (z_p^2 - 1) / 3
 
 
 @dataclass(frozen=True)
 class DarkNoise:
-    """Statistics of what differs from frame to frame of one condition.
+    """The temporal noise of one condition, from Helmert contrasts: frame k less the mean of those before it, times sqrt(k / (k + 1)).
 
-    They are taken from Helmert contrasts: every frame less the mean of those before it, scaled to the variance of one frame. Contrasts are
-    independent of each other.
+    Contrasts have the variance of one frame and are independent of each other.
     """
 
     contrasts: int
     variance_dn2: float  # of a pixel
-    pixel_dn2: float  # the same without what lines have in common
-    squares: Image  # sum of squared contrasts, over its surroundings' variance
-    lines: dict[Lines, tuple[FloatArray, FloatArray, float]]
+    pixel_dn2: float  # of a pixel, without row and column noise
+    squares: Image  # sum of squared contrasts without row and column noise, over the local variance
+    lines: dict[Lines, tuple[FloatArray, FloatArray, float]]  # as in DarkPattern
     along: dict[
         Lines, tuple[FloatArray, FloatArray, FloatArray]
-    ]  # within lines: frequency, power over the level, modes
-    white_dn2: float
-    line_dn2: dict[Lines, float]
-    cells_dn2: float  # variance of a cell's mean, measured
+    ]  # within lines: frequency (cy/px), power over that of white noise, modes
+    white_dn2: float  # as in DarkPattern
+    line_dn2: dict[Lines, float]  # as in DarkPattern
+    cells_dn2: float  # variance of a cell's mean
 
 
 @dataclass(frozen=True)
 class DarkStatistics:
-    """The statistics of one condition's dark frames."""
+    """The statistics of one condition's dark frames, of seen (False) and of held-out ones (True)."""
 
     condition: DarkCondition
-    means: dict[str, float]
-    fixed: dict[bool, DarkPattern]  # by whether they are held out; of at most `MOST_CONDITIONS` conditions
+    means: dict[str, float]  # by capture: mean of the frame without defective pixels, DN
+    fixed: dict[bool, DarkPattern]  # of at most `MOST_CONDITIONS` conditions
     changing: dict[bool, DarkNoise]
 
 
 def conditions(study: Study) -> list[DarkCondition]:
-    """Dark captures by exposure and temperature, at the gain that most have; the last third of the repeats is held out.
+    """Dark captures by exposure and temperature, at the most frequent gain. The last third of the repeats is held out.
 
-    Of two repeats both are seen, as noise needs both: then every third condition is held out.
+    Two repeats stay together, as temporal noise needs both: in every third condition both are held out. Raises NotDetermined without
+    dark captures.
     """
     captures = study.recordings.captures(DarkCapture, study.side)
     if not captures:
@@ -156,7 +157,8 @@ def conditions(study: Study) -> list[DarkCondition]:
 
 
 def dark_frames(study: Study) -> list[DarkStatistics]:
-    """Every dark capture, read once. Raises NotDetermined where there are none, or the frames are too small to be split into cells."""
+    """The statistics of all dark captures by condition. Raises NotDetermined where there are none, or where the frames are too small
+    to be split into cells."""
     every = conditions(study)
     least_px = LEAST_CELL_PX * max(CELLS)
     if min(study.camera.rows, study.camera.cols) < least_px:
@@ -171,7 +173,7 @@ def dark_frames(study: Study) -> list[DarkStatistics]:
 
 
 def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDArray[np.bool_]) -> DarkStatistics:
-    """`sound` (rows, cols): the pixels that count in the frames' means."""
+    """The statistics of one condition. `sound` (rows, cols): mask of the pixels that count in the frames' means."""
     means: dict[str, float] = {}
     mean = np.zeros((study.camera.rows, study.camera.cols), np.float32)
     contrasts: dict[bool, list[Image]] = {False: [], True: []}
@@ -188,10 +190,8 @@ def _read(study: Study, condition: DarkCondition, with_pattern: bool, sound: NDA
         if with_pattern:
             stacks[held_out].append(frame)
     changing = {out: _changing(part) for out, part in contrasts.items() if part}
-    # without a contrast of these frames (a single one) any other's variance is taken
-    variance = next((c.variance_dn2 for c in changing.values()), None)
     ids = {False: [c.id for c in condition.seen], True: [c.id for c in condition.held_out]}
-    fixed = {out: _fixed(part, tuple(ids[out]), variance) for out, part in stacks.items() if part}
+    fixed = {out: _fixed(part, tuple(ids[out])) for out, part in stacks.items() if part}
     return DarkStatistics(condition, means, fixed, changing)
 
 
@@ -214,7 +214,7 @@ def _changing(contrasts: list[Image]) -> DarkNoise:
         pixel.append(float(np.mean(np.square(np.clip(rest, -CLIP * own, CLIP * own)), dtype=np.float64)))
         total += np.square(rest)
         cells.append(float(np.mean(np.square(cell_means(cut)))))
-        if len(white) < 6:  # more spectra don't add much
+        if len(white) < 6:  # more spectra add little
             power = periodogram(cut)
             white.append(power.level)
             rows.append(power.line("rows"))
@@ -235,7 +235,7 @@ def _changing(contrasts: list[Image]) -> DarkNoise:
     )
 
 
-def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float | None) -> DarkPattern:
+def _fixed(frames: list[Image], captures: tuple[str, ...]) -> DarkPattern:
     mean: Image = np.asarray(np.mean(frames, axis=0, dtype=np.float32))
     part = frames[:MEDIAN_OF]
     away, local = from_surroundings(part)
@@ -243,7 +243,7 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
     edges = np.array([-np.inf, -TAIL_EDGES[1], -TAIL_EDGES[0], *TAIL_EDGES, np.inf])
     counts = np.histogram(z, edges)[0].astype(float)
     low, high = np.quantile(z, [0.005, 0.995])
-    # smooth structure and lines: the mean, defective pixels clipped
+    # spectra and cells are of the mean frame, with defective pixels clipped
     std = robust_std(mean)
     smooth = ndimage.uniform_filter(np.clip(mean, -8.0 * std, 8.0 * std), SMOOTH_PX, mode="mirror")
     spread = np.sqrt(local_variance(np.square(mean - smooth), 1))
@@ -269,18 +269,19 @@ def _fixed(frames: list[Image], captures: tuple[str, ...], variance_dn2: float |
 
 
 def cell_means(image: Image) -> FloatArray:
+    """Means over `CELLS` of an image, (4, 6)."""
     r = np.linspace(0, image.shape[0], CELLS[0] + 1).astype(int)
     c = np.linspace(0, image.shape[1], CELLS[1] + 1).astype(int)
     total = np.add.reduceat(np.add.reduceat(image.astype(float), r[:-1], 0), c[:-1], 1)
     return np.asarray(total / np.outer(np.diff(r), np.diff(c)))
 
 
-#: Quantities of the stages that dark frames' pixels and lines depend on.
+#: Quantities of the stages by which an effect makes pixels defective.
 DEFECTS = frozenset({"charge.defects", "signal.telegraph"})
 
 
 def fine_conditions(step: str, frames: Sequence[DarkStatistics], least_dn: float) -> list[DarkStatistics]:
-    """Conditions whose temporal noise is at least `least_dn`. Raises NotDetermined where there are none."""
+    """Conditions whose temporal noise, of a pixel, exceeds `least_dn`. Raises NotDetermined for `step` where there are none."""
     every = [f for f in frames if f.changing]
     if not every:
         raise NotDetermined(step, "no two dark frames of the same exposure and temperature")
@@ -291,15 +292,17 @@ def fine_conditions(step: str, frames: Sequence[DarkStatistics], least_dn: float
 
 
 def by_part(frames: Sequence[DarkStatistics]) -> dict[bool, list[DarkNoise]]:
-    """The temporal statistics by whether they are held out; without a part that has none."""
+    """The temporal statistics of all conditions: seen (False) and held out (True), each only where there are any."""
     parts = {out: [f.changing[out] for f in frames if out in f.changing] for out in (False, True)}
     return {out: part for out, part in parts.items() if part}
 
 
 def too_coarse(frames: Sequence[DarkStatistics], limit_dn: float) -> str:
+    """The reason why dark frames of so little noise aren't judged, in one line."""
     noise = min(np.sqrt(c.pixel_dn2) for f in frames for c in f.changing.values())
     return f"the temporal noise of dark frames is {noise:.2f} DN, below the limit of {limit_dn} DN: codes are too coarse to show how it is distributed; a higher gain would"
 
 
 def captures_of(frames: DarkStatistics, held_out: bool) -> tuple[str, ...]:
+    """Ids of a condition's seen or held-out captures."""
     return tuple(c.id for c in (frames.condition.held_out if held_out else frames.condition.seen))

@@ -1,4 +1,4 @@
-"""The mean of dark frames by exposure, temperature and time; and the black level against the stated one."""
+"""The mean of dark frames by exposure, temperature and time; and the measured black level against the stated one."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
 from sim.uniform import NOISE_NODES, Uniform
 
-#: Points of the grid on which a dark current over the field is evaluated, at most. A grid that is much coarser than the pixels
-#: moves the laws' origin and the cells' borders: at 50 DN of glow in a corner by a hundred standard deviations of a cell's mean.
+#: Most points of the grid on which the dark current over the field is evaluated. A grid much coarser than the pixels moves the laws'
+#: origin and the cells' borders: with 50 DN of glow in a corner, a cell's mean is then off by a hundred standard deviations.
 MOST_POINTS = 1e6
 
 
 def dark_current_map(study: Study, effects: Effects) -> Callable[[float | None], FloatArray]:
-    """Dark current (e/s) at a temperature (C), by pixel, or by squares of pixels where the frame has more than `MOST_POINTS`."""
+    """Function of the temperature (C) that returns the dark current (rows, cols), e/s: by pixel, or by squares of pixels where the
+    frame has more than `MOST_POINTS` pixels."""
     camera = study.camera
     down = math.ceil(math.sqrt(camera.rows * camera.cols / MOST_POINTS))
     coarse = camera.model_copy(
@@ -39,7 +40,7 @@ def dark_current_map(study: Study, effects: Effects) -> Callable[[float | None],
 
 
 def added_dark_e_per_s(study: Study, effects: Effects) -> Callable[[float | None], float]:
-    """Change of the mean dark current at a temperature (C) by effects, without defective pixels, e/s."""
+    """Function of the temperature (C) that returns the change of the mean dark current by effects, without defective pixels, e/s."""
     if not Uniform(study.camera, effects).changes_dark_current:
         return lambda temperature_c: 0.0
     at = dark_current_map(study, effects)
@@ -47,16 +48,16 @@ def added_dark_e_per_s(study: Study, effects: Effects) -> Callable[[float | None
 
 
 def added_dark_dn(study: Study, effects: Effects) -> Callable[[Capture], float]:
-    """By how many DN effects change the mean dark signal of a capture."""
+    """Function of a capture that returns the change of its mean dark signal by effects, DN."""
     rate_at = added_dark_e_per_s(study, effects)
     return lambda capture: study.noise.gain * rate_at(capture.temperature_c) * capture.exposure_s
 
 
 def dark_level_block(study: Study) -> Block:
-    """Mean of every dark frame, DN.
+    """Mean of every dark frame without defective pixels, DN.
 
-    Nuisance parameters: black level and dark current. Effects change it with time, temperature and the frame before; and what the
-    converter does at these codes, as the levels of all other frames lie above it.
+    Nuisance parameters: black level and dark current. Effects may add an offset that drifts with time or temperature, dark current,
+    image lag, and the converter's error at these codes. Raises NotDetermined without dark captures.
     """
     frames = study.once(dark_frames)
     captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
@@ -77,10 +78,10 @@ def dark_level_block(study: Study) -> Block:
             mean = model.codes(mean[:, None] + gain * study.camera.read_noise_e * NOISE_NODES).mean(axis=1)
         return Prediction(mean, study.free_offsets(exposures) | lines.jacobian(effects))
 
-    # codes as coarse as the noise move a mean, depending on where it lies between two of them
+    # noise of less than about half a code doesn't dither: rounding moves the mean, by its place between two codes
     coarse = np.array([_rounding_dn(f) for f in frames for _ in f.condition.captures])
     same = np.array([[a[1] is b[1] for b in captures] for a in captures])
-    # the position of smoothness: 10 degrees count as twice the range of exposures
+    # the coordinate of smoothness: 10 degrees count as twice the range of exposures
     reach = float(max(np.ptp(exposures), 1e-3))
     warmer = np.array([0.0 if k.temperature_c is None or noise.dark_c is None else k.temperature_c - noise.dark_c for _, k, _ in captures])  # fmt: skip
     return Block(
@@ -92,7 +93,7 @@ def dark_level_block(study: Study) -> Block:
 
 
 def _rounding_dn(frames: DarkStatistics) -> float:
-    """Largest shift of a mean by rounding, DN: exp(-2 pi^2 variance) / pi."""
+    """Largest shift of a mean by rounding, DN: exp(-2 pi^2 variance) / pi, with the variance before rounding."""
     changing = next((c.variance_dn2 for c in frames.changing.values()), None)
     if changing is None:
         return 0.1
@@ -100,7 +101,10 @@ def _rounding_dn(frames: DarkStatistics) -> float:
 
 
 def black_level_block(study: Study) -> Block:
-    """The black level of the dark frames against the stated one, DN. No effect changes it: a wrong statement isn't physics."""
+    """The measured black level against the stated one, DN. No effect changes it: a wrong statement is no effect.
+
+    Raises NotDetermined where none is stated.
+    """
     stated = study.stated.black_level_dn
     if stated is None:
         raise NotDetermined("black_level", "the black level isn't stated: nothing to hold the dark frames against")

@@ -1,4 +1,4 @@
-"""What the pixels of a row or of a column share in dark frames: row and column noise, their fixed patterns, and correlation along lines."""
+"""Row and column noise of dark frames, fixed row and column patterns, and the correlation of noise along rows and columns."""
 
 from __future__ import annotations
 
@@ -23,19 +23,22 @@ from sim.sensor.lines import Lines
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-BANDS = 6  # of a spectrum over lines
-POWER_FLOOR = 0.02  # of a band's power: what isn't quite white in a healthy read-out
-LEAST_LINE_DN = 0.3  # the same of lines' means
+BANDS = 6  # of a spectrum across lines
+POWER_FLOOR = 0.02  # relative standard deviation of a band's power: a healthy read-out isn't exactly white
+LEAST_LINE_DN = 0.3  # temporal noise of a pixel below which codes are too coarse
 
 
 def temporal_line_block(lines: Lines, study: Study) -> Block:
-    """Spectrum of what the pixels of a row (column) share in one frame and not in the next, over that of single pixels; logarithms."""
+    """Temporal row (column) noise: ln of the power spectrum of the lines' means over that of white noise, by frequency band.
+
+    0 where pixels are independent. Raises NotDetermined without repeats, and where codes are too coarse.
+    """
     frames = study.once(dark_frames)
     name = "row_noise" if lines == "rows" else "column_noise"
     fine = fine_conditions(f"dark_{name}", frames, LEAST_LINE_DN)
     parts = by_part(fine)
     frequency = next(iter(parts.values()))[0].lines[lines][0]
-    # narrow bands at low frequencies: a ripple of some rows' period lies near the bend of correlated row noise
+    # narrow bands at low frequencies tell a ripple of a few cycles a frame from correlated row noise
     bands = Bands.of(frequency, 8, 1.5)
     length = study.camera.cols if lines == "rows" else study.camera.rows
     value, variance, labels, inverse = [], [], [], []
@@ -67,8 +70,11 @@ def temporal_line_block(lines: Lines, study: Study) -> Block:
 
 
 def fixed_line_block(lines: Lines, study: Study) -> Block:
-    """Spectrum of what the pixels of a row (column) share in every frame, from the mean of the shortest exposure; and the mean of odd lines
-    less that of even ones."""
+    """Fixed row (column) pattern in the mean frame of the shortest exposure.
+
+    The numbers are ln of the power spectrum of the lines' means over that of white noise, by frequency band, and the mean of odd
+    lines less that of even ones, DN. Raises NotDetermined where codes are too coarse.
+    """
     frames = study.once(dark_frames)
     name = "row_pattern" if lines == "rows" else "column_pattern"
     first = next(f for f in frames if f.fixed)
@@ -91,13 +97,15 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
         factor.append(np.full(len(bands.middle), study.noise.gain**2 * length / part.white_dn2))
     pieces = len(first.fixed)
     one = np.diag(log_mean_variance(bands.modes))
-    kin = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
-    covariance = np.kron(kin, one) + np.eye(pieces * len(one)) * (POWER_FLOOR**2 + 0.01**2)
+    correlation = np.array([[1.0 if a == b else share[a] * share[b] for b in first.fixed] for a in first.fixed])
+    covariance = np.kron(correlation, one) + np.eye(pieces * len(one)) * (POWER_FLOOR**2 + 0.01**2)
     parity = np.array([part.parity_dn[lines] for part in first.fixed.values()])
     pixel = np.array([4.0 * part.white_dn2 / size for part in first.fixed.values()])
     offset = np.array([4.0 * part.line_dn2[lines] * length / size for part in first.fixed.values()])
     parity_cov = (
-        np.sqrt(np.outer(pixel, pixel)) * kin + np.sqrt(np.outer(offset, offset)) + np.eye(pieces) * CELL_FLOOR_DN**2
+        np.sqrt(np.outer(pixel, pixel)) * correlation
+        + np.sqrt(np.outer(offset, offset))
+        + np.eye(pieces) * CELL_FLOOR_DN**2
     )
     n = len(covariance)
     whole = np.zeros((n + pieces, n + pieces))
@@ -125,7 +133,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
 
 
 def _fixed_share(frames: DarkStatistics) -> dict[bool, float]:
-    """Share of a mean frame's pixel variance that is fixed, and so the same in seen and held-out frames."""
+    """Share of the mean frame's pixel variance that is fixed, and so common to seen and held-out frames, by part."""
     changing = next((c.white_dn2 for c in frames.changing.values()), None)
     if changing is None:
         return dict.fromkeys(frames.fixed, 0.0)
@@ -136,7 +144,11 @@ def _fixed_share(frames: DarkStatistics) -> dict[bool, float]:
 
 
 def correlation_block(study: Study) -> Block:
-    """Power within rows and columns at low frequencies over that at higher ones, logarithms: 0 where pixels are independent."""
+    """Correlation of temporal noise along rows and columns: ln of its power at low frequencies over that of white noise.
+
+    The means of the lines are excluded. 0 where pixels are independent. Raises NotDetermined where codes are too coarse or frames
+    too small.
+    """
     fine = fine_conditions("dark_correlation", study.once(dark_frames), LEAST_LINE_DN)
     value, variance, labels = [], [], []
     for out, part in by_part(fine).items():
@@ -157,10 +169,10 @@ def correlation_block(study: Study) -> Block:
     if not labels:
         raise NotDetermined(
             "dark_correlation",
-            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share shows from {int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
+            f"frames of {study.camera.rows} x {study.camera.cols} px: noise that neighbours share is measured from {int(np.ceil(1.0 / LEVEL_BAND[0]))} px a side on",
         )
     n = len(labels)
-    # noise of lines has no spectrum along them: an excess has another cause
+    # no effect predicts an excess: row and column noise has no spectrum along its lines
     return Block(
         measurement=DARK_CORRELATION, reach=0.03, value=np.concatenate(value),
         covariance=np.diag(np.concatenate(variance)), labels=tuple(labels), reads=LINES,

@@ -14,12 +14,16 @@ from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-VARIANCE_FLOOR = 0.004  # of a temporal variance
-LEAST_NOISE_DN = 0.4  # below, codes are too coarse to say what the temporal noise is
+VARIANCE_FLOOR = 0.004  # relative standard deviation of a temporal variance beside chance
+LEAST_NOISE_DN = 0.4  # below, codes are too coarse to measure temporal noise
 
 
 def dark_noise_block(study: Study) -> Block:
-    """Temporal variance of dark frames by exposure and temperature, DN^2. It grows with the dark charge, and not with an offset."""
+    """Temporal variance of dark frames by exposure and temperature, DN^2. It grows with the dark signal (shot noise), not with an
+    offset.
+
+    Nuisance parameters: read noise, dark current, gain. Raises NotDetermined without repeats, and where codes are too coarse.
+    """
     frames = study.once(dark_frames)
     points = [(f, out, c) for f in frames for out, c in f.changing.items()]
     if not points:
@@ -37,7 +41,7 @@ def dark_noise_block(study: Study) -> Block:
             for *_, c in points
         ]
     )
-    # codes as coarse as the noise change its variance, depending on where the level lies between two of them
+    # noise of less than about half a code: rounding changes its variance, by the level's place between two codes
     bare = np.maximum(value - 1.0 / 12.0, 0.0)
     coarse = (4.0 * bare + 0.1) * np.exp(-2.0 * np.pi**2 * bare)
     covariance = np.diag(
@@ -46,7 +50,7 @@ def dark_noise_block(study: Study) -> Block:
     dark = noise.gain * noise.dark_dn_per_s * exposures
     shortest = float(value[int(np.argmin(exposures))])
     base = shortest + dark - float(dark.min())
-    # the gain's prior: measured by flats, stated, or unknown
+    # relative prior standard deviation of the gain: measured by flats, stated, or unknown
     flats = len(study.flat_levels()) > 1
     gain_std = 0.05 if flats else 0.3 if study.stated.conversion_gain_dn_per_e is not None else 10.0
 
@@ -77,7 +81,7 @@ def dark_noise_block(study: Study) -> Block:
 
 
 def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn2: float) -> float:
-    """What defective pixels add to the mean variance (DN^2), contrasts cut off at CLIP standard deviations."""
+    """What defective pixels add to the mean variance (DN^2) of contrasts that are clipped at `CLIP` standard deviations."""
     cut = CLIP * np.sqrt(variance_dn2)
     more = 0.0
     for hot in model.hot:
@@ -86,7 +90,7 @@ def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn
         more += float(share @ (_cut_square(np.zeros_like(noisy), noisy, cut) - variance_dn2))
     for jumps in model.telegraph:
         share, distance_e = jumps.nodes()
-        # of two frames one is high and the other low
+        # probability that of two frames one is high and the other low
         differ = 2.0 * jumps.high_share * (1.0 - jumps.high_share)
         apart = gain * distance_e / np.sqrt(2.0)
         still = np.full_like(apart, variance_dn2)
@@ -96,7 +100,7 @@ def _defect_variance(model: Uniform, gain: float, exposure_s: float, variance_dn
 
 
 def _cut_square(mean: FloatArray, variance: FloatArray, cut: float) -> FloatArray:
-    """Mean of the square of a normal variable that is cut off at +-cut."""
+    """Mean square of a normal variable that is clipped to -cut..cut."""
     s = np.sqrt(variance)
     a, b = (-cut - mean) / s, (cut - mean) / s
     pa, pb = (np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) for x in (a, b))

@@ -1,4 +1,4 @@
-"""Light in the dark squares of patterns on a screen: veiling glare, halos and ghosts."""
+"""Light in the dark squares of patterns on a screen, as by veiling glare, halos and ghosts."""
 
 from __future__ import annotations
 
@@ -28,16 +28,15 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-SCREEN_FLOOR = (
-    6e-4  # of the lit screen: what reaches dark squares from the farthest lit ones and from around the screen
-)
+SCREEN_FLOOR = 6e-4  # share of the lit screen's level: light of lit parts that the model doesn't follow, and of the screen's surroundings
 
 
 def screen_block(study: Study) -> Block:
-    """Light in the dark squares of a pattern on the screen, beyond what the all-dark screen leaves, by channel.
+    """Mean level in the dark squares of a pattern on a screen, less that of the dark screen, by channel, DN.
 
-    Only pixels well away from any lit one count. The baseline's own point spread reaches there too and is predicted from the
-    lit pixels; a veil adds a share of the frame's mean.
+    Only pixels at least 7 px away from lit ones count. The baseline's point spread function reaches them, which is predicted from
+    the lit pixels. A veil adds a share of the frame's mean. Raises NotDetermined without white, black and patterned captures of one
+    pose and exposure, or without dark squares wide enough.
     """
     recordings, side, camera, noise = study.recordings, study.side, study.camera, study.noise
     by_pose: dict[str, dict[str, list[Any]]] = {}
@@ -111,25 +110,27 @@ def screen_block(study: Study) -> Block:
 
 @dataclass(frozen=True)
 class _DarkSquares:
+    """The dark squares of one pattern in one channel; levels in DN."""
+
     kind: str
     channel: str
     captures: tuple[str, ...]
     held_out: bool
-    value: float
-    std: float
-    tail: float
-    picture: FloatArray  # what the pattern adds to the dark screen, DN, over the channel's plane
-    use: NDArray[np.bool_]  # the dark squares' insides in it
-    around: Surroundings  # of these
-    beyond: float  # what the tail is uncertain by: light beyond the frame
-    lift: float
-    white: float
-    black: float
-    digits: float  # what rounding leaves in the value
+    value: float  # mean level less that of the dark screen
+    std: float  # of `value` by shot and read noise
+    tail: float  # predicted level by the baseline's point spread function
+    picture: FloatArray  # pattern less dark screen, one plane of the mosaic
+    use: NDArray[np.bool_]  # mask of the dark squares' pixels in it
+    around: Surroundings  # of these pixels
+    beyond: float  # standard deviation of `tail` by light from beyond the frame
+    lift: float  # mean of the whole frame less that of the dark screen
+    white: float  # mean of the lit screen less that of the dark screen
+    black: float  # mean of the dark screen above the black level
+    digits: float  # standard deviation of `value` by rounding
 
 
 def _copied(squares: _DarkSquares, effects: Effects, camera: CameraModel) -> float:
-    """What effects on the whole image bring into the dark squares, DN."""
+    """Change of the level in the dark squares by reflections of the whole image, DN."""
     shown = with_reflections(camera, squares.picture, effects)
     return float(shown[squares.use].mean() - squares.picture[squares.use].mean())
 
@@ -143,6 +144,8 @@ def _dark_squares(
     held_out: bool,
     blacks: int,
 ) -> list[_DarkSquares]:
+    """The dark squares of a pattern in each channel. `part`: its captures; `shown`, `white`, `black`: mean frames of the pattern, of the lit
+    and of the dark screen; `blacks`: number of dark-screen captures."""
     camera, noise = study.camera, study.noise
     found = []
     step = mosaic.step(camera.cfa)
@@ -171,8 +174,8 @@ def _dark_squares(
         fx = np.fft.rfftfreq(2 * share.shape[1], step)[None, :]
         radiance = study.spectrum(part[0].screen.radiance) if part[0].screen.radiance else None
         otf = np.real(optical_transfer(camera, channel, radiance, fx, fy))
-        # halves of the contrast mark the edges: as much light is drawn as there is, and far away its outline doesn't matter;
-        # a screen that reaches the frame's border goes on beyond it, nobody says how far: not at all, or without an end
+        # pixels above half the contrast are drawn as lit: the total is right, and far away the outline doesn't matter. How far a screen
+        # goes on beyond the frame's border isn't known: the tail is the mean of two cases, no light there, and the mirror image
         ends, endless = (
             np.fft.irfft2(np.fft.rfft2(whole) * otf, whole.shape)[: share.shape[0], : share.shape[1]][use].mean()
             for whole in (np.pad(picture, pad), np.pad(picture, pad, mode="symmetric"))

@@ -1,4 +1,4 @@
-"""Defective pixels in dark frames: counts of pixels that are off in every frame, and of pixels that flicker from frame to frame."""
+"""Defective pixels in dark frames: numbers of pixels that depart in every frame, and of pixels that flicker from frame to frame."""
 
 from __future__ import annotations
 
@@ -23,22 +23,24 @@ from lab.diagnose.measurements.study import Study
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-LEAST_COUNTED_DN = 0.6  # the same of single pixels, whose far tail counts
-#: Of the first edge, which one pixel in 1e5 passes by chance: edges of the bins of temporal variance.
+LEAST_COUNTED_DN = 0.6  # temporal noise of a pixel below which codes are too coarse for the tails of its distribution
+#: Lower edges of the bins of temporal variance, over the first one, which a healthy pixel passes with the probability `FLICKER_CHANCE`.
 FLICKER_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
 FLICKER_CHANCE = 1e-5
-JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)  # draws of which frames of a jumping pixel are high
-#: Standard deviation of a count's root beside chance (which is about 1 where many are expected): one defective pixel more is no finding.
+#: Telegraph noise: draws of the frames in which a pixel is at its higher level, and the shares of such frames.
+JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)
+#: Standard deviation of a rooted count beside chance (about 1 for large counts): one more defective pixel is no finding.
 COUNT_STD = 0.6
 
 
 def _rooted(counts: FloatArray) -> FloatArray:
-    """Roots of counts, of standard deviation 1 whatever the count (Anscombe 1948)."""
+    """Anscombe transform 2 sqrt(n + 3/8) of Poisson counts: standard deviation 1 except for small ones (Anscombe 1948)."""
     return np.asarray(2.0 * np.sqrt(counts + 0.375))
 
 
 def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0) -> FloatArray:
-    """Covariance of `_rooted` counts: Poisson noise (1 where many are expected), and the uncertainty of the expected counts."""
+    """Covariance of `_rooted` counts: their exact variance for Poisson counts of mean `expected`, `COUNT_STD`, and `uncertain`, the
+    standard deviation of the expected counts."""
     number = np.arange(60.0)
     mean = np.minimum(expected, 20.0)[:, None]
     share = np.exp(xlogy(number, mean) - mean - gammaln(number + 1.0))
@@ -47,10 +49,11 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
 
 
 def defective_pixel_block(study: Study) -> Block:
-    """Roots of the numbers of pixels that lie far from their surroundings in the median of repeats, by how far and by exposure.
+    """Anscombe-transformed numbers of pixels by their deviation from their surroundings in the median of repeats, by exposure.
 
-    Hot pixels are the same in every frame, and bright in proportion to the exposure. Jumps between two levels count where the temporal
-    noise is fine enough to tell them from a fixed level, as for `flickering_pixel_block`: below, all repeats of a pixel have one code.
+    The bins are `TAIL_EDGES`, in standard deviations of single pixels. Hot pixels are the same in every frame, and as bright as the exposure is long. Telegraph noise
+    is predicted where the temporal noise exceeds `LEAST_COUNTED_DN`: with less, all repeats of a pixel have one code. Raises
+    NotDetermined without dark captures.
     """
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
@@ -78,7 +81,7 @@ def defective_pixel_block(study: Study) -> Block:
         for b in range(bins)
     )
     base = expected(())
-    # the skewness of the bulk doesn't determine the far tail
+    # the skewness of most pixels doesn't determine the far tail
     uncertain = np.abs(expected((), 2.0) - expected((), 0.0)) + 0.2 * base
     return Block(
         measurement=DEFECTIVE_PIXELS, reach=1.0, value=value,
@@ -89,31 +92,32 @@ def defective_pixel_block(study: Study) -> Block:
 
 
 def _pixel_noise(study: Study, frames: DarkStatistics, part: DarkPattern) -> tuple[float, float]:
-    """(temporal, fixed) standard deviation of single pixels, DN. The fixed one is the median frame's less its temporal noise."""
+    """(temporal, fixed) standard deviation of single pixels, DN. fixed^2 = spread^2 of the median frame - its temporal variance. Of a
+    single frame, all counts as temporal."""
     moving = next((c.pixel_dn2 for c in frames.changing.values()), None)
     left = _order_moments(part.of_median)[1]
-    if moving is None:  # of a lone frame all counts as noise
+    if moving is None:
         return max(part.spread_dn, 0.05), 0.0
     return max(float(np.sqrt(moving)), 0.05), float(np.sqrt(max(part.spread_dn**2 - left * moving, 0.0)))
 
 
 def _order_moments(n: int) -> tuple[float, float]:
-    """Mean and variance of the lower median of n standard normal numbers."""
+    """Mean and variance of the lower median of n <= 5 standard normal numbers."""
     return {1: (0.0, 1.0), 2: (-0.5642, 0.6817), 3: (0.0, 0.4487), 4: (-0.2970, 0.3605), 5: (0.0, 0.2868)}[n]
 
 
 @dataclass(frozen=True)
 class _DefectClass:
-    """Defective pixels of one size: their share of all pixels, additional dark signal (DN), and distance of two levels (DN), of which the
-    higher one is met in `high_share` of the frames."""
+    """Defective pixels of one size."""
 
-    share: float
-    more_dn: float
-    jump_dn: float
-    high_share: float = 0.5
+    share: float  # of all pixels
+    more_dn: float  # additional dark signal
+    jump_dn: float  # distance of the two levels of telegraph noise, 0 without
+    high_share: float = 0.5  # share of the frames at the higher level
 
 
 def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_DefectClass]:
+    """The defective pixels of a model's effects, by the nodes of their distributions of size."""
     found = []
     for hot in model.hot:
         found += [_DefectClass(float(s), gain * float(x) * exposure_s, 0.0) for s, x in zip(*hot.nodes(), strict=True)]
@@ -127,8 +131,11 @@ def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_Def
 def _tail_shares(
     classes: Sequence[_DefectClass], moving: float, fixed: float, frames: int, spread: float, gain: float, skew: float
 ) -> FloatArray:
-    """Shares of all pixels in the bins of TAIL_EDGES: a pixel's lower median of `frames` numbers of noise `moving`, on a normal
-    fixed deviation `fixed`, is compared with `spread` times the edges."""
+    """Expected shares of all pixels in the bins of `TAIL_EDGES` and the two dark ones, (7,).
+
+    A pixel's value is the lower median of `frames` numbers with the standard deviation `moving` (DN) and the skewness `skew`, on a
+    normal fixed deviation of standard deviation `fixed` (DN). It is compared with the edges times `spread` (DN).
+    """
     low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]]) * spread + _order_moments(frames)[0] * moving
     u = np.linspace(-7.5, 7.5, 61) if fixed > 0.02 * moving else np.zeros(1)
     weight = np.exp(-0.5 * u * u)
@@ -144,7 +151,7 @@ def _tail_shares(
         _upper((at - level * jump[:, None, None]) / s[:, None, None], skew) for level in (-high, 1.0 - high)
     )
     above = np.clip(high * high_level + (1.0 - high) * low_level, 0.0, 1.0)
-    # the (n - k)-th highest of n is above where n - k of them are at least
+    # the lower median is above an edge where at least `needed` of the frames are: a binomial tail probability
     needed = frames - (frames - 1) // 2
     if frames > 1:
         above = betainc(needed, frames - needed + 1, above)
@@ -157,12 +164,15 @@ def _tail_shares(
 
 
 def _upper(z: FloatArray, skew: float) -> FloatArray:
-    """Probability of more than z of a variable of variance 1 and a small skewness (Edgeworth's first term)."""
+    """Probability that a variable of mean 0, variance 1 and small skewness exceeds z (first term of the Edgeworth series)."""
     return np.asarray(ndtr(-z) + np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) * skew / 6.0 * (z * z - 1.0))
 
 
 def flickering_pixel_block(study: Study) -> Block:
-    """Roots of the numbers of pixels whose temporal variance is far above their surroundings', by how far: all dark frames together."""
+    """Anscombe-transformed numbers of pixels by their temporal variance over that of their surroundings, all dark frames together.
+
+    Raises NotDetermined without repeats, and where codes are too coarse.
+    """
     fine = fine_conditions("flickering_pixels", study.once(dark_frames), LEAST_COUNTED_DN)
     draws = _JumpDraws.of(fine)
     parts = {out: [(k, f) for k, f in enumerate(fine) if out in f.changing] for out in by_part(fine)}
@@ -203,12 +213,13 @@ def flickering_pixel_block(study: Study) -> Block:
 
 
 def _flicker_edges(freedom: int) -> FloatArray:
+    """Edges of the sum of squares over the variance, of `freedom` degrees of freedom."""
     return np.asarray(float(chdtri(freedom, FLICKER_CHANCE)) * np.array(FLICKER_EDGES))
 
 
 def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray) -> FloatArray:
-    """Probability that a chi-squared variable is above the edges, (n, edges): exact where it is central, else its cube root is
-    taken as normal (Abdel-Aty 1954)."""
+    """Probability (n, edges) that chi-squared variables, (n,) degrees of freedom and non-centralities, exceed the edges: exact where all are
+    central, else their cube root is taken as normal (Abdel-Aty 1954)."""
     if not np.any(noncentral):
         return np.asarray(chdtrc(freedom[:, None], edges[None, :]))
     a = (freedom + noncentral)[:, None]
@@ -220,7 +231,8 @@ def _chance_above(freedom: FloatArray, noncentral: FloatArray, edges: FloatArray
 def _hot_above(
     study: Study, part: Sequence[DarkStatistics], out: bool, rate: FloatArray, edges: FloatArray
 ) -> FloatArray:
-    """Shares of hot pixels above the edges, (rates, edges), by their shot noise: chi-squared with the first two moments."""
+    """Probability (rates, edges) that the shot noise of hot pixels of `rate` (e/s) takes them above the edges: a scaled chi-squared
+    variable with the right first two moments."""
     count = np.array([f.changing[out].contrasts for f in part], float)
     noise = np.array([f.changing[out].pixel_dn2 for f in part])
     charge = study.noise.gain**2 * rate[:, None] * np.array([f.condition.exposure_s for f in part])
@@ -233,14 +245,17 @@ def _hot_above(
 
 @dataclass(frozen=True)
 class _JumpDraws:
-    """Draws of which frames of a jumping pixel are high, JUMPS of them, always the same.
+    """`JUMPS` draws, always the same, of the frames in which a pixel with telegraph noise is at its higher level.
 
-    Shares of high frames are those of `HIGH_SHARES`, in turn; any other share weighs the draws by their likelihood under it over that under
-    all of these, so that means over them follow the share smoothly (Veach and Guibas 1995).
+    They are drawn with the shares `HIGH_SHARES` in turn. For any other share, draws are weighted by their likelihood under it over
+    the sum of their likelihoods under `HIGH_SHARES`, so that means over draws change smoothly with the share (multiple importance
+    sampling, Veach and Guibas 1995).
     """
 
-    sums: dict[tuple[int, bool], FloatArray]  # of squared contrasts, by number of the condition and whether held out
-    ones: FloatArray  # (JUMPS,): high frames
+    sums: dict[
+        tuple[int, bool], FloatArray
+    ]  # (condition, held out) -> sums of squared contrasts (JUMPS,), levels 1 apart
+    ones: FloatArray  # (JUMPS,): number of frames at the higher level
     frames: int
 
     @staticmethod
@@ -262,7 +277,7 @@ class _JumpDraws:
         return _JumpDraws(sums, ones, frames)
 
     def weights(self, high_share: float) -> FloatArray:
-        """(JUMPS,), of sum 1."""
+        """Weights (JUMPS,) of the draws for a share of frames at the higher level; their sum is 1."""
 
         def log_chance(share: float) -> FloatArray:
             return np.asarray(self.ones * np.log(share) + (self.frames - self.ones) * np.log1p(-share))
@@ -280,8 +295,8 @@ def _jump_above(
     edges: FloatArray,
     freedom: int,
 ) -> FloatArray:
-    """Shares of pixels with two levels above the edges, (amplitudes, edges): mean over draws of levels, whose sums of squares over the noise
-    are `unit` for an amplitude of 1 DN."""
+    """Probability (amplitudes, edges) that telegraph noise takes pixels above the edges: mean over draws with the weights `weight`.
+    `unit` (draws,): the non-centrality of an amplitude of 1 DN."""
     found = []
     for amplitude in amplitude_e:
         away = np.square(study.noise.gain * amplitude) * unit

@@ -1,9 +1,9 @@
-"""The estimator of an edge's transfer function as a linear operator on the samples' values.
+"""The slanted-edge estimator of the diagnosis, as a linear operator on the values of an edge's pixels.
 
-The MTF's estimator finds the edge and its noise, and leaves the normal equations of the profile's spline. From these the
-departures of the transfer function from the baseline's are taken at some frequencies (`Estimator`), by weighted least squares.
-`Operators` applies the same to a model's transfer functions: nodes of a quadrature give the edge's profile, the profile gives the
-right side of the normal equations, and this gives the reported numbers.
+`lab.fit.mtf` locates the edge, measures its noise, and sets up the normal equations of the spline that describes its edge spread
+function (ESF). From these, `Estimator` estimates by weighted least squares how the optical transfer function (OTF) departs from the
+baseline's at a few frequencies. `Operators` applies the same estimator to a model: OTF -> ESF (`Quadrature`) -> right side of the
+normal equations -> reported numbers.
 """
 
 from __future__ import annotations
@@ -22,31 +22,37 @@ from lab.fit.mtf.transfer_function import EdgeGeometry
 from sim.spectrum import FloatArray
 
 ComplexArray = NDArray[np.complex128]
-#: Where the transfer function is measured, in shares of the highest frequency: its real part, and its imaginary one; this is nil
-#: up to `STILL`, as a phase in proportion to frequency only moves the edge.
+#: Frequencies at which the OTF's real and imaginary parts are measured, as shares of the highest one. The imaginary part is taken as
+#: 0 up to `STILL`, as a phase in proportion to frequency only moves the edge.
 REAL_AT = np.array([0.04, 0.09, 0.15, 0.22, 0.30, 0.39, 0.49, 0.60, 0.72, 0.86, 1.0])
 IMAGINARY_AT = np.array([0.28, 0.42, 0.57, 0.72, 0.86, 1.0])
 STILL = 0.14
-#: Departures from the baseline's transfer that count as likely: next to nothing is said of what no sample tells.
+#: Prior standard deviation of a departure of the OTF: so wide that it matters only where samples tell nothing.
 DEPARTURE_STD = 0.5
-GRID_PX, FINE_PX = 0.05, 0.0125
+GRID_PX, FINE_PX = 0.05, 0.0125  # steps of the grids of distances from the edge: of profiles, and of the pixels' values
 
 
 @dataclass(frozen=True)
 class Quadrature:
-    """ESF(d) = 1/2 + sum over nodes of Re H(f_k) odd[k](d) + (Im H(f_k) / f_k) even[k](d), H a polynomial in pieces.
+    """The ESF as a weighted sum of the OTF H at nodes f_k.
 
-    ESF(d) = 1/2 + integral of [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df. Tables are at d = 0, `GRID_PX`, ...
+    ESF(d) = 1/2 + integral over f > 0 of [Re H sin(2 pi f d) + Im H cos(2 pi f d)] / (pi f) df
+           = 1/2 + sum over k of Re H(f_k) odd[k](d) + (Im H(f_k) / f_k) even[k](d)
+
+    with H interpolated by piecewise polynomials. The tables are at the distances d = 0, `GRID_PX`, 2 `GRID_PX`, ...
     """
 
-    frequency: FloatArray
-    odd: FloatArray  # (nodes, d)
-    even: FloatArray
+    frequency: FloatArray  # (nodes,), cy/px
+    odd: FloatArray  # (nodes, distances)
+    even: FloatArray  # (nodes, distances)
 
     @staticmethod
     def of(highest: float, reach_px: float) -> Quadrature:
-        """Up to `highest` cy/px. Pieces of 1/4, 1/2, 1 cy/px with 8, 6, 6 of Gauss's points: a copy of the image 3 px aside is
-        still followed to 1e-4."""
+        """For frequencies up to `highest` (cy/px) and distances up to `reach_px`.
+
+        Pieces are 1/4 cy/px wide below 1 cy/px, 1/2 below 2, and 1 above, with 8, 6 and 6 Gauss-Legendre nodes. A double image 3 px
+        away is integrated to 1e-4.
+        """
         cuts = np.concatenate([np.arange(0.0, 1.0, 0.25), np.arange(1.0, 2.0, 0.5), np.arange(2.0, 64.0)])
         cuts = np.append(cuts[cuts < highest], highest)
         distance = np.arange(int(np.ceil(reach_px / GRID_PX)) + 2) * GRID_PX
@@ -64,7 +70,7 @@ class Quadrature:
 
 
 def _lagrange(nodes: FloatArray, at: FloatArray) -> FloatArray:
-    """(nodes, at): the polynomials that are 1 at one node and 0 at all others."""
+    """Lagrange polynomials of the nodes (1 at one node, 0 at the others) at `at`, (nodes, at)."""
     basis = np.ones((len(nodes), len(at)))
     for k, node in enumerate(nodes):
         for other in np.delete(nodes, k):
@@ -74,21 +80,22 @@ def _lagrange(nodes: FloatArray, at: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Estimator:
-    """How an edge's profile departs from the baseline's: weighted least squares of few shapes, linear in the samples' values.
+    """Weighted least squares of how an edge's profile departs from the baseline's, linear in the pixels' values.
 
-    profile = level + contrast x (baseline + shift x slope + sum of departures x shapes) + the illumination's gradient; a shape is
-    what the profile gains where the transfer function does at one frequency. So what is told of neighbouring frequencies is
-    told by all samples that see it; with next to no prior, and none of what a camera is expected to do.
+    profile = level + contrast x (baseline + shift x slope + sum of departures x shapes) + gradients of the illumination
+
+    A shape is the change of the profile by a unit change of the OTF at one frequency. The rows of the result are contrast, then
+    contrast x shift, and contrast x departures.
     """
 
-    rows: FloatArray  # (contrast, shift, departures..., distances): of values at distances
-    value: FloatArray  # (rows,): of the recording
-    covariance: FloatArray  # (rows, rows): of `value`, over repeats
+    rows: FloatArray  # (rows, distances): the operator on a profile
+    value: FloatArray  # (rows,): estimate from the recording
+    covariance: FloatArray  # (rows, rows): of `value`
 
     @staticmethod
     def of(geometry: EdgeGeometry, spread: FloatArray, shapes: FloatArray) -> Estimator:
-        """`spread` (k + g, distances): from values at distances to the normal equations' right side; `shapes` (j, distances):
-        level, contrast, slope, and the departures."""
+        """The estimator at an edge's geometry. `spread` (k + g, distances): takes a profile to the right side of the normal equations of
+        k spline and g gradient coefficients (`spread_operator`). `shapes` (j, distances): level, contrast, slope, departures."""
         size = geometry.spline.size
         matrix, right = geometry.gram[:-1, :-1], geometry.gram[:-1, -1]
         bridged = matrix[:size, :size] + geometry.spline.roughness(
@@ -106,19 +113,19 @@ class Estimator:
 
 @dataclass(frozen=True)
 class Operators:
-    """The estimators of all edges, each at its own geometry; rows are contrast, shift and departures."""
+    """The estimators of all edges as operators on OTFs, each at its own geometry; rows as in `Estimator`."""
 
-    constant: FloatArray  # (edges, rows): of the profile's mean, 1/2
-    odd: FloatArray  # (edges, rows, nodes)
-    even: FloatArray
-    profile: FloatArray  # (edges, rows, distances): of any change of the profile at `distance`
-    distance: FloatArray
-    offset: FloatArray  # (edges,): the dark side's light, of the contrast
-    shade: FloatArray  # (edges, distances): the illumination, which is in the operators
+    constant: FloatArray  # (edges, rows): by the constant part of the profile
+    odd: FloatArray  # (edges, rows, nodes): on the OTF's real part
+    even: FloatArray  # (edges, rows, nodes): on the OTF's imaginary part over frequency
+    profile: FloatArray  # (edges, rows, distances): on any other change of the profile
+    distance: FloatArray  # (distances,), px
+    offset: FloatArray  # (edges,): level of the dark side over the contrast
+    shade: FloatArray  # (edges, distances): relative illumination, which the operators contain
 
     def report(self, otf: ComplexArray, frequency: FloatArray, change: FloatArray | None = None) -> FloatArray:
-        """What is reported, (edges, rows), of the model's transfer functions (edges, nodes); `change` of the profile (edges, distances)
-        beside them."""
+        """The estimates (edges, rows) for a model's OTFs (edges, nodes), at the quadrature's `frequency`, and a further `change` of
+        its profiles (edges, distances)."""
         rows = self.constant + (self.odd @ np.real(otf)[..., None])[..., 0]
         if np.any(np.imag(otf)):
             rows = rows + (self.even @ (np.imag(otf) / frequency)[..., None])[..., 0]
@@ -129,7 +136,7 @@ class Operators:
 
 @lru_cache(maxsize=4)
 def profile_interpolation(reach_px: float) -> tuple[FloatArray, FloatArray, sparse.csr_array]:
-    """Distances of the fine and of the coarse grid, and the cubic interpolation (fine, coarse) between them."""
+    """Distances of the fine and of the coarse grid, px, and the cubic interpolation matrix (fine, coarse)."""
     count = int(np.ceil(reach_px / GRID_PX)) + 1
     coarse = GRID_PX * np.arange(-count, count + 1, dtype=float)
     ratio = round(GRID_PX / FINE_PX)
@@ -146,7 +153,8 @@ def profile_interpolation(reach_px: float) -> tuple[FloatArray, FloatArray, spar
 
 
 def spread_operator(geometry: EdgeGeometry, reach_px: float) -> FloatArray:
-    """(k + g, coarse distances): from a profile to the right side of an edge's normal equations."""
+    """Operator (k + g, coarse distances) that takes a profile to the right side of an edge's normal equations: k spline and g gradient
+    coefficients."""
     fine, _, between = profile_interpolation(reach_px)
     distance = np.asarray(geometry.distance_px, float)
     weight = _shared_out(distance, np.asarray(geometry.weight, float), fine)
@@ -159,8 +167,8 @@ def spread_operator(geometry: EdgeGeometry, reach_px: float) -> FloatArray:
 
 
 def departure_shapes(quadrature: Quadrature, top: float) -> tuple[FloatArray, FloatArray]:
-    """(nodes of the quadrature, numbers): transfer functions that are 1 at one of the frequencies measured and 0 at the others,
-    real and imaginary, cubic between; nil at no frequency and well beyond the highest."""
+    """Cubic splines that are 1 at one of the measured frequencies and 0 at the others, at the quadrature's nodes: (nodes, real parts) and
+    (nodes, imaginary parts). All are 0 at frequency 0 and from 1.25 `top` on; `top` is the highest measured frequency, cy/px."""
     f = quadrature.frequency
     tables = []
     for at, still in ((REAL_AT, np.zeros(1)), (IMAGINARY_AT, np.array([0.0, 0.5 * STILL, STILL]))):
@@ -171,7 +179,7 @@ def departure_shapes(quadrature: Quadrature, top: float) -> tuple[FloatArray, Fl
 
 
 def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> FloatArray:
-    """Amounts at any distances laid on an even grid, each on its two neighbours: sums over them are linear between grid points."""
+    """Sums (grid,) of amounts at any distances, each shared between the two nearest points of a regular grid as in linear interpolation."""
     place = (distance - grid[0]) / FINE_PX
     left = place.astype(int)
     right_part = amount * (place - left)
@@ -179,7 +187,7 @@ def _shared_out(distance: FloatArray, amount: FloatArray, grid: FloatArray) -> F
 
 
 def relative_covariance(covariance: FloatArray, rows: FloatArray) -> FloatArray:
-    """Covariance of departures relative to the contrast, of what was reported."""
+    """Covariance of the departures over the contrast, to first order, from an estimate's `rows` and their `covariance`."""
     departure = rows[2:] / rows[0]
     jacobian = (
         np.concatenate([-departure[:, None], np.zeros((len(departure), 1)), np.eye(len(departure))], axis=1) / rows[0]

@@ -1,4 +1,4 @@
-"""The slanted edges of a side: regions, repeats, and the share of their noise that repeats have in common."""
+"""The slanted edges of a side: their regions, seen and held-out repeats, and the share of their noise that repeats have in common."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ from lab.fit.mtf.samples import Region
 from lab.fit.mtf.transfer_function import EdgeMtf
 from sim.sensor import mosaic
 
-LEAST_TILT_DEG = 0.5  # below, no frame has lines enough
-PLAIN = np.array([0.25])  # cy/px, of the estimator's own transfer function, which isn't used here
+LEAST_TILT_DEG = 0.5  # below, no frame has enough rows or columns along the edge
+PLAIN = np.array([0.25])  # cy/px: where `measure_edge` evaluates its own MTF, which isn't used here
 
 
 @dataclass(frozen=True)
 class MeasuredEdge:
-    """One edge in one channel, of the seen or of the held-out repeats."""
+    """One edge in one channel, measured on the mean of its seen or of its held-out repeats."""
 
-    part: tuple[SlantedEdgeCapture, ...]
+    part: tuple[SlantedEdgeCapture, ...]  # the repeats
     channel: str
     measured: EdgeMtf
     held_out: bool
     region: Region
-    direction_deg: float  # of the normal towards the light, from x (columns) to y (rows)
-    fixed_share: float  # of the noise's variance, that repeats have in common
+    direction_deg: float  # of the normal towards the light side, from x (columns) to y (rows)
+    fixed_share: float  # share of the noise's variance that repeats have in common (PRNU)
 
     @property
     def orientation(self) -> str:
+        """The edge's nominal angle, or the measured one where none is stated, in words."""
         nominal = self.part[0].angle_deg
         return f"{self.measured.angle_deg if nominal is None else nominal:.3g} deg"
 
@@ -46,6 +47,10 @@ class MeasuredEdge:
 
 
 def measured_edges(study: Study) -> list[MeasuredEdge]:
+    """All edges of the slanted-edge captures, by region and channel. Edges are searched for where no region is stated.
+
+    Raises NotDetermined where f-number or pixel pitch isn't stated, without slanted-edge captures, and where no edge is measured.
+    """
     if not study.diffraction_is_known:
         raise NotDetermined(
             "slanted_edge", "f-number or pixel pitch isn't stated: no diffraction to hold the edges against"
@@ -84,8 +89,11 @@ def measured_edges(study: Study) -> list[MeasuredEdge]:
 
 
 def _check_phases(study: Study, channel: str, region: Region, angle_deg: float) -> None:
-    """Raise `NotDetermined` where the edge doesn't cross a whole period of the channel's samples: where a line crosses the edge is aliased, by
-    an error of that period, which biases the angle unless it averages out."""
+    """Raise `NotDetermined` where the edge crosses less than one sample period of its channel.
+
+    Aliasing makes the position at which a row or column crosses the edge err periodically, by its phase to the samples. Over less than a
+    period this error doesn't average out, and biases the angle.
+    """
     tilt_deg = abs((angle_deg + 45.0) % 90.0 - 45.0)
     lines = region[2] - region[0] if abs((angle_deg + 90.0) % 180.0 - 90.0) < 45.0 else region[3] - region[1]
     period_px = mosaic.step(study.stated.cfa) / len(mosaic.phases(study.stated.cfa)[channel])
@@ -103,11 +111,12 @@ def _check_phases(study: Study, channel: str, region: Region, angle_deg: float) 
 
 
 def _found(study: Study, capture: SlantedEdgeCapture) -> list[Region]:
+    """Regions of the edges that are found in a capture's frame."""
     return [f.region for f in find_edges(study.recordings.frame(capture), study.stated.cfa, study.saturation_dn)]
 
 
 def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, angle_deg: float) -> float:
-    """Direction of the edge's normal towards the light, from x (columns) to y (rows)."""
+    """Direction of the edge's normal towards the light side, from x (columns) to y (rows)."""
     row0, col0, row1, col1 = region
     frame = np.asarray(study.recordings.frame(capture)[row0:row1, col0:col1], float)
     angle = np.deg2rad(angle_deg)
@@ -119,7 +128,11 @@ def _direction_deg(study: Study, capture: SlantedEdgeCapture, region: Region, an
 def _fixed_share(
     study: Study, group: Sequence[SlantedEdgeCapture], frames: int, channel: str, region: Region, measured: EdgeMtf
 ) -> float:
-    """Share of the variance of a mean of `frames` frames that doesn't differ from repeat to repeat (pixels' response)."""
+    """Share of the noise variance of a mean of `frames` frames that is fixed (PRNU): 1 - temporal variance / total variance.
+
+    The temporal variance is taken from the difference of two repeats on the light side, else from shot and read noise. 0 where
+    neither is known; at most 0.95.
+    """
     total = measured.noise_std_light**2
     if len(group) > 1:
         row0, col0, row1, col1 = region

@@ -1,4 +1,4 @@
-"""Mean frames of uniform light, and the ratio of the two green planes in them."""
+"""Mean flat frames, and the ratio of the two green planes of the mosaic in them."""
 
 from __future__ import annotations
 
@@ -16,21 +16,25 @@ from sim.spectrum import FloatArray
 
 @dataclass(frozen=True)
 class FlatLevel:
-    """Frames of uniform light at one setting: means above black by plane of the mosaic, DN, and ratios of the greens."""
+    """The flat frames of one setting."""
 
     captures: tuple[Any, ...]
     held_out: bool
-    mean: dict[str, float]
-    ratios: tuple[float, ...]  # of the two greens, frame by frame, less 1
+    mean: dict[str, float]  # above the dark level, by plane of the mosaic, DN
+    ratios: tuple[float, ...]  # of each frame: signal of green on red rows over green on blue rows, less 1
 
 
 def _unclipped(study: Study, capture: Any) -> bool:
+    """Whether no channel of the capture clips."""
     return all(m is not None for m in study.levels(capture).mean.values())
 
 
 def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, float]]]:
-    """Unclipped flats by level; and for seen (False) and held-out frames (True) their mean above black, each plane over its own mean and
-    weighted by signal, with the variance of a pixel in it by shot and read noise."""
+    """Unclipped flats by level, darkest first; and for seen (False) and held-out (True) ones a mean image with its pixels' variance.
+
+    The image (rows, cols) is the mean over frames above the dark level, each plane of the mosaic over its mean, weighted by signal. The
+    variance is that of a pixel of the image by shot and read noise.
+    """
     out = study.once(held_out_flats)
     levels: list[FlatLevel] = []
     total: dict[bool, Any] = {}
@@ -69,19 +73,20 @@ def flats(study: Study) -> tuple[list[FlatLevel], dict[bool, tuple[FloatArray, f
 
 
 def dark_level_dn(study: Study, capture: Any) -> float:
+    """Mean of a capture without light: black level + dark current x exposure, DN."""
     return study.noise.black + study.noise.dark_dn_per_s * float(capture.exposure_s)
 
 
 def _green_dark(study: Study) -> float:
-    """Mean of the greens on red rows less that of the greens on blue rows in the dark, DN: fixed patterns of the read-out."""
+    """Difference of the two greens in dark frames, DN, by fixed patterns of the read-out; 0 without dark captures."""
     captures = study.recordings.captures(DarkCapture, study.side)[:16]
     pairs = [green_planes(study, np.asarray(study.recordings.frame(c), np.float32)) for c in captures]
     return float(np.mean([float(a.mean(dtype=float)) - float(b.mean(dtype=float)) for a, b in pairs])) if pairs else 0.0
 
 
 def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
-    """The green pixels on red rows, without the outermost, and for each the mean of its four diagonal neighbours on blue rows: a gradient
-    of the light cancels in their ratio."""
+    """The green pixels on red rows, without those at the border, and for each the mean of its four diagonal neighbours, the greens on blue
+    rows. A gradient of the light cancels in their ratio."""
     row, col = mosaic.phases(study.camera.cfa)["G"][0]
     red_rows = frame[row + 2 * (row == 0) : -1 : 2, col + 2 * (col == 0) : -1 : 2]
     first = row + 2 * (row == 0) - 1, col + 2 * (col == 0) - 1
@@ -92,7 +97,7 @@ def green_planes(study: Study, frame: Any) -> tuple[Any, Any]:
 
 
 def green_ratio(study: Study, frame: Any) -> float:
-    """Ratio of the greens in a frame above black, less 1."""
+    """Ratio of the two greens' means in a frame above the dark level, less 1, corrected for their difference in dark frames."""
     red_rows, blue_rows = green_planes(study, frame)
     below = max(float(blue_rows.mean(dtype=float)), 1e-3)
     return (float(red_rows.mean(dtype=float)) - study.once(_green_dark)) / below - 1.0

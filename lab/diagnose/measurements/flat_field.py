@@ -1,4 +1,4 @@
-"""Shading of flat fields: cells of the frame against cos^4, each channel relative to its mean."""
+"""Shading of flat fields: means over cells of the frame, relative to the frame's mean, against cos^4 (or the lens's) fall-off."""
 
 from __future__ import annotations
 
@@ -18,34 +18,39 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import SHADING, FieldPoints, Uniform
 
-ROWS, COLS = 6, 8
-SHADING_FLOOR = 2e-4  # of a cell, alike in its repeats: cos^4 at a cell's points, response at a cell's mean
-AXIS_STD, AXIS_STD_KNOWN = 0.01, 0.004  # of the frame's diagonal: the optical axis without and with a fitted geometry
-MOST_FRAMES, MOST_LEVELS = 6, 2  # brightest levels, seen and held out each
-BLOCK_PX = 4  # of a channel's plane: at this scale its fixed pattern is measured
-ALIKE = 1.5  # times as much of it than of independent pixels' may be left in cells
-#: Ratio to the noise's variance from which on rows are said to vary from frame to frame: one healthy set in some thousands has it.
+ROWS, COLS = 6, 8  # cells of the frame
+#: Relative standard deviation of a cell, common to repeats: numerical error of the prediction.
+SHADING_FLOOR = 2e-4
+AXIS_STD, AXIS_STD_KNOWN = (
+    0.01,
+    0.004,
+)  # of the optical axis without and with a fitted geometry, over the frame's diagonal
+MOST_FRAMES, MOST_LEVELS = 6, 2  # brightest levels, of seen and of held-out flats each
+BLOCK_PX = 4  # side of the blocks in a channel's plane at which its fixed pattern is measured
+ALIKE = 1.5  # largest ratio of the fixed pattern's variance in blocks to that of independent pixels
+#: Variance of rows between frames over that by noise from which on the light flickers. A healthy set exceeds it once in thousands.
 VARYING = 4.0
 
 
 @dataclass(frozen=True)
-class _Plane:
-    """One channel of the seen or of the held-out flats: cells relative to their mean."""
+class _ChannelCells:
+    """One channel of the mean seen or held-out flat."""
 
     captures: tuple[Any, ...]
     channel: str
     held_out: bool
-    cells: FloatArray  # (ROWS * COLS,)
-    level_e: float
+    cells: FloatArray  # (ROWS * COLS,): means over their mean
+    level_e: float  # mean signal
     noise: float  # relative variance of a cell by shot and read noise
-    pattern: float  # and by the fixed pattern, which repeats share
-    row_covariance: FloatArray  # (ROWS, ROWS), relative covariance of what rows of cells share in one frame
+    pattern: float  # relative variance of a cell by the fixed pattern, which repeats share
+    row_covariance: FloatArray  # (ROWS, ROWS): relative covariance of rows of cells by flicker of the light
 
 
 def shading_block(study: Study) -> Block:
-    """Means over 6 x 8 cells of the brightest unclipped flats, relative to their mean, by channel.
+    """Means over 6 x 8 cells of the brightest unclipped flats, relative to the mean of the frame, by channel.
 
-    The fixed pattern's variance is measured at a scale of a few pixels. Nuisance parameters: the place of the optical axis.
+    Nuisance parameters: row and column of the optical axis. Raises NotDetermined where focal length or pixel pitch isn't stated, for
+    frames too small, and without unclipped flats.
     """
     if study.stated.focal_length_mm is None or study.stated.pixel_pitch_um is None:
         raise NotDetermined(
@@ -61,7 +66,7 @@ def shading_block(study: Study) -> Block:
     if not planes:
         raise NotDetermined("flat_field", "no unclipped flat captures")
     camera = study.camera
-    # where the optical axis meets the sensor is known to a share of the frame's diagonal: the fall-off may be centred there
+
     off_px = (AXIS_STD_KNOWN if camera.geometry is not None else AXIS_STD) * float(np.hypot(camera.rows, camera.cols))
     place = _cell_points(camera, 0.0, 0.0)
     moved = {"axis:row": _cell_points(camera, off_px, 0.0), "axis:col": _cell_points(camera, 0.0, off_px)}
@@ -82,12 +87,13 @@ def shading_block(study: Study) -> Block:
     )  # fmt: skip
 
 
-def _planes(study: Study) -> list[_Plane]:
-    """The brightest levels' frames, what is seen and what is held out apart. Chosen by their settings, not by their noise."""
+def _planes(study: Study) -> list[_ChannelCells]:
+    """The mean of the brightest levels' frames by channel, seen and held-out ones apart. Levels are ranked by rounded means, so that
+    noise doesn't choose."""
     out = study.once(held_out_flats)
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups.sort(key=lambda g: -float(np.round(np.mean(list(study.levels(g[0]).whole.values())), 0)))
-    planes: list[_Plane] = []
+    planes: list[_ChannelCells] = []
     for held in (False, True):
         parts = [[c for c in g if (c.id in out) == held] for g in groups]
         picked = [part for part in parts if part][:MOST_LEVELS]
@@ -97,7 +103,8 @@ def _planes(study: Study) -> list[_Plane]:
     return planes
 
 
-def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plane]:
+def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_ChannelCells]:
+    """The mean of some captures above the dark level, by channel."""
     noise, step = study.noise, mosaic.step(study.camera.cfa)
     total: dict[str, FloatArray] = {}
     bands: dict[str, list[FloatArray]] = {c: [] for c in study.channels}
@@ -108,11 +115,11 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plan
         for channel in study.channels:
             phases = mosaic.phases(study.camera.cfa)[channel]
             plane = np.mean([frame[r::step, c::step] for r, c in phases], axis=0, dtype=float)
-            # every frame by its own mean: levels may differ
+            # each frame over its own mean, as levels may differ
             plane = plane / plane.mean()
             total[channel] = total.get(channel, 0.0) + plane / len(captures)
             bands[channel].append(_cells(plane).mean(1))
-    planes: list[_Plane] = []
+    planes: list[_ChannelCells] = []
     rows_dn2 = np.zeros((ROWS, ROWS))
     for channel, plane in total.items():
         count = len(mosaic.phases(study.camera.cfa)[channel])
@@ -122,12 +129,12 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plan
         shot = float(single.mean()) / len(captures)
         pixels = plane.size / (ROWS * COLS)
         cells = _cells(plane)
-        # of the light, and so one for all channels
+        # flicker is the light's: the mean over channels
         rows_dn2 = rows_dn2 + _row_covariance(np.array(bands[channel]), float(single.mean()) / (pixels * COLS)) / len(
             total
         )
         planes.append(
-            _Plane(
+            _ChannelCells(
                 tuple(captures), channel, held_out, (cells / cells.mean()).ravel(), float(levels.mean()) / noise.gain, shot / pixels,
                 _pattern_variance(plane, shot) / pixels,
                 rows_dn2,
@@ -137,23 +144,28 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Plan
 
 
 def _pattern_variance(plane: FloatArray, shot: float) -> float:
-    """Variance of the fixed pattern, a pixel's worth where cells average it: from adjacent blocks of 4 x 4 pixels, which may be alike;
-    at least that of adjacent pixels by themselves and at most ALIKE times that, as what is much more alike is no pixels' pattern."""
+    """Relative variance of a pixel by the fixed pattern, such that a cell of n pixels has 1 / n of it.
+
+    It is measured on differences of adjacent blocks of 4 x 4 pixels, so that a pattern that is correlated over a few pixels counts in
+    full. It is limited to 1..ALIKE times the variance of adjacent pixels: a pattern correlated more strongly isn't one of pixels.
+    """
     single = _adjacent(plane, 1) - shot
     return float(np.clip(_adjacent(plane, BLOCK_PX) - shot, max(single, 0.0), ALIKE * max(single, 0.0)))
 
 
 def _adjacent(plane: FloatArray, size: int) -> float:
-    """Half the mean square of differences between adjacent blocks' means, times the pixels of a block."""
+    """Half the mean square of differences between adjacent blocks' means, times the pixels of a block: the variance of a pixel, where
+    pixels are independent. Blocks have `size` x `size` pixels."""
     rows, cols = (n // size for n in plane.shape)
     blocks = plane[: rows * size, : cols * size].reshape(rows, size, cols, size).mean((1, 3))
     steps = np.concatenate([np.square(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
-    # the median of squares, 0.4549 of their mean: a speck of dust or the border of a tap is no pattern of the pixels
+    # the median of squares, 0.4549 of their mean, isn't moved by dust or by the border between two read-outs
     return float(np.median(steps)) / 0.4549 / 2.0 * size**2
 
 
 def _row_covariance(bands: FloatArray, noise: float) -> FloatArray:
-    """Covariance of the rows of cells of the mean of all frames beside noise, (ROWS, ROWS): 0 unless the light flickers."""
+    """Relative covariance (ROWS, ROWS) of the rows of cells in the mean of all frames, by flicker of the light: 0 where the variance
+    between frames is below `VARYING` times `noise`, that of a row of cells. `bands` (frames, ROWS)."""
     count = len(bands)
     if count < 2:
         return np.zeros((ROWS, ROWS))
@@ -162,11 +174,11 @@ def _row_covariance(bands: FloatArray, noise: float) -> FloatArray:
     spread = away.T @ away / (count - 1)
     if np.trace(spread) < VARYING * ROWS * noise:
         return np.zeros((ROWS, ROWS))
-    # few frames tell of few directions: as much again in all of them
+    # few frames span few directions: the same variance is added in all
     return np.asarray((spread + np.trace(spread) / ROWS * np.eye(ROWS)) / count)
 
 
-def _covariance(planes: Sequence[_Plane]) -> FloatArray:
+def _covariance(planes: Sequence[_ChannelCells]) -> FloatArray:
     cells = ROWS * COLS
     covariance = np.zeros((len(planes) * cells, len(planes) * cells))
     for i, a in enumerate(planes):
@@ -181,7 +193,7 @@ def _covariance(planes: Sequence[_Plane]) -> FloatArray:
     return covariance
 
 
-#: Gauss's three points in a cell and their shares: means over cells exact for shadings up to the fifth power of the place.
+#: Gauss-Legendre nodes and weights in a cell: means over cells are exact for shading up to the fifth power of the coordinates.
 _POINTS, _SHARES = np.polynomial.legendre.leggauss(3)
 
 
@@ -193,16 +205,16 @@ def _cell_points(camera: CameraModel, off_row_px: float, off_col_px: float) -> F
 
 
 def _cell_means(value: FloatArray) -> FloatArray:
-    """Of values at `_cell_points`, (cells,)."""
+    """Means over cells (cells,) of values at `_cell_points`."""
     parts = value.reshape(ROWS, 3, COLS, 3)
     return np.asarray(np.einsum("iajb,a,b->ij", parts, 0.5 * _SHARES, 0.5 * _SHARES).ravel())
 
 
-def _shaded(planes: Sequence[_Plane], place: FieldPoints, effects: Effects, study: Study) -> FloatArray:
-    """Cells of every plane relative to their mean, (planes x cells,)."""
+def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effects, study: Study) -> FloatArray:
+    """Predicted cells of all planes, each plane relative to its mean, (planes x cells,)."""
     model = Uniform(study.camera, effects)
     light = _cell_means(model.field(place).light)
-    # a veil evens out what the lens's fall-off leaves
+    # a veil of scattered light reduces the contrast of the fall-off
     even = even_share(study.camera, effects)
     light = (1.0 - even) * light + even * light.mean()
     found = []

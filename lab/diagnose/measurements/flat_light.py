@@ -1,4 +1,4 @@
-"""The light of flats, by what is stated of it: a measured radiance, or a number of photons."""
+"""The stated light of flats: a measured radiance, or a number of photons a pixel."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FlatLight:
-    """One statement of the light: of a radiometer (`path` of the spectrum), or of a number of photons in an exposure."""
+    """One statement of the light: a radiometer's reading, or a number of photons in an exposure."""
 
     name: str
-    lamp: Hashable
-    path: str | None = None
-    photons_per_s: float = 0.0
+    lamp: Hashable  # equal for readings of the same lamp
+    path: str | None = None  # of the spectrum that the radiometer read
+    photons_per_s: float = 0.0  # a pixel, where no spectrum is stated
 
 
 def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
-    """What is stated of a flat's light; None where nothing is, or where no time was exposed."""
+    """The stated light of a flat; None where nothing is stated, or where exposure or photon number is 0."""
     if flat.radiance is not None:
         return FlatLight(flat.radiance, study.lamps[flat.radiance], flat.radiance)
     light = stated_light(flat)
@@ -38,7 +38,7 @@ def reading(study: Study, flat: FlatCapture) -> FlatLight | None:
 
 
 def relative_rates(study: Study, readings: Sequence[FlatLight]) -> Mapping[tuple[str, str], float]:
-    """Rate of light in each channel by (reading, channel), over that of the first reading of its lamp."""
+    """(reading, channel) -> electron rate (photon rate, where photons are stated) over that by the first reading of the same lamp."""
     first: dict[Hashable, FlatLight] = {}
     for one in readings:
         first.setdefault(one.lamp, one)
@@ -58,7 +58,7 @@ def _rate(study: Study, one: FlatLight, channel: str) -> float:
 
 
 def misstated_levels(fit: CameraFit | None) -> tuple[InconsistentLevel, ...]:
-    """Levels whose number of photons contradicts the others, as the noise fit finds them (`lab.fit.noise.level_consistency`)."""
+    """Levels whose stated number of photons contradicts the others, as found by the noise fit (`lab.fit.noise.level_consistency`)."""
     if fit is None or fit.noise is None:
         return ()
     return tuple(level for level in fit.noise.inconsistent_levels if level.light_unit == "photons" and level.captures)

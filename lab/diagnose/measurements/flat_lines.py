@@ -1,4 +1,4 @@
-"""Lines in uniform light: steps where read-outs meet, and the difference of even and odd rows and columns."""
+"""Lines in flat fields: steps where the areas of two read-outs meet, and the difference of even and odd rows and columns."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ from lab.errors import NotDetermined
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-LINE_FLOOR = 1e-4  # of a step in an even field's lines
-#: Where read-outs meet, as shares of a side.
+LINE_FLOOR = 1e-4  # relative standard deviation of a step beside noise
+#: Where the areas of two read-outs may meet, as shares of a side.
 MEETING = (0.25, 0.5, 0.75)
-LEAST_LINES = 8  # of a plane of the mosaic, along a side: half of them tell the light's slope
-LEAST_PLACES = 8  # at fewer, the spread of lines is what pixels' noise and response make of it
+LEAST_LINES = 8  # least side of a plane of the mosaic, lines: half of them determine the light's slope
+LEAST_PLACES = 8  # places from which on the spread of steps is measured; with fewer it is that by noise and PRNU
 
 
 def line_block(study: Study) -> Block:
-    """Steps in the means of lines at halves and quarters of a side, and the difference of even and odd lines of a plane, relative to the
-    mean flat. The standard deviation of a step is measured at all other places."""
+    """Steps in the means of rows and columns at halves and quarters of a side, and the difference of even and odd lines of a plane of the
+    mosaic, relative to the mean signal.
+
+    The standard deviation of a step is measured at all other places. No effect predicts a step. Raises NotDetermined without unclipped
+    flats, and for frames too small.
+    """
     _, images = study.once(flats)
     if not images:
         raise NotDetermined("flat_lines", "no unclipped flat captures")
@@ -62,13 +66,16 @@ def line_block(study: Study) -> Block:
 
 
 def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, float, float, float]]:
-    """(share of the side, step, its standard uncertainty, variance a line of variance 1 would give it) where read-outs meet: of a
-    straight line with a step in `width` lines on either side, fitted."""
+    """(share of the side, step, its standard deviation, variance of the step for lines of variance 1) where read-outs may meet.
+
+    Least squares fit a straight line with a step to the means of `width` lines on either side. `least`: standard deviation of a line
+    by noise and PRNU; `period`: of the mosaic.
+    """
     width = max(len(line) // 16 // (2 * period) * 2 * period, 4 * period)
     x = np.arange(-width, width) + 0.5
     design = np.stack([np.ones_like(x), x, x > 0], axis=1)
     weight = np.linalg.pinv(design)[2]
-    every = np.convolve(line, weight[::-1], mode="valid")  # at boundaries width, width + 1, ...
+    every = np.convolve(line, weight[::-1], mode="valid")  # steps at the lines width, width + 1, ...
     size = float(np.sum(weight * weight))
     at = {share: round(share * len(line) / period) * period for share in MEETING}
     far = np.ones(len(every), bool)
@@ -81,8 +88,8 @@ def _steps(line: FloatArray, period: int, least: float) -> list[tuple[float, flo
 
 
 def _stripes(line: FloatArray, period: int, least: float) -> tuple[float, float]:
-    """Mean of the even lines of a plane less that of the odd ones, and its standard uncertainty by how lines four periods apart
-    depart from a straight line."""
+    """Mean of the even lines of a plane of the mosaic less that of the odd ones, and its standard deviation, from the second differences
+    of lines four periods apart."""
     lag = 4 * period
     pairs = line[: len(line) // (2 * period) * 2 * period].reshape(-1, 2, period)
     value = float((pairs[:, 0] - pairs[:, 1]).mean())

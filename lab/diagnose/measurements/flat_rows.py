@@ -1,4 +1,4 @@
-"""Light that changes while a frame is read: rows of single flat frames against those of all others."""
+"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames."""
 
 from __future__ import annotations
 
@@ -19,37 +19,40 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-MOST_FRAMES, MOST_LEVELS = 6, 8  # of a level; of a session
-WIDEN = 1.6  # from one band of frequencies to the next
+MOST_FRAMES, MOST_LEVELS = 6, 8  # frames of a level; levels of a session
+WIDEN = 1.6  # ratio of the lower ends of successive frequency bands
 HIGHEST = 0.45  # cy/row
-#: Of the power in a band, alike at all levels: noise that neighbouring rows share.
-COLOUR_STD = 0.1  # and five times as much where a few rows are a period
-#: Relative amplitude of a change of the rows' pattern from one level to another, a share of whatever falls off towards the borders.
+#: Relative prior standard deviation of a band's power, common to all levels: row noise that isn't white. Five times as much above
+#: 0.15 cy/row.
+COLOUR_STD = 0.1
+#: Prior standard deviation of the relative amplitude by which the fixed pattern of rows changes from level to level.
 PATTERN_STD = 3e-5
-#: Of the read noise: offsets of rows, where no dark frames tell.
+#: Standard deviation of the rows' offsets over the read noise, where there are no repeated dark frames.
 ROW_SHARE = 0.15
-#: Instants at which a light's phase is looked at: golden sections of a second, no period's multiples.
+#: Start times of exposures, s, at which flicker is evaluated: multiples of the golden ratio cover all phases of any period evenly.
 INSTANTS = 0.6180339887 * np.arange(24) % 1.0
 LEAST_ROWS = 24  # of a plane of the mosaic
 
 
 @dataclass(frozen=True)
 class _Level:
-    """Frames of one level: DN over the dark level, variance of a row's mean, power by band of their rows (relative, times rows)."""
+    """The frames of one level."""
 
     captures: tuple[Any, ...]
-    signal: float
-    variance: float  # of a row's mean relative to the signal, by pixels' noise
-    power: FloatArray  # (bands,) over that of the noise
-    freedom: FloatArray  # (bands,)
+    signal: float  # mean above the dark level, DN
+    variance: float  # relative variance of a row's mean by the noise of pixels
+    power: FloatArray  # (bands,): of the rows of single frames, over that of the noise
+    freedom: FloatArray  # (bands,): degrees of freedom
 
 
 def flicker_block(study: Study) -> Block:
-    """Power of single flat frames' rows by spatial frequency, against the rows of all flat frames, in parts of what noise leaves.
+    """Power spectrum of the rows of single flat frames, relative to the mean of all, over that of the pixels' noise; cube roots.
 
-    q = row means of a frame / those of all frames - 1; power |sum q exp(-2 pi i k r)|^2 / rows, over the pixels' variance. Its cube root
-    is nearly normal (Wilson and Hilferty 1931): mean 1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. What the rows of
-    dark frames show beside noise (their offsets, in DN) is expected in light as well, and the spectrum of the noise is a nuisance parameter.
+    q(r) = row means of a frame / row means of all frames - 1. Power at k cycles a frame: |sum over r of q(r) exp(-2 pi i k r / rows)|^2
+    / (rows x variance of a row's mean). The cube root of its mean over a band is nearly normal (Wilson and Hilferty 1931): mean
+    1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. Row noise of the dark frames is expected in light as well. Nuisance
+    parameters: its size, the noise's spectrum, the fixed pattern of rows, and the phases of the light. Raises NotDetermined without
+    unclipped, repeated flats, and for too few rows.
     """
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
     groups = [g[:MOST_FRAMES] for g in groups if len(g) > 1]
@@ -71,7 +74,7 @@ def flicker_block(study: Study) -> Block:
     frequency = np.array([np.sqrt(b[0] * b[-1]) for b in bands]) / (rows * step)
     freedom = np.concatenate([level.freedom for level in levels])
     value = np.cbrt(np.concatenate([level.power for level in levels]))
-    # the fixed offsets of rows in light, DN^2 -> parts of the noise's power
+    # row noise of dark frames, DN^2 -> share of the power of noise in light
     share = np.repeat([1.0 / (level.signal**2 * level.variance) for level in levels], len(bands))
     offsets, offsets_std = np.tile(dark, len(levels)) * share, np.tile(dark_std, len(levels)) * share
     pattern = np.repeat([PATTERN_STD**2 * rows / level.variance for level in levels], len(bands))
@@ -95,7 +98,7 @@ def flicker_block(study: Study) -> Block:
                 band == k, slope * COLOUR_STD * (1.0 + 4.0 * (frequency[k] > 0.15)), 0.0
             )
             jacobian[f"rows:pattern:{k}"] = np.where(band == k, slope * pattern, 0.0)
-        # a level's few frames catch the light at phases of their own: that much its power may lie off the mean over all phases
+        # the few frames of a level have phases of their own: standard deviation of their mean power about that over all phases
         for i in np.flatnonzero(spread):
             jacobian[f"rows:phase:{i}"] = np.where(np.arange(len(value)) == i, slope[i] * spread[i], 0.0)
         return Prediction(mean, jacobian)
@@ -110,11 +113,11 @@ def flicker_block(study: Study) -> Block:
 
 
 FLICKER = frozenset({"light.rows"})
-LOG_REACH = 1.0  # over a factor of e in frequency
+LOG_REACH = 1.0  # correlation length in ln(frequency)
 
 
 def _bands(rows: int, highest_cy_per_row: float) -> list[range]:
-    """Whole periods a frame in each band, from 1 to `highest_cy_per_row`, each band WIDEN times as high as the last."""
+    """Cycles a frame in each band, from 1 to `highest_cy_per_row` (at most `HIGHEST`). Each band begins at `WIDEN` times the last."""
     top = int(min(highest_cy_per_row, HIGHEST) * rows)
     bands, low = [], 1
     while low <= top:
@@ -125,12 +128,13 @@ def _bands(rows: int, highest_cy_per_row: float) -> list[range]:
 
 
 def _profile(frame: NDArray[np.floating], step: int) -> FloatArray:
-    """Means of the rows, of as many together as the mosaic repeats after."""
+    """Means of the rows, over `step` neighbouring ones each, the period of the mosaic."""
     rows = frame.shape[0] // step
     return np.asarray(frame.mean(1)[: rows * step].reshape(rows, step).mean(1))
 
 
 def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[range]) -> list[_Level]:
+    """The levels of groups of repeated flats."""
     noise, step = study.noise, mosaic.step(study.camera.cfa)
     rows = study.camera.rows // step
     profiles, variances, signals = [], [], []
@@ -138,7 +142,7 @@ def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[ran
         frames = [np.asarray(study.recordings.frame(c), np.float32) for c in group]
         dark = noise.black + noise.dark_dn_per_s * group[0].exposure_s
         mean = sum(frames[1:], frames[0]) / len(frames)
-        # pixels' noise beside what whole rows have in common
+        # pixels' noise without that of whole rows
         left = [f - mean for f in frames]
         left = [d - d.mean(1, keepdims=True) for d in left]
         pixel = float(np.mean([np.mean(np.square(d, dtype=float)) for d in left])) * len(frames) / (len(frames) - 1)
@@ -146,7 +150,7 @@ def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[ran
         profiles.append(own / own.mean(1, keepdims=True))
         signals.append(float(own.mean()))
         variances.append(pixel / (step * study.camera.cols) / signals[-1] ** 2)
-    # the reference: every frame counts by its light and its exposure, in which flicker averages out
+    # the reference: frames are weighted by signal and exposure, as flicker averages out in long ones
     weight = np.concatenate([np.full(len(g), s * g[0].exposure_s) for g, s in zip(groups, signals, strict=True)])
     weight /= weight.sum()
     every = np.concatenate(profiles)
@@ -156,7 +160,7 @@ def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[ran
     for group, signal, level in zip(groups, signals, variances, strict=True):
         at = slice(first, first + len(group))
         first += len(group)
-        # of q: a frame's own noise, less its part in the reference, and the others' there
+        # variance of q: the frame's own noise, less its covariance with the reference, and the reference's
         own = level * (1.0 - 2.0 * weight[at].mean()) + float(weight**2 @ variance)
         lines = np.abs(np.fft.rfft(every[at] / reference - 1.0, axis=1)) ** 2 / rows / own
         found.append(
@@ -172,7 +176,10 @@ def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[ran
 
 
 def _dark_power(study: Study, bands: Sequence[range]) -> tuple[FloatArray, FloatArray]:
-    """Power that dark frames' rows have beside their pixels' noise, by band, DN^2 x rows, and its standard uncertainty."""
+    """Power of the rows of dark frames beyond that of pixels' noise, by band, DN^2, and its standard deviation.
+
+    Without repeated dark frames: 0, and that of the prior `ROW_SHARE`. What is within two standard deviations of 0 is taken as 0.
+    """
     noise, step = study.noise, mosaic.step(study.camera.cfa)
     rows = study.camera.rows // step
     total, expected, freedom = np.zeros(len(bands)), 0.0, np.zeros(len(bands))
@@ -197,14 +204,14 @@ def _dark_power(study: Study, bands: Sequence[range]) -> tuple[FloatArray, Float
     mean_power = total / frames_seen
     uncertain = mean_power * np.sqrt(2.0 / (2.0 * frames_seen * np.array([len(b) for b in bands])))
     excess = mean_power - expected / frames_seen
-    # what is within its own uncertainty is none
+
     return np.where(excess > 2.0 * uncertain, excess, 0.0), uncertain
 
 
 def _modulation(
     study: Study, level: _Level, effects: Sequence[Effect], bands: Sequence[range], step: int
 ) -> tuple[FloatArray, FloatArray]:
-    """What effects on the light add to a level's power by band: mean over the instants, and one frame's spread about it."""
+    """Power (bands,) that a varying light adds to a level: mean over `INSTANTS`, and standard deviation of a single frame."""
     rows = study.camera.rows // step
     model = Uniform(study.camera, effects)
     exposure = level.captures[0].exposure_s

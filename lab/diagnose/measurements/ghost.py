@@ -1,4 +1,4 @@
-"""The ghost of a pattern: its picture turned by half a turn about the frame's middle."""
+"""The ghost of a pattern: its image, rotated by 180 degrees about the frame's middle."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GHOST_FLOOR = 1.5e-4
 
 
 def ghost_block(study: Study) -> Block:
-    """Coefficient of the picture turned by half a turn about the frame's middle: the ghost's share of the light."""
+    """Coefficient of the rotated image in the fit of the pattern: the ghost's share of the light."""
     points = [(g, p, len(p.bands) + GHOST) for g, group in enumerate(patterns(study)) for p in group]
     value = np.array([p.value[b] for _, p, b in points])
 

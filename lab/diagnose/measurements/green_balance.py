@@ -1,4 +1,4 @@
-"""The two greens of a mosaic against each other in uniform light."""
+"""The ratio of the two greens of a Bayer mosaic in uniform light."""
 
 from __future__ import annotations
 
@@ -19,30 +19,33 @@ from sim.frame import collected_mosaic
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-GREEN_FLOOR = 1e-4  # of a ratio: what two greens that are alike may differ by
-GREEN_NOISE = 0.02  # of a ratio: what a frame's has to be known to
+GREEN_FLOOR = 1e-4  # standard deviation of the ratio of equal greens beside noise
+GREEN_NOISE = 0.02  # ratios of a larger standard deviation aren't used
 CELLS = (3, 4)
-TILE_ROWS, TILE_COLS = 64, 4  # uniform light on which the effects act
+TILE_ROWS, TILE_COLS = 64, 4  # size of the uniform frame by which effects are predicted, px
 
 
 @dataclass(frozen=True)
 class _Ratio:
-    """One ratio of the greens less 1; `std` of its own noise."""
+    """One ratio of the greens."""
 
-    value: float
-    std: float
-    x: float
+    value: float  # less 1
+    std: float  # by noise
+    x: float  # wavelength, nm; 0 of flats
     condition: str
     captures: tuple[str, ...]
     held_out: bool
-    mean: dict[str, float]  # by channel, DN
+    mean: dict[str, float]  # signal by channel, DN
     exposure_s: float
     elapsed_s: float
 
 
 def green_block(study: Study) -> Block:
-    """Signal of green pixels on red rows over that of green pixels on blue rows, less 1: by level of flats, by wavelength, and by place
-    relative to the frame's mean."""
+    """Signal of the green pixels on red rows over that on blue rows, less 1.
+
+    It is measured by level of flats, by wavelength of narrowband light, and by cell of the frame relative to the cells' mean. Raises
+    NotDetermined for a camera without a mosaic, for frames too small, and without unclipped captures of uniform light.
+    """
     if study.camera.cfa == "MONO":
         raise NotDetermined("green_balance", "the camera has no colour mosaic")
     if any(n < cells for n, cells in zip(_green_shape(study), CELLS, strict=True)):
@@ -62,7 +65,7 @@ def green_block(study: Study) -> Block:
     covariance = np.diag([r.std**2 + GREEN_FLOOR**2 for r in ratios]) + common
     labels = [Label(r.x, "G", r.condition, r.captures, r.held_out) for r in ratios]
     number = CELLS[0] * CELLS[1]
-    for held_out, (image, noise) in sorted(images.items()):  # what is seen first
+    for held_out, (image, noise) in sorted(images.items()):  # seen frames first
         red_rows, blue_rows = green_planes(study, image)
         place = _cell_means(red_rows) / _cell_means(blue_rows)
         members = tuple(c.id for u in levels if u.held_out == held_out for c in u.captures)
@@ -75,7 +78,7 @@ def green_block(study: Study) -> Block:
         bigger[:size, :size] = covariance
         bigger[size:, size:] = (study.noise.prnu**2 + noise) * one + GREEN_FLOOR**2 * np.eye(number)
         if held_out and False in images:
-            # the pixels' own responses are the same in both
+            # PRNU is the same in seen and held-out frames
             bigger[size:, size - number : size] = study.noise.prnu**2 * one
             bigger[size - number : size, size:] = study.noise.prnu**2 * one
         covariance = bigger
@@ -93,7 +96,8 @@ def green_block(study: Study) -> Block:
 
 
 def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
-    """Variance of the greens' difference from frame to frame beyond shot and read noise, DN^2: row noise."""
+    """Variance of the greens' difference from frame to frame beyond shot and read noise, DN^2: row noise. It is reduced by about its
+    uncertainty, so that chance isn't taken for row noise; at least 0."""
     excess, weights = 0.0, 0.0
     for u in levels:
         signal = u.mean["G2"]
@@ -102,7 +106,7 @@ def _rows_dn2(study: Study, levels: Sequence[FlatLevel]) -> float:
             weight = (len(u.ratios) - 1) / shot**2
             excess += weight * (float(np.var(u.ratios, ddof=1)) * signal**2 - shot)
             weights += weight
-    # what chance makes of none isn't taken for some
+
     return max(excess / weights - weights**-0.5, 0.0) if weights > 0 else 0.0
 
 
@@ -117,8 +121,12 @@ def _green_shape(study: Study) -> tuple[int, int]:
 
 
 def _share(rows: FloatArray | int, cols: FloatArray | int) -> Any:
-    """Variance, of pixels of variance 1, of the mean of rows x cols green pixels less that of their four neighbours' means: 1 / n of the one;
-    of the other, whose (rows + 1) x (cols + 1) pixels count half at a border, the squared weights' sum, (m - 1/2) / m^2 along each side."""
+    """Variance of the difference of two means, for pixels of variance 1: of n = rows x cols green pixels, and of the means of their four
+    neighbours.
+
+    The first has 1 / n. The second is over (rows + 1) x (cols + 1) pixels, which count half at a border: along a side of m its sum of
+    squared weights is (m - 1/2) / m^2.
+    """
     count = rows * cols
     return 1.0 / count + (rows - 0.5) * (cols - 0.5) / count**2
 
@@ -130,6 +138,7 @@ def _cell_shares(shape: tuple[int, int]) -> FloatArray:
 
 
 def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> list[_Ratio]:
+    """The ratios of flats, one a level."""
     found = []
     for u in levels:
         signal = u.mean["G2"]
@@ -146,6 +155,7 @@ def _by_level(study: Study, levels: Sequence[FlatLevel], rows_dn2: float) -> lis
 
 
 def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
+    """The ratios of unclipped narrowband captures, one a capture."""
     found = []
     groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     for i, group in enumerate(groups):
@@ -168,11 +178,12 @@ def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
     return found
 
 
-#: Quantities of the stages that even light's fine structure depends on.
+#: Quantities of the stages by which neighbouring pixels differ in uniform light.
 GREENS = frozenset({"light.rows", "charge.collected", "charge.kernels"})
 
 
 def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:
+    """The ratio less 1 in a small uniform frame of the measured signals, with effects."""
     shape = TILE_ROWS, TILE_COLS
     electrons = {c: np.full(shape, max(m, 0.0) / study.noise.gain) for c, m in ratio.mean.items()}
     tile = mosaic.assemble(electrons, study.camera.cfa)

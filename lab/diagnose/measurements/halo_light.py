@@ -1,4 +1,4 @@
-"""Light that a lens spreads over the frame around a place."""
+"""Light that halos (wide, normal point spread) bring to a place from its surroundings."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sim.point import halos
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-LOWEST = 48  # harmonics of a frame: all that a halo of a fifth of its half diagonal leaves of a picture
+LOWEST = 48  # cosine harmonics a side: all that is left of a picture by a halo of a fifth of the half diagonal
 
 
 def halo_light(places: Sequence[Surroundings], effects: Effects, camera: CameraModel) -> FloatArray:
-    """Light that the effects' halos bring to places in planes of the mosaic from around, (places,), in the planes' unit."""
+    """Light (places,) that the effects' halos bring to places in planes of the mosaic, in the planes' unit."""
     step = mosaic.step(camera.cfa)
     found = np.zeros(len(places))
     for share, std_px in halos(camera, effects):
@@ -28,29 +28,29 @@ def halo_light(places: Sequence[Surroundings], effects: Effects, camera: CameraM
 
 
 def harmonics(picture: FloatArray) -> FloatArray:
-    """The lowest of a picture's cosine transform."""
+    """The lowest `LOWEST` x `LOWEST` coefficients of a picture's orthonormal cosine transform."""
     return np.asarray(fft.dctn(np.asarray(picture, float), norm="ortho")[:LOWEST, :LOWEST])
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Means of a picture about a place, weighted by normal distributions; what lies beyond the frame is its mirror image.
+    """Means of a picture about a place, weighted by normal distributions. The picture continues as its mirror image beyond the frame.
 
-    Cosine transforms turn the convolution into a product, of which wide distributions leave the lowest frequencies only.
+    The cosine transform turns the convolution into a product, of which wide distributions leave only the lowest frequencies.
     """
 
-    table: FloatArray  # of picture times place, (k, l)
-    rows: int
+    table: FloatArray  # (k, l): product of the transforms of picture and place
+    rows: int  # of the picture
     cols: int
 
     @staticmethod
     def of(low: FloatArray, place: NDArray[np.bool_]) -> Surroundings:
-        """`low`: the picture's lowest harmonics; `place`: the pixels about which the mean is wanted."""
+        """`low`: `harmonics` of the picture; `place` (rows, cols): mask of the pixels of the place."""
         return Surroundings(low * harmonics(place / place.sum()), *place.shape)
 
     @staticmethod
     def of_box(low: FloatArray, shape: tuple[int, ...], rows: slice, cols: slice) -> Surroundings:
-        """The same of a box in a picture of that shape."""
+        """The same for a box of rows and columns in a picture of that shape."""
         weights = [np.zeros(size) for size in shape]
         for weight, part in zip(weights, (rows, cols), strict=True):
             weight[part] = 1.0 / (part.stop - part.start)
@@ -58,7 +58,7 @@ class Surroundings:
         return Surroundings(low * np.outer(down, along), *shape)
 
     def mean(self, std_px: float) -> float:
-        """Weighted by a normal distribution of that standard deviation."""
+        """The mean weighted by a normal distribution of that standard deviation about each pixel of the place."""
         rows, cols = (
             np.exp(-0.5 * np.square(np.pi * std_px * np.arange(count) / size))
             for count, size in zip(self.table.shape, (self.rows, self.cols), strict=True)

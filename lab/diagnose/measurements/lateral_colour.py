@@ -1,4 +1,4 @@
-"""Lateral colour of a pattern on a screen: how far red and blue detail lies from green's."""
+"""Lateral colour of a pattern on a screen: displacement of its red and blue images from the green one."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from sim.point import displaced_um
 from sim.spectrum import Spectrum
 from sim.uniform import Uniform
 
-COLOUR_FLOOR_PX = (
-    0.012  # cells of whole pixels alias alike everywhere: what a drawing gets wrong there doesn't average out
-)
+COLOUR_FLOOR_PX = 0.012  # standard deviation beside noise: where cells are whole pixels, errors of the drawn pattern don't average out
 
 
 def colour_block(study: Study) -> Block:
-    """Displacement of a pattern's red and blue detail from green's, px: radial at two distances from the frame's middle, and tangential."""
+    """Displacement (px) of a pattern's red and blue images from the green one: radial at two distances from the frame's middle, and
+    tangential at one.
+
+    Raises NotDetermined for a camera without a green channel, and where no pattern is fitted.
+    """
     if "G" not in study.channels:
         raise NotDetermined("lateral_colour", "one channel: nothing to hold it against")
     points: list[tuple[Pattern, Pattern]] = []
@@ -39,7 +41,7 @@ def colour_block(study: Study) -> Block:
         for j, (q, other) in enumerate(points):
             if p.channel != q.channel or p.light is not q.light:
                 continue
-            # parts beyond the bands, which stand last, needn't be as many for every channel
+            # only these coefficients: channels may have different numbers of parts beyond the bands
             own = np.ix_(at, at)
             both = 0.5 * np.sum([one.common[own] for one in (p, q, green, other)], axis=0)
             if i == j:
@@ -67,8 +69,11 @@ def colour_block(study: Study) -> Block:
 def colour_shift_px(
     study: Study, channel: str, distance: float, light: Spectrum | None, effects: Effects, kind: str = "bernoulli"
 ) -> float:
-    """Radial displacement of a channel's detail from green's, px, at `distance` (half diagonals) from the middle: the mean of four
-    directions, weighted by the light that each channel detects."""
+    """Predicted radial displacement of a channel's image from the green one, px, at `distance` (half diagonals) from the middle.
+
+    It is the mean over four directions of the displacement by the effects, weighted over wavelengths by the photons that each channel
+    detects. `light` None: a flat spectrum; `kind`: of the capture.
+    """
     camera = study.camera
     wavelength = np.arange(400.0, 721.0, 10.0)
     half_um = camera.half_diagonal_um

@@ -1,4 +1,4 @@
-"""The scatter of repeated levels, beyond pixels' noise and what a steady lamp has: whether the light differs from frame to frame."""
+"""The scatter of repeated levels beyond that by pixels' noise and a steady lamp: whether the light changes from frame to frame."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from sim.uniform import Uniform
 #: Relative standard deviation of a steady lamp's light from frame to frame: data sheets of regulated halogen sources and integrating
 #: spheres state 0.05 %, twice that at most. No finding by itself.
 STEADY_LAMP = 5.0e-4
-#: Degrees of freedom of a number, at least, and how many numbers there are at most: by exposure.
+#: Least degrees of freedom of a number, and most numbers, each of settings of neighbouring exposures.
 LEAST_FREEDOM, MOST_NUMBERS = 4, 4
-#: Times at which a light that varies within a frame is looked at, for the variance of whole frames.
+#: Start times of frames at which a light that varies within a frame is evaluated.
 PHASES = 32
 
 
 def level_repeats_block(study: Study) -> Block:
-    """log((S + s0^2) / (noise + s0^2)) of flat settings with repeats, several of neighbouring exposures together.
+    """ln((S + s0^2) / (noise + s0^2)) of flat settings with repeats, pooled over neighbouring exposures.
 
-    S is the mean square of a setting's relative levels about their mean, with n - 1 degrees of freedom; noise what pixels' noise makes of
-    it; s0 a steady lamp's scatter. Image lag adds what the frames before leave in each repeat. Settings that are out of line with the others don't count: they are other measurements' finding.
+    S is the variance of a setting's relative levels, with n - 1 degrees of freedom; noise its expectation by the noise of pixels; s0 =
+    `STEADY_LAMP`. Image lag adds to S what each repeat's predecessor leaves in it. Settings out of line with the others are left out
+    (`steady`): other measurements find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of freedom.
     """
     groups = _by_exposure(_seen(study))
     if not groups:
@@ -39,10 +40,10 @@ def level_repeats_block(study: Study) -> Block:
     noise = np.array([_weighted(group, [r.noise for r in group]) for group in groups])
     square = np.array([sum(float(np.sum(np.square(r.away))) for r in group) for group in groups]) / freedom
     value = np.log((square + STEADY_LAMP**2) / (noise + STEADY_LAMP**2))
-    # of log chi2_f: mean and variance, as far as chi2 and not the lamp's floor sets it
+    # mean of ln(chi2_f / f), for the share of the variance that isn't the lamp's floor
     share = noise / (noise + STEADY_LAMP**2)
     bias = share * (digamma(0.5 * freedom) - np.log(0.5 * freedom))
-    # how unsteady a lamp usually is differs by as much as its usual size, and is common to all settings
+    # a lamp's usual unsteadiness is uncertain by its own size, and common to all settings
     usual = np.log1p(STEADY_LAMP**2 / (noise + STEADY_LAMP**2))
     covariance = np.diag(polygamma(1, 0.5 * freedom)) + np.outer(usual, usual)
     exposure_s = np.array([_weighted(group, [r.captures[0].exposure_s for r in group]) for group in groups])
@@ -65,7 +66,7 @@ def level_repeats_block(study: Study) -> Block:
 
 
 def _seen(study: Study) -> list[RepeatedMeans]:
-    """Repeats that aren't held out, of settings in line with each other."""
+    """The repeats that aren't held out, of settings in line with each other (`steady`)."""
     noise, out = study.noise, study.once(held_out_flats)
     found = []
     for one in repeated_levels(study, noise.black, noise.gain, noise.read_dn):
@@ -77,7 +78,7 @@ def _seen(study: Study) -> list[RepeatedMeans]:
 
 
 def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:
-    """Settings in the order of their exposure, in groups of `LEAST_FREEDOM` or more degrees of freedom."""
+    """Settings in the order of their exposure, in at most `MOST_NUMBERS` groups of at least `LEAST_FREEDOM` degrees of freedom."""
     ordered = sorted(repeats, key=lambda r: (r.captures[0].exposure_s, r.captures[0].id))
     whole = sum(len(r.away) - 1 for r in ordered)
     wanted = max(LEAST_FREEDOM, -(-whole // MOST_NUMBERS))
@@ -97,15 +98,15 @@ def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:
 
 
 def _weighted(group: list[RepeatedMeans], value: list[float]) -> float:
-    """Mean over settings by their degrees of freedom."""
+    """Mean over settings, weighted by their degrees of freedom."""
     return float(np.average(value, weights=[len(r.away) - 1 for r in group]))
 
 
 def _of_rows(model: Uniform, study: Study, exposure_s: float) -> float:
-    """Variance of whole frames' light that varies within a frame, over frames that begin at any time."""
+    """Relative variance of whole frames' levels in a light that varies within a frame, over the time at which frames begin."""
     if not model.varies_by_row:
         return 0.0
-    # steps of the golden ratio of a second meet every phase of any frequency
+    # multiples of the golden ratio of a second cover the phases of any frequency evenly
     begin_s = np.arange(PHASES) * 0.6180339887498949
     mean = [float(np.mean(model.row_factors(study.camera.rows, exposure_s, float(t)))) for t in begin_s]
     level: FloatArray = np.array(mean)
@@ -113,8 +114,8 @@ def _of_rows(model: Uniform, study: Study, exposure_s: float) -> float:
 
 
 def _of_lag(study: Study, effects: Effects, group: list[RepeatedMeans]) -> float:
-    """Mean square of what image lag adds to the repeats' relative levels, about the mean of each setting: the first often follows another
-    level."""
+    """Variance that image lag adds to the repeats' relative levels about the mean of each setting, as the first repeat often follows
+    another level."""
     carried, total = study.carried_e(effects), 0.0
     for repeats in group:
         signal_e = [

@@ -1,4 +1,4 @@
-"""All measurements, discovered: every module of this package is searched for declarations (`Measurement`)."""
+"""All measurements: every module of this package is searched for declarations (`Measurement`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lab.diagnose.measurements.block import Measurement
 
 @cache
 def measurements() -> tuple[Measurement, ...]:
-    """In the order of the report. Raises ValueError where two have the same name."""
+    """All measurements in the order of the report. Raises ValueError where two have the same name."""
     found: dict[str, Measurement] = {}
     for module in pkgutil.iter_modules(lab.diagnose.measurements.__path__):
         content = importlib.import_module(f"{lab.diagnose.measurements.__name__}.{module.name}")
@@ -23,5 +23,5 @@ def measurements() -> tuple[Measurement, ...]:
 
 
 def measurement_title(name: str) -> str:
-    """The words for a measurement in reports; the name's own where a stored result has one that is no longer there."""
+    """A measurement's title in reports; its name in words where it no longer exists, as in an older result."""
     return next((one.title for one in measurements() if one.name == name), name.replace("_", " "))

@@ -1,8 +1,8 @@
-"""What line noise of effects does to the means of single frames.
+"""Scatter of the means of single frames by row and column noise of effects.
 
-A row's disturbance is shared by its pixels, so that a frame's mean by channel scatters by more than its pixels' noise. Of n lines with
-the power spectrum S (e^2) across them, the mean over all lines has the variance S(0) / n, and half of the difference between even and
-odd lines S(1/2) / n. In a mosaic, channels on the same lines share both.
+The pixels of a line share its noise, so that the mean of a channel scatters by more than the noise of independent pixels. Of n lines
+whose noise has the power spectrum S(f) (e^2) across lines, the mean over all lines has the variance S(0) / n, and half of the
+difference between even and odd lines S(1/2) / n. In a mosaic, channels on the same lines share both.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-#: Strengths of a disturbance whose columns are kept.
+#: Most strengths of line noise whose columns are cached.
 MOST_KEPT = 16
 
 
 class LineMeans:
-    """Jacobian of a list of means by the disturbances that the lines of each capture have in them."""
+    """Jacobian of n frame means by the line noise of each capture: its mean over lines, and its even-odd difference."""
 
     def __init__(self, study: Study, points: Sequence[tuple[Capture, str | None]]) -> None:
-        """`points`: capture and channel of every mean, no channel: of the whole frame."""
+        """`points`: n of (capture, channel); channel None: the mean of the whole frame."""
         self._study = study
         self._channels = [channel for _, channel in points]
         at: dict[str, list[int]] = {}
@@ -36,7 +36,7 @@ class LineMeans:
         self._kept: dict[tuple[str, str, float], dict[str, FloatArray]] = {}
 
     def jacobian(self, effects: Effects) -> dict[str, FloatArray]:
-        """Columns (points,), per standard deviation, DN. Nothing without effects that disturb lines."""
+        """Name of a nuisance parameter -> column (n,), DN per standard deviation. Empty without effects that add line noise."""
         columns: dict[str, FloatArray] = {}
         camera, gain = self._study.camera, self._study.noise.gain
         for one in Uniform(camera, effects).lines:
@@ -52,6 +52,7 @@ class LineMeans:
         return columns
 
     def _of_captures(self, lines: str, name: str, std_dn: float) -> Iterator[tuple[str, FloatArray]]:
+        """The columns of one strength, one for each capture."""
         sign = {c: 1.0 if name == "mean" else _even_over_odd(self._study, lines, c) for c in {*self._channels}}
         change = std_dn * np.array([sign[c] for c in self._channels])
         for capture, mine in self._at.items():
@@ -62,7 +63,7 @@ class LineMeans:
 
 
 def _even_over_odd(study: Study, lines: str, channel: str | None) -> float:
-    """Mean over a channel's lines of 1 on even and -1 on odd ones."""
+    """Mean over the lines of a channel of 1 on even lines and -1 on odd ones."""
     if channel is None or mosaic.step(study.camera.cfa) == 1:
         return 0.0
     phases = mosaic.phases(study.camera.cfa)[channel]

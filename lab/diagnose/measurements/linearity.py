@@ -1,4 +1,4 @@
-"""Photon transfer of flat fields: the mean level against the exposure."""
+"""Linearity of flat fields: the mean level against the exposure, or against the number of photons."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ from lab.fit.rounding import rounding_std_dn
 from sim.spectrum import FloatArray
 from sim.uniform import LEVEL, SPECTRAL, electron_rate
 
-LEVEL_FLOOR = 1.0e-4  # of a level, one for its repeats: non-linearity below what a linear camera may have, and rounding
-READING_COLOUR_STD = 5e-4  # of a lamp's reading, by channel: the radiometer's noise by wavelength
-RADIOMETER_STD = 0.002  # of a narrowband reading, common to the channels, where too few readings say less
+# Relative standard deviations.
+LEVEL_FLOOR = 1.0e-4  # of a level, common to its repeats: nonlinearity of a linear camera
+READING_COLOUR_STD = 5e-4  # of a radiometer's reading in one channel: its noise by wavelength
+RADIOMETER_STD = 0.002  # of a radiometer's reading, common to the channels; the most that narrowband readings may have
 
 
 def linearity_block(study: Study) -> Block:
-    """Mean of every flat frame by channel, DN, against the exposure.
+    """Mean of every unclipped flat frame by channel, DN, against the exposure, or the number of photons where that is stated.
 
-    Against the number of photons where that is stated in place of a radiance. Nuisance parameters: black level, dark current, each
-    channel's rate, the readings of the light. What remains is nonlinearity.
+    Nuisance parameters: black level, dark current, the electron rate of each channel in each lamp, and the radiometer's readings. What
+    remains is nonlinearity. Raises NotDetermined for flats without stated light, for fewer than three levels, and where fewer than
+    four means are unclipped.
     """
     groups = [g for g in study.flat_levels() if reading(study, g[0]) is not None and g[0].id not in study.misstated]
     if not groups and study.flat_levels():
@@ -47,7 +49,7 @@ def linearity_block(study: Study) -> Block:
     signal = np.maximum(value - noise.black - noise.dark_dn_per_s * exposures, 1e-3)
     of = {c.id: found for c, *_ in points if (found := reading(study, c)) is not None}
     readings = list({one.name: one for one in of.values()}.values())
-    # one reading of a lamp against its first, by channel: what the radiometer says changed between passes
+    # readings of a lamp against its first one, by channel: the change of the lamp between passes
     relative = relative_rates(study, readings)
     key = [(of[c.id].lamp, channel) for c, channel, *_ in points]
     scaled = exposures * np.array([relative[of[c.id].name, channel] for c, channel, *_ in points])
@@ -56,7 +58,7 @@ def linearity_block(study: Study) -> Block:
         mine = np.array([k == pair for k in key])
         low = mine & (signal < 0.6 * (study.saturation_dn - noise.black))
         use = low if low.sum() > 1 else mine
-        # the median: a level that contradicts the others mustn't move where the model is linear about
+        # the median isn't moved by a level that contradicts the others
         typical = weighted_median(signal[use] / scaled[use], scaled[use])
         rate[pair] = typical / noise.gain / float(study.field.light.mean())
     covariance = _level_covariance(study, study.flat_levels(), points, signal)
@@ -88,8 +90,10 @@ def linearity_block(study: Study) -> Block:
 def _changed(
     study: Study, readings: list[FlatLight], relative: Mapping[tuple[str, str], float], effects: Effects
 ) -> Mapping[tuple[str, str], float]:
-    """Rates of light in each channel, by (reading, channel), over those of the lamp's first reading, as effects change them. Light of one
-    wavelength, of which the photons are stated, changes alike at all levels: that is in its rate."""
+    """`relative` rates, (reading, channel) -> rate over that by the lamp's first reading, as effects on the spectrum change them.
+
+    Light stated in photons changes by the same factor at all levels, which is part of its free rate.
+    """
     if not acting(effects, SPECTRAL):
         return relative
     changed = dict(relative)
@@ -104,8 +108,10 @@ def _changed(
 def _of_readings(
     study: Study, readings: list[FlatLight], lights: list[FlatLight], channels: list[str]
 ) -> dict[str, tuple[float, np.ndarray]]:
-    """Relative standard deviations of the lamps' readings, and of each in every channel, by the name of their nuisance parameter, with
-    masks (n,) of the means that they move. Nothing where every lamp was read once: that is in its rate."""
+    """Nuisance parameters of the radiometer's readings: name -> (relative prior standard deviation, mask (n,) of the means it changes).
+
+    One for each reading, and one for each reading and channel. None where every lamp was read once, as its free rate covers that.
+    """
     found: dict[str, tuple[float, np.ndarray]] = {}
     if len(readings) == len({one.lamp for one in readings}):
         return found
@@ -119,7 +125,8 @@ def _of_readings(
 
 
 def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], signal: FloatArray) -> FloatArray:
-    """Of flat frames' levels: shot and read noise, the lamp's repeatability (common to a frame's channels), and what repeats share."""
+    """Covariance (n, n) of flat frames' means, DN^2: shot and read noise, the lamp's repeatability (common to a frame's channels), and
+    floor and rounding (common to repeats)."""
     noise = study.noise
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
     group_of = {c.id: i for i, group in enumerate(groups) for c in group}
@@ -137,14 +144,14 @@ def _level_covariance(study: Study, groups: list[list[Any]], points: list[Any], 
 
 
 def _setting(capture: FlatCapture) -> str:
-    """What flats of one level share, in words."""
+    """The setting of a flat in words: exposure, and photons where they are stated."""
     if capture.photons_per_pixel is None:
         return f"{capture.exposure_s:.4g} s"
     return f"{capture.photons_per_pixel:.6g} photons, {capture.exposure_s:.4g} s"
 
 
 def _flat_points(study: Study, groups: list[list[Any]]) -> list[tuple[Any, str, float, bool]]:
-    """(capture, channel, mean DN, held out) of every flat frame's unclipped channels."""
+    """(capture, channel, mean in DN, held out) of all unclipped channels of flat frames."""
     points = []
     out = study.once(held_out_flats)
     for group in groups:

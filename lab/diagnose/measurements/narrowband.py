@@ -21,19 +21,19 @@ from lab.fit.rounding import rounding_std_dn
 from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import LEVEL, SPECTRAL
 
-NARROWBAND_FLOOR = 1e-4  # of a level, each channel by itself, one for its repeats
-
-
-READING_SAMPLE_STD = 1e-3  # of a narrowband reading, sample by sample, where no repeats tell
-MOST_SAMPLE_STD = 4e-3
-READING_STD = 1e-4  # least relative standard deviation of readings
-_READINGS = 8  # wavelengths from which on their standard deviation is measured
+# Relative standard deviations.
+NARROWBAND_FLOOR = 1e-4  # of a level, independent between channels, common to its repeats
+READING_SAMPLE_STD = 1e-3  # of a sample of a radiometer's reading, where no wavelength was read twice
+MOST_SAMPLE_STD = 4e-3  # the most that is measured of it
+READING_STD = 1e-4  # the least of a reading, common to the channels
+_READINGS = 8  # readings from which on their standard deviation is measured
 
 
 def narrowband_block(study: Study) -> Block:
-    """Mean of every narrowband frame by channel, DN, against the maker's curves.
+    """Mean of every unclipped narrowband frame by channel, DN, against the maker's sensitivity curves.
 
-    Nuisance parameters: black level, dark current, and a smooth few per cent of the curves.
+    Nuisance parameters: black level, dark current, and smooth errors of the curves (`curves`). Raises NotDetermined where the curves
+    aren't stated, and for fewer than four means.
     """
     if not study.stated.quantum_efficiency:
         raise NotDetermined(
@@ -70,7 +70,7 @@ def narrowband_block(study: Study) -> Block:
     light_of = np.array([every.index(path) for path in {c.id: c.radiance for c, *_ in points}.values()])
 
     def jacobian_of(effects: Effects, share: FloatArray) -> dict[str, FloatArray]:
-        """By the nuisance parameters; `share`: DN over electrons a second on axis."""
+        """Name of a nuisance parameter -> derivative (n,), DN. `share` (n,): DN for an electron a second on axis."""
         jacobian = study.free_offsets(exposures) | study.free_warmth([c for c, *_ in points])
         jacobian |= levels.lines.jacobian(effects)
         return jacobian | {k: v * share for k, v in curves.jacobian(effects).items()}
@@ -78,7 +78,7 @@ def narrowband_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
         if not acting(effects, LEVEL | LAG | DARK_CURRENT):
-            # what acts on the light's colours alone leaves signals in proportion to its rates
+            # effects on the spectrum alone: signals are proportional to the rates
             share = noise.gain * float(study.field.light.mean()) * exposures
             return Prediction(
                 noise.black + noise.dark_dn_per_s * exposures + share * rates, jacobian_of(effects, share)
@@ -98,7 +98,8 @@ def narrowband_block(study: Study) -> Block:
 def _narrowband_covariance(
     study: Study, points: list[tuple[Any, str, float, bool]], signal: FloatArray, curves: CurveJacobian
 ) -> FloatArray:
-    """Of narrowband signals: shot and read noise, what repeats share, the radiometer's reading, the lamp's repeatability."""
+    """Covariance (n, n) of narrowband means, DN^2: shot and read noise, floor and rounding (common to repeats), the radiometer's readings,
+    and the lamp's repeatability (common to a frame's channels)."""
     noise = study.noise
     exposures = np.array([c.exposure_s for c, *_ in points])
     pixels = np.array([study.levels(c).pixels[channel] for c, channel, *_ in points])
@@ -123,11 +124,11 @@ def _narrowband_covariance(
 
 
 def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expected: FloatArray) -> float:
-    """Relative standard deviation of a radiometer's readings that all channels share, from the second differences between neighbouring
-    wavelengths; at most RADIOMETER_STD, so that no structure of the light's or the filters' passes for noise.
+    """Relative standard deviation s of a radiometer's readings, common to the channels, from second differences along wavelength.
 
-    Neighbours u_1, u_2, u_3 in relative deviation: u_2 - (u_1 + u_3) / 2 has variance 1.5 s^2 beside that of the noise; the median of
-    the magnitudes leaves a few outlying wavelengths out.
+    With u the ln of measured over expected signal at neighbouring wavelengths, u_2 - (u_1 + u_3) / 2 has the variance 1.5 s^2 + that of
+    the noise. The median of its magnitude isn't moved by a few outlying wavelengths. At most `RADIOMETER_STD`, so that structure of
+    the light or of filters isn't taken for noise; that, too, for fewer than `_READINGS` readings.
     """
     deviation: dict[str, tuple[float, float, float]] = {}
     by_frame: dict[str, list[int]] = {}
@@ -152,8 +153,12 @@ def _reading_std(points: list[Any], signal: FloatArray, shot: FloatArray, expect
 
 
 def _sample_std(repeats: Iterable[Sequence[Spectrum]]) -> float:
-    """Relative standard deviation of a radiometer's readings from sample to sample, from those of one wavelength each: of the log ratio of two
-    readings about its mean, over sqrt 2, where the light exceeds a tenth of its peak; the median of all pairs."""
+    """Relative standard deviation of a sample of a radiometer's reading, independent of its neighbours. `repeats`: the readings of each
+    wavelength.
+
+    Of two readings: the standard deviation of their log ratio over sqrt 2, at samples above a tenth of the peak. The median over pairs
+    is taken, at most `MOST_SAMPLE_STD`.
+    """
     found = []
     for readings in repeats:
         for first, second in pairwise(readings):

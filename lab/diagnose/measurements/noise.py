@@ -13,12 +13,15 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import NOISE_NODES, Uniform
 
-VARIANCE_FLOOR = 0.002  # of a variance: what clipping and rounding leave
-GAIN_STD, READ_STD = 0.3, 0.3  # of the first guesses of conversion gain and dark variance
+VARIANCE_FLOOR = 0.002  # relative standard deviation of a variance beside chance: rounding, a few clipped pixels
+GAIN_STD, READ_STD = 0.3, 0.3  # relative prior standard deviations of conversion gain and dark variance
 
 
 def variance_block(study: Study) -> Block:
-    """Temporal variance of flats by channel, DN^2, against their mean. Nuisance parameters: gain and read noise."""
+    """Temporal variance of flats by channel, DN^2, against their mean signal.
+
+    Nuisance parameters: conversion gain, and read noise at each gain setting. Raises NotDetermined for fewer than four variances.
+    """
     of_channel = channel_planes(study)
     points: list[tuple[Repeats, str, float, float, float]] = []
     for repeats in study.once(flat_repeats):
@@ -70,14 +73,16 @@ def variance_block(study: Study) -> Block:
 
 
 def channel_planes(study: Study) -> dict[str, list[str]]:
-    """The mosaic's planes by channel."""
+    """Channel -> names of its planes of the mosaic."""
     names = list(mosaic.planes(np.zeros((2, 2)), study.camera.cfa))
     return {channel: [n for n in names if n[0] == channel] for channel in study.channels}
 
 
 def behind(signal_e: FloatArray, light: FloatArray, effects: Effects, study: Study) -> tuple[FloatArray, FloatArray]:
-    """Electrons (levels, points of the field) behind repeats_of mean signals (levels,) in uniform light that falls off as `light`
-    says (of mean 1), and the response's slope there: the effects' response undone by three fixed-point steps."""
+    """Electrons (levels, points of the field) that give the measured mean signals (levels,), e, and the response's slope there.
+
+    `light` (points,): relative illumination, of mean 1. A nonlinear response is inverted by three fixed-point steps.
+    """
     model = Uniform(study.camera, effects)
     electrons = np.maximum(signal_e[:, None] * light, 1e-3)
     if model.is_linear:
@@ -92,7 +97,7 @@ def behind(signal_e: FloatArray, light: FloatArray, effects: Effects, study: Stu
 
 
 def coded_variance(dn: FloatArray, dn2: FloatArray, effects: Effects, study: Study) -> FloatArray:
-    """Temporal variance (DN^2) of normal variables of means `dn` and variances `dn2` after the converter's codes."""
+    """Variance (DN^2) of normal variables of means `dn` and variances `dn2`, in a converter's codes, by quadrature."""
     values = dn[..., None] + np.sqrt(dn2)[..., None] * NOISE_NODES
     return np.asarray(Uniform(study.camera, effects).codes(values).var(axis=-1))
 

@@ -1,4 +1,4 @@
-"""First guesses of black level, dark current, gain, read noise and fixed pattern, and how repeatable levels are."""
+"""First estimates of black level, dark current, gain, read noise and PRNU, and of the repeatability of levels."""
 
 from __future__ import annotations
 
@@ -27,44 +27,48 @@ from sim.spectrum import FloatArray
 if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
-STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # of a stated black level: what a data sheet may be off by
-BLACK_FLOOR_DN = 0.01  # of a frame's mean: rounding of a quiet camera
-USUAL_JITTER_DN = 0.02  # of a dark frame's mean, from repeat to repeat
-USUAL_PRNU = 0.008
-#: Local mean of a plane of the mosaic: box and border left out, px, and the plane's least side from which the box is taken. In smaller planes than
-#: LEAST_PLANE_PX the pixels' own response can't be told.
+STATED_BLACK_SHARE, STATED_BLACK_DN = 0.03, 2.0  # standard deviation of a stated black level, relative and absolute
+BLACK_FLOOR_DN = 0.01  # standard deviation of a frame's mean beside noise
+USUAL_JITTER_DN = 0.02  # usual standard deviation of a dark frame's mean, from repeat to repeat
+USUAL_PRNU = 0.008  # where no flats tell
+#: Local mean of a plane of the mosaic: side of the box and width of the border that is left out, px. The wide one is used in planes of
+#: at least `WIDE_PLANE_PX` a side. In planes below `LEAST_PLANE_PX` PRNU isn't measured.
 WIDE_WINDOW_PX, NARROW_WINDOW_PX = (9, 6), (3, 1)
 WIDE_PLANE_PX, LEAST_PLANE_PX = 24, 6
-ALIKE_C = 2.0  # dark captures whose temperatures are that close count as of one
+ALIKE_C = 2.0  # dark captures whose temperatures differ by less than this from the nearest count as of one temperature
 
 
 @dataclass(frozen=True)
 class NoiseGuess:
-    """First guesses, good to a few per cent: nuisance parameters are linear about these."""
+    """First estimates, good to a few per cent. Predictions are linear in the nuisance parameters about these."""
 
-    black: float
+    black: float  # DN
     dark_dn_per_s: float
-    dark_c: float | None  # the sensor's temperature at which the dark current holds
-    gain: float  # 1 where nothing tells it
+    dark_c: float | None  # temperature of the sensor that the dark current holds for
+    gain: float  # DN/e; 1 where nothing tells it
     gain_is_known: bool
     read_dn: float
-    prnu: float
-    jitter_dn: float  # of a dark frame's mean
-    jitter_lamp: float  # of a flat frame's mean, relative
-    black_std: float  # of the guess
-    dark_std: float  # DN/s, of the guess
+    prnu: float  # relative
+    jitter_dn: float  # standard deviation of a dark frame's mean, from repeat to repeat
+    jitter_lamp: float  # relative standard deviation of a flat frame's mean, from repeat to repeat
+    black_std: float  # standard deviation of `black`
+    dark_std: float  # standard deviation of `dark_dn_per_s`
 
     def spread_dn2(self, signal_dn: FloatArray) -> FloatArray:
-        """Variance of pixels at a signal before rounding; read noise that rounding hides counts for nothing."""
+        """Variance (DN^2) of pixels at a signal before rounding: shot noise, read noise (0 where rounding hides it), PRNU."""
         return np.asarray(self.gain * signal_dn + unrounded(self.read_dn**2) + (self.prnu * signal_dn) ** 2)
 
 
 def noise_guess(study: Study) -> NoiseGuess:
+    """First estimates from dark and flat captures; what they don't determine is taken from the data sheet, else a usual value.
+
+    The gain is the slope of temporal variance over signal of repeated flats, else the stated one, else that of any repeats.
+    """
     recordings, stated = study.recordings, study.stated
     black = stated.black_level_dn if stated.black_level_dn is not None else 0.0
     dark, read, jitter = 0.0, 1.0, BLACK_FLOOR_DN
     dark_c = study.temperature_c
-    # the dark current is anything: within reason, what a data sheet says or some tens of electrons
+    # without dark frames: a dark current as stated, or of some tens of electrons
     expected = stated.dark_current_e_per_s if stated.dark_current_e_per_s is not None else 50.0
     dark_std = max(expected * (stated.conversion_gain_dn_per_e or 1.0), 0.5)
     black_std = 0.05 * study.camera.white_level_dn
@@ -72,7 +76,7 @@ def noise_guess(study: Study) -> NoiseGuess:
         black_std = max(STATED_BLACK_DN, STATED_BLACK_SHARE * black)
     darks = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
     if darks:
-        # at one temperature, at which most captures were taken: what the others change isn't the baseline's
+        # at one temperature, that of most captures: the baseline's dark current doesn't depend on it
         off = [0.0 if study.temperature_c is None or g[0].temperature_c is None else abs(g[0].temperature_c - study.temperature_c) for g in darks]  # fmt: skip
         sound = study.once(sound_pixels)
         frames_mean = [np.array([float(recordings.frame(c).mean(where=sound)) for c in g]) for g in darks]
@@ -84,9 +88,9 @@ def noise_guess(study: Study) -> NoiseGuess:
             dark, black = (float(v) for v in np.polyfit(t, level, 1))
             dark = max(dark, 0.0)
             warm = [c for i in near for c in darks[i] if c.temperature_c is not None]
-            if warm:  # the longest ones tell
+            if warm:  # long exposures determine the dark current
                 dark_c = float(np.average([c.temperature_c for c in warm], weights=[c.exposure_s for c in warm]))
-            dark_std = max(dark, 0.5)  # effects (a glow) may be all of it
+            dark_std = max(dark, 0.5)  # an effect such as glow may be all of it
         else:
             black = float(level[0])
             black_std += dark_std * float(t[0])
@@ -111,14 +115,15 @@ def noise_guess(study: Study) -> NoiseGuess:
 
 
 def _transfer_points(study: Study, black: float) -> tuple[list[float], list[float], float]:
-    """Signal and temporal variance (DN, DN^2) of repeated flats by level and channel; PRNU from what is between them and saturation."""
+    """Signal (DN) and temporal variance (DN^2) of repeated flats by level and channel; and the PRNU, of the last plane whose signal is
+    between 0.3 and 0.8 of saturation."""
     step, prnu = mosaic.step(study.camera.cfa), USUAL_PRNU
     signal, variance = [], []
     for group in study.flat_levels():
         if len(group) < 2:
             continue
         frames = [study.recordings.frame(c) for c in group]
-        evened = [_even_rows(f, step) for f in frames]  # a light that flickers is no shot noise
+        evened = [_even_rows(f, step) for f in frames]  # without flicker of the light
         freedom = 1.0 - step / frames[0].shape[1]
         for channel in study.channels:
             planes = [study.pixels_of(f, channel) for f in frames]
@@ -136,15 +141,19 @@ def _transfer_points(study: Study, black: float) -> tuple[list[float], list[floa
 
 
 def variance_between_pixels(plane: FloatArray) -> float:
-    """Variance (DN^2) of a plane (rows, cols) about its local mean over w x w pixels, in which each pixel has a share of 1 / w^2: that much of the
-    variance is put back. Planes too small for the wide window get the narrow one."""
+    """Variance (DN^2) between the pixels of a plane (rows, cols), about the local mean over w x w pixels.
+
+    The local mean holds 1 / w^2 of the pixel itself: the variance is divided by 1 - 1 / w^2. Planes below `WIDE_PLANE_PX` get the
+    narrow window.
+    """
     width, border = WIDE_WINDOW_PX if min(plane.shape) >= WIDE_PLANE_PX else NARROW_WINDOW_PX
     rough = (plane - ndimage.uniform_filter(plane, width))[border:-border, border:-border]
     return float(rough.var() / (1.0 - 1.0 / width**2))
 
 
 def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
-    """DN/e by repeats of whatever was seen: temporal variance over signal, of pixels alike in signal; None without repeats."""
+    """Gain (DN/e) from two repeats of any scene: temporal variance over signal, in eight bins of pixels of similar signal. None without
+    repeats."""
     signal, variance = [], []
     for group in study.groups(None, lambda c: c.model_dump_json(exclude={"id", "frame", "time", "temperature_c"})):
         if len(group) < 2 or group[0].kind == "dark":
@@ -163,7 +172,8 @@ def _scene_gain(study: Study, black: float, read_dn: float) -> float | None:
 
 
 def _transfer_slope(signal: FloatArray, variance: FloatArray, read_dn: float) -> float:
-    """DN/e: of the line from the read noise through temporal variances over signal, each by its own size."""
+    """Gain (DN/e): slope of the temporal variance over signal, of a line through the read noise's variance at signal 0, weighted by the
+    inverse variance."""
     weight = 1.0 / np.maximum(variance, 1e-9)
     return float(np.sum(weight * signal * (variance - read_dn**2)) / np.sum(weight * signal**2))
 
@@ -179,10 +189,10 @@ def _even_rows(frame: Any, step: int) -> FloatArray:
 
 
 def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[FloatArray], own_dn2: float) -> float:
-    """Standard deviation of the repeats' means, less what changes evenly with time in all groups alike: that is a drift.
+    """Standard deviation of the repeats' means (DN) about a linear drift with time that all groups have in common.
 
-    Settings that scatter out of line don't count (`steady`). Of few repeats it is pulled towards what is usual: `USUAL_JITTER_DN` beside
-    the pixels' own noise, whose variance in a frame's mean is `own_dn2`, counts as two repeats.
+    Settings out of line are left out (`steady`). With few repeats it is shrunk towards the usual: the variance `USUAL_JITTER_DN`^2 +
+    `own_dn2`, that of a frame's mean by its pixels' noise, counts as two degrees of freedom.
     """
     repeats = []
     for group, mean in zip(groups, means, strict=True):
@@ -203,7 +213,8 @@ def _jitter(study: Study, groups: Sequence[Sequence[Capture]], means: Sequence[F
 
 
 def pair_variance(frames: Sequence[Any]) -> float:
-    """Temporal variance from repeats: mean over pixels of the sample variance, frames' means taken out."""
+    """Temporal variance of a pixel (DN^2) from repeats: mean over pixels of the sample variance, after each frame's mean is subtracted.
+    0 for a single frame."""
     stack = np.stack([np.asarray(f, np.float32) - np.float32(np.mean(f, dtype=float)) for f in frames])
     n = len(frames)
     return (

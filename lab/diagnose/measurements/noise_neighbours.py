@@ -1,4 +1,4 @@
-"""The correlation of the temporal noise of neighbouring pixels."""
+"""The correlation of the temporal noise of neighbouring pixels, in the dark and in uniform light."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ from sim.sensor.electrons import passed_on
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
-CORRELATION_FLOOR = 3e-4  # of a correlation: what the pixels' own shares of taken-out means leave
+CORRELATION_FLOOR = 3e-4  # standard deviation of a correlation beside chance
 
 
 def neighbour_block(study: Study) -> Block:
-    """Correlation of the temporal noise of neighbouring pixels by level of light and in the dark: none where pixels are
-    independent, whatever gain, noise and level are."""
+    """Correlation of the temporal noise of neighbouring pixels (`PAIRS`), by level of light and in the dark.
+
+    It is 0 where pixels are independent, whatever gain, noise and level are. Raises NotDetermined without repeats whose noise
+    exceeds a code.
+    """
     points = [r for r in (*study.once(dark_repeats), *study.once(flat_repeats)) if np.all(np.isfinite(r.correlation))]
     if not points:
         raise NotDetermined(
@@ -76,10 +79,11 @@ def correlations(
     rounding_e2: float,
     kernel: FloatArray | None,
 ) -> FloatArray:
-    """Predicted correlations by `PAIRS` in uniform light: the mean over the mosaic's phases.
+    """Predicted correlations by `PAIRS` in uniform light, (6,): means over the phases of the mosaic.
 
-    By plane: shot noise's variance and the share of each neighbour's departure that a pixel takes over; read noise is each pixel's
-    own; `kernel` filters both within a plane; rounding comes last and is each pixel's own.
+    `shot_e2` and `share` (planes,): variance of the shot noise, and share of each neighbour's departure from its mean that a pixel
+    takes over. Read noise (`read_e2`) is independent. `kernel` filters both within a plane. Rounding (`rounding_e2`) is added last
+    and is independent.
     """
     period = 1 if cfa == "MONO" else 2
     at = dict.fromkeys(planes, (0, 0)) if period == 1 else _phase_of(cfa)
@@ -120,13 +124,14 @@ def correlations(
 
 
 def _four_neighbours(values: FloatArray) -> FloatArray:
-    """Sum of each pixel's four neighbours, nothing beyond the border."""
+    """Sum of each pixel's four neighbours, with zeros beyond the border."""
     wide = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
     wide[1:-1, 1:-1] = values
     return np.asarray(wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:])
 
 
 def _phase_of(cfa: Cfa) -> dict[str, tuple[int, int]]:
+    """(row, column) of each plane in the period of the mosaic."""
     index = np.arange(4).reshape(2, 2)
     return {name: divmod(int(plane[0, 0]), 2) for name, plane in mosaic.planes(index, cfa).items()}
 

@@ -1,4 +1,4 @@
-"""A random pattern on a screen, drawn on the camera's pixels where the registration places it."""
+"""A random pattern on a screen, drawn at the place in the camera's frame where the registration finds it."""
 
 from __future__ import annotations
 
@@ -23,31 +23,34 @@ from sim.point import optical_transfer
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
-OVERSAMPLE = 4
-LARGEST_PX = 320  # largest side of the part that is fitted: enough for a band's contrast to 1e-3
-MARGIN_PX = 12  # border of the frame and of that part that is left out: drawings there lack light from outside
-MARGIN_CELLS = 2.0
-#: Edges of the bands above half a cycle a pixel, by the larger of both frequencies: they are fitted, not measured.
-#: Rings beyond the bands, each with the finer rings at whose middles an effect's transfer is taken.
+OVERSAMPLE = 4  # samples a pixel, along rows and columns
+LARGEST_PX = 320  # largest side of the window that is fitted: enough for a band's contrast to 1e-3
+MARGIN_PX = 12  # border of frame and window that isn't fitted, as the drawing lacks the light from outside
+MARGIN_CELLS = 2.0  # border of the pattern that isn't fitted
+#: Rings above 0.5 cy/px, by the larger of |fx| and fy, that alias. Each is one term of the fit and isn't reported. The inner edges divide
+#: it into finer rings, at whose mean frequencies an effect's OTF is evaluated.
 BEYOND_CY_PER_PX = ((0.5, 0.54, 0.58, 0.62), (0.62, 0.68, 0.74, 0.8), (0.8, 0.9, 1.0, 1.15, 1.35, 4.0))
-LEAST_PIXELS = 1500
+LEAST_PIXELS = 1500  # of a channel
 
 
 def mask_points(mask: NDArray[np.bool_], window: tuple[slice, slice]) -> FloatArray:
-    """(x, y) in the frame of a mask's pixels, (pixels, 2)."""
+    """(x, y) in the frame, px, of the pixels that a mask of the window marks, (pixels, 2)."""
     row, col = np.nonzero(mask)
     return np.column_stack([col + window[1].start, row + window[0].start]).astype(float)
 
 
 def from_middle(camera: CameraModel, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Along columns and rows from the frame's middle, in half diagonals, and the squared distance."""
+    """x and y of points (n, 2) from the frame's middle, in half diagonals, and the squared distance; (n,) each."""
     half = camera.half_diagonal_px
     u, v = ((points - 0.5 * np.array([camera.cols - 1, camera.rows - 1])) / half).T
     return u, v, u * u + v * v
 
 
 def pattern_window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The part of the frame that is looked at: the pattern's middle, even numbers of rows and columns."""
+    """The window of the frame that is fitted: rows and columns about the pattern's middle, in even numbers and beginning at even ones.
+
+    Raises NotDetermined where the pattern lies outside the frame.
+    """
     row, col = (np.arange(0, n, 4) for n in seen.shape)
     x, y = np.meshgrid(col, row)
     cells = warp.cells(np.column_stack([x.ravel(), y.ravel()]).astype(float)).reshape(*x.shape, 2)
@@ -59,38 +62,38 @@ def pattern_window(seen: FloatArray, warp: ScreenWarp, shape: tuple[int, ...]) -
         low, high = max(int(at.min()) - MARGIN_PX, 0), min(int(at.max()) + MARGIN_PX + 4, length)
         size = 2 * (min(high - low, LARGEST_PX) // 2)
         low += (high - low - size) // 2
-        low -= low % 2  # mosaics keep their phase
+        low -= low % 2  # the mosaic keeps its phase
         slices.append(slice(low, low + size))
     return slices[0], slices[1]
 
 
 @dataclass(frozen=True)
 class BeyondPart:
-    """A part of the drawing beyond the bands: its picture, and the two frequencies (the same, mirrored) at which its power lies in the
-    mean."""
+    """A part of the drawn pattern at frequencies beyond the bands."""
 
-    picture: FloatArray
-    fx: tuple[float, float]
+    picture: FloatArray  # at the window's pixels
+    fx: tuple[float, float]  # mean |fx| and |fy| of its power, cy/px, in two quadrants: (fx, fy) and (fx, -fy)
     fy: tuple[float, float]
 
     @staticmethod
     def of(picture: FloatArray, fx: FloatArray, fy: FloatArray, power: FloatArray) -> BeyondPart:
-        """`power` (rows, cols / 2 + 1) of the part at the frequencies `fx` (1, cols / 2 + 1) and `fy` (rows, 1)."""
+        """The part whose power spectrum is `power` (rows, cols / 2 + 1), at the frequencies `fx` (1, cols / 2 + 1) and `fy` (rows, 1)."""
         x, y = (float(np.average(np.broadcast_to(np.abs(f), power.shape), weights=power)) for f in (fx, fy))
         return BeyondPart(picture, (x, x), (y, -y))
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """The pattern drawn by area on a window of the frame, `OVERSAMPLE` samples a pixel."""
+    """The pattern drawn on a window of the frame, each sample the mean over its area, `OVERSAMPLE` samples a pixel."""
 
     warp: ScreenWarp
     window: tuple[slice, slice]
-    fine: FloatArray
-    inside: NDArray[np.bool_]  # pixels well inside the pattern
+    fine: FloatArray  # (OVERSAMPLE rows, OVERSAMPLE cols): 0 on dark cells, 1 on lit ones
+    inside: NDArray[np.bool_]  # (rows, cols): pixels inside the margins of pattern and window
 
     @staticmethod
     def of(target: FloatArray, warp: ScreenWarp, window: tuple[slice, slice]) -> Canvas:
+        """Draw the cells `target` (rows, columns of the pattern), where `warp` places them."""
         y, x = (np.arange(w.start - 16.0, w.stop + 24.0, 8.0) for w in window)
         at = warp.cells(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
         row, col = (w.start + (np.arange(OVERSAMPLE * (w.stop - w.start)) + 0.5) / OVERSAMPLE - 0.5 for w in window)
@@ -105,21 +108,21 @@ class Canvas:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of the window, px."""
+        """Rows and columns of the window, px."""
         return self.inside.shape[0], self.inside.shape[1]
 
     @cached_property
     def drawn(self) -> NDArray[np.complex128]:
-        """The picture's transform, at all frequencies of its samples."""
+        """Fourier transform of `fine`, at all its frequencies."""
         return np.asarray(fft.rfft2(self.fine))
 
     @cached_property
     def low(self) -> NDArray[np.complex128]:
-        """The picture's transform below half a cycle a pixel: (rows, cols / 2 + 1), as of the window's own pixels."""
+        """Fourier transform of the drawn pattern up to 0.5 cy/px, (rows, cols / 2 + 1), as of point samples at the pixels' centres."""
         return self._below(self.drawn)
 
     def as_shown(self, effects: Effects, camera: CameraModel) -> NDArray[np.complex128]:
-        """As `low`, of the picture as a screen with effects shows it, over its lit state there."""
+        """As `low`, for the pattern as a screen with effects shows it, over the lit screen with the same effects."""
         y, x = (
             (w.start + (np.arange(n) + 0.5) / OVERSAMPLE - 0.5 * whole) * camera.pixel_pitch_um
             for w, n, whole in zip(self.window, self.fine.shape, (camera.rows, camera.cols), strict=True)
@@ -133,7 +136,7 @@ class Canvas:
         part = whole[:, : cols // 2 + 1] / OVERSAMPLE**2
         part = np.concatenate([part[: rows // 2], part[len(part) - rows // 2 :]])
         fy, fx = self.frequencies
-        # a sample is a mean over its square; a pixel's centre lies between samples
+        # divided by the sinc of a sample's square, and shifted from the first sample's centre to the pixel's
         turn = np.exp(1j * np.pi * (fx + fy) * (1.0 - 1.0 / OVERSAMPLE))
         return np.asarray(part * turn / (np.sinc(fx / OVERSAMPLE) * np.sinc(fy / OVERSAMPLE)))
 
@@ -143,19 +146,19 @@ class Canvas:
         return fft.fftfreq(self.shape[0])[:, None], fft.rfftfreq(self.shape[1])[None, :]
 
     def passed(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
-        """Transfer of a lens and of the pixel at these frequencies, (rows, cols / 2 + 1)."""
+        """OTF of a lens, symmetric about the axis, times that of the pixel's aperture at `frequencies`, (rows, cols / 2 + 1)."""
         fy, fx = self.frequencies
         return np.asarray(otf(np.hypot(fx, fy)) * aperture_otf(fx, fy, fill_factor))
 
     def picture(self, spectrum: NDArray[np.complex128]) -> FloatArray:
-        """Back to the window's pixels."""
+        """Inverse Fourier transform: the picture (rows, cols) at the window's pixels."""
         return np.asarray(fft.irfft2(spectrum, self.shape))
 
     def beyond(self, otf: CubicSpline, fill_factor: float) -> list[list[BeyondPart]]:
-        """What the lens passes above half a cycle a pixel, at the pixels: by ring and by whether it lies nearer to rows or columns, each
-        in finer rings.
+        """The aliased parts of the picture, from frequencies above 0.5 cy/px that the lens passes: a list for each ring and each pair of
+        opposite sectors (|fx| >= |fy| or not), of its finer rings.
 
-        Cells of whole pixels repeat their spectrum: what aliases is coherent with what doesn't.
+        Where cells are a whole number of pixels the spectrum repeats, and aliases are coherent with what lies below 0.5 cy/px.
         """
         above = self._above(otf, fill_factor)
         found = []
@@ -172,12 +175,13 @@ class Canvas:
         return found
 
     def beyond_picture(self, otf: CubicSpline, fill_factor: float) -> FloatArray:
-        """All of `beyond` together, at the pixels (rows, cols)."""
+        """The sum of all parts of `beyond`, (rows, cols)."""
         above = self._above(otf, fill_factor)
         inside = above.between(BEYOND_CY_PER_PX[0][0], BEYOND_CY_PER_PX[-1][-1])
         return self._aliased(np.where(inside, above.spectrum, 0.0), above.rows)
 
     def _above(self, otf: CubicSpline, fill_factor: float) -> _Above:
+        """The spectrum of the drawn pattern behind lens and pixel, up to the lens's cutoff."""
         rows, cols = (OVERSAMPLE * n for n in self.shape)
         highest = min(float(otf.x[-1]), 0.5 * OVERSAMPLE)
         keep = np.abs(fft.fftfreq(rows, 1.0 / OVERSAMPLE)) < highest
@@ -191,7 +195,7 @@ class Canvas:
         return _Above(np.where(radius < highest, high, 0.0), fx, fy, keep)
 
     def _aliased(self, part: NDArray[np.complex128], rows: NDArray[np.bool_]) -> FloatArray:
-        """A part of the spectrum above, as the pixels sample it."""
+        """The picture (rows, cols) of a part of that spectrum, sampled at the pixels. `rows`: which rows of the full spectrum it has."""
         cols = OVERSAMPLE * self.shape[1]
         spread = np.zeros((len(rows), part.shape[1]), complex)
         spread[rows] = part
@@ -202,27 +206,31 @@ class Canvas:
 
 @dataclass(frozen=True)
 class _Above:
-    """The drawn spectrum as far as the lens passes it, (kept rows, cols), its frequencies (cy/px), and which rows are kept."""
+    """The spectrum of the drawn pattern up to the lens's cutoff."""
 
-    spectrum: NDArray[np.complex128]
-    fx: FloatArray
-    fy: FloatArray
-    rows: NDArray[np.bool_]
+    spectrum: NDArray[np.complex128]  # (kept rows, kept columns)
+    fx: FloatArray  # (1, kept columns), cy/px
+    fy: FloatArray  # (kept rows, 1), cy/px
+    rows: NDArray[np.bool_]  # mask of the kept rows
 
     def between(self, low: float, end: float) -> NDArray[np.bool_]:
-        """Where the larger of both frequencies lies in [low, end)."""
+        """Mask of the frequencies with low <= max(|fy|, fx) < end."""
         largest = np.maximum(np.abs(self.fy), self.fx)
         return np.asarray((largest >= low) & (largest < end))
 
 
 def lens_otf(study: Study, channel: str, light: Spectrum | None) -> CubicSpline:
-    """The baseline's transfer without the pixel's aperture: it looks the same all around the axis."""
+    """OTF of the baseline's lens without the pixel's aperture, against frequency (cy/px). On axis it is the same in all directions."""
     f = np.linspace(0.0, 2.0, 101)
     whole = np.real(optical_transfer(study.camera, channel, light, f, 0.0 * f, (), "bernoulli"))
     return CubicSpline(f, whole / aperture_otf(f, 0.0 * f, study.camera.fill_factor))
 
 
 def channel_pixels(study: Study, canvas: Canvas, channel: str, seen: FloatArray) -> NDArray[np.bool_]:
+    """Mask (rows, cols) of the window's pixels of a channel inside the pattern. `seen`: the frame, NaN where the screen isn't.
+
+    Raises NotDetermined for fewer than `LEAST_PIXELS`.
+    """
     mask = canvas.inside & np.isfinite(seen[canvas.window])
     step = mosaic.step(study.camera.cfa)
     own = np.zeros_like(mask)
@@ -237,6 +245,6 @@ def channel_pixels(study: Study, canvas: Canvas, channel: str, seen: FloatArray)
 
 
 def below_nyquist(canvas: Canvas) -> NDArray[np.bool_]:
-    """Frequencies below half a cycle a pixel along both axes."""
+    """Mask of the frequencies below 0.5 cy/px along both axes."""
     fy, fx = canvas.frequencies
     return np.asarray((np.abs(fy) < 0.5) & (fx < 0.5))

@@ -1,4 +1,4 @@
-"""The contrast that a random pattern on a screen keeps, by spatial frequency, orientation and channel."""
+"""Contrast of the image of a random pattern over that of the baseline camera, by spatial frequency, orientation and channel."""
 
 from __future__ import annotations
 
@@ -14,17 +14,21 @@ from sim.point import TRANSFER_AT, common_wavelengths, detected_transfer, mixed,
 from sim.spectrum import FloatArray
 from sim.uniform import electron_rate
 
-LARGEST_STD = 0.04  # of a band's contrast: beyond, it says nothing
-CONTRAST_FLOOR = 0.0015  # of a band's contrast: drawing and registration
-CONTRAST_SCALE_STD = 0.01  # of a screen's level, for each channel of each part of the repeats
-SCREEN_BLUR_PX = 0.08  # standard deviation of a Gaussian: cells of a target needn't have sharp borders
-PLACINGS = 4  # steps in which a shifted picture is found
+LARGEST_STD = 0.04  # bands of a larger standard deviation aren't used
+CONTRAST_FLOOR = 0.0015  # standard deviation of a band's contrast beside noise: drawing and registration
+CONTRAST_SCALE_STD = (
+    0.01  # prior standard deviation of the contrast's scale, for each channel of seen and held-out repeats
+)
+SCREEN_BLUR_PX = 0.08  # prior standard deviation of the Gaussian blur of the cells' borders
+PLACINGS = 4  # Gauss-Newton steps that find an image's shift
 
 
 def contrast_block(study: Study) -> Block:
-    """Contrast of a random pattern over the baseline's, by frequency, orientation and channel.
+    """Contrast of a random pattern over that of the baseline, by frequency, orientation and channel: the bands' coefficients of
+    `pattern_fit`.
 
-    Nuisance parameters: the screen's levels, and a blur of its cells.
+    Nuisance parameters: the contrast's scale, and a blur of the screen's cells. Raises NotDetermined where no band is known to
+    `LARGEST_STD`.
     """
     found = patterns(study)
     labels: list[Label] = []
@@ -33,7 +37,7 @@ def contrast_block(study: Study) -> Block:
         for p in group:
             spread = np.sqrt(np.diag(p.shown + p.common))
             for b, band in enumerate(p.bands):
-                if spread[b] < LARGEST_STD and b > 0:  # the lowest band is the levels'
+                if spread[b] < LARGEST_STD and b > 0:  # the lowest band is that of white and black levels
                     places.append((number, p, b))
                     labels.append(Label(band.frequency, p.channel, f"{band.angle_deg:.0f} deg", p.captures, p.held_out))
     if not places:
@@ -42,7 +46,7 @@ def contrast_block(study: Study) -> Block:
     frequency = np.array([label.x for label in labels])
     covariance = joint_covariance(places, study) + np.diag(np.full(len(value), CONTRAST_FLOOR**2))
     scales = [f"pattern:{number}:{p.channel}:{p.held_out}" for number, p, _ in places]
-    # the held-out part of a pattern has the prediction of the seen part
+    # seen and held-out repeats of a pattern share one prediction
     poses: list[dict[str, tuple[Pattern, list[int], list[int]]]] = [{} for _ in found]
     for k, (number, p, b) in enumerate(places):
         _, members, parts = poses[number].setdefault(p.channel, (p, [], []))
@@ -80,7 +84,7 @@ def contrast_block(study: Study) -> Block:
 def _transfers(
     study: Study, sights: dict[str, tuple[Pattern, list[int], list[int]]], effects: Effects
 ) -> NDArray[np.complex128]:
-    """Of a pose's channels at the frequencies of all bands and of the parts beyond, one after another: (channels, nodes)."""
+    """OTFs of the channels of one pose, (channels, nodes), at the nodes of all bands and then of the parts beyond the bands."""
     camera, first = study.camera, next(iter(sights.values()))[0]
     fx = np.concatenate([*(b.fx for b in first.bands), first.beyond[:, 0].ravel()])
     fy = np.concatenate([*(b.fy for b in first.bands), first.beyond[:, 1].ravel()])
@@ -96,11 +100,11 @@ def _transfers(
 
 
 def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What a transfer's real and its imaginary part at all bands' nodes, and its real part at the places beyond the bands, do to the
-    bands' coefficients, (bands, nodes) each.
+    """Weights that take a ratio of OTFs to the bands' coefficients: of its real part and of its imaginary part at the bands' nodes,
+    (bands, nodes) each, and of its real part at the frequencies of the parts beyond, (bands, frequencies).
 
-    The real part is a sum of even powers of the frequency, by least squares over the nodes, and a rest. The rest and the imaginary part
-    act by their means over the lower and the upper half of every band.
+    The real part is split into even powers of the frequency, fitted over the nodes by least squares, and a rest. The rest, and the
+    imaginary part, enter by their means over the lower and the upper half of each band.
     """
     fx, fy = (np.concatenate([getattr(band, name) for band in p.bands]) for name in ("fx", "fy"))
     halves = np.zeros((2 * len(p.bands), len(fx)))
@@ -116,13 +120,15 @@ def _node_weights(p: Pattern) -> tuple[FloatArray, FloatArray, FloatArray]:
     powers = np.transpose(even_powers(fx, fy))
     weight = np.sqrt(np.concatenate([band.power * band.share for band in p.bands]))
     fit = np.linalg.pinv(weight[:, None] * powers) * weight
-    outside = 0.5 * np.repeat(by_part, 2, axis=1)  # of two places each
+    outside = 0.5 * np.repeat(by_part, 2, axis=1)  # two frequencies each
     return smooth @ fit + by_half @ (halves - halves @ powers @ fit), by_phase @ halves, outside
 
 
 def _in_place(p: Pattern, ratio: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """A change of transfer where the drawing is laid over the picture: a shift s that least squares find, of which
-    sum P f Im(ratio exp(-2 pi i f s)) = 0 along both axes (Gauss and Newton), isn't a loss of contrast."""
+    """A ratio of OTFs without the shift s that the registration would take up.
+
+    s solves sum over nodes of P f Im(ratio exp(-2 pi i f s)) = 0 along both axes, P the power of the pattern, by Gauss-Newton steps.
+    """
     if not np.any(np.abs(np.imag(ratio)) > 1e-6):
         return ratio
     turn = 2.0 * np.pi * np.array([np.concatenate([b.fx for b in p.bands]), np.concatenate([b.fy for b in p.bands])])

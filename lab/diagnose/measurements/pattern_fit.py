@@ -1,14 +1,14 @@
-"""The fit of a random pattern on a screen: a picture as a sum of parts of the drawn pattern.
+"""The fit of a random (Bernoulli) pattern on a screen: its image as a linear combination of parts of the drawn pattern.
 
-The Bernoulli pattern is drawn where the checkerboard says that it is (`lab.fit.psf.screen_registration`) and passed through the
-baseline's transfer function. The drawing P is split into bands P_b of frequency and orientation, and the picture is
+The pattern is drawn where the checkerboard captures place it (`lab.fit.psf.screen_registration`), and blurred by the baseline's OTF.
+The drawn pattern P is split into bands P_b of frequency and orientation. The recorded image, black subtracted and divided by white
+less black, is fitted by least squares over the pixels of each channel:
 
-    picture = sum over bands of c_b P_b + border P (1 - P) + ghost T + constant + shifts . gradient P + P beyond the bands
+    image = sum over bands of c_b P_b + border P (1 - P) + ghost T + constant + shifts . gradient P + parts of P beyond the bands
 
-with T the picture turned by half a turn about the frame's middle. The coefficients come from least squares over each channel's own
-pixels; a channel whose picture is displaced from green's is drawn at its own place. Under the baseline every c_b is 1 and all other
-coefficients are 0. Drawing and picture are sampled by the same pixels: aliasing is in both, and a band holds its own frequencies
-alone.
+T is the recorded image, rotated by 180 degrees about the frame's middle. For the baseline camera every c_b and the coefficients of
+the parts beyond are 1, all others 0. P is sampled at the same pixels as the image, so that both are aliased alike. A channel whose
+image is displaced from the green one is drawn at its own place.
 """
 
 from __future__ import annotations
@@ -50,65 +50,74 @@ from sim.frame import with_reflections
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum
 
-RINGS_CY_PER_PX = (0.0, 0.03, 0.08, 0.14, 0.2, 0.27, 0.34, 0.42, 0.5)
-SECTORS = 4  # orientations of a half turn: about 0, 45, 90, 135 degrees
-NODES = (4, 3)  # of a band, in radius and angle, at which an effect's transfer is taken
-#: Even powers of the frequency, up to this order in both directions together, in which a transfer's change is smooth over all bands; the
-#: rest acts by halves of bands. A pattern is strongest at low frequencies, and where its cells are a whole number of pixels, a mosaic's
-#: red and blue pixels see the same numbers at f and 1/2 cy/px - f: what is drawn wrongly within a strong band leaks into a weak one.
+RINGS_CY_PER_PX = (0.0, 0.03, 0.08, 0.14, 0.2, 0.27, 0.34, 0.42, 0.5)  # edges of the bands in frequency
+SECTORS = 4  # bands in orientation: about 0, 45, 90, 135 degrees
+NODES = (4, 3)  # of a band, in radius and angle, at which an effect's OTF is evaluated
+#: Highest total order of the even powers of (fx, fy) that describe an effect's change of the OTF over all bands; the rest enters by
+#: halves of bands. Where cells are a whole number of pixels, a mosaic's red and blue pixels have the same samples at f and
+#: 1/2 cy/px - f. Errors within a strong band at low frequencies would then leak into a weak one at high frequencies.
 EVEN_ORDER = 8
 EVEN_TERMS = sum(order + 1 for order in range(0, EVEN_ORDER + 1, 2))
-GHOST_BLUR_PX = 3.0
-LEAST_BEYOND = 5e-4  # of the contrast: weaker parts beyond the bands are taken as drawn
-REFINEMENTS = 2
+GHOST_BLUR_PX = 3.0  # standard deviation of the Gaussian blur of the ghost's term
+LEAST_BEYOND = (
+    5e-4  # contrast (rms) of the parts beyond the bands from which on they are fitted; weaker ones are taken as drawn
+)
+REFINEMENTS = 2  # Gauss-Newton steps of the registration
 FEWEST_CELLS = 400
-MOST_MOVES = 4  # of a channel's drawing: a linear step finds some half of a shift of half a cell
-SCALING = np.array([0.0, 0.0, 1.0, 1.0, 1.0])  # of the shifts (x, y, radial, radial^3, across): what an axis keeps
-MOVED_PX = 0.1  # a channel further off is drawn where it is: less shows as well where the blur is not the drawn one
+MOST_MOVES = 4  # times that a displaced channel is drawn anew: a linear step finds about half of a shift by half a cell
+SCALING = np.array(
+    [0.0, 0.0, 1.0, 1.0, 1.0]
+)  # the shifts (x, y, radial, radial^3, tangential) of a lens that scales an image
+MOVED_PX = 0.1  # a channel displaced by more is drawn anew; less may come from another blur than the drawn one
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A Bernoulli pattern of one pose, in one channel, in one part of its repeats: coefficients and their covariance."""
+    """The fit of one pattern, at one pose of the screen, in one channel, to its seen or its held-out repeats."""
 
     captures: tuple[str, ...]
     held_out: bool
     channel: str
     bands: tuple[Band, ...]
-    value: FloatArray  # (bands + MORE + parts beyond the bands,)
-    shown: FloatArray  # covariance by what differs from repeat to repeat
-    common: FloatArray  # ... and by what white, black and drawing share
-    mix: FloatArray  # (bands, EVEN_TERMS + 4 bands + parts): what even powers of the frequency, halves of bands, their phases, and parts beyond do to them
-    beyond: FloatArray  # (parts, 2, 2): frequencies (fx of two places, fy of two places) of the parts beyond the bands
-    shown_by: Callable[[Effects], FloatArray]  # as `value`: what screens that show greys otherwise change
-    levels_e: tuple[float, float]  # electrons of black and of white
+    value: (
+        FloatArray  # coefficients (k,): of the bands, the eight of `BORDER` to `ACROSS`, and the parts beyond the bands
+    )
+    shown: FloatArray  # (k, k): covariance by temporal noise of the repeats
+    common: FloatArray  # (k, k): covariance by what seen and held-out repeats share: white, black, registration
+    mix: FloatArray  # (bands, EVEN_TERMS + 4 bands + parts): change of the bands' coefficients by a unit of `_LinearModel.mix`'s terms
+    beyond: FloatArray  # (parts, 2, 2): (fx, fy) of the parts beyond the bands, cy/px, each at two frequencies
+    shown_by: Callable[[Effects], FloatArray]  # change of the coefficients by effects on the screen's light
+    levels_e: tuple[float, float]  # electrons on dark and on lit cells
     light: Spectrum | None
-    ghost: Callable[[Effects], float]  # the coefficient of the ghost under effects on the image as a whole
-    reach: float  # largest distance from the frame's middle in half diagonals
+    ghost: Callable[[Effects], float]  # change of the ghost's coefficient by reflections of the whole image
+    reach: float  # largest distance of its pixels from the frame's middle, half diagonals
     places_um: tuple[
         tuple[float, float], ...
-    ]  # (x, y) from the frame's middle, of the mean and the variances of the pixels that it was fitted to
+    ]  # four points (x, y) from the frame's middle with the mean and the variances of its pixels
 
 
-#: Coefficients behind the bands', in their order: cell borders, ghost, constant, shift x, shift y, radial, radial^3, across.
+#: Indices of the coefficients after the bands': cell borders, ghost, constant, shift x, shift y, radial, radial^3, tangential.
 BORDER, GHOST, CONSTANT, SHIFT_X, RADIAL, RADIAL3, ACROSS = 0, 1, 2, 3, 5, 6, 7
 
 
 @dataclass(frozen=True)
 class Band:
-    """A ring's sector: the mean frequency and orientation of the pattern's power in it, and nodes with their shares of it."""
+    """A band of frequency and orientation, and the nodes at which an effect's OTF is evaluated."""
 
-    frequency: float
+    frequency: float  # mean over the pattern's power, cy/px
     angle_deg: float
-    fx: FloatArray
-    fy: FloatArray
-    share: FloatArray
-    power: float  # of the pattern in it
-    upper: NDArray[np.bool_]  # nodes of the upper half of the frequencies
+    fx: FloatArray  # (nodes,), cy/px
+    fy: FloatArray  # (nodes,), cy/px
+    share: FloatArray  # (nodes,): share of the band's power
+    power: float  # of the pattern
+    upper: NDArray[np.bool_]  # (nodes,): in the upper half of the band's frequencies
 
 
 def patterns(study: Study) -> list[list[Pattern]]:
-    """Every Bernoulli pattern by channel and part; a list for each (pose, target), which share the light of white and black."""
+    """The fits of all Bernoulli patterns, computed once a study: a list for each (pose, target), by channel, seen and held out.
+
+    Raises NotDetermined where f-number or pixel pitch isn't stated, and where no pattern is fitted.
+    """
     return study.once(_patterns)
 
 
@@ -141,7 +150,7 @@ def _patterns(study: Study) -> list[list[Pattern]]:
 
 
 def mean_rate(study: Study, captures: Sequence[Capture]) -> FloatArray:
-    """Mean of the frames above black and dark current, DN a second of exposure."""
+    """Mean of the captures' frames above black level and dark current, DN/s. Raises NotDetermined where one is saturated."""
     recordings, noise = study.recordings, study.noise
     total = np.zeros((study.camera.rows, study.camera.cols))
     for capture in captures:
@@ -161,11 +170,12 @@ def _measured(
     boards: Sequence[Any],
     out: set[str],
 ) -> list[Pattern]:
+    """The fits of one pattern at one pose. `group`: its captures, of which those in `out` are held out; `boards`: checkerboards."""
     camera = study.camera
     white, black = mean_rate(study, whites), mean_rate(study, blacks)
     contrast = white - black
     for plane in mosaic.planes(contrast, camera.cfa).values():
-        plane[plane < 0.2 * np.quantile(plane, 0.98)] = np.nan  # where the screen isn't
+        plane[plane < 0.2 * np.quantile(plane, 0.98)] = np.nan  # beside the screen
     boards = [c for c in boards if c.target == boards[0].target]
     cells = study.recordings.target(group[0].target)
     if cells.size < FEWEST_CELLS or not 0.02 < float(np.mean(cells > 0)) < 0.98:
@@ -184,28 +194,28 @@ def _measured(
     for _ in range(REFINEMENTS):
         warp = _refined(study, whole, target, warp, window, reference, light)
     canvas = Canvas.of(target, warp, window)
-    # one set of frequencies for all channels, so that an effect's transfer is formed once
+    # the same nodes for all channels, so that an effect's OTF is evaluated once
     otfs = [lens_otf(study, channel, light) for channel in camera.channels]
     laid = np.sum([np.square(np.abs(canvas.low * canvas.passed(otf, camera.fill_factor))) for otf in otfs], axis=0)
     turned = ndimage.gaussian_filter(np.nan_to_num(whole), GHOST_BLUR_PX)[::-1, ::-1]
     found = []
     for channel in camera.channels:
-        design = _Design.of(study, canvas, channel, light, whole, turned, laid)
+        design = _LinearModel.of(study, canvas, channel, light, whole, turned, laid)
         picture = whole[window]
         points = mask_points(design.mask, window)
         drawn, moved = canvas, np.zeros(len(design.coefficients(picture[design.mask])[design.shifts]))
-        # too far for a linear step: the pattern is drawn anew at the shifted place, until the rest is small
+        # a shift too large for a linear step: the pattern is drawn anew at the displaced place, until the rest is small
         for _ in range(MOST_MOVES if channel != reference else 0):
             step = design.coefficients(picture[design.mask])[design.shifts]
             if np.abs(_field(camera, points, step)).max() <= MOVED_PX:
                 break
-            # where cells are a whole number of pixels, a loss of contrast looks like a shift of the whole: a lens scales colours
+            # where cells are a whole number of pixels, a loss of contrast looks like a common shift: a step without one is tried as well
             tried = []
             for part in (step, step * SCALING):
                 field = _field(camera, points, moved + part)
                 there = np.linalg.lstsq(warp.basis(points).T, field.T, rcond=1e-12)[0].T
                 displaced = Canvas.of(target, warp.displaced(there), window)
-                tried.append((part, displaced, _Design.of(study, displaced, channel, light, whole, turned, laid)))
+                tried.append((part, displaced, _LinearModel.of(study, displaced, channel, light, whole, turned, laid)))
             part, displaced, anew = min(tried, key=lambda one: one[2].left_rms(picture))
             if anew.left_rms(picture) >= design.left_rms(picture):
                 break
@@ -216,14 +226,13 @@ def _measured(
             float(np.nanmean(black[window][design.mask])) * exposure / study.noise.gain,
             float(np.nanmean(white[window][design.mask])) * exposure / study.noise.gain,
         )
-        ghost_by = _ghost_by(study, design, whole, window)
-        shown_by = _shown_by(study, design, drawn)
+        ghost_by, shown_by = _ghost_by(study, design, whole, window), _shown_by(study, design, drawn)
         solved = []
         for part, picture in zip(parts, seen, strict=True):
             dn = np.maximum(picture[window][design.mask] * area + black[window][design.mask], 0.0) * exposure
             temporal = (study.noise.gain * dn + study.noise.read_dn**2) / len(part) / (area * exposure) ** 2
             solved.append(design.solved(picture[window][design.mask], temporal))
-        # one for all parts, or what they share could exceed what one of them has
+        # one matrix for seen and held-out repeats, so that their joint covariance stays positive definite
         common = np.mean([c for *_, c in solved], axis=0)
         for value, *_ in solved:
             value[design.shifts] += moved
@@ -239,7 +248,7 @@ def _measured(
 
 
 def _places_um(camera: CameraModel, points: FloatArray) -> tuple[tuple[float, float], ...]:
-    """Four places (x, y) from the frame's middle, of the mean and the variances of pixels' places, (pixels, 2)."""
+    """Four points (x, y) from the frame's middle, um, whose mean and variances are those of `points` (pixels, 2), px."""
     middle, spread = (
         np.mean(points, axis=0) - 0.5 * np.array([camera.cols - 1, camera.rows - 1]),
         np.std(points, axis=0),
@@ -249,7 +258,7 @@ def _places_um(camera: CameraModel, points: FloatArray) -> tuple[tuple[float, fl
 
 
 def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> FloatArray:
-    """Where a pixel sees what would lie at itself without these shifts (x, y, radial, radial^3, across), less where it is: (2, pixels), px."""
+    """Displacement (2, pixels), px, at which a drawing is sampled for an image with these shifts (x, y, radial, radial^3, tangential)."""
     u, v, r2 = from_middle(camera, points)
     x, y, radial, radial3, across = shifts
     outwards = radial + radial3 * r2
@@ -257,9 +266,10 @@ def _field(camera: CameraModel, points: FloatArray, shifts: FloatArray) -> Float
 
 
 def _ghost_by(
-    study: Study, design: _Design, seen: FloatArray, window: tuple[slice, slice]
+    study: Study, design: _LinearModel, seen: FloatArray, window: tuple[slice, slice]
 ) -> Callable[[Effects], float]:
-    """Change of the ghost's coefficient by effects on the whole image: of the pattern's picture through them, over that of the lit screen."""
+    """Function of effects: change of the ghost's coefficient by their reflections. They act on the pattern's and on the lit screen's image,
+    whose ratio is fitted."""
     picture, lit = np.nan_to_num(seen), np.isfinite(seen).astype(float)
     weight = (design.inverse[len(design.bands) + GHOST] @ design.columns).astype(np.float32)
     before = picture[window][design.mask]
@@ -273,8 +283,9 @@ def _ghost_by(
     return coefficient
 
 
-def _shown_by(study: Study, design: _Design, canvas: Canvas) -> Callable[[Effects], FloatArray]:
-    """What effects on a screen's light do to a pattern's coefficients: it is drawn as the screen shows it, over the lit screen."""
+def _shown_by(study: Study, design: _LinearModel, canvas: Canvas) -> Callable[[Effects], FloatArray]:
+    """Function of effects: change (k,) of a pattern's coefficients by those on the screen's light. The pattern is drawn as such a screen
+    shows it, over the lit screen."""
     none = np.zeros(len(design.inverse))
 
     @lru_cache(maxsize=8)
@@ -298,7 +309,7 @@ def _refined(
     channel: str,
     light: Spectrum | None,
 ) -> ScreenWarp:
-    """The registration from the corners, improved by the pattern itself: a step of Gauss and Newton's method."""
+    """The registration `warp`, improved on the pattern itself by a Gauss-Newton step."""
     canvas, otf = Canvas.of(target, warp, window), lens_otf(study, channel, light)
     fy, fx = canvas.frequencies
     spectrum = canvas.low * canvas.passed(otf, study.camera.fill_factor)
@@ -308,7 +319,7 @@ def _refined(
     )
     picture = picture + canvas.beyond_picture(otf, study.camera.fill_factor)[mask]
     terms = warp.basis(mask_points(mask, window))
-    # with contrasts of their own: where cells are a whole number of pixels, a loss of contrast looks like a displacement
+    # the bands' contrasts are fitted as well: where cells are a whole number of pixels, a loss of contrast looks like a displacement
     bands = [canvas.picture(np.where(part, spectrum, 0.0))[mask] for *_, part in _band_masks(canvas)]
     columns = np.concatenate([across * terms, down * terms, bands, [np.ones_like(picture)]])
     scale = np.sqrt(np.mean(columns**2, axis=1))[:, None]
@@ -318,7 +329,8 @@ def _refined(
 
 
 def _band_masks(canvas: Canvas) -> Iterator[tuple[tuple[float, float], float | None, NDArray[np.bool_]]]:
-    """Every band that has frequencies: the ends of its ring, the middle of its sector (none: the whole ring), and where it lies."""
+    """(edges of its ring in cy/px, middle of its sector in rad, mask of its frequencies) of every band that isn't empty. The lowest ring is
+    one band, with None for the sector."""
     fy, fx = canvas.frequencies
     radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
     for i, (low, high) in enumerate(pairwise(RINGS_CY_PER_PX)):
@@ -331,23 +343,25 @@ def _band_masks(canvas: Canvas) -> Iterator[tuple[tuple[float, float], float | N
 
 
 def _away(angle: FloatArray, middle: float) -> FloatArray:
-    """Angles from the middle of a sector, of directions without a sense: -pi/2..pi/2."""
+    """Angles from the middle of a sector, of undirected orientations: -pi/2..pi/2."""
     return np.asarray(np.mod(angle - middle + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
 
 
 @dataclass(frozen=True)
-class _Design:
-    """The linear model of a channel's pixels: columns (coefficients, pixels), and the part without a coefficient, (pixels,)."""
+class _LinearModel:
+    """The linear model of one channel's pixels with k coefficients."""
 
-    mask: NDArray[np.bool_]
+    mask: NDArray[np.bool_]  # (rows, cols): its pixels in the window
     bands: tuple[Band, ...]
-    columns: FloatArray
-    fixed: FloatArray
-    inverse: FloatArray  # of the normal matrix
-    mix: FloatArray  # (bands, EVEN_TERMS + 4 bands + parts): what even powers of the frequency, halves of bands, their phases, and parts beyond do to them
-    beyond: FloatArray  # (parts, 2, 2): frequencies (fx of two places, fy of two places) of the parts beyond the bands
-    passed: FloatArray  # the transfer that the picture was drawn with: (rows, cols / 2 + 1)
-    reach: float
+    columns: FloatArray  # (k, pixels)
+    fixed: FloatArray  # (pixels,): weak parts beyond the bands, which have no coefficient
+    inverse: FloatArray  # (k, k): of the normal matrix
+    #: (bands, EVEN_TERMS + 4 bands + parts): coefficients of the bands in least squares fits of even powers of the frequency times P,
+    #: of the halves of the bands, of these with a phase of 90 degrees, and of the parts beyond the bands.
+    mix: FloatArray
+    beyond: FloatArray  # as in Pattern
+    passed: FloatArray  # (rows, cols / 2 + 1): OTF that P was drawn with
+    reach: float  # as in Pattern
 
     @staticmethod
     def of(
@@ -358,8 +372,9 @@ class _Design:
         seen: FloatArray,
         turned: FloatArray,
         laid: FloatArray,
-    ) -> _Design:
-        """`laid`: where bands' nodes lie, the power that is their weight: (rows, cols / 2 + 1)."""
+    ) -> _LinearModel:
+        """The model of a channel. `seen`: the recorded image; `turned`: the same, blurred and rotated by 180 degrees; `laid`
+        (rows, cols / 2 + 1): power spectrum by which the nodes of the bands are placed."""
         camera = study.camera
         fy, fx = canvas.frequencies
         radius, angle = np.hypot(fx, fy), np.arctan2(fy, fx + 0.0 * fy)
@@ -375,10 +390,10 @@ class _Design:
         for (low, high), sector, part in _band_masks(canvas):
             middle = sector or 0.0
             away = _away(angle, middle)
-            # in two halves, so that what a transfer does within the band is known
+            # in two halves, for changes of the OTF within the band
             sides = [part & (radius < 0.5 * (low + high)), part & (radius >= 0.5 * (low + high))]
             pieces = [canvas.picture(np.where(side, spectrum, 0.0)) for side in sides]
-            # a quarter of a period on along the band's direction: what a transfer's phase adds
+            # with a phase of 90 degrees along the band's direction: the imaginary part of the OTF
             on = 1j * np.where(np.cos(angle - middle) >= 0, spectrum, -spectrum)
             turned_halves += [canvas.picture(np.where(side, on, 0.0))[mask] for side in sides]
             picture = pieces[0] + pieces[1]
@@ -394,7 +409,7 @@ class _Design:
         picture = (low_part + np.sum(beyond, axis=0))[mask]
         across, down = (canvas.picture(2j * np.pi * f * spectrum)[mask] for f in (fx, fy))
         u, v, r2 = from_middle(camera, mask_points(mask, canvas.window))
-        # light that lands further out by s has the picture of a place nearer by s
+        # an image displaced outwards by s has, at a place, what lay further in by s
         outwards, around = -(u * across + v * down), -(u * down - v * across)
         grey = np.clip(picture, 0.0, 1.0)
         more = [
@@ -416,26 +431,28 @@ class _Design:
         pieces = [*smooth, *halves, *turned_halves, *(part.picture[mask] for part in outside)]
         mix = (inverse @ (table @ np.array(pieces).T))[: len(bands)]
         beyond_f = np.array([part.fx + part.fy for part in outside]).reshape(len(outside), 2, 2)
-        return _Design(mask, tuple(bands), table, fixed, inverse, mix, beyond_f, passed, float(np.sqrt(r2.max())))
+        return _LinearModel(mask, tuple(bands), table, fixed, inverse, mix, beyond_f, passed, float(np.sqrt(r2.max())))
 
     @property
     def shifts(self) -> slice:
-        """Of the coefficients, those by how far the picture is moved: x, y, radial, radial^3, across."""
+        """Indices of the coefficients that displace the image: x, y, radial, radial^3, tangential."""
         return slice(len(self.bands) + SHIFT_X, len(self.bands) + ACROSS + 1)
 
     def coefficients(self, seen: FloatArray) -> FloatArray:
+        """Least squares coefficients (k,) for the values `seen` (pixels,)."""
         return np.asarray(self.inverse @ (self.columns @ (seen - self.fixed)))
 
     def left_rms(self, picture: FloatArray) -> float:
-        """Root mean square of what the fit leaves of the window's picture, at the channel's pixels."""
+        """Root mean square residual of the fit to an image (rows, cols) of the window."""
         seen = picture[self.mask]
         left = seen - self.fixed - self.coefficients(seen) @ self.columns
         return float(np.sqrt(np.mean(np.square(left))))
 
     def solved(self, seen: FloatArray, temporal: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Coefficients; their covariance by `temporal`, the variance (pixels,) that repeats average out; and by the rest.
+        """Coefficients (k,); their covariance by temporal noise of variance `temporal` (pixels,); and their covariance by the rest of the
+        residuals.
 
-        The pixels' variances differ: the covariance is that of the residuals as they are (White 1980).
+        As the pixels' variances differ, the latter is estimated from the squared residuals (White 1980).
         """
         value = self.coefficients(seen)
         left = seen - self.fixed - value @ self.columns
@@ -446,7 +463,7 @@ class _Design:
 
 
 def even_powers(fx: FloatArray, fy: FloatArray) -> list[FloatArray]:
-    """fx^i fy^j of even i + j up to `EVEN_ORDER`, in units of the highest frequency of the bands."""
+    """The `EVEN_TERMS` products fx^i fy^j of even i + j up to `EVEN_ORDER`, frequencies over the bands' highest."""
     x, y = fx / RINGS_CY_PER_PX[-1], fy / RINGS_CY_PER_PX[-1]
     return [x ** (n - k) * y**k for n in range(0, EVEN_ORDER + 1, 2) for k in range(n + 1)]
 
@@ -462,9 +479,10 @@ def _band(
     *,
     whole: bool,
 ) -> Band:
-    """Nodes where the power `laid` is in a band, its cells gathered by radius and angle, and the shares of `power` there."""
+    """The band of the frequencies `part` and its nodes: the band is divided into `NODES` cells in radius and angle, and each has its node at
+    the mean of the power `laid`, and its share of `power`."""
     r, a = radius[part], away[part]
-    on, p = (np.where(r > 0, at[part], 0.0) for at in (laid, power))  # the mean isn't blurred
+    on, p = (np.where(r > 0, at[part], 0.0) for at in (laid, power))  # no blur changes frequency 0
     span = np.pi if whole else np.pi / SECTORS
     i = np.minimum(((r - ends[0]) / (ends[1] - ends[0]) * NODES[0]).astype(int), NODES[0] - 1)
     j = np.clip(((a / span + 0.5) * NODES[1]).astype(int), 0, NODES[1] - 1)
@@ -486,7 +504,10 @@ def _band(
 
 
 def joint_covariance(places: Sequence[tuple[int, Pattern, int]], study: Study) -> FloatArray:
-    """Covariance of coefficients: parts of one pattern in one channel share white, black and drawing."""
+    """Covariance (n, n) of n coefficients, each (number of the group, pattern, index).
+
+    Seen and held-out repeats of one pattern in one channel share `Pattern.common`.
+    """
     n = len(places)
     table = np.zeros((n, n))
     for i, (g, p, b) in enumerate(places):

@@ -1,4 +1,4 @@
-"""Single pixels of dark frames against their surroundings: which stand out, and statistics in which those don't count."""
+"""Outlying pixels of dark frames, and robust statistics that leave them out."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from sim.sensor.lines import Lines
 if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
-CLIP = 4.5  # standard deviations at which single pixels are cut off where they don't count
-MEDIAN_OF = 5  # frames at most, whose median shows defective pixels
-SMOOTH_PX, LOCAL_PX = 9, 33  # boxes over which a pixel's surroundings and their noise are taken
-#: Standard deviations of single pixels' fixed pattern from which on a pixel counts as defective, and no longer in the frames' means.
+CLIP = 4.5  # standard deviations at which pixels are clipped in robust statistics
+MEDIAN_OF = 5  # most frames whose median shows defective pixels
+SMOOTH_PX, LOCAL_PX = 9, 33  # sides of the boxes for the local mean and the local variance of a pixel's surroundings
+#: Standard deviations of the fixed pattern from which on a pixel counts as defective and is left out of the frames' means.
 DEFECTIVE = 10.0
 
 
 def sound_pixels(study: Study) -> NDArray[np.bool_]:
-    """(rows, cols): pixels that don't stand far out of their surroundings in the median of repeated dark frames, where they are hot most: at
-    the longest exposure and at the highest temperature.
+    """Mask (rows, cols) of the pixels that aren't defective.
 
-    One hot pixel of 3000 e/s has more shot noise than the mean of a small frame's others; one that saturates bends it.
+    A defective pixel departs by more than `DEFECTIVE` standard deviations from its surroundings in the median of repeated dark frames,
+    at the longest exposure or at the highest temperature. In a small frame, a single hot pixel of 3000 e/s would dominate the noise of
+    the mean, and one that saturates would make it nonlinear.
     """
     groups = study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db))
     sound = np.ones((study.camera.rows, study.camera.cols), bool)
@@ -41,10 +42,11 @@ def sound_pixels(study: Study) -> NDArray[np.bool_]:
 
 
 def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
-    """How far pixels of the lower median of frames lie from their surroundings, without lines; and the standard deviation of these, DN."""
+    """Departures (rows, cols) of the pixels of the frames' lower median from their local mean, without the means of rows and columns;
+    and their local standard deviation, DN."""
     level = [f - row_means(f)[:, None] for f in frames]
     median: Image = np.sort(np.array(level), axis=0)[(len(frames) - 1) // 2]
-    # defective pixels: deviation from their surroundings without lines, in standard deviations of these
+
     std = robust_std(median)
     flat, _ = without_lines(median, np.clip(median, -CLIP * std, CLIP * std))
     step = 2
@@ -62,7 +64,7 @@ def from_surroundings(frames: list[Image]) -> tuple[Image, Image]:
 
 
 def robust_std(image: Image) -> float:
-    """Standard deviation of the pixels within five of it. At least a quarter of a code."""
+    """Standard deviation of the pixels within five standard deviations of 0, by iteration; at least a quarter of a code."""
     low, high = np.quantile(image.ravel()[:: max(image.size // 200_000, 1)], [0.02, 0.98])
     std = max(float(high - low) / 4.107, 0.3)
     for _ in range(3):
@@ -72,13 +74,14 @@ def robust_std(image: Image) -> float:
 
 
 def row_means(image: Image) -> Image:
+    """Means (rows,) of the rows, pixels clipped at `CLIP` standard deviations."""
     std = robust_std(image)
     return np.asarray(np.clip(image, -CLIP * std, CLIP * std).mean(axis=1))
 
 
 def without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
-    """An image less the means of its rows and columns (of `cut`); and the variance of the lines' means beyond that of independent pixels,
-    from differences of neighbouring lines, in which smooth structure cancels."""
+    """An image less the means of the rows and columns of `cut`, the clipped image; and the variance of these means beyond that of
+    independent pixels, by lines. It is taken from differences of neighbouring lines, in which smooth structure cancels."""
     rows, cols = cut.mean(axis=1, dtype=np.float64), cut.mean(axis=0, dtype=np.float64)
     own = float(np.var(np.diff(cut, axis=1), dtype=np.float64)) / 2.0
     spare: dict[Lines, float] = {
@@ -90,7 +93,8 @@ def without_lines(image: Image, cut: Image) -> tuple[Image, dict[Lines, float]]:
 
 
 def local_variance(squares: Image, freedom: int) -> Image:
-    """Mean square of a pixel's surroundings a degree of freedom, outliers clipped."""
+    """Local variance (rows, cols): mean of `squares` over `LOCAL_PX` x `LOCAL_PX` pixels, outliers clipped, over the degrees of freedom
+    of a pixel's sum of squares."""
     usual = float(np.mean(np.minimum(squares, 16.0 * freedom * np.median(squares) / 0.45)))
     cap = np.float32(64.0 * usual)
     rough = ndimage.uniform_filter(np.minimum(squares, cap), LOCAL_PX, mode="mirror")

@@ -1,4 +1,4 @@
-"""Quantities of the stages that predictions depend on, and which effects change them."""
+"""Quantities of the stages (`sim.stages`) that several measurements read, and the effects that change such quantities."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from lab.diagnose.measurements.block import Effects
 from sim.effects.base import Effect
 from sim.effects.library import changed_by
 
-#: Of measurements in whose prediction the frame before enters.
+#: Image lag.
 LAG = frozenset({"charge.lag"})
-#: Of measurements in which dark current is a nuisance parameter.
 DARK_CURRENT = frozenset({"charge.dark_current"})
-#: Of measurements of single frames' means.
+#: Row and column noise.
 LINES = frozenset({"signal.lines"})
-#: Of measurements of patterns: what a screen shows of what it is asked for, and reflections of the whole image.
+#: The light of a screen for the picture that it is given.
 SHOWN = frozenset({"light.screen"})
+#: Displaced, scaled or rotated copies of the image.
 REFLECTIONS = frozenset({"image.copies"})
-#: Of measurements of where light lands.
+#: Displacement of the image by place and wavelength.
 SHIFT = frozenset({"image.shift"})
 
 
 def acting(effects: Effects, reads: frozenset[str]) -> tuple[Effect, ...]:
-    """Those of the effects that change any of these quantities of the stages."""
+    """The effects that change any of the quantities `reads`."""
     return tuple(effect for effect in effects if not reads.isdisjoint(changed_by(effect)))

@@ -1,8 +1,8 @@
-"""How repeatable levels are: the scatter of repeats of one setting beyond pixels' noise.
+"""Repeatability of levels: the scatter of repeats of one setting beyond the noise of pixels.
 
-Nobody states it, so the recordings have to tell. It is a tolerance of every level, and mustn't be set by one capture whose
-shutter or light isn't what is stated: settings that scatter out of line with the others don't count (`steady`), so that what they
-hold stays a departure that the diagnosis finds.
+It is measured, as no data sheet states it, and is a tolerance of every level. A capture whose shutter or light isn't as stated mustn't
+widen that tolerance: settings whose scatter is out of line with the others are left out (`steady`), and stay a departure for the
+diagnosis to find.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from sim.spectrum import FloatArray
 if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
-LAMP_FLOOR = 1.0e-4  # of a level, common to the channels of a capture
-#: Probability, over all settings, that a scatter as large is chance; and the share of the settings that may be out of line: of
-#: more, the scatter is the light's.
+LAMP_FLOOR = 1.0e-4  # least relative standard deviation of a level, common to the channels of a capture
+#: False-alarm probability, over all settings, of calling one out of line; and the largest share of settings out of line: with more,
+#: the scatter is taken as the light's.
 OUT_OF_LINE_PROBABILITY, OUT_OF_LINE_SHARE = 1.0e-3, 0.25
-#: Efficiency of the median of squares beside their mean: as many degrees of freedom it is worth.
+#: Efficiency of the median of squares relative to their mean, by which degrees of freedom are multiplied.
 MEDIAN_EFFICIENCY = 0.37
-#: Weight of the repeatability of all flat frames beside that of one setting's, in repeats.
+#: Weight of the common repeatability against that of a single setting, in degrees of freedom.
 COMMON_REPEATS = 4
 
 
 @dataclass(frozen=True)
 class RepeatedMeans:
-    """Frames of one setting: their levels less the mean; seconds less the mean; variance by pixels' noise."""
+    """The n repeats of one setting."""
 
     captures: tuple[Capture, ...]
-    away: FloatArray
-    elapsed_s: FloatArray
-    noise: float
+    away: FloatArray  # (n,): levels less their mean
+    elapsed_s: FloatArray  # (n,): times less their mean
+    noise: float  # variance of a level by the noise of pixels
 
 
 def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> list[RepeatedMeans]:
-    """Of every flat setting with repeats, all unclipped channels together, relative to the mean level, without frames that may hold image
-    lag of another level. `black` in DN, `gain` in DN/e."""
+    """The repeats of every flat setting: levels over all unclipped channels, relative to their mean. Frames that may hold image lag of
+    another level are left out (`Study.settled`). `black` in DN, `gain` in DN/e."""
     found = []
     for group in map(study.settled, study.flat_levels()):
         planes = [c for c in study.channels if all(study.levels(k).mean[c] is not None for k in group)]
@@ -60,12 +60,13 @@ def repeated_levels(study: Study, black: float, gain: float, read_dn: float) -> 
 
 
 def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
-    """Those settings whose scatter is in line with the others'.
+    """The settings whose scatter is in line with that of the others.
 
-    With the settings' common trend b with time (weighted median of their slopes) taken out, S_g = sum((a - b t)^2) of n_g repeats is
-    (s_g^2 + s^2) chi2_f, f = n_g - 1, s_g^2 the pixels' noise. s^2 is where the median over settings of S_g / (s_g^2 + s^2) over the
-    median of chi2_f is 1. A setting is out of line where S_g / f over s_g^2 + s^2 exceeds the F distribution's quantile at
-    `OUT_OF_LINE_PROBABILITY` over the number of settings. Where more than `OUT_OF_LINE_SHARE` of the settings are, all count.
+    Setting g with n_g repeats has S_g = sum((a - b t)^2), b the common trend with time (weighted median of the settings' slopes). It is
+    distributed as (s_g^2 + s^2) chi2_f with f = n_g - 1 degrees of freedom and s_g^2 the variance by the noise of pixels. The common
+    variance s^2 is the one at which the median over settings of S_g / (s_g^2 + s^2) / median(chi2_f) is 1. A setting is out of line
+    where S_g / f / (s_g^2 + s^2) exceeds the quantile of the F distribution at `OUT_OF_LINE_PROBABILITY` / number of settings. Where
+    more than `OUT_OF_LINE_SHARE` of the settings are, or where there are fewer than four, all are returned.
     """
     if len(repeats) * OUT_OF_LINE_SHARE < 1.0:
         return list(repeats)
@@ -91,15 +92,15 @@ def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
 
 
 def weighted_median(value: FloatArray, weight: FloatArray) -> float:
-    """The value below which half of the weight lies."""
+    """The value up to which half of the weight lies."""
     order = np.argsort(value)
     below = np.cumsum(weight[order])
     return float(value[order][int(np.searchsorted(below, 0.5 * below[-1]))])
 
 
 def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
-    """Relative standard deviation of repeated flat frames' levels beyond pixels' noise, without a common trend with time (a lamp's drift),
-    over the settings that are in line. Settings count by the inverse of their noise's variance."""
+    """Relative standard deviation of repeated levels beyond the noise of pixels and a common drift with time, over the settings in line.
+    Settings are weighted by the inverse variance of their noise. 0 without repeats."""
     repeats = steady(repeats)
     weight = np.array([1.0 / (r.noise + LAMP_FLOOR**2) for r in repeats])
     moved = sum(w * float(r.elapsed_s @ r.elapsed_s) for w, r in zip(weight, repeats, strict=True))
@@ -112,15 +113,15 @@ def level_repeatability(repeats: Sequence[RepeatedMeans]) -> float:
 
 
 def level_std(study: Study, groups: list[list[Any]]) -> FloatArray:
-    """Relative standard deviation of a frame's level by group: all flat frames', or a setting's own where that is larger, as in a
-    flickering light that short exposures don't average; of a setting out of line, all flat frames'."""
+    """Relative standard deviation (groups,) of a frame's level: the common one, or a setting's own where that is larger, as in a
+    flickering light that short exposures don't average. A setting out of line has the common one."""
     noise = study.noise
     found = np.full(len(groups), noise.jitter_lamp)
     place = {c.id: i for i, group in enumerate(groups) for c in group}
     for repeats in steady(repeated_levels(study, noise.black, noise.gain, noise.read_dn)):
         moved = float(repeats.elapsed_s @ repeats.elapsed_s)
         left, free = repeats.away, len(repeats.away) - 1
-        if free > 1 and moved > 0:  # a trend with time isn't noise
+        if free > 1 and moved > 0:  # without a linear trend with time
             left, free = left - float(repeats.elapsed_s @ left) / moved * repeats.elapsed_s, free - 1
         elif moved > 0:
             continue

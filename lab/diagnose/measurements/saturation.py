@@ -1,4 +1,4 @@
-"""The level from which on a pixel counts as clipped."""
+"""The code from which on a pixel counts as clipped."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from sim.sensor import mosaic
 if TYPE_CHECKING:
     from lab.diagnose.measurements.study import Study
 
-CLIPPED_SHARE = 2e-4  # of a plane: with fewer clipped pixels its mean counts
+CLIPPED_SHARE = 2e-4  # of a plane's pixels: with fewer clipped ones its mean is used
 
 
 def clipping_level_dn(study: Study) -> float:
-    """DN from which on a pixel counts as clipped: the converter's highest code, or less where full wells come before it.
+    """Code (DN) from which on a pixel counts as clipped: the converter's highest, or less where the full well is reached before it.
 
-    Full wells have no shot noise: a plane whose highest quantiles lie closer together than a third of their distance by shot noise is
-    at full well.
+    Pixels at full well have no shot noise. A plane is taken to be there where its 97, 99 and 99.9 % quantiles lie closer together
+    than a third of their distance by shot noise.
     """
     white = study.camera.white_level_dn
     gain = study.stated.conversion_gain_dn_per_e
@@ -35,7 +35,7 @@ def clipping_level_dn(study: Study) -> float:
                     continue
                 middle, high, top = np.quantile(values, [0.97, 0.99, 0.999])
                 if gain is None:
-                    # a tenth of the usual noise of a well of 1e5 e: what no unclipped plane falls below
+                    # a tenth of the shot noise for a full well of 1e5 e: less than any unclipped plane has
                     least = 0.1 * np.sqrt(max(top - black, 1.0) * white / 1e5)
                 else:
                     least = np.sqrt(gain * max(top - black, 1.0)) / 3.0
@@ -47,5 +47,5 @@ def clipping_level_dn(study: Study) -> float:
     if not below:
         return white
     top = float(np.median([t for t, _ in below]))
-    # a margin of the read noise under the pile
+    # a margin below the full well for the noise of its pixels
     return min(white, top - 3.0 * max(float(np.median([w for _, w in below])), 2.0))

@@ -1,4 +1,4 @@
-"""The grid of a screen's own pixels: the strongest line in the spectrum of the lit screen."""
+"""The grid of a screen's own pixels: the strongest spectral line of the lit screen's image."""
 
 from __future__ import annotations
 
@@ -20,37 +20,39 @@ from sim.frame import screen_light
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-CERTAIN = 8.0  # standard deviations
-GRID_STD = 1.3  # of the strongest line's number: the noise's mean is measured, too
-GRID_DETREND_PX = 8.0  # what is wider is shading
-GRID_LOWEST = 0.12  # cycles a sample: below, what was taken off as shading still tells
-GRID_LARGEST = 512  # samples a side
-GRID_OF_CAMERA = 12.0  # of a flat's mean power: a line that flats have, too, is the camera's
+CERTAIN = 8.0  # standard deviations beyond which strength is stated on a logarithmic scale
+GRID_STD = 1.3  # of the strongest line's normal quantile; above 1, as the noise's mean is measured
+GRID_DETREND_PX = 8.0  # standard deviation of the Gaussian by which shading is removed
+GRID_LOWEST = 0.12  # cycles a sample below which shading remains
+GRID_LARGEST = 512  # largest side of the box, samples
+GRID_OF_CAMERA = 12.0  # power over a flat's mean from which on a line of flats is the camera's
 
 
 @dataclass(frozen=True)
 class _Line:
-    """The strongest line in a lit screen's spectrum."""
+    """The strongest spectral line of a lit screen."""
 
     channel: str
     captures: tuple[str, ...]
     cycles_per_px: float
     power: float  # over the noise's mean
-    per_amplitude: float  # power of a line that a grid of amplitude 1 gives
-    places: int
+    per_amplitude: float  # power over the noise's mean of a grid of amplitude 1
+    places: int  # effective number of independent frequencies
 
     def normal(self, power: float) -> float:
-        """The standard normal quantile of the probability that the largest of `places` exponential variables is `power` or less."""
-        rare = np.log(self.places) - power  # logarithm of the probability, far out
+        """Standard normal quantile of the probability that the largest of `places` exponential variables of mean 1 is at most `power`.
+        Above `CERTAIN`, quantile q becomes CERTAIN (1 + ln(q / CERTAIN))."""
+        rare = np.log(self.places) - power  # ln of the probability to exceed it, where that is small
         normal = float(np.sqrt(-2.0 * rare)) if rare < -600.0 else -float(special.ndtri(-np.expm1(-np.exp(rare))))
-        # far out the logarithm is taken: only the order of magnitude matters
+        # only the order of magnitude matters there
         return normal if normal < CERTAIN else CERTAIN * (1.0 + float(np.log(normal / CERTAIN)))
 
 
 def grid_block(study: Study) -> Block:
-    """Strength of the strongest line in the spectrum of the lit screen by channel, as a standard normal number.
+    """Strength of the strongest spectral line of the lit screen by channel, as a standard normal quantile.
 
-    Lines along rows and columns, and lines that uniform light shows as well, are the camera's and don't count.
+    Lines along rows and columns, and lines that flats show as well, are the camera's and left out. Raises NotDetermined without
+    white captures, and where the screen fills too little of the frame.
     """
     groups = study.groups(WhiteCapture, lambda c: (c.screen.pose, c.exposure_s))
     if not groups:
@@ -87,6 +89,7 @@ def grid_block(study: Study) -> Block:
 
 
 def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
+    """The strongest line in one channel of the mean of some captures."""
     step = mosaic.step(study.camera.cfa)
     row, col = mosaic.phases(study.camera.cfa)[channel][0]
     plane = mean_rate(study, group)[row::step, col::step]
@@ -102,7 +105,7 @@ def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
         count &= ndimage.maximum_filter(of_flats / level, 3) < GRID_OF_CAMERA
     relative = np.where(count, power / noise, 0.0)
     i, j = np.unravel_index(int(np.argmax(relative)), relative.shape)
-    # a cos a cos is four lines of a quarter each
+    # a product of two cosines of amplitude 1 has four lines of a quarter
     unit = (0.25 * window.sum()) ** 2 / noise[i, j]
     return _Line(
         channel, tuple(c.id for c in group), float(np.hypot(fy[i, 0], fx[0, j])) / step, float(relative[i, j]), float(unit), int(0.6 * count.sum())
@@ -110,7 +113,7 @@ def _line(study: Study, group: Sequence[Any], channel: str) -> _Line:
 
 
 def _box(bright: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """A rectangle well inside the lit part."""
+    """A rectangle inside the lit part. Raises NotDetermined where that is too small."""
     slices = []
     for axis in (0, 1):
         share = bright.mean(axis=1 - axis)
@@ -125,11 +128,11 @@ def _box(bright: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def _power(plane: FloatArray, step: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Power spectrum of a plane over its smooth part, the mean that noise has at every frequency, and the window."""
+    """Power spectrum of a plane over its smooth part less 1, the mean power of noise at every frequency, and the window (Hann)."""
     smooth = ndimage.gaussian_filter(plane, GRID_DETREND_PX / step, mode="nearest")
     window = np.outer(np.hanning(plane.shape[0]), np.hanning(plane.shape[1]))
     relative = plane / np.maximum(smooth, 1e-12) - 1.0
-    # outlying pixels are clipped: they aren't lines
+    # outlying pixels are clipped
     relative = np.clip(relative, *np.quantile(relative, [0.0005, 0.9995]))
     power = np.abs(fft.rfft2(relative * window)) ** 2
     fy, fx = fft.fftfreq(plane.shape[0])[:, None], fft.rfftfreq(plane.shape[1])[None, :]

@@ -1,7 +1,7 @@
-"""Slanted edges: the transfer function that the estimator reports, and the same of a model at the same geometry.
+"""Slanted edges: the optical transfer function (OTF) across each edge, measured, and predicted by a camera model.
 
-A prediction goes through the estimator at the recording's geometry (`edge_estimator.Operators`): shading and a nonlinear response
-are in it.
+A prediction goes through the same estimator at the recorded edge's geometry (`edge_estimator.Operators`), shading and nonlinear
+response included. A pair (channel, light) is called a sight.
 """
 
 from __future__ import annotations
@@ -50,23 +50,24 @@ from sim.point import (
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
 
-EDGE_FLOOR = 3e-4  # of the contrast: numerical floor of the edge estimator and the model's wavelength sampling
-#: The highest frequency, cy/px, but not beyond this share of the lens's cutoff.
+EDGE_FLOOR = 3e-4  # standard deviation of the OTF beside noise: numerical error of the estimator and of the model's wavelength sampling
+#: Highest measured frequency, and its largest share of the lens's cutoff.
 HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE = 1.15, 0.95
+#: Suffix of the condition of imaginary parts, and their distance from real parts in `Block.along`.
 ASIDE, APART_CY_PER_PX = ", asymmetry", 100.0
-#: Prior standard deviation of the bend of the light on the target across the edge, of the level at `UNEVEN_PX` from it.
+#: Prior standard deviation of the curvature of the target's illumination across the edge: relative change of the level at `UNEVEN_PX`.
 UNEVEN_STD, UNEVEN_PX = 0.003, 50.0
-UNEVEN_ORDER = 4  # of the polynomial that shading along the distance is
-#: Edges whose directions differ by less are of one direction, deg.
+UNEVEN_ORDER = 4  # of the polynomial in the distance from the edge that describes shading
+#: Edges whose directions differ by less (deg) share one direction.
 ALIKE_DEG = 0.35
-#: Of light of which nothing is said: what its spectrum may differ from an even one by, over 150 nm and in a part of it.
+#: Prior relative standard deviations of a spectrum that isn't stated: of a tilt over 150 nm, and of triangles of half-width `PART_NM`.
 TILT_STD, PART_STD, PART_NM = 0.5, 0.6, 60.0
-#: Wavelengths at which aberrated transfers are formed; and those at which the perfect lens's, which has the cutoff's kink, is.
+#: Number of wavelengths for the OTF with effects; for unstated spectra; and step (nm) for the diffraction-limited OTF, whose cutoff has
+#: a kink.
 WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
-HIGHEST_CY_PER_PX = 10.0
-#: Predictions that are kept, and as many of their parts: a step of a refit leaves the others as they were.
-KEPT = 64
-#: Quantities of the stages that change a profile beside its transfer.
+HIGHEST_CY_PER_PX = 10.0  # of the quadrature
+KEPT = 64  # most entries of each cache
+#: Quantities of the stages that change an edge's profile otherwise than by the OTF.
 CHANGING = SHADING | {"signal.response", "image.veils"}
 KERNELS = frozenset({"charge.kernels"})
 K = TypeVar("K")
@@ -75,7 +76,7 @@ _Key = tuple[Effect, ...]
 
 
 def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
-    """What stands in `store`, made if it doesn't; the oldest goes first."""
+    """The value of `key` in the cache `store`, computed by `make` if it is missing. The oldest of `KEPT` entries is dropped."""
     if key not in store:
         if len(store) >= KEPT:
             store.pop(next(iter(store)))
@@ -84,10 +85,12 @@ def _kept(store: dict[K, V], key: K, make: Callable[[], V]) -> V:
 
 
 def edge_block(study: Study) -> Block:
-    """Transfer function of every slanted edge by channel: its real part, which is contrast, and its imaginary part about the
-    profile's own middle, which only a lopsided blur has.
+    """OTF of every slanted edge by channel: the real part, which is contrast, and the imaginary part about the profile's middle, which
+    only an asymmetric blur has.
 
-    The light side's noise is larger than the dark side's, so that the two parts' errors go together.
+    Errors of the two parts are correlated, as the light side has more noise than the dark side. Nuisance parameters: curvature of the
+    illumination across the edge, and spectra that aren't stated. Raises NotDetermined where f-number or pixel pitch isn't stated, and
+    where no edge is measured.
     """
     edges = _Edges(study)
     x = edges.frequencies
@@ -104,24 +107,24 @@ def edge_block(study: Study) -> Block:
         ),
         reads=TRANSFER_AT | CHANGING | {"image.transmittance"}, predict=predict,
         scale=np.ones(edges.value.size),
-        # discrepancies of the real part and of the imaginary part are independent
+        # model discrepancies of real and imaginary parts are independent
         along=np.tile(np.where(np.arange(len(x)) < len(REAL_AT), x, x + APART_CY_PER_PX), len(edges.edges)),
     )  # fmt: skip
 
 
 class _Edges:
-    """The edges of one side, their numbers and the model's."""
+    """The edges of one side: their measured OTFs and the model's predictions."""
 
     def __init__(self, study: Study) -> None:
         self._study, self._camera = study, study.camera
         self.edges = measured_edges(study)
         lights = list(dict.fromkeys(e.part[0].light_radiance for e in self.edges))
-        #: All channels in every light: neighbours of other colours may matter.
+        #: All channels in every light, as charge may come from neighbours of other channels.
         self._sights = [(c, light) for light in lights for c in study.channels]
         self._sight = np.array([self._sights.index((e.channel, e.part[0].light_radiance)) for e in self.edges])
         self._turns, self._turn = _clusters(np.array([e.direction_deg for e in self.edges]), ALIKE_DEG)
         places = [_place_um(study, e) for e in self.edges]
-        if len(set(places)) == 1:  # what differs from place to place can't be told from what doesn't
+        if len(set(places)) == 1:  # edges at one place can't tell a change over the field
             places = [(0.0, 0.0)] * len(places)
         self._places = list(dict.fromkeys(places))
         self._place = np.array([self._places.index(p) for p in places])
@@ -133,7 +136,7 @@ class _Edges:
         reach = max(e.measured.geometry.reach_px for e in self.edges) + 3 * GRID_PX
         self._quadrature = Quadrature.of(min(cutoff, HIGHEST_CY_PER_PX), reach)
         top = min(HIGHEST_MEASURED_CY_PER_PX, CUTOFF_SHARE * self._mean_cutoff())
-        #: cy/px of the numbers, real parts and then imaginary ones.
+        #: Frequencies (cy/px) of the real parts, then of the imaginary parts.
         self.frequencies = np.concatenate([REAL_AT, IMAGINARY_AT]) * top
         self._at = departure_shapes(self._quadrature, top)
         self._spectral: dict[tuple[_Key, bool], tuple[FloatArray, FloatArray, ComplexArray]] = {}
@@ -159,8 +162,8 @@ class _Edges:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Noise of all edges' numbers. What repeats have in common (the pixels' unequal response), edges in the same place and of the
-        same direction have, too."""
+        """Covariance (n, n) of all edges' numbers: noise, rounding and floor. Edges on the same pixels in the same direction share the
+        fixed part of their noise (PRNU)."""
         factors = [np.linalg.cholesky(c + 1e-16 * np.eye(len(c))) for c in self._noise]
         size = self.value.shape[1]
         out = np.zeros((self.value.size,) * 2)
@@ -176,8 +179,11 @@ class _Edges:
 
     @property
     def _rounded(self) -> FloatArray:
-        """What rounding may do to numbers, (changes, edges, frequencies), one standard deviation each: over a profile whose dark side
-        spreads by less than a code, a saw-tooth of the level, its harmonics of any phase, as no level is known to a fraction of a code."""
+        """Changes (waves, edges, frequencies) of the numbers by rounding, one standard deviation each.
+
+        Where noise is less than about half a code, rounding adds a saw-tooth of the level to the profile. Its harmonics enter with free
+        phases, as no level is known to a fraction of a code.
+        """
         contrast = np.array([e.measured.light_level - e.measured.dark_level for e in self.edges])[:, None]
         level_dn = np.maximum(self._light_profile * contrast, 0.0)
         waves = rounding_waves_dn(level_dn, self._study.noise.spread_dn2(level_dn))
@@ -189,19 +195,19 @@ class _Edges:
     # --- the model ---
 
     def predict(self, effects: Effects) -> FloatArray:
-        """Numbers of all edges, (edges, frequencies)."""
+        """Predicted OTFs of all edges at `frequencies`, (edges, frequencies)."""
         key = tuple(effects)
         return _kept(self._numbers_of, key, lambda: self._numbers(self._reported(key)))
 
     def _numbers(self, rows: FloatArray) -> FloatArray:
-        """Transfer functions at `frequencies`, (edges, frequencies), of what the estimators report."""
+        """OTFs at `frequencies`, (edges, frequencies), from the estimators' `rows` (edges, rows)."""
         return np.asarray(rows[:, 2:] / rows[:, :1] + self._level)
 
     def _reported(
         self, effects: tuple[Effect, ...], more: FloatArray | None = None, otf: ComplexArray | None = None
     ) -> FloatArray:
-        """Of the model, (edges, rows), its profiles where the recorded ones lie: noise and lopsided blurs move them. `more` and `otf`:
-        of the profiles on top, and the transfer functions in place of the effects'."""
+        """The estimators' rows (edges, rows) for the model, whose profiles are shifted to the recorded ones' position. `more` (edges,
+        distances): a further change of the profiles; `otf` (edges, nodes): in place of the effects'."""
         otf, change = self._otf(effects) if otf is None else otf, self._change(effects)
         if more is not None:
             change = more if change is None else change + more
@@ -218,7 +224,7 @@ class _Edges:
         return rows
 
     def _estimated(self, reach_px: float) -> tuple[list[Estimator], Operators]:
-        """The estimator of every edge, about its baseline, and all of them as operators on transfer functions."""
+        """The estimator of every edge, linear about the baseline, and all of them as operators on OTFs."""
         distance = profile_interpolation(reach_px)[1]
         quadrature = self._quadrature
         half, count = len(distance) // 2, quadrature.odd.shape[1]
@@ -247,23 +253,23 @@ class _Edges:
         return estimators, Operators(constant, by_odd, by_even, rows, distance, offsets, shades)
 
     def _mean_cutoff(self) -> float:
-        """The lens's cutoff at the mean wavelength of all sights, cy/px."""
+        """The lens's cutoff at the mean detected wavelength of all sights, cy/px."""
         nodes, shares = common_wavelengths(self._camera, self._lit)
         lens = self._camera.lens
         mean = float((shares @ nodes).mean())
         return self._camera.pixel_pitch_um * lens.imaging.cutoff_cy_per_um(mean, lens.f_number)
 
     def _otf(self, effects: tuple[Effect, ...]) -> ComplexArray:
-        """(edges, nodes): transfer functions along the edges' normals."""
+        """OTFs along the edges' normals, (edges, nodes)."""
         local = self._places if varies_over_field(self._camera, effects) else [(0.0, 0.0)] * len(self._places)
         found = {place: self._sights_otf(effects, place) for place in dict.fromkeys(local)}
         table = np.array([found[place] for place in local])
-        # what is spread widely is of the profile (`_change`): its transfer falls within the first of the quadrature's nodes
+        # halos are part of the profile (`_change`), as their OTF falls off below the first node of the quadrature
         veiled = wide_contrast(self._camera, effects, self._quadrature.frequency)
         return np.asarray(table[self._place, self._sight, self._turn] / veiled)
 
     def _sights_otf(self, effects: tuple[Effect, ...], place_um: tuple[float, float]) -> ComplexArray:
-        """(sights, directions, nodes) at a place."""
+        """OTFs of all sights and directions at a place, (sights, directions, nodes)."""
         spectral = acting(effects, SPECTRAL)
         nodes, shares, kink = self._wavelengths(spectral, bool(acting(effects, frozenset({"image.shift"}))))
         fx, fy = self._frequencies
@@ -279,14 +285,18 @@ class _Edges:
 
     @cached_property
     def _frequencies(self) -> tuple[FloatArray, FloatArray]:
+        """fx and fy of the quadrature's nodes along each direction, (directions, nodes), cy/px."""
         turn = np.deg2rad(self._turns)
         return np.outer(np.cos(turn), self._quadrature.frequency), np.outer(np.sin(turn), self._quadrature.frequency)
 
     def _wavelengths(
         self, spectral: tuple[Effect, ...], dispersed: bool
     ) -> tuple[FloatArray, FloatArray, ComplexArray]:
-        """A few wavelengths (w,), their shares (sights, w), and what these few miss of the perfect lens's transfer. Of light that is
-        `dispersed` the transfer turns fast with the wavelength: the nodes are its own."""
+        """A few wavelengths (w,), nm, their weights (sights, w), and the error of the diffraction-limited OTF with these few (sights,
+        directions, nodes).
+
+        Where the image is displaced by wavelength (`dispersed`), or weights would be large, the wavelengths are chosen for this spectrum.
+        """
 
         def worked_out() -> tuple[FloatArray, FloatArray, ComplexArray]:
             grid, perfect = self._perfect
@@ -303,26 +313,27 @@ class _Edges:
 
     @cached_property
     def _few(self) -> FloatArray:
-        """Wavelengths (w,), nm, that serve whatever effects do to the light's colours: transfers at them are kept."""
+        """Wavelengths (w,), nm, chosen for the baseline's spectra. OTFs at them are cached, and serve most changes of the spectrum."""
         grid, _ = self._perfect
         return gauss_rule(grid, wavelength_shares(self._camera, self._lit, grid).mean(axis=0), WAVELENGTHS)[0]
 
     @cached_property
     def _perfect(self) -> tuple[FloatArray, ComplexArray]:
-        """Wavelengths (w,), nm, and the lens's and the pixel's transfer at each without effects, (w, directions, nodes)."""
+        """Wavelengths (w,), nm, `FINE_NM` apart, and the baseline's OTF at each, (w, directions, nodes)."""
         curves = self._camera.quantum_efficiency.values()
         low, high = min(c.wavelength_nm[0] for c in curves), max(c.wavelength_nm[-1] for c in curves)
         grid = np.linspace(low, high, 2 + int((high - low) / FINE_NM))
         return grid, np.array([transfer_at(self._camera, float(w), *self._frequencies) for w in grid])
 
     def _mixed(self, otf: ComplexArray, moving: tuple[Effect, ...]) -> ComplexArray:
-        """Charge that moves between pixels of different colours: neighbours' edges, weighted by their light."""
+        """OTFs (sights, directions, nodes) with charge that moves between pixels of different colours."""
         count = len(self._camera.channels)
         parts = [slice(first, first + count) for first in range(0, len(otf), count)]
         rates = np.array([max(self._rate(k), 0.0) for k in range(len(otf))])
         return np.concatenate([mixed(self._camera, otf[p], rates[p], *self._frequencies, moving) for p in parts])
 
     def _rate(self, sight: int) -> float:
+        """Electrons a second of a sight; 1 where its light isn't stated."""
         channel, light = self._lit[sight]
         if light is None:
             return 1.0
@@ -331,7 +342,7 @@ class _Edges:
     # --- what changes a profile beside its transfer ---
 
     def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
-        """Change of the profiles (edges, distances) by the effects' shading, by responses that bend and by halos."""
+        """Change of the profiles (edges, distances) by shading, a nonlinear response and halos; None where there is none."""
         changing = acting(effects, CHANGING)
         return _kept(self._changes, changing, lambda: self._changed(changing))
 
@@ -359,7 +370,7 @@ class _Edges:
 
     @cached_property
     def _light_profile(self) -> FloatArray:
-        """(edges, distances): the profiles under the baseline, above no light, of the contrast."""
+        """The baseline's profiles (edges, distances) above the dark level, over the contrast."""
         half = len(self._operators.distance) // 2
         count = self._quadrature.odd.shape[1]
         rising = np.real(self._baseline) @ self._quadrature.odd
@@ -369,7 +380,7 @@ class _Edges:
         return np.asarray((0.5 + profile + self._operators.offset[:, None]) * self._operators.shade)
 
     def _shade(self, edge: int, distance: FloatArray, effects: Effects) -> FloatArray:
-        """Light over the distance from an edge, averaged along it, of that at the edge."""
+        """Illumination (distances,) over that at the edge, averaged along the edge, with effects."""
         x_um, y_um, light, fit = self._lighting[edge]
         terms = fit @ Uniform(self._camera, effects).illuminated(light, x_um, y_um)
         reach = self.edges[edge].measured.geometry.reach_px
@@ -377,8 +388,8 @@ class _Edges:
 
     @cached_property
     def _lighting(self) -> list[tuple[FloatArray, ...]]:
-        """Of every edge: places around it, (points,) um from the optical axis; the baseline's light there; and (terms, points), which take
-        light to a polynomial in the distance: a mean over all that lies at the same distance, however long the edge is there."""
+        """Of every edge: x and y of points around it (points,), um from the optical axis; the baseline's illumination there; and the
+        matrix (terms, points) that fits a polynomial in the distance from the edge to the illumination by least squares."""
         camera = self._camera
         axis, pitch = optical_axis_px(camera), camera.pixel_pitch_um
         found: list[tuple[FloatArray, ...]] = []
@@ -398,8 +409,8 @@ class _Edges:
 
     @cached_property
     def jacobian(self) -> dict[str, FloatArray]:
-        """Derivatives by the nuisance parameters: the bend of the light on the target, one for each region, direction and light; and the
-        spectrum of light that nobody states."""
+        """Name of a nuisance parameter -> derivative (n,) per prior standard deviation: curvature of the illumination, for each region,
+        direction and light; and spectra that aren't stated."""
         base = self.predict(())
         bend = self._light_profile * np.square(self._operators.distance / UNEVEN_PX) * UNEVEN_STD
         moved = self._numbers(self._reported((), bend))
@@ -414,8 +425,10 @@ class _Edges:
         return found
 
     def _other_colours(self) -> FloatArray:
-        """By how much the sights' transfers, (ways, sights, directions, nodes), may differ where nothing is said of their light and that of
-        equal energy stands for it: by its tilt, and in parts of the spectrum by themselves. A standard deviation each."""
+        """Changes (ways, sights, directions, nodes) of the OTFs of sights whose light isn't stated, one prior standard deviation each.
+
+        An equal-energy spectrum stands for such light. It may be tilted, and differ by triangles along the wavelength.
+        """
         blind = np.array([light is None for _, light in self._lit])
         shape = len(blind), *self._frequencies[0].shape
         if not blind.any():
@@ -433,7 +446,7 @@ class _Edges:
 
 
 def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Means of angles that lie closer together than `width`, and which of them each belongs to."""
+    """Clusters of angles with gaps of more than `width` (deg) between them: mean angles (clusters,), and the cluster (angles,) of each."""
     order = np.argsort(angle_deg)
     start = np.concatenate([[True], np.diff(angle_deg[order]) > width])
     label = np.cumsum(start) - 1
@@ -444,7 +457,7 @@ def _clusters(angle_deg: FloatArray, width: float) -> tuple[FloatArray, NDArray[
 
 
 def _place_um(study: Study, edge: MeasuredEdge) -> tuple[float, float]:
-    """(x, y) of the edge's middle from the sensor's centre."""
+    """(x, y) of the edge's middle from the sensor's centre, um."""
     field_mm = edge.part[0].field_mm
     if field_mm is not None and edge.part[0].region is not None:
         return 1000.0 * field_mm[1], 1000.0 * field_mm[0]

@@ -1,4 +1,4 @@
-"""Frames that were recorded twice: a capture whose frame is bit for bit that of an earlier one wasn't taken."""
+"""Stale frames: a capture whose frame equals an earlier one's bit for bit wasn't taken anew."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from lab.capture_kinds.base import Capture
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-NOISELESS_DN = 0.5  # a frame of less standard deviation may be like another by chance
+NOISELESS_DN = 0.5  # frames of a smaller standard deviation may be equal by chance
 
 
 def stale(recordings: RecordingSet, side: Side) -> tuple[tuple[str, str], ...]:
-    """(id, reason) of every capture whose frame equals an earlier one bit for bit, noise included: it wasn't taken anew.
+    """(id, reason in one line) of every capture whose frame equals an earlier one's bit for bit, noise included.
 
-    Frames without noise may be equal and don't count: those of nearly one code, and recordings of which most repeats are equal.
+    Frames without noise may be equal: those of a standard deviation below `NOISELESS_DN` aren't tested, and nothing is returned where
+    more than half of the repeats are equal.
     """
     first: dict[bytes, Capture] = {}
     found: list[tuple[str, str]] = []

@@ -1,7 +1,6 @@
-"""Two cameras in one scene: the ratio of their signals against that of uniform light.
+"""The signal ratio of the two cameras in a scene that both see, against their ratio in uniform light.
 
-It is judged on the right camera's side, beside the left one. The difference of the two sensitivities is each camera's own: only what
-the scene adds to it counts.
+Dividing by the ratio in uniform light removes the difference of the two sensitivities. The measurement belongs to the right side.
 """
 
 from __future__ import annotations
@@ -32,27 +31,26 @@ from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
-# Of a ratio of the two sides, relative.
-SCENE_STD = 0.01  # a scene seen from two places: gloss, angles, edges of the region that is compared
-CHANNEL_STD = 0.004  # light of another colour than the uniform light's, each channel by itself
+# Relative standard deviations of the ratio of the two sides.
+SCENE_STD = 0.01  # common to a scene's channels: gloss, viewing angles, borders of the compared region
+CHANNEL_STD = 0.004  # common to a channel in all scenes: light of another colour than the flats'
 OWN_STD = 0.004  # of one channel in one scene
-LIGHT_STD = 0.005  # common to all scenes: the uniform light before one side and the other
-GLARE_STD = (
-    0.02  # of a camera's light, scattered evenly over its frame, where its screens' dark squares don't say how much
-)
-SAME_LAMP = 0.02
-SAME_COLOUR = 0.04  # of a ratio of channels
+LIGHT_STD = 0.005  # common to all: a change of the uniform light between the two sides
+GLARE_STD = 0.02  # prior standard deviation of the share of a camera's light that is scattered evenly over its frame
+SAME_LAMP = 0.02  # largest difference of two normalised spectra of one lamp, summed over wavelengths
+SAME_COLOUR = 0.04  # largest relative difference between channel ratios in one light
 FEWEST_PIXELS = 200
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
 def needs_both_sides(study: Study, step: str) -> None:
+    """Raises NotDetermined for `step` unless this is the right side of a pair."""
     if "left" not in study.recordings.sides or study.side != "right":
         raise NotDetermined(step, "a pair of cameras is looked at from its right side, beside the left one")
 
 
 class _Darks:
-    """A side's signal without light, DN, by exposure: of its dark frames, or the maker's black level."""
+    """A side's mean signal without light by exposure: a line through its dark frames, else the stated black level."""
 
     def __init__(self, study: Study, side: Side) -> None:
         frames = study.recordings.captures(DarkCapture, side)
@@ -67,15 +65,17 @@ class _Darks:
             self._black = study.recordings.camera(side).black_level_dn or 0.0
 
     def at(self, exposure_s: float) -> float:
+        """The mean signal without light, DN."""
         return self._black + self._slope * exposure_s
 
 
 def scene_gain_block(study: Study) -> Block:
     """ln(right / left) of the signals in every scene that both cameras see, less that in uniform light, by channel.
 
-    A share g of a camera's light that is scattered evenly changes a region's signal by the factor 1 + g (mean of the frame / mean of the
-    region - 1). The right camera's share is predicted; the left one's, as far as its screens' dark squares tell, is taken out, and what
-    they leave open is a nuisance parameter.
+    Veiling glare, which scatters a share g of a camera's light evenly over the frame, changes a region's signal by the factor
+    1 + g (mean of the frame / mean of the region - 1). The right camera's g is predicted by effects. The left camera's g is estimated from
+    the dark squares of its screens and corrected for; its uncertainty is a nuisance parameter. Raises NotDetermined without unclipped
+    flats of one lamp on both sides, and without a scene that both saw in that lamp's light.
     """
     needs_both_sides(study, "stereo_gain")
     darks = {side: _Darks(study, side) for side in SIDES}
@@ -133,28 +133,29 @@ def scene_gain_block(study: Study) -> Block:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A channel in the region of a frame: DN a second, corrected for the lens's fall-off, and mean of the frame / mean of the region - 1."""
+    """One channel in a region of a frame."""
 
-    rate: float
-    lift: float
+    rate: float  # mean signal, DN/s, corrected for the lens's fall-off
+    lift: float  # mean of the frame / mean of the region - 1
 
 
 @dataclass(frozen=True)
-class _Lamp:
-    """A lamp before one side: the shape of its spectrum, DN a second by channel over its radiance, and `_Seen.lift`."""
+class _UniformLight:
+    """Uniform light before one side, as of one radiance file."""
 
     wavelength_nm: FloatArray
-    shape: FloatArray  # sum 1
-    level: dict[str, float]
-    lift: dict[str, float]
+    shape: FloatArray  # spectral radiance, normalised to the sum 1
+    level: dict[str, float]  # by channel: median signal over radiance, DN/s
+    lift: dict[str, float]  # by channel: mean `_Seen.lift`
 
-    def like(self, other: _Lamp) -> bool:
-        """Whether it's the same lamp, read anew: 2 % of its light at other wavelengths at most."""
+    def like(self, other: _UniformLight) -> bool:
+        """Whether both are readings of one lamp: their normalised spectra differ by less than `SAME_LAMP`."""
         there = np.interp(self.wavelength_nm, other.wavelength_nm, other.shape, left=0.0, right=0.0)
         return bool(np.abs(there / max(there.sum(), 1e-300) - self.shape).sum() < SAME_LAMP)
 
 
-def _uniform(study: Study, side: Side, dark: _Darks) -> list[_Lamp]:
+def _uniform(study: Study, side: Side, dark: _Darks) -> list[_UniformLight]:
+    """The uniform lights of a side's flats, by radiance file, in which every channel has an unclipped signal."""
     recordings = study.recordings
     white = recordings.camera(side).saturation_dn
     gathered: dict[str, dict[str, list[_Seen]]] = {}
@@ -172,12 +173,12 @@ def _uniform(study: Study, side: Side, dark: _Darks) -> list[_Lamp]:
             wavelength, radiance = recordings.spectrum(path).arrays
             middle = {c: float(np.median([seen.rate for seen in v])) for c, v in by_channel.items()}
             lift = {c: float(np.mean([seen.lift for seen in v])) for c, v in by_channel.items()}
-            found.append(_Lamp(wavelength, radiance / max(float(radiance.sum()), 1e-300), middle, lift))
+            found.append(_UniformLight(wavelength, radiance / max(float(radiance.sum()), 1e-300), middle, lift))
     return found
 
 
 def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndarray | None) -> dict[str, _Seen]:
-    """By channel what a frame's middle or a mask's pixels see; without clipped channels."""
+    """The unclipped channels of a capture in the pixels of `mask`, or in the middle half of the frame."""
     camera, frame = study.recordings.camera(side), study.recordings.frame(capture)
     rows, cols = frame.shape
     row, col = np.arange(rows)[:, None], np.arange(cols)[None, :]
@@ -203,6 +204,7 @@ def _signals(study: Study, capture: Any, side: Side, dark: _Darks, mask: np.ndar
 def _rates(
     study: Study, side: Side, dark: _Darks, captures: Sequence[Capture], mask: np.ndarray | None
 ) -> dict[str, _Seen]:
+    """The channels in a region, means over captures."""
     white = study.recordings.camera(side).saturation_dn
     found: dict[str, list[_Seen]] = {}
     for capture in captures:
@@ -215,7 +217,8 @@ def _rates(
 
 
 def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]]:
-    """Scenes that both sides saw, by name: each side's captures, and the pixels that show the same part of the scene."""
+    """Scenes that both sides saw, by name: for each side its captures, and the mask of the pixels that show the same part of the scene (None:
+    the middle of the frame)."""
     found: dict[str, list[tuple[list[Any], np.ndarray | None]]] = {}
     views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
     for pose in views[0]:
@@ -231,7 +234,7 @@ def _scenes(study: Study) -> dict[str, list[tuple[list[Any], np.ndarray | None]]
 
 
 def _screen_captures(study: Study, side: Side) -> dict[str, list[Any]]:
-    """The lit screen's captures at the plain gain, by pose."""
+    """The captures of the lit screen without gain in dB, by pose."""
     found: dict[str, list[Any]] = {}
     for capture in study.recordings.captures(WhiteCapture, side):
         if not capture.gain_db:
@@ -240,8 +243,10 @@ def _screen_captures(study: Study, side: Side) -> dict[str, list[Any]]:
 
 
 def _glare(study: Study, side: Side) -> tuple[float, float]:
-    """Share of a camera's light that is scattered evenly, and its standard deviation: weighted least squares of the light in the dark
-    squares of its screens beside `GLARE_STD`; never below 0."""
+    """Share of a camera's light that is scattered evenly over its frame, and its standard deviation.
+
+    Weighted least squares of the light in the dark squares of its screens, with the prior 0 +- `GLARE_STD`; at least 0.
+    """
     camera = camera_model(study.recordings, side, None, maker_curves=True)
     try:
         squares = screen_block(Study(study.recordings, side, camera))
@@ -255,9 +260,11 @@ def _glare(study: Study, side: Side) -> tuple[float, float]:
     return max(float((squares.value - without)[seen] @ weighted) / precision, 0.0), precision**-0.5
 
 
-def _same_colour(rates: dict[str, _Seen], lamp: _Lamp) -> bool:
-    """Whether a grey scene is lit by the lamp of the flats: the ratios of its channels agree. Under another light a difference of the
-    cameras' filters would look like a gain. A camera of one channel can't tell: False."""
+def _same_colour(rates: dict[str, _Seen], lamp: _UniformLight) -> bool:
+    """Whether a grey scene is lit by the lamp of the flats: its channel ratios agree to `SAME_COLOUR`.
+
+    In another light a difference of the two cameras' filters would look like a gain. False for a camera of one channel.
+    """
     if len(lamp.level) < 2 or set(rates) != set(lamp.level):
         return False
     gap = np.array([np.log(seen.rate / lamp.level[c]) for c, seen in rates.items()])
@@ -265,7 +272,7 @@ def _same_colour(rates: dict[str, _Seen], lamp: _Lamp) -> bool:
 
 
 def _board_masks(study: Study, left: BoardView, right: BoardView) -> list[np.ndarray] | None:
-    """The hull of the corners that both cameras saw, in each frame."""
+    """Masks of the convex hull of the corners that both cameras saw, in each frame; None for fewer than six corners."""
     index, at_left, at_right = np.intersect1d(left.index, right.index, return_indices=True)
     if len(index) < 6:
         return None

@@ -1,7 +1,4 @@
-"""Whether the two cameras of a pair capture at the same time: where each sees a moving board.
-
-Boards that stand still say nothing of it.
-"""
+"""Delay between the two cameras of a pair, from where each sees a moving board. Boards that stand still don't tell."""
 
 from __future__ import annotations
 
@@ -22,16 +19,20 @@ from lab.fit.geometry.pinhole import project
 from sim.frame import right_delay_s
 from sim.spectrum import FloatArray
 
-#: Captures of a moving board that lie further apart say nothing of its speed.
-LONGEST_GAP_S = 1.0
-SLOWEST_PX_PER_S = 5.0
+LONGEST_GAP_S = 1.0  # between captures from which a board's speed is taken
+SLOWEST_PX_PER_S = 5.0  # speed of the fastest board from which on the delay is measured
 FEWEST_PAIRS = 6
-SHIFT_STD_PX = 0.05  # of a pair: the speed between captures isn't even
-POINTING_STD_PX = 2.0  # of the rig's turn and the cameras' axes, over the frame
+SHIFT_STD_PX = 0.05  # standard deviation of a pair's displacement beside noise, as the speed varies between captures
+POINTING_STD_PX = 2.0  # prior standard deviation of the displacement by the rig's rotation and the optical axes
 
 
 def time_block(study: Study) -> Block:
-    """Displacement of a moving board in the right picture from where the left camera's pose puts it, across the baseline, px."""
+    """Displacement (px) of a moving board in the right image from where the left camera's pose puts it, perpendicular to the rig's
+    baseline.
+
+    A delay t of the right camera displaces it by speed x t. Nuisance parameters: a common displacement, and its gradients over the
+    frame. Raises NotDetermined where the cameras can't be calibrated, and for fewer than `FEWEST_PAIRS` pairs of a moving board.
+    """
     needs_both_sides(study, "stereo_time")
     moving = _moving(study)
     views = [{v.capture.pose: v for v in views_of(study, side)[0]} for side in SIDES]
@@ -69,7 +70,10 @@ def time_block(study: Study) -> Block:
 
 
 def _moving(study: Study) -> dict[str, FloatArray]:
-    """Speed (x, y), px/s, of the board's middle in the right picture, of poses between others that lie close in time."""
+    """Pose -> speed (x, y) of the board in the right image, px/s, from the captures just before and after it.
+
+    Raises NotDetermined where no board moves.
+    """
     timed = [(study.elapsed_s(v.capture), v) for v in views_of(study, "right")[0] if v.capture.time is not None]
     timed.sort(key=lambda one: one[0])
     found = {}
@@ -93,7 +97,8 @@ def _moving(study: Study) -> dict[str, FloatArray]:
 def _gaps(
     pairs: Sequence[tuple[str, BoardView, BoardView]], left: Calibration, right: Calibration
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean gap of each pair's corners in the right picture across the baseline's direction there, px; that direction (x, y)."""
+    """Mean displacement (pairs,), px, of each pair's corners in the right image, perpendicular to the rig's baseline there; and the unit
+    vector (x, y) of that direction. The rig's pose is the median over pairs."""
     turns, shifts = [], []
     poses = []
     for _, one, two in pairs:

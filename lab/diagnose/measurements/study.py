@@ -1,4 +1,4 @@
-"""One side of a recording set: its frames summarised once, and what several measurements ask of them."""
+"""The study of one side of a recording set: frames summarised once, and what several measurements need of them."""
 
 from __future__ import annotations
 
@@ -26,21 +26,26 @@ from sim.uniform import FieldPoints, Uniform
 
 T = TypeVar("T")
 C = TypeVar("C", bound=Capture)
-TAIL_STD = 0.1  # of the light that the baseline's point spread sends into dark squares and patches
-WARMTH_STD = 0.1  # of the dark current, a degree: it doubles within 5 to 10 degrees
+TAIL_STD = 0.1  # relative standard deviation of the light that the baseline's point spread function sends far
+WARMTH_STD = 0.1  # prior relative change of the dark current per degree C: it doubles within 5 to 10 degrees
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Means of one capture: DN by channel over the unclipped plane, None where it clips; over the plane as it is; its pixels."""
+    """Means of one capture by channel."""
 
-    mean: dict[str, float | None]
+    mean: dict[str, float | None]  # DN; None where the channel clips
     pixels: dict[str, int]
-    whole: dict[str, float]
+    whole: dict[str, float]  # DN, clipped or not
 
 
 class Study:
-    """One side of a recording set, each frame summarised once. Measurements are made from it."""
+    """One side of a recording set, from which measurements are made. What they share is computed once.
+
+    `camera`: the baseline; its gain, black level, dark current, read noise and full well are replaced by first estimates
+    (`noise_guess`). `saturation_dn`: code from which on pixels clip (None: estimated). `misstated`: ids of flats whose stated number of photons contradicts
+    the others.
+    """
 
     def __init__(
         self,
@@ -50,9 +55,8 @@ class Study:
         saturation_dn: float | None = None,
         misstated: frozenset[str] = frozenset(),
     ) -> None:
-        #: Ids of flats whose stated number of photons contradicts the others'.
         self.misstated = misstated
-        #: Captures that are left out, as their frames weren't taken: (id, reason in one line).
+        #: Captures that are left out, as their frames weren't taken anew: (id, reason in one line).
         self.stale: tuple[tuple[str, str], ...] = stale(recordings, side)
         left_out = {name for name, _ in self.stale}
         self.recordings = recordings.without(left_out) if left_out else recordings
@@ -67,7 +71,7 @@ class Study:
         times = [c.time for c in recordings.captures(side=side) if c.time is not None]
         self._start = min(times) if times else None
         warm = [c.temperature_c for c in recordings.captures(side=side) if c.temperature_c is not None]
-        #: The sensor's, at most captures; None where none is stated.
+        #: Median temperature of the sensor; None where none is stated.
         self.temperature_c = float(np.median(warm)) if warm else None
         self.field = FieldPoints.of(camera)
         if saturation_dn is None:
@@ -87,14 +91,17 @@ class Study:
         )
 
     def elapsed_s(self, capture: Capture) -> float:
+        """Time since the side's first capture, s; 0 where no time is stated."""
         return 0.0 if capture.time is None or self._start is None else (capture.time - self._start).total_seconds()
 
     def spectrum(self, path: str) -> Spectrum:
+        """A spectrum of the recording set, read once."""
         if path not in self._spectra:
             self._spectra[path] = self.recordings.spectrum(path)
         return self._spectra[path]
 
     def plane_mask(self, channel: str, shape: tuple[int, int]) -> FloatArray:
+        """Mask (rows, cols) of a channel's pixels in a frame of that shape."""
         mask = np.zeros(shape, bool)
         step = mosaic.step(self.camera.cfa)
         for row, col in mosaic.phases(self.camera.cfa)[channel]:
@@ -102,12 +109,13 @@ class Study:
         return mask
 
     def pixels_of(self, frame: Any, channel: str) -> FloatArray:
-        """All pixels of a channel, flat, as float."""
+        """Values (pixels,) of a channel's pixels in a frame."""
         step = mosaic.step(self.camera.cfa)
         parts = [frame[row::step, col::step] for row, col in mosaic.phases(self.camera.cfa)[channel]]
         return np.concatenate([np.asarray(p, float).ravel() for p in parts])
 
     def levels(self, capture: Capture) -> Levels:
+        """The means of a capture by channel, computed once. A channel clips where `CLIPPED_SHARE` of its pixels do."""
         if capture.id not in self._levels:
             frame = self.recordings.frame(capture)
             mean: dict[str, float | None] = {}
@@ -123,23 +131,26 @@ class Study:
 
     @property
     def diffraction_is_known(self) -> bool:
-        """Whether f-number and pitch are stated."""
+        """Whether f-number and pixel pitch are stated."""
         return self.stated.f_number is not None and self.stated.pixel_pitch_um is not None
 
     @property
     def level_is_known(self) -> bool:
-        """Whether the light in front of the lens tells how many DN to expect."""
+        """Whether the radiance before the lens predicts a level in DN: gain, f-number and pixel pitch are known."""
         return self.noise.gain_is_known and self.diffraction_is_known
 
     @property
     def tail_std(self) -> float:
-        """Relative standard deviation of the light that the baseline's point spread sends far; 1 where lens or pitch aren't stated."""
+        """Relative standard deviation of the light that the baseline's point spread function sends far; 1 where f-number or pixel
+        pitch isn't stated."""
         return TAIL_STD if self.diffraction_is_known else 1.0
 
     @cached_property
     def lamps(self) -> dict[str, int]:
-        """Radiance file of flats -> number of its lamp. Files are of one lamp where they differ by less than 1 % in shape and 5 % in level: a
-        radiometer reads the lamp anew before every pass."""
+        """Radiance file of flats -> number of its lamp.
+
+        Files that differ by less than 1 % in spectral shape and 5 % in level are readings of one lamp, taken anew before every pass.
+        """
         found: list[tuple[FloatArray, FloatArray]] = []
         lamps: dict[str, int] = {}
         for capture in self.recordings.captures(FlatCapture, self.side):
@@ -159,22 +170,22 @@ class Study:
         return lamps
 
     def flat_levels(self) -> list[list[Any]]:
-        """Flat captures by what makes their level: exposure, lamp, gain."""
+        """Flat captures by what sets their level: exposure, lamp, gain, number of photons."""
         return self.groups(
             "flat", lambda c: (c.exposure_s, self.lamps.get(c.radiance, -1), c.gain_db, c.photons_per_pixel)
         )
 
     def groups(self, kind: Any, key: Callable[[Any], object]) -> list[list[Any]]:
-        """Captures of a kind by their settings, in the manifest's order."""
+        """Captures of a kind with equal `key`, in the manifest's order."""
         found: dict[object, list[Any]] = {}
         for capture in self.recordings.captures(kind, self.side):
             found.setdefault(key(capture), []).append(capture)
         return list(found.values())
 
-    # --- parts that several blocks share ---
+    # --- what several measurements share ---
 
     def once(self, make: Callable[[Study], T]) -> T:
-        """`make(self)`, computed once for all measurements that need it; raises NotDetermined again where it did."""
+        """`make(self)`, computed once. Where it raised NotDetermined, that is raised again."""
         if make not in self._made:
             try:
                 self._made[make] = make(self)
@@ -187,22 +198,25 @@ class Study:
 
     @cached_property
     def _before(self) -> dict[str, Capture]:
-        """The capture before each, in the order of their times where all have one, else in the manifest's. A capture after
-        dummy frames follows one like itself."""
+        """Id of a capture -> the capture whose frame was read before its own: by time where all have one, else in the manifest's order. After
+        dummy frames that is a frame of the same capture."""
         order: list[Capture] = list(self.recordings.captures(side=self.side))
         if all(c.time is not None for c in order):
             order.sort(key=self.elapsed_s)
         return {c.id: before for before, c in pairwise(order)} | {c.id: c for c in order if c.dummy_frames}
 
     def settled(self, group: Sequence[C]) -> list[C]:
-        """Repeats that follow another of them, and so hold no image lag of another level; all where these are fewer than two."""
+        """Repeats that follow another of the group, and so hold no image lag of another level; all, where these are fewer than two."""
         names = {c.id for c in group}
         found = [c for c in group if c.id in self._before and self._before[c.id].id in names]
         return found if len(found) > 1 else list(group)
 
     def carried_e(self, effects: Effects) -> Callable[[Capture, str], float]:
-        """By how many electrons image lag changes a channel's mean of a capture, given what was read of it and of the capture
-        before: read is y_t = (1 - q) x_t + q y_(t-1), of which q (y_(t-1) - y_t) is new. The first one follows empty pixels."""
+        """Function of a capture and a channel: change of the mean by image lag, electrons.
+
+        Lag of share q reads y_t = (1 - q) x_t + q y_(t-1) for the charge x_t. The change is taken as q (y_(t-1) - y_t) from the measured
+        levels, generally lag_e(y_(t-1)) - lag_e(y_t). Before the first capture pixels are empty.
+        """
         if not acting(effects, LAG):
             return lambda capture, channel: 0.0
         model = Uniform(self.camera, effects)
@@ -218,20 +232,22 @@ class Study:
         return carried
 
     def offset(self, effects: Effects) -> Callable[[Capture], float]:
-        """DN that effects add to the black level of a capture."""
+        """Function of a capture: change of its black level by effects, DN."""
         model = Uniform(self.camera, effects)
         return lambda capture: model.offset_dn(self.elapsed_s(capture), capture.temperature_c)
 
     def free_offsets(self, exposures: FloatArray) -> dict[str, FloatArray]:
-        """Jacobian by black level and dark current, per prior standard deviation: that of their first guess."""
+        """Jacobian by black level and dark current, for n exposures: name -> (n,), DN per standard deviation of the first estimate."""
         return {
             "black": np.full(len(exposures), self.noise.black_std),
             "dark": exposures * self.noise.dark_std,
         }
 
     def free_warmth(self, captures: Sequence[Capture]) -> dict[str, FloatArray]:
-        """Jacobian by the change of dark current per degree, for captures at another temperature than the dark frames. Dark frames don't take it:
-        they measure the change."""
+        """Jacobian by the change of dark current per degree C: name -> (n,), DN per prior standard deviation.
+
+        It is for captures at another temperature than the dark frames. Measurements of dark frames don't use it: they measure the change.
+        """
         if self.noise.dark_c is None:
             return {}
         warmer = [0.0 if c.temperature_c is None else c.temperature_c - self.noise.dark_c for c in captures]
@@ -240,4 +256,5 @@ class Study:
 
 
 def mean_frame(recordings: RecordingSet, captures: Sequence[Capture]) -> FloatArray:
+    """Mean (rows, cols) of the captures' frames, DN."""
     return np.asarray(np.mean([recordings.frame(c).astype(float) for c in captures], axis=0))

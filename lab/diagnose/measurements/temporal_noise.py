@@ -1,9 +1,9 @@
-"""Temporal noise of repeated frames: its variance by plane of the mosaic, and the correlation of neighbouring pixels.
+"""Temporal noise of repeated frames: its variance by plane of the mosaic, and the correlation between neighbouring pixels.
 
-Frames of one setting are compared with their mean. What isn't a pixel's own is taken out before, plane by plane: the frame's level
-(of flats as a factor, so that shading and pixels' responses don't count where the lamp flickers), and the mean of every row and
-of every column (read-out, flicker by rows). What that takes from the pixels' own noise is put back. Pixels that depart by more
-than `OUTLIER` standard deviations don't count for the correlation.
+Noise is the departure of a frame from the mean of its repeats. Before, the frame's level is removed in each plane of the mosaic (as a
+factor for flats, so that shading and PRNU cancel where the lamp varies), and afterwards the mean of every row and column (row and
+column noise, flicker). The variance that this takes from the pixels is restored. Pixels beyond `OUTLIER` standard deviations are left
+out of the correlation.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 
 OUTLIER = 6.0
-#: Values that a level is repeats_of by; frames beyond them cost time and teach nothing.
+#: Pixel values from which a level is measured; further frames wouldn't improve it noticeably.
 ENOUGH = 3_000_000
-LEAST_PLANE_PX = 4  # of a plane of the mosaic, a side
-LEAST_DN2 = 0.02  # a temporal variance below which nothing but rounding is seen
-#: Pairs of pixels on the mosaic, by how the report calls them: (rows down, columns to the right).
+LEAST_PLANE_PX = 4  # least side of a plane of the mosaic
+LEAST_DN2 = 0.02  # temporal variance below which rounding hides the noise
+#: Pairs of neighbouring pixels: name in the report -> displacements (rows down, columns to the right).
 PAIRS: dict[str, tuple[tuple[int, int], ...]] = {
     "next in the row": ((0, 1),),
     "next in the column": ((1, 0),),
@@ -41,26 +41,26 @@ PAIRS: dict[str, tuple[tuple[int, int], ...]] = {
 
 @dataclass(frozen=True)
 class Repeats:
-    """Temporal noise of the repeats of one setting: by plane of the mosaic the mean above black and the variance (DN, DN^2; None
-    where it is clipped), the variance's standard uncertainty as a share of it; by `PAIRS` the correlation and its covariance."""
+    """Temporal noise of the repeats of one setting; dictionaries are by plane of the mosaic."""
 
     captures: tuple[str, ...]
     exposure_s: float
-    gain: float  # factor on the conversion gain, of the setting in dB
+    gain: float  # factor on the conversion gain by the gain setting in dB
     held_out: bool
-    signal: dict[str, float]
-    variance: dict[str, float | None]
-    relative_std: dict[str, float]
-    correlation: FloatArray
-    correlation_covariance: FloatArray
+    signal: dict[str, float]  # mean above black, DN
+    variance: dict[str, float | None]  # DN^2; None where the plane clips, or rounding hides the noise
+    relative_std: dict[str, float]  # relative standard deviation of the variance
+    correlation: FloatArray  # by `PAIRS`, (6,); NaN where it isn't determined
+    correlation_covariance: FloatArray  # (6, 6)
 
     @property
     def level(self) -> float:
+        """Mean signal of the planes, DN."""
         return float(np.mean(list(self.signal.values())))
 
 
 def flat_repeats(study: Study) -> list[Repeats]:
-    """Of every level of light, what is seen and what is held out by themselves; darkest first."""
+    """The temporal noise of all repeated flat settings, seen and held-out repeats apart, darkest first."""
     out = study.once(held_out_flats)
     found = []
     for group in study.flat_levels():
@@ -71,20 +71,20 @@ def flat_repeats(study: Study) -> list[Repeats]:
 
 
 def dark_repeats(study: Study) -> list[Repeats]:
-    """Of every setting of dark frames, every third held out."""
+    """The temporal noise of all repeated dark settings, of three or more of which every third is held out."""
     groups = [g for g in study.groups("dark", lambda c: (c.exposure_s, c.temperature_c, c.gain_db)) if len(g) > 1]
     return [repeats_of(study, g, len(groups) >= 3 and i % 3 == 1) for i, g in enumerate(groups)]
 
 
 def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats:
-    """The noise of two repeats or more. Raises NotDetermined where the frames are too small."""
+    """The temporal noise of two or more repeats of one setting. Raises NotDetermined where the frames are too small."""
     cfa, lit = study.camera.cfa, captures[0].kind != "dark"
     first = study.recordings.frame(captures[0])
     least_px = LEAST_PLANE_PX * mosaic.step(cfa)
     if min(first.shape) < least_px:
         raise NotDetermined(
             "temporal_noise",
-            f"frames of {first.shape[0]} x {first.shape[1]} px: without rows' and columns' means too few numbers are left; {least_px} px a side are enough",
+            f"frames of {first.shape[0]} x {first.shape[1]} px: after the means of rows and columns are removed, too few values are left; {least_px} px a side are enough",
         )
     use = list(captures)[: max(2, int(np.ceil(ENOUGH / first.size)) + 1)]
     frames = [np.array(study.recordings.frame(c), np.float32) for c in use]
@@ -112,7 +112,7 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
     moving = min(variance.values()) > LEAST_DN2
     if not (moving and (all(clean.values()) or not lit)):
         correlation = np.full(len(PAIRS), np.nan)
-    # correlated noise has more uncertain estimates
+    # correlation of the noise widens the standard deviations
     std = np.sqrt(np.diag(covariance))
     spread = 1.0 + float(np.sum(_NUMBER * np.square(np.where(np.abs(correlation) > 4.0 * std, correlation, 0.0))))
     return Repeats(
@@ -131,7 +131,8 @@ def repeats_of(study: Study, captures: Sequence[Any], held_out: bool) -> Repeats
 
 
 def _level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
-    """Leave departures from the mean frame, in place; `black_dn` None: the frames' levels are no factors but sums."""
+    """Reduce frames, in place, to departures from their mean frame without row and column means. Levels are matched by factors above
+    `black_dn`, or by subtraction where that is None."""
     for name in mosaic.planes(frames[0], cfa):
         planes = [mosaic.planes(f, cfa)[name] for f in frames]
         means = [float(p.mean(dtype=float)) for p in planes]
@@ -148,12 +149,12 @@ def _level_out(frames: Sequence[Any], cfa: Cfa, black_dn: float | None) -> None:
             np.subtract(plane, plane.mean(axis=0, keepdims=True), out=plane)
 
 
-#: How many pairs of every kind a pixel has.
+#: Number of pairs of each kind that a pixel belongs to.
 _NUMBER = np.array([2.0 * len(lags) for lags in PAIRS.values()])
 
 
 def _correlations(frames: Sequence[Any], freedom: int, cfa: Cfa) -> FloatArray:
-    """Correlations of standardised departures by `PAIRS`, less what independent pixels show of them."""
+    """Correlations (6,) of standardised departures by `PAIRS`, less their expectation for independent pixels."""
     found = []
     for lags in PAIRS.values():
         total = 0.0
@@ -238,7 +239,7 @@ def _shifted(values: FloatArray, step: int) -> FloatArray:
 
 
 def _moved(shape: tuple[int, int], down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Of pairs `down` rows and `right` columns apart, where the one and the other stand."""
+    """Slices of a frame that pair each pixel with the one `down` rows below and `right` columns to the right."""
     rows, cols = shape
     here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
     there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
@@ -246,5 +247,5 @@ def _moved(shape: tuple[int, int], down: int, right: int) -> tuple[tuple[slice, 
 
 
 def _count(shape: tuple[int, int], lags: Sequence[tuple[int, int]]) -> int:
-    """How many such pairs a frame has."""
+    """Number of pairs with these displacements in a frame."""
     return sum((shape[0] - down) * (shape[1] - abs(right)) for down, right in lags)

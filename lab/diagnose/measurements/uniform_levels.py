@@ -1,4 +1,4 @@
-"""Means by channel of captures of uniform light, all predicted at once: what linearity and narrowband signals share."""
+"""Prediction of the mean levels of captures of uniform light, shared by linearity and narrowband signals."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from sim.uniform import Uniform
 
 
 class UniformLevels:
-    """Means of a list of (capture, channel), n of them, of captures that each stand once in `captures`."""
+    """Mean levels of n pairs of capture and channel. `captures` lists each capture once."""
 
     def __init__(self, study: Study, points: Sequence[tuple[Capture, str]]) -> None:
+        """`points`: n of (capture, channel)."""
         self._study = study
         self.captures: tuple[Capture, ...] = tuple({capture.id: capture for capture, _ in points}.values())
         number = {capture.id: i for i, capture in enumerate(self.captures)}
@@ -30,7 +31,7 @@ class UniformLevels:
         self.lines = LineMeans(study, points)
 
     def of_light_dn(self, effects: Effects, rates: Mapping[str, FloatArray]) -> FloatArray:
-        """DN (n,) of light and of the camera's own dark current, after read-out. `rates`: e/s on axis by channel, (captures,)."""
+        """DN (n,) by light and the baseline's dark current, after read-out. `rates`: channel -> electrons a second on axis, (captures,)."""
         model = Uniform(self._study.camera, effects)
         field = model.field(self._study.field)
         electrons = model.electrons(rates, self._exposure_s, field=field, elapsed_s=self._elapsed_s)
@@ -41,8 +42,7 @@ class UniformLevels:
         return found
 
     def beside_light_dn(self, effects: Effects) -> FloatArray:
-        """DN (n,) that are neither of light nor of the camera's own dark current: black level, image lag, offsets, additional dark
-        current."""
+        """DN (n,) by all else: black level, offsets, image lag, and dark current that effects add."""
         study = self._study
         offset, dark, carried = study.offset(effects), added_dark_dn(study, effects), study.carried_e(effects)
         of_capture = np.array([study.noise.black + offset(capture) + dark(capture) for capture in self.captures])

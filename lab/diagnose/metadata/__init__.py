@@ -1,7 +1,7 @@
-"""What is stated of a camera or of captures, and its recordings contradict: found before any physics is looked for.
+"""Misstated metadata: statements about a camera or its captures that the recordings contradict.
 
-A wrong statement makes physics out of nothing: exchanged colours, lights at other wavelengths. What is found here is told as metadata,
-with the value that the recordings fit, and the diagnosis goes on with that value.
+They are looked for before any effect, as a wrong statement would be taken for physics. A finding is reported with the value that the
+recordings fit, and the diagnosis continues with that value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sim.camera import Side
 
 __all__ = ["Misstatement", "misstatements", "unchecked"]
 
-#: In this order: what follows is judged with what was found before it.
+#: Each check gets the recordings as corrected by those before it.
 _CHECKS = (
     misstated_bit_depth,
     misstated_black_level,
@@ -31,7 +31,7 @@ _CHECKS = (
 
 
 def misstatements(recordings: RecordingSet, side: Side) -> tuple[RecordingSet, tuple[Misstatement, ...]]:
-    """The recordings with the values that they fit in place of wrong statements, and these statements."""
+    """The recordings with wrong statements of a side replaced by the values that fit, and what was replaced."""
     found: list[Misstatement] = []
     for check in _CHECKS:
         one = check(recordings, side)

@@ -9,16 +9,16 @@ from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-LEAST_PILED = 100  # pixels on one code
-LEAST_PILED_SHARE = 1e-3  # of a frame
-LEAST_BITS = 6  # a code of fewer bits may be any level
+LEAST_PILED = 100  # pixels at one code from which on they count as clipped
+LEAST_PILED_SHARE = 1e-3  # the same, as a share of a frame
+LEAST_BITS = 6  # of fewer bits, the highest code is too likely to be any level
 
 
 def misstated_bit_depth(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Where no frame has a code above 2^k - 1, with k fewer than the stated bits, and pixels pile up there.
+    """A bit depth that is stated too large: no frame has a code above 2^k - 1, k less than the stated bits, and pixels are clipped there.
 
-    A full well below the converter's range piles up, too, but its read noise spreads the pixels over codes, and it lies at a highest code
-    of k bits by a chance of 1 in thousands. A bit depth that is stated too small is refused when the set is read.
+    Pixels at a full well below the converter's range are spread over codes by read noise, and that well is 2^k - 1 with a probability
+    of one in thousands. A bit depth that is stated too small is refused when the recording set is read. None where nothing is found.
     """
     camera = recordings.camera(side)
     piled: dict[str, int] = {}
@@ -51,7 +51,7 @@ def misstated_bit_depth(recordings: RecordingSet, side: Side) -> Misstatement | 
         check=f"The frames of the {side} camera are clipped at {highest} DN ({count} pixels in {len(piled)} captures), the highest code of {bits} "
         f"bits, but bit_depth = {camera.bit_depth} and a white level of {camera.saturation_dn:g} DN are stated: correct bit_depth to {bits} and "
         f"white_level_dn to {highest}.",
-        # normal noise has half of the pixels above the mean of those on a code, and here none is
+        # noise would put about as many pixels above that code, and none is there
         chi2_stated=float(count),
         chi2_corrected=0.0,
         n=len(piled),

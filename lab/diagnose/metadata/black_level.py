@@ -1,4 +1,4 @@
-"""A black level that isn't that of the dark frames."""
+"""A stated black level that the dark frames contradict."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from lab.diagnose.metadata.misstatement import Misstatement, restated_camera
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-#: Share of the converter's range (5 DN of 12 bits) that a stated black level may be off by: data sheets round it, and it moves with temperature.
+#: Tolerance of a stated black level, as a share of the converter's range (5 DN of 12 bits): data sheets round it, and it depends on temperature.
 TOLERANCE = 5.0 / 4096.0
 LEAST_TOLERANCE_DN = 1.0
-SIGMA = 5.0  # of the measured black level beyond the tolerance
+SIGMA = 5.0  # standard deviations of the measured black level beyond the tolerance
 
 
 def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Where the mean of dark frames, carried to no exposure, is further off the stated level than `TOLERANCE`.
+    """A black level that differs from the dark frames' mean, extrapolated to zero exposure, by more than `TOLERANCE`.
 
-    One line through the means by exposure, at the gain and temperature of the shortest; where all have one exposure, dark current is part
-    of it and nothing is told that a current of the same size explains.
+    A line is fitted to the means by exposure, of the frames at the gain and temperature of the shortest. With a single exposure, dark
+    current can't be told from black level. None where nothing is found.
     """
     stated = recordings.camera(side).black_level_dn
     darks = recordings.captures(DarkCapture, side)
@@ -44,7 +44,7 @@ def misstated_black_level(recordings: RecordingSet, side: Side) -> Misstatement 
         return None
     return Misstatement(
         measurement=BLACK_LEVEL,
-        where="dark frames, carried to no exposure",
+        where="dark frames, extrapolated to zero exposure",
         shape="the stated black level contradicts the dark frames",
         check=f"The dark frames of the {side} camera have a black level of {black:.2f} ± {std:.2g} DN, but black_level_dn = {stated:g} is stated: "
         f"correct it to {black:.1f}, or the darks are of another camera or setting.",

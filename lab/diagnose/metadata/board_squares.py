@@ -1,4 +1,4 @@
-"""Numbers of squares, or a size of markers, that aren't those of the board in the pictures."""
+"""A stated number of squares, or size of markers, that the frames of a board contradict."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from lab.fit.geometry.board_layout import BoardLayout, board_layout
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-LOOKED_AT = 6  # pictures of a board
+LOOKED_AT = 6  # most frames of a board that are used
 FEWEST_PICTURES = 2
-#: Of a marker's stated side: a detector finds a blurred dark marker up to 7 % too small.
+#: Tolerance of a marker's side, relative and absolute: detection finds a blurred dark marker up to 7 % too small.
 MARKER_TOLERANCE, MARKER_PX = 0.15, 2.0
 
 
 def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Where the pictures of a board fit another number of squares than stated, or markers of another size beside its squares.
+    """Boards whose frames fit another number of squares, or another ratio of marker to square, than stated; None where all fit.
 
-    The length of a square can't be told: a board twice as large at twice the distance has the same picture.
+    The length of a square can't be checked: a board twice as large at twice the distance gives the same image.
     """
     boards: dict[tuple[Any, ...], list[CharucoCapture]] = {}
     for capture in recordings.captures(CharucoCapture, side):
@@ -67,7 +67,7 @@ def misstated_board(recordings: RecordingSet, side: Side) -> Misstatement | None
 
 
 def _contradicted(stated: CharucoCapture, layout: BoardLayout) -> tuple[dict[str, Any], list[str]]:
-    """The values that fit in place of those that don't, and both in words."""
+    """The statements to correct, with the values that fit, and sentences about both."""
     update: dict[str, Any] = {}
     told = []
     same = layout.squares == stated.squares or (not stated.has_markers and layout.squares == stated.squares[::-1])

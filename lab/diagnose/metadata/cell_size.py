@@ -1,4 +1,4 @@
-"""A size of a screen's cells that isn't that in the pictures."""
+"""A stated size of a screen's cells that the frames contradict."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from lab.fit.psf.screen_registration import register
 from lab.formats.recording_set import RecordingSet
 from sim.camera import Side
 
-TOLERANCE = 0.05  # of a cell: the stated size is nominal, and a tilted screen's cells differ over the frame
+TOLERANCE = 0.05  # relative: the stated size is nominal, and cells of a tilted screen differ over the frame
 
 
 def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Where the checkerboard's corners have cells that are further than `TOLERANCE` off `cell_camera_px`, mean over the pattern.
+    """A `cell_camera_px` that differs by more than `TOLERANCE` from the size of the cells in the middle of the pattern; None
+    where it fits.
 
-    The cell's size is a first guess of the registration, which finds its own.
+    The registration finds the size by itself: the stated one is only its start.
     """
     try:
         pictures = [one for one in screen_pictures(recordings, side) if one.first.screen.cell_camera_px is not None]
@@ -61,7 +62,7 @@ def misstated_cell_size(recordings: RecordingSet, side: Side) -> Misstatement | 
 
 
 def _cell_px(pictures: ScreenPictures, stated: float) -> float | None:
-    """Side of a cell in camera px: the root of its mean area over the pattern; None where the pattern isn't found."""
+    """Side of a cell in camera px: the square root of its area in the middle of the pattern; None where the pattern isn't found."""
     try:
         warp = register(
             pictures.checkerboard, pictures.bernoulli, pictures.checkerboard_target, pictures.bernoulli_target, stated

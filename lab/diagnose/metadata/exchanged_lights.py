@@ -1,4 +1,4 @@
-"""Two lights that are stated for each other's captures."""
+"""Two lights whose statements are exchanged between their captures."""
 
 from __future__ import annotations
 
@@ -22,29 +22,31 @@ from sim.spectrum import FloatArray
 
 @dataclass(frozen=True)
 class ExchangeRule:
-    """When two lights count as exchanged. `out_of_line`: their error over the median one of all lights, at least; `better`: that after
-    the exchange over that before, at most. `of_each`: of the two errors the smaller one before and the larger one after count, else both."""
+    """When two lights count as exchanged. Errors are rms departures of ln(rate) from its prediction."""
 
-    out_of_line: float
-    better: float
-    of_each: bool
+    out_of_line: float  # least ratio of their error to the median error of all lights
+    better: float  # largest ratio of their error after the exchange to that before
+    of_each: (
+        bool  # whether each light has to pass: the smaller error before, the larger one after; else the rms of both
+    )
 
 
 FEWEST_LIGHTS = 4
-DIM = 0.02  # of a light's brightest channel: curves differ from the maker's by any factor where they are low
-LEAST_ERROR = 0.005  # in the logarithm: no light's captures fit better
-SURER = 0.7  # ... over that of the next best exchange, at most
-UNKNOWN_LEVELS = 0.1  # median error from which on the lights' levels are taken for unknown: relative spectra
+#: Share of a light's brightest channel that is added to all rates: low rates count little, as low sensitivities may differ by any factor.
+DIM = 0.02
+LEAST_ERROR = 0.005  # of ln(rate)
+SURER = 0.7  # largest ratio of the error of the best exchange to that of the next best
+UNKNOWN_LEVELS = 0.1  # median error from which on the lights' levels count as unknown, as of relative spectra
 CURVES = ExchangeRule(out_of_line=5.0, better=0.25, of_each=True)
-PATCHES = ExchangeRule(
-    out_of_line=1.5, better=0.5, of_each=False
-)  # whose print and light leave some per cent, at any light
+#: Printed patches have errors of some per cent in any light.
+PATCHES = ExchangeRule(out_of_line=1.5, better=0.5, of_each=False)
 CHART_COLUMNS = 6  # of patches, row by row
-CURVE_ORDER = 2  # in the wavelength, of a channel's departure from the maker's curve
+CURVE_ORDER = 2  # degree in the wavelength of a channel's departure from the maker's curve
 
 
 def exchanged_lights(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Where the captures of two lights fit each other's stated light, and not their own: of narrowband lights, else of a chart's."""
+    """Two lights whose captures fit each other's statement and not their own: narrowband lights, else lights of a chart. None where none
+    is found."""
     if not recordings.captures("narrowband", side) and not recordings.captures("chart", side):
         return None
     camera = camera_model(recordings, side, maker_curves=True)
@@ -52,14 +54,15 @@ def exchanged_lights(recordings: RecordingSet, side: Side) -> Misstatement | Non
 
 
 def _narrowband(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstatement | None:
-    """By the channels' rates against the sensitivity curves. A channel's departure from its curve is a polynomial in the wavelength."""
+    """Two narrowband lights, by the channels' rates against the sensitivity curves. A channel may depart from its curve by a polynomial in
+    the wavelength."""
     seen = [one for one in narrowband_planes(recordings, side) if np.any(np.isfinite(one.rate))]
     if len(seen) < FEWEST_LIGHTS or recordings.camera(side).quantum_efficiency is None:
         return None
     expected = np.array(list(predicted(recordings, camera, seen).values())).T
     phases, step = mosaic.phases(camera.cfa), mosaic.step(camera.cfa)
     rate = np.array([[one.rate[[step * r + c for r, c in phases[name]]].mean() for name in phases] for one in seen])
-    known = np.isfinite(rate)  # of a channel that clips nothing is
+    known = np.isfinite(rate)  # clipped channels are NaN
     usable = known.any(axis=1) & (expected.max(axis=1) > 0)
     if usable.sum() < FEWEST_LIGHTS:
         return None
@@ -69,7 +72,7 @@ def _narrowband(recordings: RecordingSet, side: Side, camera: CameraModel) -> Mi
     brightest = np.argmax(np.where(known, expected, -1.0), axis=1)
     expected = expected * float(np.median(rate[every, brightest] / expected[every, brightest]))
     dim = np.maximum(DIM * np.nanmax(rate, axis=1), [one.offset for one in seen])
-    # departures (of captures i, with light j, channels)
+    # ln(rate) of light i less its prediction by the statement of light j: (i, j, channels)
     left = np.log(np.where(known, np.maximum(rate, 0.0), np.nan)[:, None] + dim[:, None, None]) - np.log(
         expected[None] + dim[:, None, None]
     )
@@ -86,7 +89,8 @@ def _narrowband(recordings: RecordingSet, side: Side, camera: CameraModel) -> Mi
 
 
 def _chart(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstatement | None:
-    """By how the patches' rates compare with each other in every channel, whatever the light's level and the channel's sensitivity are."""
+    """Two lights of a chart, by the ratios of the patches' rates in every channel, which don't depend on the light's level or the channel's
+    sensitivity."""
     lights = chart_planes(recordings, side)
     if len(lights) < FEWEST_LIGHTS:
         return None
@@ -126,7 +130,7 @@ def _chart(recordings: RecordingSet, side: Side, camera: CameraModel) -> Misstat
 
 
 def _pattern_error(rate: FloatArray, expected: FloatArray, place: FloatArray, offset: float) -> float:
-    """Rms departure, in the logarithm, of the patches' rates from those expected, less a level and a gradient of the light."""
+    """Rms of ln(rate) less ln(expected rate) of the patches, after a level and a gradient of the light are fitted."""
     if expected.max() <= 0:
         return np.inf
     dim = max(DIM * float(rate.max()), offset)
@@ -137,7 +141,7 @@ def _pattern_error(rate: FloatArray, expected: FloatArray, place: FloatArray, of
 
 
 def _smooth(x: FloatArray, y: FloatArray, order: int) -> FloatArray:
-    """A polynomial through most of the points that are finite: least sum of magnitudes, by weights."""
+    """Polynomial (n,) through the finite points with the least sum of absolute residuals, by iteratively reweighted least squares."""
     scaled = (x - x.mean()) / max(float(np.ptp(x)), 1e-9)
     table = np.vander(scaled, order + 1)
     known = np.isfinite(y)
@@ -152,6 +156,8 @@ def _smooth(x: FloatArray, y: FloatArray, order: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Exchange:
+    """An exchange of two lights: their numbers, and the rms of their errors before and after it."""
+
     first: int
     second: int
     before: float
@@ -166,7 +172,8 @@ def _told(
     measurement: Measurement,
     rule: ExchangeRule,
 ) -> Misstatement | None:
-    """The exchange that brings two lights in line. `errors` (n, n): of the captures of light i with the statement of light j."""
+    """The exchange of two lights that fits, None where none passes `rule`. `errors` (n, n): of the captures of light i with the
+    statement of light j."""
     typical = max(float(np.median(np.diag(errors))), LEAST_ERROR)
     every = [
         _Exchange(i, j, _rms(errors[i, i], errors[j, j]), _rms(errors[i, j], errors[j, i]))
@@ -210,7 +217,7 @@ def _name(light: LitPlanes) -> str:
 
 
 def _exchanged(recordings: RecordingSet, one: LitPlanes, other: LitPlanes) -> RecordingSet:
-    """The recordings with what is stated of the two lights exchanged."""
+    """The recordings with the statements of the two lights exchanged."""
     keys = ("radiance", "wavelength_nm", "bandwidth_nm")
     by_id = {c.id: c for c in recordings.manifest.captures}
     update: dict[str, dict[str, Any]] = {}

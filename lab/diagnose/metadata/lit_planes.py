@@ -1,4 +1,4 @@
-"""Rates of the four planes of a mosaic in lights of known spectra, and the rates that sensitivity curves predict for them."""
+"""Signal rates of the planes of a mosaic in lights of stated spectra, and the rates that sensitivity curves predict for them."""
 
 from __future__ import annotations
 
@@ -21,29 +21,26 @@ from sim.spectrum import FloatArray, Spectrum
 from sim.uniform import electron_rate
 
 C = TypeVar("C", bound=Capture)
-CLIPPED_SHARE = 0.01  # of a plane at the highest code: from here on its mean is too low
-OFFSET_DN = 1.0  # of a dark level that isn't measured at the exposure: dimmer signals say nothing
+CLIPPED_SHARE = 0.01  # share of a plane's pixels from which on it counts as clipped
+OFFSET_DN = 1.0  # uncertainty of the dark level
 FEWEST_PIXELS = 8  # of a patch in a plane
 
 
 @dataclass(frozen=True)
 class LitPlanes:
-    """What one part of the frame saw in one light: mean rates of the mosaic's planes by (row, col), DN/s above dark; NaN where clipped.
-
-    `offset`: DN/s that the dark level leaves open. `reflectance`: of a chart's patch.
-    """
+    """The signal of a part of the frame in one light."""
 
     captures: tuple[str, ...]
     kind: str
     radiance: str
     wavelength_nm: float | None
-    reflectance: Spectrum | None
-    rate: FloatArray
-    offset: float
+    reflectance: Spectrum | None  # of a chart's patch
+    rate: FloatArray  # (planes,): mean signal above dark of the mosaic's planes, row by row, DN/s; NaN where clipped
+    offset: float  # uncertainty of the rates by the dark level, DN/s
 
 
 def narrowband_planes(recordings: RecordingSet, side: Side) -> list[LitPlanes]:
-    """One for each wavelength, all captures of it together."""
+    """The planes in each narrowband light: one item a wavelength, the mean of its captures."""
     darks = _dark_levels(recordings, side)
     groups: dict[float, list[NarrowbandCapture]] = {}
     for capture in _exposed(recordings.captures(NarrowbandCapture, side)):
@@ -61,7 +58,7 @@ def narrowband_planes(recordings: RecordingSet, side: Side) -> list[LitPlanes]:
 
 
 def chart_planes(recordings: RecordingSet, side: Side) -> list[list[LitPlanes]]:
-    """One for each patch, for every light of a chart. Of a light's exposures, each plane of a patch has the longest that doesn't clip it."""
+    """The planes of each patch, in every light of a chart. Each plane is taken from the longest exposure that doesn't clip it."""
     darks = _dark_levels(recordings, side)
     groups: dict[str, list[ChartCapture]] = {}
     for capture in _exposed(recordings.captures(ChartCapture, side)):
@@ -95,7 +92,7 @@ def _exposed(captures: Sequence[C]) -> list[C]:
 def _rates(
     recordings: RecordingSet, side: Side, capture: Capture, part: Frame, darks: Mapping[float, float]
 ) -> FloatArray:
-    """Rates of the planes in a part of a frame that begins at an even row and column, DN/s above dark."""
+    """Rates (planes,) in a part of a frame that begins at an even row and column, DN/s above dark."""
     camera = recordings.camera(side)
     step = mosaic.step(camera.cfa)
     nearest = min(darks, key=lambda exposure_s: abs(np.log(max(exposure_s, 1e-9) / capture.exposure_s)))
@@ -109,7 +106,7 @@ def _rates(
 
 
 def _dark_levels(recordings: RecordingSet, side: Side) -> dict[float, float]:
-    """Exposure -> mean of its first dark frame, DN; the stated black level where there is none."""
+    """Exposure -> mean of its first dark frame, DN; without dark frames, 0 s -> the stated black level."""
     first: dict[float, Capture] = {}
     for dark in recordings.captures("dark", side):
         first.setdefault(dark.exposure_s, dark)

@@ -1,4 +1,4 @@
-"""One wrong statement, and what it is told as."""
+"""One misstatement, and how a result reports it."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ from sim.camera import Side
 
 @dataclass(frozen=True)
 class Misstatement:
-    """A statement that recordings contradict. `chi2_stated`, `chi2_corrected`: of `n` numbers, with the value that is stated and with the one
-    that fits. `corrected`: the recordings with that value."""
+    """A statement that the recordings contradict."""
 
     measurement: Measurement  # that shows it
     where: str
-    shape: str  # what contradicts what
-    check: str  # both values, as a sentence
-    chi2_stated: float
-    chi2_corrected: float
+    shape: str  # which statement contradicts which recordings
+    check: str  # stated and fitting value, as a sentence
+    chi2_stated: float  # of `n` numbers, with the stated value
+    chi2_corrected: float  # of these, with the value that fits
     n: int
     captures: tuple[str, ...]
-    corrected: RecordingSet
+    corrected: RecordingSet  # the recordings with the value that fits
 
     def told(self, side: Side) -> Unexplained:
-        """As results have it."""
+        """The misstatement as an item of a result."""
         return Unexplained(
             side=side,
             measurement=self.measurement.name,

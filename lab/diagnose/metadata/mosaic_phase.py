@@ -1,4 +1,5 @@
-"""A mosaic whose colours lie elsewhere than stated: planes that answer lights as another channel's curve says."""
+"""A stated arrangement of the mosaic's colours that the recordings contradict: planes respond to lights as another channel's sensitivity
+predicts."""
 
 from __future__ import annotations
 
@@ -14,22 +15,24 @@ from sim.camera import Cfa, Side
 from sim.spectrum import FloatArray
 
 MOSAICS: tuple[Cfa, ...] = ("RGGB", "BGGR", "GRBG", "GBRG")
+# Errors are rms departures of ln(rate) from its prediction.
 FEWEST_LIGHTS = 3
-BRIGHT = 10.0  # times what the dark level leaves open: of dimmer lights nothing is said
-DIM = 0.05  # of a light's brightest plane: curves differ from the maker's by any factor where they are low
-LEAST_ERROR = 0.15  # in the logarithm, of the stated mosaic: curves and crosstalk leave less
-BETTER = 0.5  # error of another mosaic over that of the stated one, at most
-SURER = 0.75  # ... over that of the next best, at most
-MOST_GAIN = 0.7  # of a channel against the maker's curve, logarithm: nobody's curves are worse
+BRIGHT = 10.0  # least signal over the uncertainty of the dark level
+#: Share of a light's brightest plane that is added to all rates: low rates count little, as low sensitivities may differ by any factor.
+DIM = 0.05
+LEAST_ERROR = 0.15  # of the stated mosaic: errors of the curves and crosstalk are smaller
+BETTER = 0.5  # largest ratio of the best mosaic's error to that of the stated one
+SURER = 0.75  # largest ratio of the best mosaic's error to that of the next best
+MOST_GAIN = 0.7  # largest |ln| of a channel's gain against the maker's curve
 ROUNDS = 6
 
 
 def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement | None:
-    """Where the planes' rates, relative to each other in each light, fit another mosaic than the stated one.
+    """A stated mosaic that fits the planes' rates worse than another one; None where it fits.
 
-    r = ln(plane's rate) - ln(channel's predicted rate) less a level for each light and a gain for each channel, over narrowband lights and
-    patches of a chart; the mosaic with the least rms of r. Without stated curves typical ones stand for them: wrong colours are wrong by
-    factors.
+    r = ln(rate of a plane) - ln(predicted rate of its channel) - level of the light - gain of the channel, over narrowband lights and
+    patches of a chart. The mosaic with the least rms of r is the best. Where no sensitivity curves are stated, typical ones are used: wrong
+    colours are wrong by factors.
     """
     stated = recordings.camera(side).cfa
     if stated == "MONO":
@@ -49,7 +52,7 @@ def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement
     if errors[best] > BETTER * errors[stated] or errors[best] > SURER * errors[second]:
         return None
     n = 4 * len(seen)
-    # the numbers' standard deviation is taken for what the better mosaic leaves, at least that of sound curves
+    # the numbers' standard deviation is estimated by the best mosaic's error
     std = max(errors[best], LEAST_ERROR / 3.0)
     return Misstatement(
         measurement=NARROWBAND if narrow else CHART,
@@ -66,7 +69,7 @@ def misstated_mosaic_phase(recordings: RecordingSet, side: Side) -> Misstatement
 
 
 def _error(seen: list[LitPlanes], rates: dict[str, FloatArray], cfa: Cfa) -> float:
-    """Rms of the planes' logarithmic departures from the channels of `cfa`."""
+    """Rms of r (see `misstated_mosaic_phase`) for the mosaic `cfa`."""
     rate = np.array([one.rate for one in seen])  # NaN where clipped
     expected = np.where(np.isfinite(rate), np.array([rates[channel] for channel in cfa]).T, np.nan)
     expected = expected * (np.nansum(rate, axis=1) / np.maximum(np.nansum(expected, axis=1), 1e-300))[:, None]

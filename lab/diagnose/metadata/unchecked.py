@@ -1,4 +1,4 @@
-"""What is stated, decides figures, and no recording of the set can contradict."""
+"""Statements that determine results and that no recording of the set can check."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim.camera import Side
 
 
 def unchecked(recordings: RecordingSet, side: Side) -> Iterator[Skipped]:
-    """A bit depth of which no pixel uses the highest bit, and the length of a board's squares."""
+    """The bit depth, where no pixel reaches its highest bit, and the length of a board's squares."""
     camera = recordings.camera(side)
     highest = 0
     for capture in recordings.captures(side=side):

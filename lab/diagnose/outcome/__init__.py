@@ -1,1 +1,1 @@
-"""What is told of a diagnosis: findings, pictures, improved models, the next capture."""
+"""What a diagnosis reports: findings, residual pictures, improved models, the next capture."""

@@ -49,23 +49,22 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Design:
-    """A capture that could be taken: the prediction of a hypothesis (n,), its covariance (n, n), and the sequence that
-    takes it (None: a station can't by itself)."""
+class CandidateCapture:
+    """A capture that could be taken."""
 
     words: str
-    predict: Callable[[Hypothesis], FloatArray]
-    covariance: FloatArray
-    plan: CapturePlan | None = None
+    predict: Callable[[Hypothesis], FloatArray]  # (n,): its numbers under a hypothesis
+    covariance: FloatArray  # (n, n)
+    plan: CapturePlan | None = None  # the sequence that takes it; None: a station can't by itself
 
 
-def designs(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[Design]:
-    """All captures that are considered."""
+def candidate_captures(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[CandidateCapture]:
+    """All captures that are considered, in order: narrowband, edges, flats, darks, and those of the session again."""
     camera = model.camera
     lamp = _lamp(recordings, side)
     yield from _narrowband(camera)
     yield from _edges(camera, model, lamp)
-    yield from _ladders(camera, lamp)
+    yield from _exposure_series(camera, lamp)
     yield from _steady(camera, lamp)
     yield from _darks(camera)
     yield from _again(recordings, side, model)
@@ -97,7 +96,7 @@ def _means(h: Hypothesis, light: Spectrum, kind: str, exposure_s: float, elapsed
     return {c: float(value) / gain for c, value in model.mean_dn(collected).items()}
 
 
-def _narrowband(camera: CameraModel) -> Iterator[Design]:
+def _narrowband(camera: CameraModel) -> Iterator[CandidateCapture]:
     """Light of one wavelength, every 5 nm."""
     for centre in np.arange(400.0, 721.0, 5.0):
         light = Spectrum.of((centre - 10.0, centre, centre + 10.0), (0.0, 1e-3, 0.0))
@@ -112,7 +111,7 @@ def _narrowband(camera: CameraModel) -> Iterator[Design]:
         noise = (signal + camera.read_noise_e**2) / (PIXELS * REPEATS)
         floor = np.square(signal) * (NARROWBAND_FLOOR**2 + CURVE_ROUGH_STD**2)
         around = {"from_nm": float(centre - 5.0), "to_nm": float(centre + 5.0), "step_nm": 2.5}
-        yield Design(
+        yield CandidateCapture(
             f"narrowband light at {centre:g} nm",
             predict,
             np.diag(noise + floor + (BLACK_FLOOR_DN / camera.conversion_gain_dn_per_e) ** 2),
@@ -120,7 +119,7 @@ def _narrowband(camera: CameraModel) -> Iterator[Design]:
         )
 
 
-def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iterator[Design]:
+def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
     """Slanted edges: at four orientations, in the lamp's and in narrowband light, at the lens's and at twice its
     f-number."""
     frequency = np.arange(1, 17) * 0.05
@@ -153,10 +152,10 @@ def _edges(camera: CameraModel, model: MeasurementModel, lamp: Spectrum) -> Iter
             plan = CapturePlan((EdgeSequence(frames=2 * REPEATS),)) if is_usual else None
             if n:
                 words = f"slanted edges at 5, 50, 95 and 140 degrees in {name}{at}"
-                yield Design(words, predict, np.diag(np.square(np.tile(std, n // len(std)))), plan)
+                yield CandidateCapture(words, predict, np.diag(np.square(np.tile(std, n // len(std)))), plan)
 
 
-def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
+def _exposure_series(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
     """Flats at many levels: by the exposure, or by the light at one exposure. Means and variances. Nuisance parameters:
     gain, read noise, black level, and the light in each channel."""
     shares = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.92]) / FILLED
@@ -164,13 +163,13 @@ def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
     if full <= 0:
         return
     dimmed = [Spectrum.of(*(lamp.arrays[0], share * lamp.arrays[1])) for share in shares]
-    ladders = {
+    series = {
         "flats at ten exposures, from 1 to 92 % of the full well": [(lamp, share * full) for share in shares],
         "flats at one exposure and ten levels of the light, from 1 to 92 % of the full well": [
             (d, full) for d in dimmed
         ],
     }
-    for words, steps in ladders.items():
+    for words, steps in series.items():
 
         def predict(h: Hypothesis, steps: list[tuple[Spectrum, float]] = steps) -> FloatArray:
             levels = [list(_means(h, light, "flat", seconds).values()) for light, seconds in steps]
@@ -196,11 +195,11 @@ def _ladders(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
         covariance += NUISANCE_STD**2 * sum(np.outer(column, column) for column in jacobian)
         by_exposure = all(light is lamp for light, _ in steps)
         sequence = FlatSequence(levels=tuple((FILLED * shares).round(3).tolist()), frames=2 * REPEATS)
-        yield Design(words, predict, covariance, CapturePlan((sequence,)) if by_exposure else None)
+        yield CandidateCapture(words, predict, covariance, CapturePlan((sequence,)) if by_exposure else None)
 
 
-def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
-    """The same flat again and again; the lamp's level is a nuisance parameter, its change with time isn't."""
+def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[CandidateCapture]:
+    """The same flat, repeated over an hour. The lamp's level is a nuisance parameter, its change with time isn't."""
     full = _filling_exposure_s(camera, lamp)
     times = np.linspace(0.0, SESSION_S, 13)
     if full <= 0:
@@ -212,25 +211,25 @@ def _steady(camera: CameraModel, lamp: Spectrum) -> Iterator[Design]:
     mean = predict(Hypothesis("", (), camera))
     noise = (mean + camera.read_noise_e**2) / (PIXELS * REPEATS)
     levels = np.kron(np.eye(len(camera.channels)), np.ones((len(times), len(times)))) * np.outer(mean, mean)
-    yield Design(
+    yield CandidateCapture(
         "the same flat every five minutes for an hour",
         predict,
         np.diag(noise + np.square(2.0 * LAMP_FLOOR * mean)) + NUISANCE_STD**2 * levels,
     )
 
 
-def _darks(camera: CameraModel) -> Iterator[Design]:
+def _darks(camera: CameraModel) -> Iterator[CandidateCapture]:
     """Dark frames by exposure, by time and by temperature; black level and dark current are nuisance parameters."""
     gain, reference = camera.conversion_gain_dn_per_e, camera.dark_current_reference_c
     times = np.linspace(0.0, SESSION_S, 13)
-    ladders = {
+    series = {
         "dark frames every five minutes for an hour": [(0.01, t, reference) for t in times],
         "dark frames with the sensor 10 and 20 degrees warmer": [
             (s, 0.0, reference + c) for c in (0, 10, 20) for s in (0.01, 1.0, 5.0)
         ],
         "dark frames from 1 ms to 20 s": [(s, 0.0, reference) for s in np.geomspace(0.001, 20.0, 10)],
     }
-    for words, steps in ladders.items():
+    for words, steps in series.items():
 
         def predict(h: Hypothesis, steps: list[tuple[float, float, float]] = steps) -> FloatArray:
             found = []
@@ -245,11 +244,11 @@ def _darks(camera: CameraModel) -> Iterator[Design]:
         covariance += NUISANCE_STD**2 * (np.ones_like(covariance) + np.outer(seconds, seconds))
         exposures = "from 1 ms" in words
         plan = CapturePlan((DarkSequence(exposures_s=tuple(seconds.round(4).tolist()), frames=REPEATS),))
-        yield Design(words, predict, covariance, plan if exposures else None)
+        yield CandidateCapture(words, predict, covariance, plan if exposures else None)
 
 
-def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[Design]:
-    """Every measurement once more, with the same captures; those of few dark frames with more repeats, which lowers their covariance."""
+def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Iterator[CandidateCapture]:
+    """Every measurement again with the same captures. Those of dark frames with few repeats get more, which reduces their covariance."""
     darks = {c.id: c for c in recordings.captures(DarkCapture, side)}
     repeats = repeats_of(darks.values())
     for block, at in zip(model.blocks, model.slices, strict=True):
@@ -263,6 +262,6 @@ def _again(recordings: RecordingSet, side: Side, model: MeasurementModel) -> Ite
             exposures = tuple(sorted({darks[name].exposure_s for name in names if darks[name].exposure_s > 0}))
             plan = CapturePlan((DarkSequence(exposures_s=exposures, frames=MORE_REPEATS),)) if exposures else None
             words = f"the dark frames of {title} again, {MORE_REPEATS} at each setting in place of {repeats}"
-            yield Design(words, predict, block.covariance * repeats / MORE_REPEATS, plan)
+            yield CandidateCapture(words, predict, block.covariance * repeats / MORE_REPEATS, plan)
         else:
-            yield Design(f"the captures of {title} again, with as many repeats", predict, block.covariance)
+            yield CandidateCapture(f"the captures of {title} again, with as many repeats", predict, block.covariance)

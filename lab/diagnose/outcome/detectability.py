@@ -1,4 +1,4 @@
-"""What could have been detected of each effect in these recordings, and which effect looks most like it."""
+"""The smallest detectable size of each effect in these recordings, and the effect that is most like it."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def detectability(side: Side, verdict: Verdict, policy: DecisionPolicy) -> Itera
 def _smallest(
     effect: type[Effect], members: list[tuple[tuple[Effect, ...], FloatArray]], needed: float
 ) -> dict[str, float]:
-    """By parameter, the least departure from `absent` that reaches a non-centrality; none for effects whose shape has
-    no small limit."""
+    """Parameter -> least departure from `absent` at which the non-centrality is `needed`. Empty for effects with prototypes of shape, whose
+    signature isn't a power of the size."""
     found: dict[str, float] = {}
     if effect.shapes:
         return found

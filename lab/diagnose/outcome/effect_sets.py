@@ -1,4 +1,4 @@
-"""The sets of effects that the search leaves, as a result and in sentences."""
+"""The credible sets of effects that the search found, as a result and in sentences."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LISTED_SETS = 5
 
 
 def side_models(side: Side, found: ModelSet, policy: DecisionPolicy) -> SideModels:
-    """What the search says of one side."""
+    """The sets of effects of one side, as a result."""
     return SideModels(
         side=side,
         share=policy.model_set_share,
@@ -30,8 +30,11 @@ def set_sentences(
     unexplained: Sequence[Unexplained],
     policy: DecisionPolicy,
 ) -> Iterator[str]:
-    """What the sets say beyond the names: effects that are neither named nor among the rivals of a name and that may well be a part, where
-    the names explain everything, as sets of listed effects fit an unlisted cause badly; and what the budget left."""
+    """Sentences about effects that may be present, though they are neither named nor rivals of a name; and about sets that the budget left
+    unweighed.
+
+    The former are given only where the names explain everything: listed effects fit an unlisted cause badly.
+    """
     for one in models:
         named = [e for e in effects if one.side in e.sides]
         told = {n for e in named for n in (e.name, *e.alternatives)}

@@ -1,4 +1,4 @@
-"""How well each place and each measurement fits, under the baseline and with what was found."""
+"""Goodness of fit of each slice and each measurement, with the baseline and with what was found."""
 
 from __future__ import annotations
 
@@ -91,8 +91,10 @@ def held_out(verdict: Verdict) -> HeldOut | None:
 
 
 def residual_curves(side: Side, verdict: Verdict) -> Iterator[ResidualCurve]:
-    """Every measurement by condition and channel, seen and held out: measured values and both predictions. The baseline is drawn as it is
-    stated, with the nuisance parameters of the model with what was found; its levels end at the white level, as a camera's do."""
+    """Curves of every measurement by condition and channel, seen and held out apart: measured values, and predictions before and after.
+
+    Before is the stated baseline at the nuisance parameters that were fitted with the effects. Levels are limited to 0..white level.
+    """
     model = verdict.model
     before = model.stated_mean(model.nuisance_estimates(verdict.effects, verdict.kernels))
     after = model.fitted_mean(verdict.effects, verdict.kernels)

@@ -40,11 +40,11 @@ LOWEST, HIGHEST = 0.05, 3.0
 
 @dataclass(frozen=True)
 class Correction:
-    """What stands in the improved model for one unexplained mismatch, in words; `kind` is None where nothing does."""
+    """The correction of the improved model for one unexplained mismatch."""
 
     measurement: str
-    kind: Applied | None
-    said: str
+    kind: Applied | None  # the stage that it acts on; None: there is no correction
+    said: str  # in words
 
 
 def improved_model(

@@ -31,7 +31,7 @@ from sim.effects.library import effects as library
 
 #: Members of a named family that its sentence lists.
 TOLD_MEMBERS = 4
-#: What to add to recordings in which no measurement can be looked at.
+#: What to capture where no measurement is determined.
 LEAST_CAPTURES = "Add dark frames at two exposures, and flat frames at three levels or more with the light's radiance: the measurements begin with these."
 
 
@@ -81,6 +81,7 @@ def merged(source: str, found: Sequence[SideFindings], policy: DecisionPolicy) -
 
 
 def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedEffect]:
+    """The named effects of all sides, one item a name."""
     by_name: dict[str, list[tuple[Side, NamedCandidate]]] = {}
     for findings in found:
         for one in findings.named:
@@ -146,7 +147,7 @@ def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:
 def _family_statement(
     family: Family, members: Sequence[Member], is_exact: bool, seen: str, values: str, corrections: Sequence[str]
 ) -> str:
-    """What a named family is, in sentences: how far its laws hold, which they are, and the capture that tells them apart."""
+    """The sentences about a named family: how well its laws hold, which they are, and the capture that tells them apart."""
     names = [f"{m.name} ({100 * m.probability:.0f} %)" for m in members[:TOLD_MEMBERS]]
     told = [family.sentence, f"{seen}."]
     if is_exact:
@@ -207,7 +208,7 @@ def _summary(
     """The diagnosis in sentences."""
     lines = []
     if verdict == "nothing_judged":
-        lines.append("No measurement of these recordings could be looked at, so nothing is said of the camera.")
+        lines.append("These recordings determine no measurement, so nothing is said about the camera.")
     if verdict == "no_mismatch":
         agree = ", and held-out captures agree" if held_out is not None else "; no captures are held out"
         lines.append(

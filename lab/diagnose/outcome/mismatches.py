@@ -128,9 +128,11 @@ def unexplained(
     corrections: Sequence[Correction],
     policy: DecisionPolicy,
 ) -> list[Unexplained]:
-    """Every mismatch that is left: where, how its discrepancy looks, which law comes nearest, and chi2 with and
-    without the discrepancy's covariance, of what only held-out captures show that of theirs; the captures, and what is to be checked of
-    them. `corrections` of the improved model, one for each. What the nearest law of a named family leaves isn't listed."""
+    """Every mismatch that no name explains: where it is, the shape of its discrepancy, the nearest law, captures, and what to check.
+
+    chi2 is of the seen numbers, without and with the discrepancy's covariance; of a mismatch that only held-out captures show, it is
+    theirs. `corrections`: one for each discrepancy. What the nearest law of a named family leaves isn't listed.
+    """
     model = verdict.model
     gaussian = model.gaussian(verdict.effects)
     held = held_by_families(verdict, policy)
@@ -189,7 +191,7 @@ def _seen_chi2(model: MeasurementModel, gaussian: Gaussian, index: np.ndarray) -
 
 
 def _level_check(recordings: RecordingSet, level: OutlyingLevel) -> str:
-    """What captures whose level isn't that of what is stated would be in line with, as a sentence."""
+    """The exposure, or the light, that a level out of line with its statement would fit, as a sentence."""
     stated = {c.id: c.exposure_s for c in recordings.captures() if c.id in level.captures}
     exposure_s = float(np.mean(list(stated.values())))
     many = len(level.captures) > 1
@@ -201,10 +203,10 @@ def _level_check(recordings: RecordingSet, level: OutlyingLevel) -> str:
 
 
 def _held_out_shape(outlying: Sequence[OutlyingLevel]) -> str:
-    """How a mismatch looks that only held-out captures show."""
+    """The shape of a mismatch that only held-out captures show, in words."""
     if outlying:
         return "single captures aren't in line with the others"
-    return "held-out captures contradict what the other captures say"
+    return "held-out captures contradict the other captures"
 
 
 def _shape(
@@ -215,7 +217,7 @@ def _shape(
     outlying: Sequence[OutlyingLevel],
     policy: DecisionPolicy,
 ) -> str:
-    """How a discrepancy looks, and the law that comes nearest to it."""
+    """The shape of a discrepancy, and the law nearest to it, in words."""
     if outlying:
         return _held_out_shape(outlying)
     block = verdict.model.blocks[one.index]
@@ -228,7 +230,7 @@ def _shape(
 def _nearest(
     one: Discrepancy, verdict: Verdict, near: Sequence[Candidate], chi2_without: float, policy: DecisionPolicy
 ) -> str:
-    """The nearest law of the library, and why it isn't named: what it leaves, or what fits as well."""
+    """The nearest law of the library, and why it isn't named, in words: it leaves too much, or others fit as well."""
     model, at = verdict.model, verdict.model.slices[one.index]
     nearest = max(near, key=lambda c: c.log_odds)
     name = nearest.effect.name

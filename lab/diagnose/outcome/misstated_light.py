@@ -1,4 +1,4 @@
-"""Levels whose stated number of photons contradicts the others: what the noise fit left out, told as metadata."""
+"""Flat levels whose stated number of photons contradicts the others, which the noise fit left out, reported as misstated metadata."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from lab.diagnose.inference.refit import refit
 from lab.diagnose.inference.score import signatures
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.curves import freed_curve
-from lab.diagnose.outcome.candidate_captures import Hypothesis, designs
+from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.visibility import visibility
 from lab.formats.recording_set import RecordingSet
@@ -55,40 +55,42 @@ LEAST_DISTANCE = 0.02
 
 
 @dataclass(frozen=True)
-class Proposal:
+class CaptureProposal:
     """A capture, what it would tell, and the sequence that takes it (None: a station can't by itself)."""
 
     capture: NextCapture
     plan: CapturePlan | None
 
 
-def proposals(recordings: RecordingSet, side: Side, verdict: Verdict, policy: DecisionPolicy) -> tuple[Proposal, ...]:
+def proposals(
+    recordings: RecordingSet, side: Side, verdict: Verdict, policy: DecisionPolicy
+) -> tuple[CaptureProposal, ...]:
     """Captures to take next, best first; none where no rivals are left."""
     rivals = _rivals(verdict, policy)
     if len(rivals) < 2:
         return ()
     found = []
-    for design in designs(recordings, side, verdict.model):
-        lower = cholesky(design.covariance, lower=True)
-        white = {h.name: solve_triangular(lower, design.predict(h), lower=True) for h in rivals}
+    for candidate in candidate_captures(recordings, side, verdict.model):
+        lower = cholesky(candidate.covariance, lower=True)
+        white = {h.name: solve_triangular(lower, candidate.predict(h), lower=True) for h in rivals}
         pairs = {(a, b): 0.5 * float(np.sum(np.square(white[a] - white[b]))) for a, b in combinations(white, 2)}
         nearest = min(pairs, key=lambda pair: pairs[pair])
-        found.append((pairs[nearest], nearest, design))
+        found.append((pairs[nearest], nearest, candidate))
     found.sort(key=lambda item: -item[0])
     # a capture that neither rival changes tells nothing: an f-number for darks
     found = [item for item in found if item[0] >= LEAST_DISTANCE] or found[:1]
     return tuple(
-        Proposal(
+        CaptureProposal(
             NextCapture(
                 side=side,
-                capture=design.words,
+                capture=candidate.words,
                 rivals=nearest,
                 distance=distance,
                 told_apart=float(ndtr(np.sqrt(0.5 * distance))),
             ),
-            design.plan,
+            candidate.plan,
         )
-        for distance, nearest, design in found[: policy.next_captures_listed]
+        for distance, nearest, candidate in found[: policy.next_captures_listed]
     )
 
 

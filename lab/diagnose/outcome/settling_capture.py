@@ -1,7 +1,7 @@
-"""What to capture where a mismatch has no name: captures of the same kind that change what the measurement depends on.
+"""What to capture where a mismatch has no name: captures of the same kind under another condition.
 
-Only conditions that can change the measurement are proposed: dark frames have no light, so that no lens, lamp or wavelength acts on them.
-Where few repeats were taken, more of them come first: a law shows in what stays alike.
+Only conditions that can change the measurement are proposed: without light, no lens, lamp or wavelength acts on dark frames. Where there
+are few repeats, more of them are proposed first.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from sim.camera import Side
 FEW_REPEATS, MORE_REPEATS = 8, 16
 #: What to vary, by the kind of all captures of a measurement; else by its axis, which says what it follows.
 BY_KIND = {
-    "dark": "at another exposure and another temperature of the sensor: what comes with time, with warmth or with every read-out differs in these",
-    "narrowband": "at half the exposure, and at the wavelengths between: the response follows the level, a filter the wavelength",
-    "chart": "at half the exposure, and with the chart turned by 180 degrees: the response follows the level, the light its place",
-    "charuco": "with the board turned by 90 degrees, and nearer: the lens stays with the frame, the board's errors turn with it",
+    "dark": "at another exposure and another sensor temperature: dark current grows with both, row and column noise with neither",
+    "narrowband": "at half the exposure, and at the wavelengths between: a nonlinear response depends on the level, a filter on the wavelength",
+    "chart": "at half the exposure, and with the chart rotated by 180 degrees: a nonlinear response depends on the level, uneven light on the place",
+    "charuco": "with the board rotated by 90 degrees, and nearer: errors of the lens stay with the frame, errors of the board rotate with it",
 }
 BY_AXIS = {
-    "spatial_frequency": "at another f-number and in light of another wavelength: diffraction and aberrations follow these, the sensor doesn't",
-    "field": "at another f-number, and with the camera turned by 180 degrees: the lens and the sensor stay with the frame, the light turns",
-    "level": "at other levels of the light and the same exposure: the response follows the level, the dark signal the exposure",
-    "row_frequency": "at another exposure: a source's flicker follows the time of each row, lines of the read-out don't",
+    "spatial_frequency": "at another f-number and in light of another wavelength: diffraction and aberrations depend on these, the sensor doesn't",
+    "field": "at another f-number, and with the camera rotated by 180 degrees: lens and sensor stay with the frame, uneven light rotates",
+    "level": "at other levels of the light and the same exposure: a nonlinear response depends on the level, the dark signal on the exposure",
+    "row_frequency": "at another exposure: flicker of the source depends on the time of each row, row noise of the read-out doesn't",
 }
-ELSE = "once more after a break, in the reverse order: what follows the time differs then"
+ELSE = "again after a break, in the reverse order: a drift with time differs then"
 
 
 def repeats_of(captures: Iterable[Capture]) -> int:
@@ -54,14 +54,14 @@ def settling_sentence(recordings: RecordingSet, side: Side, left: Sequence[Unexp
     captures = [c for c in recordings.captures(side=side) if c.id in set(item.captures)]
     kinds = {c.kind for c in captures}
     every = [c for c in recordings.captures(side=side) if c.kind in kinds]
-    what = " and ".join(sorted(kinds)) + " captures" if kinds else "captures that are off"
+    what = " and ".join(sorted(kinds)) + " captures" if kinds else "captures with the mismatch"
     repeats = repeats_of(every)
     if kinds == {"dark"}:
         what = "dark frames"
         if repeats < FEW_REPEATS:
             return (
-                f"Take {MORE_REPEATS} {what} at each setting (there are {repeats}): their noise hides how the mismatch of the {side} camera "
-                "looks. Then, take them at another exposure."
+                f"Take {MORE_REPEATS} {what} at each setting (there are {repeats}): their noise hides the shape of the mismatch of the {side} "
+                "camera. Then take them at another exposure."
             )
     (kind,) = kinds if len(kinds) == 1 else ("",)
     return f"Repeat the {what} of the {side} camera {BY_KIND.get(kind) or BY_AXIS.get(item.axis, ELSE)}."

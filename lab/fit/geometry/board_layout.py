@@ -1,8 +1,8 @@
-"""How many squares a board has, by its pictures, whatever is stated of it.
+"""The number of squares of a board, from its frames alone.
 
-Markers are numbered row by row over a board's light squares: their numbers and places are a plane's picture for one number of columns
-only. A plain checkerboard's corners are counted by OpenCV's detector, which grows a grid from its middle. What no picture tells is the
-length of a square: a board twice as large at twice the distance has the same picture.
+Markers are numbered row by row over the light squares of a board. Their numbers and places fit a homography for one number of columns
+only. The corners of a plain checkerboard are counted by OpenCV's detector, which grows a grid from the middle. Frames don't tell the
+length of a square: a board twice as large at twice the distance gives the same image.
 """
 
 from __future__ import annotations
@@ -20,46 +20,47 @@ from lab.capture_kinds.charuco import CharucoCapture
 Array = NDArray[np.floating[Any]]
 Grey = NDArray[np.uint8]
 
-FEWEST_MARKERS = 6  # of a picture: a homography has 8 parameters, two of which a marker's centre gives
+FEWEST_MARKERS = 6  # of a frame: a homography has 8 parameters, and a marker's centre gives two equations
 MOST_COLUMNS = 40
-#: Rms distance of markers' centres from a homography, of a marker's side: a layout that fits has less (lenses bend a board by some
-#: hundredths), one that doesn't has so many times that of the one that fits.
+#: Rms distance of the markers' centres from a homography, over a marker's side: the most of a layout that fits (distortion gives some
+#: hundredths), and the least ratio of any other layout's to it.
 FITS, WORSE = 0.15, 5.0
-FEWEST_ABSENT = 4  # markers in sight that no picture shows, from which on a row counts as not there
-LARGEST_PX = 1000.0  # of a picture in which a plain board's corners are counted: larger ones are shrunk
-SMALLEST_GRID = (3, 3)  # inner corners that the search for a plain board starts from
+FEWEST_ABSENT = 4  # markers that should be in view and aren't found, from which on a stated row counts as missing
+LARGEST_PX = 1000.0  # side of a frame in which a plain board's corners are counted; larger frames are reduced
+SMALLEST_GRID = (3, 3)  # inner corners from which the search for a plain board starts
 
 
 @dataclass(frozen=True)
 class BoardLayout:
-    """What pictures of a board fit. `squares`: (rows, cols). `marker_share`: a marker's side over a square's; None: no markers. `rms`,
-    `rms_stated`: distances of the markers' centres from their places, of a marker's side, with these squares and with those stated;
-    None: the stated squares have no such markers, or there are none. `pictures`: on which it rests."""
+    """The layout that frames of a board fit."""
 
-    squares: tuple[int, int]
-    marker_share: float | None
-    marker_px: float | None
-    rms: float | None
-    rms_stated: float | None
-    pictures: int
+    squares: tuple[int, int]  # rows, columns
+    marker_share: float | None  # a marker's side over a square's; None without markers
+    marker_px: float | None  # a marker's side; None without markers
+    rms: (
+        float | None
+    )  # rms distance of the markers' centres from their places, over a marker's side; None without markers
+    rms_stated: float | None  # the same with the stated squares; None without markers, or where no homography fits
+    pictures: int  # number of frames used
 
 
 @dataclass(frozen=True)
 class _Markers:
-    """Markers of one picture: numbers (n,), corners (n, 4, 2) and centres (n, 2), px; size of the picture (rows, cols)."""
+    """The n markers found in one frame."""
 
     number: NDArray[np.int64]
-    corners: Array
-    centres: Array
-    shape: tuple[int, int]
+    corners: Array  # (n, 4, 2), px
+    centres: Array  # (n, 2), px
+    shape: tuple[int, int]  # of the frame: rows, columns
 
     @property
     def side_px(self) -> float:
+        """Median side of a marker, px."""
         return float(np.median(np.linalg.norm(np.roll(self.corners, 1, axis=1) - self.corners, axis=2)))
 
 
 def board_layout(pictures: Sequence[Grey], capture: CharucoCapture) -> BoardLayout | None:
-    """The layout that pictures (rows, cols) of one board fit; None where they don't tell it. `capture`: what is stated of it."""
+    """The layout that frames (rows, cols) of one board fit; None where they don't determine it. `capture`: what is stated about it."""
     if capture.dictionary == "none":
         return _plain_layout(pictures)
     code = getattr(cv2.aruco, capture.dictionary, None)
@@ -92,6 +93,7 @@ def board_layout(pictures: Sequence[Grey], capture: CharucoCapture) -> BoardLayo
 
 
 def _markers(detector: Any, picture: Grey) -> _Markers | None:
+    """The markers whose number occurs once in a frame; None for fewer than `FEWEST_MARKERS`."""
     corners, ids, _ = detector.detectMarkers(picture)
     if ids is None:
         return None
@@ -101,7 +103,7 @@ def _markers(detector: Any, picture: Grey) -> _Markers | None:
     if once.sum() < FEWEST_MARKERS:
         return None
     number, quads = number[once], quads[once]
-    # a projection keeps where diagonals meet
+    # the centre is where the diagonals meet, which a projection keeps
     along, across = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
     between = quads[:, 1] - quads[:, 0]
     share = (between[:, 0] * across[:, 1] - between[:, 1] * across[:, 0]) / (
@@ -112,14 +114,16 @@ def _markers(detector: Any, picture: Grey) -> _Markers | None:
 
 
 def _places(number: NDArray[np.int64], cols: int, parity: int) -> Array:
-    """Centres (n, 2), (x, y) in squares, of markers on a board of so many columns, whose first light square is the first (parity 0) or second."""
+    """Places (n, 2), (x, y) in squares, of markers on a board of `cols` columns, whose first light square is the first (parity 0) or the
+    second (parity 1)."""
     rows = 2 * (int(number.max()) // cols + 2)
     row, col = np.nonzero((np.indices((rows, cols)).sum(axis=0) + parity) % 2 == 0)
     return np.column_stack([col, row])[number].astype(float)
 
 
 def _homography(one: _Markers, cols: int, parity: int) -> tuple[Array, float] | None:
-    """From the board, in squares, to the picture, by all markers; and the rms distance of their centres, px."""
+    """The homography from the board (squares) to the frame (px), fitted to all markers, and the rms distance of their centres from it, px.
+    None where none fits."""
     places = _places(one.number, cols, parity)
     if np.ptp(places[:, 0]) == 0 or np.ptp(places[:, 1]) == 0:
         return None
@@ -131,7 +135,7 @@ def _homography(one: _Markers, cols: int, parity: int) -> tuple[Array, float] | 
 
 
 def _rms(seen: Sequence[_Markers], cols: int, parity: int) -> float:
-    """Over all pictures, of a marker's side; infinite where one has no homography."""
+    """Rms distance of the markers' centres from the homographies of all frames, over a marker's side; infinite where a frame has none."""
     total, count = 0.0, 0
     for one in seen:
         fitted = _homography(one, cols, parity)
@@ -151,7 +155,7 @@ def _sides(one: _Markers, cols: int, parity: int) -> Array:
 
 
 def _lacks_rows(seen: Sequence[_Markers], cols: int, parity: int, rows: int, stated: int) -> bool:
-    """Whether markers of rows from `rows` on, up to the stated number, would lie well inside pictures that don't show them."""
+    """Whether `FEWEST_ABSENT` markers of the rows from `rows` to `stated` should lie inside frames in which they aren't found."""
     row, col = np.nonzero((np.indices((stated, cols)).sum(axis=0) + parity) % 2 == 0)
     beyond = np.column_stack([col, row])[row >= rows].astype(float)
     absent = 0
@@ -166,9 +170,9 @@ def _lacks_rows(seen: Sequence[_Markers], cols: int, parity: int, rows: int, sta
 
 
 def _plain_layout(pictures: Sequence[Grey]) -> BoardLayout | None:
-    """A plain checkerboard's squares, the fewer first, where most pictures show the same number.
+    """The squares of a plain checkerboard, the smaller number first, where most frames show the same number; else None.
 
-    A board that is stated too small is found, too, anywhere on the larger one: poses of a pair don't belong together then.
+    A board that is stated too small would be found anywhere on the larger one, at unrelated poses in the frames of a pair.
     """
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
     counts: list[tuple[int, int]] = []

@@ -239,7 +239,7 @@ def _check_focal_length(solution: Solution) -> None:
     why = (
         f"all views are parallel within {apart:.0f} deg, so that focal length and distance can't be told apart"
         if apart < PARALLEL_DEG
-        else f"it is open by {100 * min(uncertain, 9.99):.0f} %"
+        else f"its standard deviation is {100 * min(uncertain, 9.99):.0f} %"
     )
     raise NotDetermined(
         "geometry", f"the focal length isn't determined: {why}; tilt the board by 20..40 deg in several views"

@@ -1,4 +1,4 @@
-"""A plane grid of dots in a picture: which there are, and their centres to hundredths of a pixel."""
+"""A plane grid of dots in a frame: finding the grid, and the dots' centres to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from lab.fit.geometry.corners import CornerFits
 
 Array = NDArray[np.floating[Any]]
 
-#: Of the spacing of the dots: radius of the window about a dot, and its inner radius from which on it is taken for background.
+#: Radius of the window about a dot, over the spacing of the dots; and the share of that radius beyond which is background.
 WINDOW, BACKGROUND = 0.5, 0.8
-#: Share of a dot's contrast below which a pixel counts as background; least contrast, of the picture's.
+#: Share of a dot's contrast that is subtracted from the weights; least contrast of a dot, in a picture of 0..1.
 LEAST_SHARE, LEAST_CONTRAST = 0.1, 0.1
 PASSES = 4
 
 
 def dot_grid(grey: NDArray[np.uint8], rows: int, cols: int) -> Array:
-    """First guesses of the dots' centres, (rows, cols, 2) in (x, y), dark on light or light on dark; all of them have to be in view.
+    """First estimates of the dots' centres, (rows, cols, 2), (x, y) px. Dots are dark on light or light on dark, and all are in view.
 
     Raises `NotDetermined` where no grid of that size is found.
     """
@@ -38,11 +38,12 @@ def dot_centres(
 ) -> CornerFits:
     """Centroids of the dots at `points` (n, 2), (x, y), in a picture (rows, cols) of 0..1.
 
-        c = sum w r / sum w,   w = (I - background) / (peak - background) less `LEAST_SHARE`, 0 at least
+        c = sum w r / sum w,   w = max((I - background) / (peak - background) - `LEAST_SHARE`, 0)
 
-    within half a spacing; the background is the median beyond 0.8 of that. Standard deviation by the noise s of the background:
-    s sqrt(sum |r - c|^2 / 2) / sum w. The centroid of an ellipse isn't the dot's centre in perspective: with dots of radius a at distance z
-    the two differ by some f (a / z)^2 sin(2 tilt) / 2 pixels, f the focal length in pixels.
+    within half a spacing. The background is the median beyond 0.8 of that radius. A coordinate has the standard deviation
+    s sqrt(sum |r - c|^2 / 2) / sum w, with s the noise of the background over the contrast. In perspective, the centroid of the ellipse
+    isn't the image of the dot's centre: for dots of radius a at distance z and a focal length of f px they differ by about
+    f (a / z)^2 sin(2 tilt) / 2 px.
     """
     points = np.array(points, float)
     index = np.arange(rows * cols) if index is None else index
@@ -63,7 +64,7 @@ def dot_centres(
 def _centroid(
     picture: Array, start: Array, radius: float, dx: NDArray[np.int64], dy: NDArray[np.int64]
 ) -> tuple[Array, float] | None:
-    """One dot's centroid and the standard deviation of a coordinate; None where there is no dot, or it is at the picture's border."""
+    """The centroid of one dot and the standard deviation of a coordinate; None where there is no dot, or it touches the frame's border."""
     height, width = picture.shape
     at, std = start, np.inf
     for _ in range(PASSES):

@@ -15,7 +15,11 @@ from lab.fit.mtf.samples import Region, region_planes
 from sim.camera import Cfa
 from sim.sensor.mosaic import step as period
 
-LEAST_EDGE_PX, LEAST_ROOM_PX, MOST_EDGES = 40.0, 20.0, 24
+LEAST_EDGE_PX, LEAST_ROOM_PX, MOST_EDGES = (
+    40.0,
+    20.0,
+    24,
+)  # least length, least room on either side, most edges of a frame
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,9 @@ def find_edges(frame: ArrayLike, cfa: Cfa = "MONO", saturation_dn: float | None 
             continue
         for share in (0.9, 0.7, 0.5):
             half = 0.5 * share * lengths[index] * np.abs(along)
-            if min(2.0 * half.max(), 2.0 * half.max()) < 0.6 * LEAST_EDGE_PX:
+            if 2.0 * half.max() < 0.6 * LEAST_EDGE_PX:
                 break
-            # Across the edge, not so much that the next side of a square is within the region
+            # across the edge, only so much that the next side of a square stays outside the region
             room = np.maximum(half, np.minimum(LEAST_ROOM_PX + half.min(), 0.47 * lengths[index] * np.abs(along).max()))
             start = np.maximum(np.ceil(np.array(middle) - room), 0).astype(int)
             stop = np.minimum(np.floor(np.array(middle) + room) + 1, values.shape).astype(int)

@@ -74,7 +74,7 @@ def robust_response(
     inside = ~clipped & (light > 0) & (signal >= low * saturation) & (signal <= high * saturation)
     if np.count_nonzero(inside) < LEAST_LEVELS:
         return None
-    law = _Law.of(light[inside], signal[inside], signal_std[inside], saturation)
+    law = _LightLaw.of(light[inside], signal[inside], signal_std[inside], saturation)
     sound = law.sound_levels(rng)
     solution, scatter = law.fitted(sound)
     outlier = np.zeros(light.size, bool)
@@ -98,15 +98,16 @@ def _light_at(u: FloatArray, solution: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Law:
-    """The levels (n,) of the law: basis (n, 1 + p), offset first; log(light / u); relative noise of the signal."""
+class _LightLaw:
+    """A law of the light over n levels, linear in its coefficients: log(light / u) = basis @ coefficients. `basis` (n, 1 + p), the offset first; `value` (n,) is
+    log(light / u); `noise` (n,) is the relative standard deviation of the signal."""
 
     basis: FloatArray
     value: FloatArray
     noise: FloatArray
 
     @classmethod
-    def of(cls, light: FloatArray, signal: FloatArray, signal_std: FloatArray, saturation: float) -> _Law:
+    def of(cls, light: FloatArray, signal: FloatArray, signal_std: FloatArray, saturation: float) -> _LightLaw:
         u = signal / saturation
         degree = 1 + (u.size >= SQUARE_FROM) + (u.size >= CUBE_FROM)
         basis = np.concatenate([1.0 / u[:, None], np.polynomial.polynomial.polyvander(u, degree)], axis=1)

@@ -39,8 +39,8 @@ CLIPPED_SHARE = 0.95  # of the range above black: a mean above it may be of a cl
 
 
 @dataclass(frozen=True)
-class _Light:
-    """One mean in narrowband light, DN/s above dark. `power`: proportional to the light's."""
+class _TableLight:
+    """One row of the table: narrowband light of a relative `power`, and a channel's mean in it, `rate` +- `rate_std` (DN/s above dark)."""
 
     channel: str
     wavelength_nm: float
@@ -107,7 +107,7 @@ def _power(row: TableRow) -> float:
     return (current or 0.0) / responsivity
 
 
-def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Light | None:
+def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _TableLight | None:
     """The row's rate; None where its mean may be clipped."""
     channel, power = _channel(row, camera), _power(row)
     exposure_s, mean = row.value("exposure_s", 1e-9), row.value("mean_dn")
@@ -122,7 +122,7 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Ligh
         black, black_std = nearest.value("mean_dn"), nearest.value("mean_std_dn")
     if mean > black + CLIPPED_SHARE * (camera.saturation_dn - black):
         return None
-    return _Light(
+    return _TableLight(
         channel,
         row.value("wavelength_nm", 1.0),
         row.value("bandwidth_nm", 0.1),
@@ -132,7 +132,7 @@ def _light(row: TableRow, darks: Sequence[TableRow], camera: DataSheet) -> _Ligh
     )
 
 
-def _fitted(lights: Sequence[_Light], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
+def _fitted(lights: Sequence[_TableLight], channels: Sequence[str], remarks: list[str]) -> SpectralFit:
     by_channel = {c: [one for one in lights if one.channel == c] for c in channels}
     for channel, own in by_channel.items():
         if len({one.wavelength_nm for one in own}) < MIN_SPECTRA:
@@ -182,7 +182,7 @@ def _fitted(lights: Sequence[_Light], channels: Sequence[str], remarks: list[str
     )
 
 
-def _photons(light: _Light, wave: FloatArray) -> FloatArray:
+def _photons(light: _TableLight, wave: FloatArray) -> FloatArray:
     """Photons per nm, up to a factor: a triangle of the light's bandwidth, as a monochromator with equal slits has."""
     shape = np.clip(1.0 - np.abs(wave - light.wavelength_nm) / light.bandwidth_nm, 0.0, None)
     area = float(np.sum(shape * trapezoid_weights(wave)))
@@ -193,7 +193,7 @@ def _photons(light: _Light, wave: FloatArray) -> FloatArray:
 
 
 def _joint_covariance(
-    at: FloatArray, solved: dict[str, tuple[float, Sensitivity]], by_channel: dict[str, list[_Light]]
+    at: FloatArray, solved: dict[str, tuple[float, Sensitivity]], by_channel: dict[str, list[_TableLight]]
 ) -> FloatArray:
     """Covariance of the curves of all channels, channel after channel. Channels share the error of the reference's reading of each light."""
     blocks = []

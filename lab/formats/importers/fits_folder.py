@@ -1,8 +1,8 @@
-"""A folder of FITS frames: what each is says its header, or an `index.csv` beside them, as of a folder of raws.
+"""A folder of FITS frames. The header of each says what it shows, or an `index.csv` beside them, as in a folder of raws.
 
 Used of the header: IMAGETYP or OBSTYPE (dark, bias, zero, flat), EXPTIME or EXPOSURE (s), CCD-TEMP, DATE-OBS. An index has one row a frame;
-its empty cells of exposure, temperature and time are taken from the header. GAIN and BAYERPAT have no common meaning: what they say
-belongs into `camera.toml`, which has the camera's keys, `cfa` and `bit_depth` at least.
+its empty cells of exposure, temperature and time are taken from the header. GAIN and BAYERPAT have no common meaning: state these values in
+`camera.toml`, which has the camera's keys, `cfa` and `bit_depth` at least.
 """
 
 from __future__ import annotations

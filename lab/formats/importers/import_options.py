@@ -1,4 +1,4 @@
-"""What the command line says beside a path, for the importers that ask for it."""
+"""Options of an import: what the user states because a format doesn't hold it."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from lab.formats.recording_set.writing import contents
 
 
 class _Sent(io.RawIOBase):
-    """A file that can only be written to, and gives out what it was given."""
+    """A write-only file whose content is taken away piece by piece."""
 
     def __init__(self) -> None:
         self._held = bytearray()

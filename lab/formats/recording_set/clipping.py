@@ -1,4 +1,4 @@
-"""Clipped pixels: their share of each channel, and whether a saturated flat is the top of an exposure ladder."""
+"""Clipped pixels: their share of each channel, and whether a saturated flat is the top of an exposure series."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from lab.formats.recording_set.recordings import RecordingSet
 CLIPPED_LIMIT = 0.5
 #: Scale of a light that is stated as a number of photons.
 PHOTONS = "photons"
-#: Least number of unsaturated levels below a saturated flat for it to be the top of an exposure ladder.
-LADDER_LEVELS = 3
+#: Least number of unsaturated levels below a saturated flat for it to be the top of an exposure series.
+SERIES_LEVELS = 3
 #: Share of the levels of a light whose stated light may contradict the others: these are left out, and a warning names them.
 WRONG_SHARE = 0.2
 #: Factor between the stated light of an unsaturated level and that which the others' median slope gives its mean, above which it contradicts them.
@@ -29,7 +29,7 @@ BENT_SCATTER = 0.8
 #: Relative difference of two lights below which they are one level: readings of a light scatter.
 SAME_LIGHT = 0.01
 #: Least share of the flat's signal that these levels must predict for it. Below 1, as lamps and sensors aren't exactly linear.
-LADDER_REACH = 0.85
+LEAST_PREDICTED = 0.85
 
 
 @dataclass(frozen=True)
@@ -95,10 +95,10 @@ def flat_level(recordings: RecordingSet, flat: FlatCapture, frame: Frame, clippe
     return ClippedLevel(flat.id, where, flat.gain_db, light, scale, mean_dn, clipped, scatter_dn)
 
 
-def _why_not_a_ladder(level: ClippedLevel, channel: str, levels: list[ClippedLevel], black: float) -> str | None:
-    """Why the clipped `channel` of a flat isn't the top of an exposure ladder, with the remedy; None where it is.
+def _why_not_series_end(level: ClippedLevel, channel: str, levels: list[ClippedLevel], black: float) -> str | None:
+    """Why the clipped `channel` of a flat isn't the top of an exposure series, with the remedy; None where it is.
 
-    EMVA 1288 asks for exposures up to and beyond saturation. A clipped flat is accepted where at least `LADDER_LEVELS` unclipped
+    EMVA 1288 asks for exposures up to and beyond saturation. A clipped flat is accepted where at least `SERIES_LEVELS` unclipped
     levels of the same gain and light lie below it, their slope predicts that it clips, and its repeats clip too.
     """
     unclipped = [
@@ -112,21 +112,21 @@ def _why_not_a_ladder(level: ClippedLevel, channel: str, levels: list[ClippedLev
         if other.light >= level.light and other.clipped[channel] < CLIPPED_LIMIT / 5:
             return f"but {other.id} with as much light isn't; recapture it"
     below = sorted((other for other in unclipped if 0 < other.light < level.light), key=lambda other: other.light)
-    if len({other.light for other in below}) < LADDER_LEVELS:
-        return f"expose shorter, or add {LADDER_LEVELS} unsaturated levels below it"
-    slope = float(np.median([(other.mean_dn[channel] - black) / other.light for other in below[-LADDER_LEVELS:]]))
-    if slope * level.light < LADDER_REACH * (level.mean_dn[channel] - black):
+    if len({other.light for other in below}) < SERIES_LEVELS:
+        return f"expose shorter, or add {SERIES_LEVELS} unsaturated levels below it"
+    slope = float(np.median([(other.mean_dn[channel] - black) / other.light for other in below[-SERIES_LEVELS:]]))
+    if slope * level.light < LEAST_PREDICTED * (level.mean_dn[channel] - black):
         return f"but the flats below it predict {black + slope * level.light:.0f} DN; recapture it"
     return None
 
 
 def contradicting_levels(unclipped: list[ClippedLevel], channel: str, black: float) -> list[ClippedLevel]:
-    """Unclipped flats of one gain and light whose stated light contradicts the others by more than `WRONG_FACTOR`.
+    """Unclipped flats of one gain and light whose stated light contradicts that of the others by more than `WRONG_FACTOR`.
 
-    The median slope of signal against light tells which: it holds while fewer than half of the levels are wrong. None where more
-    than `WRONG_SHARE` of the levels are off: then no majority says what the light is. `black`: DN; where it isn't known, the
-    offset of a line through the levels (Theil and Sen) stands for it. Levels at the full well, or where the response bends at its
-    top, say nothing about the slope, and having less signal than it says is no contradiction there.
+    The reference is the median slope of signal against light, which holds while fewer than half of the levels are wrong. Empty where more
+    than `WRONG_SHARE` of the levels contradict it: then no majority says what the light is. `black`: DN; if unknown, the offset of a robust
+    line through the levels (Theil and Sen). Levels at the full well or in the bend at the top of the response don't count for the slope,
+    and less signal than the slope predicts is no contradiction there.
     """
     bent = _bent_levels(unclipped, channel)
     signals: dict[float, float] = {}
@@ -201,7 +201,7 @@ def _by_light(levels: list[ClippedLevel]) -> list[list[ClippedLevel]]:
 
 
 def saturated_flats(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[str]:
-    """One line for each clipped flat that isn't the top of an exposure ladder, unless its photon number may be wrong."""
+    """One line for each clipped flat that isn't the top of an exposure series, unless its photon number may be wrong."""
     misplaced = list(_misplaced(levels, camera))
     forgiven = _forgiven(misplaced, levels)
     for level, channel, why in misplaced:
@@ -211,18 +211,18 @@ def saturated_flats(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[s
 
 
 def _misplaced(levels: list[ClippedLevel], camera: DataSheet) -> Iterator[tuple[ClippedLevel, str, str]]:
-    """Clipped flats that aren't the top of an exposure ladder, with the channel and why."""
+    """Clipped flats that aren't the top of an exposure series, with the channel and why."""
     for level in levels:
         for channel, share in level.clipped.items():
             if share <= CLIPPED_LIMIT:
                 continue
-            if why := _why_not_a_ladder(level, channel, levels, camera.black_level_dn or 0.0):
+            if why := _why_not_series_end(level, channel, levels, camera.black_level_dn or 0.0):
                 yield level, channel, why
                 break
 
 
 def _forgiven(misplaced: list[tuple[ClippedLevel, str, str]], levels: list[ClippedLevel]) -> set[int]:
-    """Ids of the misplaced flats that state photons, where few enough levels do: a statement may be wrong, unlike a shutter."""
+    """Ids of misplaced flats that state photon numbers, if they are few enough: a stated number may be wrong, unlike an exposure."""
     photons = [level for level, *_ in misplaced if level.scale.startswith(PHOTONS)]
     lights = {level.light for level in levels if level.scale.startswith(PHOTONS)}
     few = len({level.light for level in photons}) <= WRONG_SHARE * len(lights)

@@ -22,7 +22,7 @@ MOST_PX = 1 << 15
 
 
 class DataSheet(Open):
-    """What the manufacturer says of one camera. The fits test it. None: not known."""
+    """The manufacturer's data of one camera, which the fits test. None: not known."""
 
     rows: int = Field(gt=0, le=MOST_PX)
     cols: int = Field(gt=0, le=MOST_PX)

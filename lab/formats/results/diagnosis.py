@@ -8,7 +8,7 @@ from lab.formats.results.skipped import Skipped
 from sim.camera import Side
 from sim.parameters import Frozen
 
-#: `nothing_judged`: no measurement could be looked at.
+#: `nothing_judged`: the recordings determine no measurement.
 DiagnosisVerdict = Literal["no_mismatch", "explained", "partly_explained", "unexplained", "nothing_judged"]
 
 

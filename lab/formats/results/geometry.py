@@ -52,10 +52,10 @@ class CrossValidation(Frozen):
 
 
 class CornerErrors(Frozen):
-    """What the corners depart from the model by, px, as standard deviations of one coordinate.
+    """Departure of the corners from the model, px, as standard deviations of one coordinate, in two parts.
 
-    `noise_px`: the part that each corner has by itself, the sampling error. `model_error_px`: the part that neighbouring corners
-    share (board, print, lens, motion), the error of the model; 0 where none is significant. Both are in `covariance`.
+    `noise_px`: independent from corner to corner, the sampling error. `model_error_px`: correlated between neighbouring corners (board,
+    print, lens, motion), the error of the model; 0 where it isn't significant. Both are in `covariance`.
     """
 
     noise_px: float

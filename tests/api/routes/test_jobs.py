@@ -1,4 +1,4 @@
-"""Jobs over REST. The work is a stand-in; `lab.pipeline` and `lab.jobs` have tests of their own."""
+"""Jobs over REST. The work is a stub; `lab.pipeline` and `lab.jobs` have tests of their own."""
 
 from __future__ import annotations
 

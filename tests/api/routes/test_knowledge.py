@@ -1,4 +1,4 @@
-"""What the models declare is what the service tells."""
+"""The service describes what the models declare: parameters and effects."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_effects_are_those_of_the_library(shared: Running) -> None:
         assert client.get("/api/v1/effects/magic").status_code == 404
 
 
-def test_who_asks(shared: Running) -> None:
+def test_a_key_is_told_its_name_and_scope(shared: Running) -> None:
     for scope in shared.keys:
         with shared.client(scope) as client:
             assert client.get("/api/v1/me").json() == {"name": scope, "scope": scope}

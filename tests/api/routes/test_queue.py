@@ -76,7 +76,7 @@ def test_the_queue_goes_on_when_the_service_is_back(tmp_path: Path) -> None:
             client.queue_session(waiting)
 
 
-def test_a_halt_holds_what_waits_until_it_is_released(running: Running, client: ServiceClient) -> None:
+def test_a_halt_holds_queued_sessions_until_they_are_released(running: Running, client: ServiceClient) -> None:
     running.bench.delay_s = SLOW_S
     runs = client.start_session(darks("runs", queue=False)).id
     waits = client.start_session(darks("waits")).id
@@ -96,7 +96,7 @@ def test_a_halt_holds_what_waits_until_it_is_released(running: Running, client: 
     assert client.wait_session(waits).state == "finished"
 
 
-def test_a_session_that_cannot_begin_holds_what_waits_until_it_has_finished(
+def test_a_session_that_cannot_begin_holds_queued_ones_until_it_has_finished(
     running: Running, client: ServiceClient
 ) -> None:
     good = client.start_session(darks("good", not_before=datetime.now(UTC) + timedelta(days=1))).id
@@ -128,7 +128,7 @@ def test_two_stations_do_not_wait_for_each_other(running: Running, client: Servi
     assert ended[there].runs[0].started < closed < ended[waits].runs[0].started
 
 
-def test_what_cannot_wait_is_refused(shared: Running) -> None:
+def test_sessions_that_cannot_be_queued_are_refused(shared: Running) -> None:
     with shared.client("operate") as client:
         begun = {"station": "fakes", "queue": False, "not_before": "2030-01-01T00:00:00Z"}
         for asked, said in (
@@ -161,7 +161,7 @@ def test_a_session_is_fetched_as_a_recording_set(shared: Running, tmp_path: Path
         assert (here.frame(mine) == there.frame(theirs)).all()
 
 
-def test_a_session_is_deleted_with_its_files_and_not_what_was_found(running: Running, client: ServiceClient) -> None:
+def test_a_session_is_deleted_with_its_files_and_its_results_stay(running: Running, client: ServiceClient) -> None:
     running.bench.delay_s = SLOW_S
     session_id = client.start_session(darks("gone", queue=False)).id
     for refused in (lambda: client.delete_session(session_id), lambda: client.fetch_session(session_id, Path("x"))):

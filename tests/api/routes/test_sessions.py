@@ -1,4 +1,4 @@
-"""Stations, sessions and captures over REST, on instruments that are not there."""
+"""Stations, sessions and captures over REST, on fake instruments."""
 
 from __future__ import annotations
 
@@ -63,7 +63,9 @@ def test_stations_are_the_files_of_the_folder(running: Running) -> None:
         ({"name": "x" * 200}, 422, "name"),
     ],
 )
-def test_what_cannot_be_started_is_one_line(shared: Running, changes: dict[str, Any], status: int, said: str) -> None:
+def test_a_session_that_cannot_start_is_refused_in_one_line(
+    shared: Running, changes: dict[str, Any], status: int, said: str
+) -> None:
     (shared.store.root / "stations" / "broken.toml").write_text("name = ")
     (shared.store.root / "outside.toml").write_text("")
     before = len(shared.store.sessions())
@@ -108,7 +110,7 @@ def test_events_tell_each_step_and_the_end(tmp_path: Path) -> None:
     assert states[-1] == "finished" and "running" in states
 
 
-def test_who_comes_late_hears_how_things_stand(shared: Running) -> None:
+def test_a_late_follower_gets_the_present_state(shared: Running) -> None:
     with shared.client("read") as client:
         told = events(client, f"/api/v1/sessions/{only_session(shared)}/events")
     assert [name for name, _ in told] == ["state", "end"]
@@ -196,7 +198,7 @@ def test_stopping_the_service_leaves_sessions_resumable(tmp_path: Path) -> None:
     assert 1 < info.steps_done < info.steps
 
 
-def test_two_follow_and_one_leaves(tmp_path: Path) -> None:
+def test_one_of_two_followers_may_disconnect(tmp_path: Path) -> None:
     with serving(tmp_path, delay_s=0.02) as running, running.client("operate") as client:
         session_id = start(client)
         path = f"/api/v1/sessions/{session_id}/events"

@@ -143,7 +143,9 @@ def test_a_transcript_is_kept_on_request(running: Running) -> None:
         ("/stations/fakes/devices/Stage!", 422, "device"),
     ],
 )
-def test_what_isnt_there_is_told_in_one_line(shared: Running, path: str, status: int, said: str) -> None:
+def test_missing_stations_and_devices_are_refused_in_one_line(
+    shared: Running, path: str, status: int, said: str
+) -> None:
     (shared.store.root / "stations" / "broken.toml").write_text("name = ")
     try:
         with shared.client("read") as client:

@@ -56,7 +56,7 @@ class TestBasler:
             ({"pixel_format": "Yuv"}, "pixel format Yuv isn't offered or known"),
         ],
     )
-    def test_what_it_has_not_got_is_named(self, settings: dict[str, str], message: str) -> None:
+    def test_features_that_it_lacks_are_named(self, settings: dict[str, str], message: str) -> None:
         with pytest.raises(InstrumentError, match=message):
             BaslerCamera(LEFT, **settings).connect()
 

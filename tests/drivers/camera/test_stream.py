@@ -1,4 +1,4 @@
-"""Series of pairs: each trigger's frames together, and everything that gets lost taken again, on mock cameras with ready frames."""
+"""Series of frame pairs on mock cameras with prepared frames: the frames of a trigger stay together, and lost frames are taken again."""
 
 from __future__ import annotations
 

@@ -363,7 +363,7 @@ def test_lines_are_checked_against_the_cameras_own(device: U3vDevice, settings: 
         camera_of(device, **settings).connect()
 
 
-def test_what_bends_the_codes_is_switched_off_and_the_black_level_told(device: U3vDevice) -> None:
+def test_processing_of_codes_is_switched_off_and_the_black_level_read(device: U3vDevice) -> None:
     with camera_of(device) as camera:
         assert camera.nodes.get("GammaEnable") is False
         assert camera.sensor().black_level == 64.0

@@ -120,7 +120,7 @@ def test_a_fault_is_one_error_and_then_it_works_again(
     diode.close()
 
 
-def test_what_is_outside_is_refused(served: Callable[..., str], calibration: str) -> None:
+def test_a_wavelength_or_light_out_of_range_is_refused(served: Callable[..., str], calibration: str) -> None:
     with diode_at(served(MockScpiMeter(Line(550.0, 1e6)), Tcp("127.0.0.1", 0)), calibration) as diode:
         with pytest.raises(InstrumentError, match=r"1200 nm is outside its calibration's 300\.\.1100 nm"):
             diode.measure(1200)

@@ -1,4 +1,4 @@
-"""Backups: while sessions capture and are packed, restored as they are, and refused where they would be worth nothing."""
+"""Backups: taken while sessions capture and are packed, restored unchanged, and refused where they would be useless."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_session_that_is_packed_meanwhile_is_whole_in_the_backup(
     restored.close()
 
 
-def test_what_would_be_worth_nothing_is_refused(store: Store, tmp_path: Path) -> None:
+def test_useless_backups_are_refused(store: Store, tmp_path: Path) -> None:
     session = captured(store)
     for folder in (store.root, store.root / "backup", tmp_path):
         with pytest.raises(InputError, match="lies in it"):

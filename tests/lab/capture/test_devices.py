@@ -1,4 +1,4 @@
-"""Blocking calls behind a time-out, and the level of a frame."""
+"""Blocking calls with a time-out, and the level of a frame."""
 
 import threading
 import time
@@ -29,7 +29,7 @@ def test_a_driver_that_never_comes_back_is_given_up() -> None:
     status.add_callback(lambda _: done.set())
     assert done.wait(30)
     assert isinstance(status.exception(), NoAnswer)
-    assert "camera left: not back after 0.05 s" in str(status.exception())
+    assert "camera left: no answer within 0.05 s" in str(status.exception())
     free.set()  # and its late return changes nothing
     time.sleep(0.02)
     assert not status.success

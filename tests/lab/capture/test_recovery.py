@@ -1,4 +1,4 @@
-"""Sessions whose process ended without a word: the station is made safe, the reason is told, and the session goes on."""
+"""Sessions whose process died: the station is made safe, the reason recorded, and the session resumed where that is allowed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is connected is found, tested in words, and written into a station file that can be read."""
+"""Connected instruments are found, tested and written into a station file that can be read."""
 
 from __future__ import annotations
 

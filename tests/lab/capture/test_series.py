@@ -1,4 +1,4 @@
-"""The engine's series: steps that repeat an exposure are one series of cameras that stream, and what gets lost is in the journal."""
+"""Series of frames: steps that repeat an exposure become one series of streaming cameras, and lost frames are recorded in the journal."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_frames_that_get_lost_are_taken_again_and_told(store: Store, devices: tu
     assert pairs == [[number, number] for number in (2, 4, 6, 7, 8)]
 
 
-def test_what_repeats_a_step() -> None:
+def test_repeats_of_a_step_are_counted() -> None:
     station = fake_station()
     first, *others = DarkSequence(exposures_s=(0.001, 0.01), frames=2).steps(station)
     assert repeats_of(others[0], others[1:]) == 1  # the ladder turns: 0.01 s twice

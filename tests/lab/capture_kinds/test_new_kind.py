@@ -1,4 +1,4 @@
-"""A new kind of capture is one file: everything else plans, takes, keeps, exports, reads, lists and reports it untouched."""
+"""A new kind of capture takes one file: planning, capture, store, export, import and report handle it unchanged."""
 
 from __future__ import annotations
 

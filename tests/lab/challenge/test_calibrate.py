@@ -1,4 +1,4 @@
-"""Calibrating rules: another policy is told from the default one, and what differs is listed."""
+"""Calibration of decision rules: a policy is compared with the default one, and the differences are listed."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_rule_is_changed_by_its_name() -> None:
 @pytest.mark.parametrize(
     ("rule", "said"), [("luck=1", "no such rule"), ("most_effects=few", "give NAME=VALUE"), ("most_effects", "give NAME=VALUE")]
 )  # fmt: skip
-def test_what_is_no_rule_is_refused(rule: str, said: str) -> None:
+def test_an_unknown_rule_is_refused(rule: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         changed_policy((rule,))
 
@@ -59,7 +59,7 @@ def test_a_proof_is_not_tuned_on() -> None:
         refuse_proof(TRUTHS.model_copy(update={"purpose": "proof"}))
 
 
-def test_what_differs_is_listed_by_case() -> None:
+def test_differences_are_listed_by_case() -> None:
     text = comparison(_scored(named("defocus")), _scored(named()))
     assert "1 of 2 cases differ" in text
     assert "case-1, concealed defocus: explained (defocus) -> unexplained (no name)" in text

@@ -1,4 +1,4 @@
-"""Strengths and the oracle in linear Gaussian problems whose answers are known."""
+"""Strengths of concealed effects and the oracle, in linear Gaussian problems with known answers."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ NAMES = [f"effect_{k}" for k in range(45)]
 
 
 def tolerance(parameters: int, strength: float) -> float:
-    """Four standard deviations of a share over DRAWS, and of the price: 10 % of the false alarms' share, and so much of the power; then the share
-    of draws in which one of the others is worth its price."""
+    """Tolerance of the oracle's share of right names: four standard deviations over DRAWS; the change of the power if the share of false
+    alarms is off by 40 %, four times the price's error of 10 %; and the share of draws in which another effect exceeds its price."""
     low, power, high = (
         float(ncx2.sf(chi2.isf(FALSE_ALARMS * factor / len(NAMES), parameters), parameters, strength))
         for factor in (0.6, 1.0, 1.4)
@@ -31,7 +31,7 @@ def tolerance(parameters: int, strength: float) -> float:
 
 
 def orthogonal(parameters: int, size: int = 150) -> list[Directions]:
-    """45 effects that no other can imitate, the first with more parameters."""
+    """45 mutually orthogonal effects: the first with `parameters` parameters, the others with one."""
     axes = np.eye(size)
     first = Directions(NAMES[0], axes[:, 50 : 50 + parameters])
     return [first, *(Directions(name, axes[:, [k]]) for k, name in enumerate(NAMES) if k)]
@@ -40,8 +40,8 @@ def orthogonal(parameters: int, size: int = 150) -> list[Directions]:
 @pytest.mark.parametrize("parameters", [1, 3])
 @pytest.mark.parametrize("strength", [10.0, 15.0, 25.0, 30.0, 40.0])
 def test_the_oracle_has_the_power_of_the_chi2_test(parameters: int, strength: float) -> None:
-    """One effect among 45 that no other can imitate: it is told where its noncentral chi2 is above the threshold; that a false one comes before
-    it is as rare as the false alarms."""
+    """One effect among 45 that are orthogonal to it is named where its non-central chi2 exceeds the threshold; a false name comes first as
+    rarely as false alarms do."""
     candidates = orthogonal(parameters)
     mean = candidates[0].basis @ np.full(parameters, np.sqrt(strength / parameters))
     found = oracle_share(mean, candidates, NAMES[:1], np.random.default_rng(1), DRAWS)
@@ -50,22 +50,23 @@ def test_the_oracle_has_the_power_of_the_chi2_test(parameters: int, strength: fl
 
 
 def test_the_table_of_the_specification() -> None:
-    """The power at 1 % over 45 effects that planning was done with, to its two decimals."""
+    """The specification's table of power at 1 % false alarms over 45 effects, to its two decimals."""
     for parameters, shares in ((1, (0.30, 0.57, 0.90, 0.96, 1.00)), (3, (0.16, 0.39, 0.79, 0.90, 0.98))):
         power = ncx2.sf(chi2.isf(FALSE_ALARMS / 45, parameters), parameters, np.array([10.0, 15.0, 25.0, 30.0, 40.0]))
         np.testing.assert_allclose(power, shares, atol=0.0101)
 
 
 def test_the_oracle_keeps_its_false_alarms() -> None:
-    """Nothing concealed: the shares of all names together are 1 %, the price's 10 % included; twenty copies of each cost no more."""
+    """Nothing concealed: all names together have a share of 1 %, within the 10 % of the price's own error; twenty copies of each effect
+    change nothing."""
     candidates, rng = orthogonal(1), np.random.default_rng(2)
     few = [Directions(one.name, one.basis) for one in candidates[:3] for _ in range(20)]
     named = sum(oracle_share(np.zeros(150), few, [name], rng, 5000) for name in NAMES[:3])
     assert abs(named - FALSE_ALARMS) < 4.0 * np.hypot(0.1 * FALSE_ALARMS, np.sqrt(FALSE_ALARMS / (3 * 5000)))
 
 
-def test_twins_are_told_by_chance() -> None:
-    """Two effects with the same direction: each comes first in no more than all draws, and neither is told from the other."""
+def test_effects_with_one_direction_are_named_by_chance() -> None:
+    """Two effects with the same direction: together they come first in at most all draws, and neither is told from the other."""
     axes = np.eye(20)
     twins = [Directions("one", axes[:, :1]), Directions("two", axes[:, :1]), Directions("other", axes[:, 1:2])]
     mean = 10.0 * axes[:, 0]
@@ -75,7 +76,7 @@ def test_twins_are_told_by_chance() -> None:
 
 
 def test_conditional_and_separable_parts_of_oblique_directions() -> None:
-    """|d|^2 (1 - cos^2) beyond one direction; beyond a plane, what is left of it by Gram and Schmidt."""
+    """Beyond one direction: |d|^2 (1 - cos^2). Beyond a plane: the residual of Gram-Schmidt orthogonalisation."""
     axes, angle = np.eye(5), np.radians(30.0)
     change = 6.0 * axes[:, 0]
     partner = np.cos(angle) * axes[:, [0]] + np.sin(angle) * axes[:, [1]]
@@ -89,7 +90,7 @@ def test_conditional_and_separable_parts_of_oblique_directions() -> None:
 
 
 def test_the_noise_of_a_measured_change_cancels() -> None:
-    """Two draws of the noise: d1' P d2 is |P d|^2 on average, without the n that one draw's square would add."""
+    """With two draws of the noise, the mean of d1' P d2 is |P d|^2; the square of one draw would add the noise of n numbers."""
     rng, basis = np.random.default_rng(4), span(np.random.default_rng(5).normal(size=(50, 3)))
     change = rng.normal(size=50)
     true = beyond(change, change, basis)
@@ -126,7 +127,7 @@ def test_a_known_law_takes_the_place_of_the_nearest_direction() -> None:
 
 
 @pytest.mark.parametrize("truth", [[], ["a", "b", "c"], ["nobody"]])
-def test_what_the_oracle_cannot_be_asked(truth: list[str]) -> None:
+def test_the_oracle_refuses_impossible_questions(truth: list[str]) -> None:
     candidates = [Directions(name, np.eye(4)[:, [k]]) for k, name in enumerate("abc")]
     with pytest.raises(ValueError, match="one or two of its candidates"):
         oracle_share(np.zeros(4), candidates, truth, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Strengths of concealed laws from made-up summaries, whose noise and changes are known."""
+"""Non-centralities of concealed laws from made-up summaries with known noise and changes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STD = 2.0
 
 
 def summaries(change: np.ndarray) -> SimpleNamespace:
-    """Six summaries of one measurement, moved by `change` standard deviations from where a healthy camera's are."""
+    """Six summaries of one measurement, displaced by `change` standard deviations from those of a healthy camera."""
     labels = [SimpleNamespace(channel="Y", condition=k, captures=("a",)) for k in range(6)]
     block = SimpleNamespace(measurement=SimpleNamespace(name="made_up"), labels=labels)
     return SimpleNamespace(
@@ -32,7 +32,7 @@ def library(**directions: np.ndarray) -> LibraryChanges:
 
 
 def test_a_single_effect_beside_its_nearest_rival() -> None:
-    """6 sigma along the first axis; a rival at 30 degrees to it leaves 36 sin^2 = 9, one at right angles everything."""
+    """6 sigma along the first axis; beside a rival at 30 degrees 36 sin^2 = 9 is left, beside one at right angles everything."""
     absent, present = summaries(0.0 * AXES[0]), summaries(6.0 * AXES[0])
     rivals = library(mine=AXES[0], near=np.cos(np.pi / 6) * AXES[0] + np.sin(np.pi / 6) * AXES[1], far=AXES[2])
     whole, without = [present, present], [[absent, absent]]
@@ -48,7 +48,7 @@ def test_a_single_effect_beside_its_nearest_rival() -> None:
 
 
 def test_a_pair_of_which_one_imitates_the_other() -> None:
-    """The second law lies at 30 degrees to the first: beyond it, a quarter of its squared length is left, and of the first's, too."""
+    """The second law lies at 30 degrees to the first: a quarter of the squared length of each is left beyond the other."""
     oblique = np.cos(np.pi / 6) * AXES[0] + np.sin(np.pi / 6) * AXES[1]
     one, two = 10.0 * AXES[0], 4.0 * oblique
     whole, without = [summaries(one + two)] * 2, [[summaries(two)] * 2, [summaries(one)] * 2]

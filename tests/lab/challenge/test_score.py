@@ -1,4 +1,4 @@
-"""Scores of made-up results against figures worked out by hand."""
+"""Scores of made-up results against figures computed by hand."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def counts(rate: Rate) -> tuple[int, int]:
 
 
 def test_a_family_is_no_effect_and_may_be_right() -> None:
-    """Two members told, neither singled out: the family is right, the effect isn't named, and the rival set holds both."""
+    """Two members are listed, neither is named: the family is right, the effect isn't named, and the rival set holds both."""
     told = (
         named("defocus")
         .effects[0]
@@ -131,7 +131,7 @@ def test_outside_laws_are_of_families_that_there_are() -> None:
     assert all(law.families <= known for law in OUTSIDE)
 
 
-def test_every_figure_is_what_a_hand_counts() -> None:
+def test_every_figure_is_the_one_counted_by_hand() -> None:
     found = scored()
     assert [counts(s.top_1) for s in found.singles] == [(1, 3), (1, 1), (1, 1)]
     assert [counts(s.alone) for s in found.singles] == [(1, 3), (0, 1), (1, 1)]
@@ -269,7 +269,7 @@ def test_the_page_shows_both_curves(tmp_path: Path) -> None:
 
 
 def test_seals_from_before_strengths_were_measured_hold() -> None:
-    """The text that is sealed has nothing of what wasn't measured, and all of what was."""
+    """The sealed text leaves out figures that weren't measured, and holds all that were."""
     plain = truth("single", ("defocus", 80.0))
     assert not {"oracle_share", "separability", "conditional", "nearest_rival"} & set(canonical(plain).split('"'))
     measured = canonical(with_strengths(plain, (70.0,), 0.9))

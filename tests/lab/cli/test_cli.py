@@ -41,7 +41,7 @@ from sim.effects.library import effects
 
 @pytest.fixture(autouse=True)
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """No test touches the data folder of the working directory."""
+    """Keep tests away from the data folder of the working directory."""
     folder = tmp_path / "data"
     monkeypatch.setenv("CALIBENCH_DATA", str(folder))
     return folder
@@ -54,7 +54,7 @@ def folder(small_set: Callable[..., RecordingSet], tmp_path: Path) -> Path:
 
 @pytest.fixture
 def flats(tmp_path: Path) -> Path:
-    """A MONO camera of 0.5 DN/e: darks and a ladder of flats, small and quick to fit."""
+    """A MONO camera of 0.5 DN/e: darks and a series of flats, small and quick to fit."""
     rng = np.random.default_rng(7)
     frames, captures = {}, []
     for number, (kind, photons) in enumerate(
@@ -205,7 +205,7 @@ def test_a_failure_while_writing_leaves_the_old_file(
 
 
 @pytest.mark.parametrize(("passed", "code"), [(True, 0), (False, 4)])
-def test_a_check_that_falls_short(
+def test_a_failed_check_exits_with_4(
     flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passed: bool, code: int
 ) -> None:
     check = Check(name="mtf", side="left", capture="edge-1", n=10, chi2=11.0, rms_relative_percent=1.0, passed=passed)
@@ -232,7 +232,7 @@ def test_diagnosis_with_a_stored_fit(
 
 
 def test_a_result_is_on_disk_before_anything_is_printed(tmp_path: Path) -> None:
-    """A pipe that nobody reads from, as of `| head -0`: the JSON is whole all the same."""
+    """Output to a closed pipe, as of `| head -0`: the JSON is complete all the same."""
     file = tmp_path / "effects.json"
     read_end, write_end = os.pipe()
     os.close(read_end)

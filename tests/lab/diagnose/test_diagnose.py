@@ -1,4 +1,4 @@
-"""Diagnoses of recordings of a second image former that hold little."""
+"""Diagnoses of small recording sets of the second image former."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_nothing_to_judge_is_said(edges: RecordingSet) -> None:
     result = diagnose(bare)
     assert result.verdict == "nothing_judged"
     assert not result.mismatches
-    assert "could be looked at" in result.summary[0]
+    assert "determine no measurement" in result.summary[0]
     assert result.next_capture is not None
     assert "dark frames" in result.next_capture
     assert result.held_out is None

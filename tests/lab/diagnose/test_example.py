@@ -1,4 +1,4 @@
-"""The worked example of the documentation, on a camera of another image former, and what is told of real recordings."""
+"""The worked example of the documentation, on a camera of the second image former, and diagnoses of real recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One level whose shutter isn't what is stated: told, with its captures and the exposure that fits."""
+"""One level with a misstated shutter time is reported with its captures and the exposure that fits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flats of which photon numbers are stated, as EMVA 1288 descriptors do, are held against these."""
+"""Flats with stated photon numbers, as in EMVA 1288 descriptors, are compared with these."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Healthy cameras of which the maker says less, or of which less was recorded, or otherwise: what can't be judged is
-left out, and nothing is found."""
+"""Healthy cameras with less metadata or fewer recordings: what can't be judged is skipped, and nothing is found."""
 
 from __future__ import annotations
 
@@ -66,16 +65,15 @@ def _only(*kinds: str) -> Change:
     ],
     ids=["narrowband", "chart", "chart and edges", "f-number", "pitch", "fill factor"],
 )
-def test_what_nobody_says_is_no_mismatch(change: Change) -> None:
+def test_missing_metadata_are_no_mismatch(change: Change) -> None:
     model, _ = measurement_model(_changed(change), "left", None)
     assert model is not None
     found = decide(model, np.random.default_rng(1), DecisionPolicy())
     assert (found.before, found.named, found.abstained) == ((), (), ())
 
 
-def test_edges_in_light_of_which_nothing_is_said_are_not_out_of_focus() -> None:
-    """A monochrome camera: against light of equal energy its edges score 52 over a threshold of 17, and were
-    'defocus'."""
+def test_edges_in_unknown_light_are_not_called_defocus() -> None:
+    """A monochrome camera: predicted with equal-energy light its edges scored 52 over a threshold of 17, and were called 'defocus'."""
 
     def unlit(content: dict[str, Any]) -> None:
         _only("dark", "flat", "slanted_edge")(content)
@@ -90,7 +88,7 @@ def test_edges_in_light_of_which_nothing_is_said_are_not_out_of_focus() -> None:
     assert (found.before, found.named, found.abstained) == ((), (), ())
 
 
-def test_the_gain_is_told_by_whatever_was_taken_twice() -> None:
+def test_the_gain_is_estimated_from_any_repeated_captures() -> None:
     """By repeats of a chart to a few per cent: thousands of pixels, but pixels of a level aren't quite alike."""
     studies = [
         Study(r, "left", camera_model(r, "left", None, maker_curves=True))
@@ -135,8 +133,8 @@ def test_codes_too_coarse_for_the_noise_are_no_mismatch() -> None:
 @pytest.mark.parametrize(
     ("key", "factor"), [("f_number", 0.7), pytest.param("pixel_pitch_um", 1.25, marks=pytest.mark.slow)]
 )
-def test_what_is_stated_wrongly_is_no_blur(key: str, factor: float) -> None:
-    """Edges tell of N / pitch alone: what comes out of both is true to 3 %, and no aberration has the name."""
+def test_a_misstated_pitch_or_f_number_is_no_blur(key: str, factor: float) -> None:
+    """Edges determine f-number / pitch only: the ratio is right to 3 %, and no aberration is named."""
 
     def edges(content: dict[str, Any]) -> None:
         _only("dark", "flat", "slanted_edge")(content)

@@ -1,4 +1,4 @@
-"""Two calibrations compared: what is the same says so, what changed is found, and a motion of the camera is no change."""
+"""Comparison of two calibrations: no change is reported without one, changes are found, and a motion of the camera is no change."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_one_point_of_a_curve_is_found_with_its_place():
 
 
 def test_rounding_is_no_change():
-    """A normalised curve is 1 at frequency 0 but for rounding, and states an uncertainty of that size."""
+    """A normalised curve is 1 at frequency 0 up to rounding, and states an uncertainty of that size."""
     one, two = (
         FitResult(
             source="m",

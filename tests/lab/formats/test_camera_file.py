@@ -1,3 +1,5 @@
+"""Camera files: written and read back exactly, and wrong keys named in one line."""
+
 from __future__ import annotations
 
 import tomllib

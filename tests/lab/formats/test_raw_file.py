@@ -1,3 +1,5 @@
+"""Raw files (.npy, .tif, .dng): the codes come back, and LibRaw sees the same mosaic, levels and colours."""
+
 from __future__ import annotations
 
 import json

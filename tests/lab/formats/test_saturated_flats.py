@@ -43,6 +43,7 @@ def saturate(folder: Path, flats: list[dict[str, Any]], exposure_s: float, dn: i
 
 
 def test_the_saturated_end_of_an_exposure_ladder_is_wanted(folder: Path) -> None:
+    """A series of exposures is meant to end in saturation: nothing is reported."""
     saturate(folder, flats_of(folder, "left")[:2], exposure_s=0.0125)
     assert read(folder).warnings == ()
 

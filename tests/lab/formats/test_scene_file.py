@@ -1,3 +1,5 @@
+"""Lights, pictures and spectral cubes from files: units, scaling, and refusals in one line."""
+
 from __future__ import annotations
 
 import io

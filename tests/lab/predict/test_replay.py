@@ -1,4 +1,4 @@
-"""Captures again, as a model makes them: against recordings of the second image former, and against the model's own draws."""
+"""Captures predicted by a model: against recordings of the second image former, and against frames drawn by the model itself."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Validation on recordings of a second image former: a healthy camera passes, a concealed filter is caught, and the filter's
-model mends it."""
+"""Validation on recordings of the second image former: a healthy camera passes, a concealed filter fails, and passes with its model."""
 
 from __future__ import annotations
 

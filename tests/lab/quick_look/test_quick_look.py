@@ -1,4 +1,4 @@
-"""What an operator sees of a session under way: a frame's histogram, and curves from frames whose law is known."""
+"""The quick look at a session under way: a frame's histogram, and curves of frames with a known law."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The EMVA 1288 data sheet: what stands in its table, what its spectra and histograms are of, and that it stands on the page."""
+"""The EMVA 1288 data sheet: its table, spectra and histograms, and their place on the page."""
 
 from __future__ import annotations
 

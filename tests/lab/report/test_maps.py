@@ -1,4 +1,4 @@
-"""Maps of single pixels as files: what is written is what was found, and what isn't determined is left out."""
+"""Maps of single pixels as files: they hold the fitted values, and undetermined ones are left out."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def _transfer(
 
 
 def _everything(acting: tuple[Effect, ...]) -> np.ndarray:
-    """All that stages can change, in one vector, in units of its own size."""
+    """All quantities that stages can change, in one vector, each in units of its own size."""
     otf = [
         optical_transfer(CAMERA, c, LIGHT, f, g, acting, place_um=PLACE_UM)
         for c in "RGB"

@@ -1,4 +1,4 @@
-"""Laws of the light and of its fall-off against what they are in plain formulas."""
+"""Laws of the light and of its fall-off against closed forms."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Diffraction and the pixel's aperture against closed forms."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Birefringent plates, glass plates, filter edges and veils against textbook formulas."""
+
 from __future__ import annotations
 
 import numpy as np

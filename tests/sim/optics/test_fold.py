@@ -1,3 +1,5 @@
+"""The transfer function folded onto the pixels' frequencies, against sums over its aliases."""
+
 from __future__ import annotations
 
 import numpy as np

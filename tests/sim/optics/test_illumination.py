@@ -1,3 +1,5 @@
+"""Relative illumination: cos^4, a maker's curve, a measured flat field."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Imaging models of a lens: transfer functions with the right symmetry, and against closed forms."""
+
 from __future__ import annotations
 
 import tomllib
@@ -186,7 +188,7 @@ def test_wavelengths_between_are_linear_and_beyond_are_held() -> None:
     np.testing.assert_array_equal(beyond, high)
 
 
-def test_sums_are_forgiven_a_thousandth() -> None:
+def test_sums_within_a_thousandth_of_1_are_accepted() -> None:
     values = {
         "wavelength_nm": (550.0,),
         "psf": (((0.0, 0.3), (0.3, 0.4005)),),

@@ -1,3 +1,5 @@
+"""Transfer functions of aberrated pupils against closed forms, sums and FFTs."""
+
 from __future__ import annotations
 
 from itertools import product

@@ -1,3 +1,5 @@
+"""Superposition of field-dependent point spread functions against exact sums over the sources."""
+
 from __future__ import annotations
 
 from dataclasses import replace

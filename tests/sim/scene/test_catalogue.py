@@ -1,3 +1,5 @@
+"""The named scenes: their placement before the camera, contrast, size and documentation."""
+
 from __future__ import annotations
 
 from pathlib import Path

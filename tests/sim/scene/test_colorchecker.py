@@ -1,3 +1,5 @@
+"""Reflectances of the ColorCheckers against published colours."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Photometry of light sources: luminance, the CIE's illuminants, screens."""
+
 from __future__ import annotations
 
 import numpy as np

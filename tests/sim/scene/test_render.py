@@ -1,3 +1,5 @@
+"""Scenes drawn by area: against integrals and closed forms, sample by sample."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+"""Screens: gamma of each primary, black and white, stripes of sub-pixels."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Projection and distortion of target planes against OpenCV's."""
+
 from __future__ import annotations
 
 import cv2

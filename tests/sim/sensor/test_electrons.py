@@ -1,3 +1,5 @@
+"""From electrons to codes: moments of clipped and rounded noise, dark current, fixed patterns."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -104,7 +106,7 @@ def test_dark_frames_keep_their_mean_under_dsnu(colour_camera: CameraModel) -> N
     assert frame[:, 1::2].mean() == pytest.approx(240 + 0.35 * (0.1 + 20), abs=0.05)
 
 
-def test_the_read_out_bends_and_stirs(colour_camera: CameraModel) -> None:
+def test_read_out_response_and_noise_are_in_the_moments(colour_camera: CameraModel) -> None:
     camera = colour_camera.model_copy(update={"rows": 200, "cols": 300})
     read_out = ReadOut(lambda e: e * (1 - 1e-5 * e), lambda e: e * 0.9, 3.0)
     electrons = np.full((200, 300), 6000.0)

@@ -1,3 +1,5 @@
+"""Colour filter mosaics: phases, planes, channels."""
+
 from __future__ import annotations
 
 import numpy as np

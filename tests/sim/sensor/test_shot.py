@@ -1,3 +1,5 @@
+"""Shot noise is Poisson, at every mean."""
+
 from __future__ import annotations
 
 import numpy as np

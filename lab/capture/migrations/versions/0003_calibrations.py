@@ -1,4 +1,4 @@
-"""A calibration's life, its figures, and sessions that demand a certified one."""
+"""Certification and expiry of calibrations, their figures, and sessions that demand a certified calibration."""
 
 from __future__ import annotations
 

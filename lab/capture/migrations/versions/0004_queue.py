@@ -1,4 +1,4 @@
-"""Sessions that wait for their instruments, and what makes deleting a session quick."""
+"""The queue of sessions, and indices that make deleting a session quick."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def calibrated() -> Geometry:
 
 
 def test_distortion_is_named_beside_an_earlier_calibration_and_never_by_itself() -> None:
-    """2 % of the corner's distance: of 3 px there, half a pixel where boards reach, against 0.006 px of a cell's mean."""
+    """2 % of the corner's distance is 3 px there, half a pixel where the boards are; a cell's mean has a standard deviation of 0.006 px."""
     bent = study_of(recorded(concealed.LensDistortionLaw(2.0, 0, 7), noise_draw=1))
     alone = judged(bent, None)
     assert not alone.named
@@ -68,7 +68,7 @@ def test_the_same_lens_is_no_finding_and_one_that_slipped_is_decentred() -> None
 @pytest.mark.slow
 @pytest.mark.parametrize(("gain", "glare"), [(0.0, 0.0), (0.0, 3.0), (8.0, 0.0), (8.0, 3.0)])
 def test_a_gain_that_only_scenes_show_is_named(gain: float, glare: float) -> None:
-    """`glare` (%) of the left camera brightens its boards by as much; its screens' dark squares say so."""
+    """`glare` (%) brightens the left camera's boards; the dark squares of its screens show it too."""
     plan = Plan(kinds=("dark", "flat", "charuco", "screen"))
     laws = [concealed.StereoGainLaw(gain, 0, 7)] if gain else []
     veil = [concealed.VeilingGlareLaw(glare, 0, 7)] if glare else []

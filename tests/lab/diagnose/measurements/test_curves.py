@@ -1,4 +1,4 @@
-"""What is free of a maker's curve: a leak as a flat sensitivity leaves, and the rounding of its values."""
+"""Freedom of a maker's sensitivity curve: a constant leak, and the rounding of its values."""
 
 from __future__ import annotations
 

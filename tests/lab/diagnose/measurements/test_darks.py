@@ -1,4 +1,4 @@
-"""What dark frames say: their statistics against drawn numbers, silence on healthy cameras, names of what was put in."""
+"""Measurements of dark frames: their statistics against drawn numbers, no finding on healthy cameras, names of concealed effects."""
 
 from __future__ import annotations
 
@@ -257,7 +257,8 @@ def test_what_sim_renders_is_named_with_its_parameters(one: Effect) -> None:
     [(laws.PeriodicBandingLaw(1.5, 0, 3), "dark_row_noise"), (laws.TapOffsetLaw(1.5, 0, 3), "dark_field")],
     ids=["banding", "tap"],
 )
-def test_siblings_are_located_and_get_no_name(law: Law, measurement: str) -> None:
+def test_laws_like_listed_effects_are_located_and_get_no_name(law: Law, measurement: str) -> None:
+    """Laws that the library lacks and that resemble its effects: banding of a fixed period, an offset of one read-out tap."""
     verdict = _verdict(_concealed(92, law))
     assert not verdict.named
     assert measurement in {part.block.measurement.name for part in verdict.after}

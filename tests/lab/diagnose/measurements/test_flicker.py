@@ -1,4 +1,4 @@
-"""Flickering light in the rows of flat frames: by another former's laws and by `sim`'s, and what isn't flicker."""
+"""Flickering light in the rows of flat frames: laws of the second image former and of `sim`, and look-alikes that aren't flicker."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_rows_of_healthy_frames_are_noise() -> None:
 
 @pytest.mark.parametrize(("variant", "cfa"), [(0, "MONO"), pytest.param(1, "GRBG", marks=pytest.mark.slow)])
 def test_flicker_of_another_former_is_named(variant: int, cfa: str) -> None:
-    """A sine and a rectified one; bands of half a period in these frames, of 0.3 % of the light at 5 ms."""
+    """A sinusoidal and a rectified modulation: half a period over the frame, 0.3 % of the light at 5 ms."""
     found = verdict(former(11, LightFlickerLaw(1.0, variant, 3), cfa=cfa), *LOOKED_AT)
     assert names(found) == ["light_flicker"]
 
@@ -47,11 +47,11 @@ def test_bands_that_move_from_repeat_to_repeat_are_no_shot_noise() -> None:
 
 
 def test_noise_of_rows_is_no_flicker() -> None:
-    """What dark frames' rows have as well: white from row to row, and a ripple of a fixed period."""
+    """Row noise that dark frames have, too: white, and a ripple of a fixed period."""
     for law in (RowNoiseLaw(4.0), PeriodicBandingLaw(3.0, 0, 5)):
         assert "light_flicker" not in names(verdict(former(12, law), *LOOKED_AT))
 
 
-def test_what_says_nothing_of_rows_is_refused() -> None:
+def test_recordings_that_determine_no_flicker_are_refused() -> None:
     with pytest.raises(NotDetermined, match="repeated"):
         measured_model(former(1, kinds=("dark",)), flicker_block)

@@ -1,4 +1,4 @@
-"""How steady the light is from frame to frame: on the second former's cameras, and on scatter that is drawn."""
+"""Repeatability of the light from frame to frame: cameras of the second image former, and drawn scatter."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tests.lab.diagnose.on_blocks import former, study
 
 
 @pytest.mark.parametrize("seed", [772511, 772512, 772513, 772514])
-def test_a_steady_source_shows_nothing(seed: int) -> None:
+def test_a_steady_source_is_no_finding(seed: int) -> None:
     block = level_repeats_block(study(former(seed)))
     left = block.value - block.predict(()).mean
     assert np.all(np.abs(left) < 3.0 * np.sqrt(np.diag(block.covariance)))
 
 
 def test_an_unsteady_source_is_named_with_its_size() -> None:
-    """1.2 % in each frame; of f degrees of freedom a standard deviation is known to sqrt(1 / (2 f)), 25 % of 8."""
+    """1.2 % from frame to frame; with f degrees of freedom a standard deviation is known to sqrt(1 / (2 f)), 25 % for f = 8."""
     here = study(former(772521, SourceInstabilityLaw(1.2, 0, 9)))
     verdict = decide(
         MeasurementModel((level_repeats_block(here),), here.camera), np.random.default_rng(0), DecisionPolicy()

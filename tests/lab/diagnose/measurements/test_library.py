@@ -18,7 +18,7 @@ def test_every_declaration_is_complete_and_has_a_place_of_its_own() -> None:
     assert found[-1].name == "stereo_time"
 
 
-def test_reports_say_the_title_or_the_name_of_one_that_is_gone() -> None:
+def test_a_measurement_that_is_gone_is_titled_by_its_name() -> None:
     assert measurement_title("slanted_edge") == "transfer function of slanted edges"
     assert measurement_title("no_longer_there") == "no longer there"
 

@@ -1,4 +1,4 @@
-"""What row noise does to frames' means: its covariance between channels against drawn frames."""
+"""Row noise in the means of frames: its covariance between channels against drawn frames."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_means_scatter_as_drawn_rows_do(correlation: float) -> None:
 
 
 def _ends(rows: int) -> float:
-    """What a finite number of correlated rows has less than the spectrum at 0 says, of first order: 2 / rows for |correlation| = 1/2."""
+    """First-order correction of a mean over a finite number of correlated rows against the spectrum at 0: 2 / rows for |correlation| = 1/2."""
     return 2.0 / rows
 
 

@@ -1,4 +1,4 @@
-"""Temporal noise: what neighbours share is told apart from what isn't there, by white noise, by analytic kernels, and by both image formers."""
+"""Noise correlated between neighbouring pixels: white noise, analytic kernels, and frames of both image formers."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _verdict(study: Study) -> Verdict:
 
 
 def test_correlations_of_a_filter_are_its_autocorrelation() -> None:
-    """White noise through a kernel: by hand, at every pair; on a mosaic a colour's pixels are two apart."""
+    """White noise through a kernel: correlations computed by hand for every pair; on a mosaic, pixels of a colour are two apart."""
     kernel = np.array([[0.0, 0.05, 0.0], [0.05, 0.8, 0.05], [0.0, 0.05, 0.0]])
     size = np.sum(kernel**2)
     own = {"1,0": 2 * 0.8 * 0.05 / size, "1,1": 2 * 0.05**2 / size, "2,0": 0.05**2 / size}
@@ -115,7 +115,7 @@ def test_noise_of_healthy_cameras_is_what_the_covariances_say(cfa: str) -> None:
 
 
 def test_a_lamp_that_flickers_and_rows_with_noise_leave_no_correlation() -> None:
-    """Rows' noise of 3 e, as large as the pixels' own: the rows' means are taken out and what that takes is put back. Of 144 numbers."""
+    """Row noise of 3 e, as large as the pixels': row means are subtracted, and what that subtracts is corrected for. 144 numbers."""
     blocks = [neighbour_block(_rendered((effect("row_noise")(noise_e=3.0),), seed)) for seed in (20, 21, 22)]
     pulls = np.concatenate([b.value / np.sqrt(np.diag(b.covariance)) for b in blocks])
     assert np.mean(np.square(pulls)) < 1.0 + 3.0 * np.sqrt(2.0 / len(pulls))
@@ -158,7 +158,7 @@ def test_what_sim_renders_is_predicted_and_named(one: Effect, cfa: str) -> None:
     ids=lambda v: v if isinstance(v, str) else f"{v.strength:g}-{v.variant}",
 )
 def test_what_another_former_conceals_is_named(law: Law, name: str) -> None:
-    """Non-centralities of 70 and more: by how what neighbours share grows with the level, darks among them."""
+    """Non-centralities of 70 and more, from the growth of the correlation with the level, dark frames included."""
     assert [c.effect.name for c in _verdict(_concealed(770021, (law,), cfa="MONO")).named] == [name]
 
 

@@ -1,4 +1,4 @@
-"""Fine structure of even light: greens, steps where read-outs meet, stripes; on cameras of the second image former."""
+"""Fine structure of flat fields: green imbalance, steps between read-out taps, stripes; on cameras of the second image former."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_mono_camera_has_no_greens() -> None:
 
 
 @pytest.mark.parametrize("law", [VignettingLaw(8.0, 0, 1), LightFlickerLaw(10.0, 0, 1)], ids=lambda law: law.name)
-def test_greens_don_t_see_slopes_of_light(law: Law) -> None:
+def test_a_slope_of_the_light_is_no_green_imbalance(law: Law) -> None:
     block = green_block(_study(771013, (law,)))
     assert _chi2(block) < 1.0 + 3.0 * np.sqrt(2.0 / len(block.value))
 
@@ -86,7 +86,8 @@ def test_unlike_greens_are_named_and_measured() -> None:
 
 
 def test_crosstalk_along_rows_is_no_green_imbalance() -> None:
-    """Half as much again along rows: greens differ by wavelength, as their neighbours do; 0.5 % and 0.75 % are 0.625 % and +-20 %."""
+    """Crosstalk is half as large again along rows: greens differ by wavelength, as their neighbours do. 0.5 % and 0.75 % are 0.625 % +- 20
+    %."""
     study = _study(771015, (CrosstalkLaw(0.5, 2),))
     blocks = (green_block(study), narrowband_block(study))
     verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
@@ -110,6 +111,6 @@ def test_a_tap_gain_is_a_step_in_the_middle_and_has_no_name() -> None:
 
 
 def test_white_columns_are_no_steps() -> None:
-    """Columns' fixed offsets are the columns' own scatter, by which steps are judged."""
+    """Steps are judged by the scatter of the columns, which fixed column offsets widen."""
     model = MeasurementModel((line_block(study := _study(771017, (ColumnNoiseLaw(1.0, 0),))),), study.camera)
     assert not mismatches(model, model.gaussian(), DecisionPolicy())

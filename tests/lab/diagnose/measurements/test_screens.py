@@ -1,4 +1,4 @@
-"""Patterns on screens: healthy cameras leave nothing to find, and what second image formers conceal is found by its own measurement."""
+"""Patterns on screens: no finding on healthy cameras, and concealed effects of the second image former in the right measurement."""
 
 from __future__ import annotations
 
@@ -108,15 +108,15 @@ def test_what_a_screen_shows_is_named(law: Law, name: str) -> None:
 
 
 def test_a_screen_that_fills_the_frame_lights_dark_squares_from_beyond() -> None:
-    """The former's screen goes on beyond the frame; what that is uncertain by is half of all that an endless screen would add."""
+    """The former's screen continues beyond the frame; the uncertainty of its light is half of what an endless screen would add."""
     found = measured_model(shared_study(), screen_block)
     gaussian = found.gaussian()
     away = (found.value - gaussian.mean) / np.sqrt(np.diag(gaussian.block_covariance(0)))
     assert np.all(np.abs(away) < 1.5)
 
 
-def test_a_copy_of_the_image_falls_into_the_dark_squares() -> None:
-    """Of light of mean m in the plane, turned about its middle, 1 % of what lies there: between nothing and the brightest."""
+def test_a_ghost_brightens_dark_squares() -> None:
+    """A ghost: 1 % of the image rotated by 180 degrees. A dark square gets between 0 and 1 % of the brightest light."""
     block = measured_model(shared_study(), screen_block).blocks[0]
     more = block.predict((Ghost(share_percent=1.0),)).mean - block.predict(()).mean
     assert np.all(more > 0.0)
@@ -178,8 +178,8 @@ def test_a_filter_is_predicted_on_a_screen_of_any_geometry(cell_px: float, turn_
         assert abs(getattr(found.effects[0], name) - 1.9) < 3.0 * std
 
 
-def test_what_was_measured_dies_with_its_study() -> None:
-    """A service diagnoses one set after another: thirty megabytes a set would stay for ever."""
+def test_pattern_fits_are_freed_with_their_study() -> None:
+    """A study's fits are freed with it (30 MB a set): a service diagnoses one set after another."""
     study = study_of(recorded())
     contrast_block(study)
     kept = weakref.ref(study)
@@ -189,7 +189,8 @@ def test_what_was_measured_dies_with_its_study() -> None:
 
 
 def test_a_colours_contrast_is_that_of_its_own_place() -> None:
-    """Red and blue land half a pixel out and more. Drawn where green is, they would lose 2 to 4 % below 0.25 cy/px."""
+    """Red and blue are displaced by half a pixel and more. Drawn at green's place, their contrast would be 2 to 4 % too low below 0.25
+    cy/px."""
     plain, moved = (contrast_block(shared_study(*laws)) for laws in ((), (concealed.LateralColourLaw(4.0, 0, 5),)))
     kept = {(k.channel, k.condition, round(k.x, 2)): v for k, v in zip(plain.labels, plain.value, strict=True)}
     lost = [
@@ -215,7 +216,7 @@ def test_lateral_colour_is_measured_along_the_radius_alone() -> None:
 
 
 def test_the_screen_s_grid_is_seen_in_white_frames_alone() -> None:
-    """Lit screens without white captures say nothing of it, and one channel nothing of lateral colour."""
+    """Other lit screens don't show the screen's pixel grid, and a single channel doesn't show lateral colour."""
     mono = study_of(recorded(cfa="MONO"))
     assert abs(float(grid_block(mono).value[0])) < 4.0
     with pytest.raises(NotDetermined, match="one channel"):

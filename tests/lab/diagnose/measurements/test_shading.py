@@ -1,4 +1,4 @@
-"""Uneven flat fields: which law, about which point, and what no law fits."""
+"""Non-uniform flat fields: which law, about which centre, and shapes that no law fits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_healthy_cells_scatter_as_they_should() -> None:
 
 @pytest.mark.parametrize("variant", [0, *(pytest.param(v, marks=pytest.mark.slow) for v in (1, 2))])
 def test_vignetting_is_named_whatever_its_power(variant: int) -> None:
-    """As the square of the radius, two discs that part, as the fourth power."""
+    """As the square of the radius, as the overlap of two discs, as the fourth power."""
     found = verdict(former(21, VignettingLaw(4.0, variant, 1), cfa="RGGB"), *LOOKED_AT)
     assert names(found) == ["vignetting"]
     if variant == 0:
@@ -67,7 +67,8 @@ def test_what_no_law_fits_is_seen_and_gets_no_name(law: Law) -> None:
 
 
 def test_a_pattern_that_neighbours_share_counts_more() -> None:
-    """White: its own variance, within 3 sqrt(2 / 192) of blocks' differences and as much of a median's; alike: at most ALIKE times."""
+    """White pattern: its own variance, within 3 sqrt(2 / 192) of blocks' differences and the same for the median; common pattern: at most
+    ALIKE times as much."""
     rng = np.random.default_rng(3)
     white = 1.0 + 0.01 * rng.standard_normal((192, 256))
     assert _pattern_variance(white, 0.0) == pytest.approx(1e-4, rel=0.2)

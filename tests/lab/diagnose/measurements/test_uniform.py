@@ -1,4 +1,4 @@
-"""Levels of flat fields and narrowband light: what bends, drifts or is off, told apart, and true covariances."""
+"""Levels of flat fields and narrowband light: nonlinearity, drift and wrong wavelengths are told apart, with right covariances."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ LEVELS: list[tuple[Law, bool]] = [
     [*LEVELS[:1], *(pytest.param(*case, marks=pytest.mark.slow) for case in LEVELS[1:])],
     ids=lambda value: f"{value.name}-{value.variant}" if isinstance(value, Law) else f"shuttle-{value}",
 )
-def test_what_changes_levels_is_told_apart(law: Law, shuttle: bool) -> None:
-    """Up only, where time and level go together but for the repeats; and up and down."""
+def test_effects_on_levels_are_told_apart(law: Law, shuttle: bool) -> None:
+    """A series of levels upwards only, in which time and level go together except in repeats; and one up and down."""
     found = verdict(former(31, law, shuttle=shuttle), linearity_block)
     assert names(found) == [law.effect]
     for name, value in law.library_parameters().items():
@@ -79,7 +79,7 @@ def test_what_changes_levels_is_told_apart(law: Law, shuttle: bool) -> None:
     ],
     ids=lambda law: law.name,
 )
-def test_what_changes_narrow_lines_is_told_apart(law: Law) -> None:
+def test_effects_on_narrowband_light_are_told_apart(law: Law) -> None:
     found = verdict(former(32, law, cfa="RGGB", kinds=UNIFORM), linearity_block, narrowband_block)
     assert names(found) == [law.effect]
 
@@ -91,7 +91,7 @@ def test_what_changes_narrow_lines_is_told_apart(law: Law) -> None:
     ids=lambda law: law.name,
 )
 def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None:
-    """The red leak of a grey sensor has no colour to be known by: a radiometer's law took some of it and left more."""
+    """The red leak of a MONO sensor isn't told by its colour: the radiometer's law explained a part of it, and left more."""
     cfa = "MONO" if isinstance(law, RedLeakLaw) else "RGGB"
     found = verdict(former(33, law, cfa=cfa, kinds=UNIFORM), linearity_block, narrowband_block)
     assert not found.named
@@ -99,7 +99,7 @@ def test_structure_that_no_law_has_is_located_and_gets_no_name(law: Law) -> None
 
 
 def test_second_order_light_shows_where_half_the_wavelength_is_seen() -> None:
-    """A sweep to 900 nm: beyond 800 a blue line comes along. Share within 3 standard uncertainties."""
+    """A sweep to 900 nm: beyond 800 nm a line at half the wavelength is visible. Share within 3 standard uncertainties."""
     truth = SecondOrderLight(share_percent=3.0)
     found = verdict(rendered(6, (truth,), sweep_to_nm=900, repeats=2), linearity_block, narrowband_block)
     assert names(found) == ["second_order_light"]
@@ -125,7 +125,7 @@ def test_a_drifting_lamp_is_repeatable() -> None:
 
 
 class _Reading:
-    """What the standard deviation of readings needs of a capture."""
+    """The keys of a capture that the standard deviation of readings depends on."""
 
     def __init__(self, name: str, wavelength_nm: float) -> None:
         self.id, self.wavelength_nm = name, wavelength_nm
@@ -133,7 +133,7 @@ class _Reading:
 
 @pytest.mark.parametrize("std", [0.0, 1e-3, 0.02])
 def test_standard_deviation_of_readings_is_measured_and_capped(std: float) -> None:
-    """60 second differences: the median of magnitudes is good to 20 %; more than a radiometer's noise is no radiometer's."""
+    """From 60 second differences, the median modulus is good to 20 %; the cap is the largest noise that a radiometer may have."""
     rng = np.random.default_rng(7)
     points = [(_Reading(f"c{i}", 400.0 + 5.0 * i), "Y") for i in range(62)]
     signal = 1e4 * (1.0 + std * rng.standard_normal(62))

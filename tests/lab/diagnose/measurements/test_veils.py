@@ -1,4 +1,4 @@
-"""Light that is spread over the frame and about its place."""
+"""Veiling glare: uniform over the frame, or a halo about its source."""
 
 from __future__ import annotations
 

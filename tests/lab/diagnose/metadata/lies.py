@@ -1,4 +1,4 @@
-"""Manifests that say something wrong of sound recordings."""
+"""Manifests with wrong metadata around recordings of healthy cameras."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def with_cells(recordings: RecordingSet, factor: float) -> RecordingSet:
 
 
 def told(recordings: RecordingSet) -> list[str]:
-    """What is found to be stated wrongly, as sentences; the corrected recordings have nothing more."""
+    """The findings about wrong metadata, as sentences; the corrected recordings have none."""
     corrected, found = misstatements(recordings, "left")
     assert misstatements(corrected, "left")[1] == ()
     return [one.check for one in found]

@@ -1,4 +1,4 @@
-"""Wrong statements of sound cameras of the second former are found and told with the value that fits; right ones aren't."""
+"""Wrong metadata of healthy cameras of the second image former are reported with the value that fits; right ones aren't reported."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LIGHTS = ("dark", "narrowband", "chart")
 
 @pytest.mark.parametrize("cfa", MOSAICS)
 @pytest.mark.parametrize("kinds", [("dark", "narrowband"), ("dark", "chart")], ids=lambda kinds: kinds[1])
-def test_the_mosaic_that_the_planes_answer_as_is_told(cfa: str, kinds: tuple[str, ...]) -> None:
+def test_a_wrong_mosaic_phase_is_reported(cfa: str, kinds: tuple[str, ...]) -> None:
     recordings = _recorded(11, cfa, kinds)
     assert told(recordings) == []
     for wrong in MOSAICS:
@@ -38,7 +38,7 @@ def test_the_mosaic_that_the_planes_answer_as_is_told(cfa: str, kinds: tuple[str
             assert f"correct cfa to {cfa}" in line
 
 
-def test_the_mosaic_is_told_without_the_maker_s_curves_too() -> None:
+def test_a_wrong_mosaic_phase_is_reported_without_the_makers_curves() -> None:
     recordings = restated(_recorded(11, "GRBG", LIGHTS), quantum_efficiency=None)
     assert told(recordings) == []
     (line,) = told(restated(recordings, cfa="BGGR"))
@@ -100,8 +100,8 @@ def test_a_bit_depth_that_is_stated_too_large_is_told() -> None:
     assert told(_clipped(recordings, 1000)) == []
 
 
-def test_what_no_recording_can_contradict_is_said() -> None:
-    """Of 12 bits, pixels above half of the range use the highest one."""
+def test_metadata_that_no_recording_can_check_are_listed() -> None:
+    """At 12 bits, pixels above half of the range use the highest bit."""
     recordings = _recorded(13, "MONO", ("dark", "flat"))
     assert [*unchecked(recordings, "left")] == []
     (one,) = unchecked(_clipped(recordings, 1000), "left")
@@ -115,18 +115,18 @@ def test_what_no_recording_can_contradict_is_said() -> None:
     [InfraredCutFilterLaw, StrayLightLaw, CrosstalkLaw, BlackLevelDriftLaw],
     ids=lambda law: law.name,
 )
-def test_physics_is_no_wrong_statement(law: type[Law]) -> None:
+def test_effects_are_not_reported_as_wrong_metadata(law: type[Law]) -> None:
     for seed in (14, 15):
         assert told(_recorded(seed, "RGGB", LIGHTS, law(law.nominal, 0))) == []
 
 
-def test_healthy_cameras_state_nothing_wrong() -> None:
+def test_healthy_cameras_have_no_wrong_metadata() -> None:
     for seed, cfa in ((21, "GBRG"), (22, "MONO")):
         assert told(_recorded(seed, cfa, ("dark", "flat", "narrowband", "chart", "screen"))) == []
 
 
 @pytest.mark.slow
-def test_sixty_drawn_healthy_cameras_state_nothing_wrong() -> None:
+def test_sixty_drawn_healthy_cameras_have_no_wrong_metadata() -> None:
     """Frames, converters and screens of all kinds. None of 60: below 5 % with 95 % confidence (0.95 ** 60 = 0.046)."""
     for seed in range(820_000, 820_060):
         frame = DrawnFrame.drawn(np.random.default_rng([seed, 5]))
@@ -135,8 +135,8 @@ def test_sixty_drawn_healthy_cameras_state_nothing_wrong() -> None:
         assert told(recordings_of(camera, plan)) == [], seed
 
 
-def test_a_diagnosis_goes_on_with_what_fits() -> None:
-    """A sound camera with two exchanged lights: they are told, and nothing else is."""
+def test_a_diagnosis_goes_on_with_the_corrected_metadata() -> None:
+    """A healthy camera with two exchanged lights: these are reported, and nothing else."""
     recordings = with_exchanged_wavelengths(_recorded(12, "RGGB", ("dark", "narrowband")), 500.0, 600.0)
     found = diagnose(recordings)
     assert (found.verdict, found.effects, found.mismatches) == ("unexplained", (), ())

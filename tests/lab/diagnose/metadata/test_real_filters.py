@@ -84,6 +84,6 @@ def test_two_exchanged_filters_are_told(exchanged: tuple[int, int]) -> None:
 
 
 def test_a_mosaic_with_red_for_blue_is_told() -> None:
-    """Typical curves stand for those that nobody states."""
+    """Typical sensitivity curves are used, as none are stated."""
     (line,) = told(restated(_recorded(), cfa="GRBG"))
     assert "correct cfa to GBRG" in line

@@ -1,4 +1,4 @@
-"""What could have been detected, and told apart."""
+"""Sizes from which effects can be detected, and told apart."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from sim.effects.defocus import Defocus
 from tests.lab.diagnose.outcome.filtered_edges import NOISE, filtered_edges
 
 
-def test_detectable_is_seen_at_its_rate() -> None:
+def test_a_detectable_size_is_detected_at_the_stated_rate() -> None:
     """200 000 draws of a squared normal: 3 sigma of the rate are 0.002."""
     size = np.sqrt(detectable(12.0))
     score = np.square(np.random.default_rng(1).standard_normal(200_000) + size)
     assert np.mean(score > 12.0) == pytest.approx(0.9, abs=0.002)
 
 
-def test_the_smallest_size_that_is_seen_has_that_non_centrality() -> None:
+def test_the_detectable_size_has_the_stated_non_centrality() -> None:
     """The change by the effect at that size, whitened: lambda to 5 %, as blurs bend a little beyond the slope at
     zero."""
     verdict = filtered_edges()

@@ -1,4 +1,4 @@
-"""What is told of the sets of effects, and where nothing is."""
+"""The sets of effects in a result, and when there are none."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _told(models: SideModels, *effects: NamedEffect, left: Sequence[Unexplained]
     return " ".join(set_sentences([models], effects, left, POLICY))
 
 
-def test_sets_are_told_where_they_hold_what_no_name_does() -> None:
+def test_sets_are_reported_where_they_hold_an_effect_without_a_name() -> None:
     both = _models((["defocus"], 0.67), (["defocus", "coma"], 0.3))
     assert "defocus (67 %), defocus with coma (30 %)." in _told(both, _named("defocus"))
     assert _told(_models((["defocus"], 0.97)), _named("defocus")) == ""
@@ -44,7 +44,7 @@ def test_sets_are_told_where_they_hold_what_no_name_does() -> None:
     assert _told(both) == ""  # nothing is named: what else it is was weighed, too
 
 
-def test_what_the_budget_left_is_told_by_name() -> None:
+def test_sets_that_the_budget_left_out_are_listed() -> None:
     left = [("ghost",), ("ghost", "coma"), ("a",), ("b",), ("c",), ("d",), ("e",)]
     told = _told(_models((["defocus"], 0.97), left=left), _named("defocus"))
     assert "120 s of CPU time were spent" in told

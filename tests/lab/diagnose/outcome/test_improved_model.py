@@ -61,8 +61,10 @@ def test_a_saved_model_explains_the_recordings(filtered: tuple[RecordingSet, Dia
     assert again.improved["left"].effects == saved.effects
 
 
-def test_a_saved_model_simulates_with_what_was_found(filtered: tuple[RecordingSet, Diagnosis], tmp_path: Path) -> None:
-    """A red light through the saved camera: by as much dimmer as the filter found passes less of it."""
+def test_a_saved_model_simulates_with_the_named_effect(
+    filtered: tuple[RecordingSet, Diagnosis], tmp_path: Path
+) -> None:
+    """Red light through the saved camera is dimmer by the loss of the filter that was found."""
     saved = _through_a_file(filtered[1].improved["left"], tmp_path)
     light = tmp_path / "red.csv"
     light.write_text("wavelength_nm,radiance_w_sr_m2_nm\n690,0\n695,0.05\n700,0\n", encoding="utf-8")
@@ -83,7 +85,7 @@ NOISE = 0.004
 
 
 def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
-    """Two channels' contrasts exp(-2 f), off by `departs`; without effects but corrections."""
+    """Contrasts exp(-2 f) of two channels, off by `departs`; a model without effects, with corrections only."""
     content = default_camera()
     labels = tuple(Label(float(f), c, "5 deg", ("edge-1",), False) for c in "RG" for f in FREQUENCY)
     contrast = np.tile(np.exp(-2.0 * FREQUENCY), 2)
@@ -100,9 +102,9 @@ def _edges(departs: np.ndarray) -> tuple[Block, CameraFile]:
     return block, content
 
 
-def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
-    """A ripple of 10 % of the contrast: the saved correction follows it to what 46 points of noise 0.004 / exp(-2 f)
-    leave open, and the model with it explains the numbers."""
+def test_a_mismatch_without_a_name_is_saved_as_a_correction() -> None:
+    """A ripple of 10 % of the contrast: the saved correction follows it within the noise 0.004 / exp(-2 f) of 46 points, and the model with
+    it explains the numbers."""
     ripple = 0.1 * np.sin(9.0 * FREQUENCY)
     block, content = _edges(ripple)
     model = MeasurementModel((block,), content.camera)
@@ -117,7 +119,7 @@ def test_what_has_no_name_stands_in_the_model_as_a_correction() -> None:
     assert chi2(mended.value - mended.mean(), block.covariance) < 46 + 3 * np.sqrt(92)
 
 
-def test_what_the_model_has_no_place_for_is_said() -> None:
+def test_a_discrepancy_that_the_model_cannot_hold_is_reported() -> None:
     block, content = _edges(0.1 * np.sin(9.0 * FREQUENCY))
     model = MeasurementModel(
         (replace(block, measurement=replace(block.measurement, title="patches of light", places="patches")),),

@@ -1,4 +1,4 @@
-"""The next capture: as far apart as it says, the best one first, and taken by a station where it can."""
+"""The next capture: distances are as predicted, the best one comes first, and a station takes it where it can."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import Block, Label, Prediction
-from lab.diagnose.outcome.candidate_captures import Hypothesis, designs
+from lab.diagnose.outcome.candidate_captures import Hypothesis, candidate_captures
 from lab.diagnose.outcome.next_capture import next_sentence, proposals
 from lab.diagnose.outcome.settling_capture import settling_sentence
 from lab.diagnose.policy import DecisionPolicy
@@ -63,18 +63,18 @@ def _undecided(one: Effect, *others: tuple[str, float]) -> Verdict:
 
 
 def _best(*hypotheses: Effect) -> str:
-    """The words of the design in which two effects lie furthest apart."""
+    """The words of the candidate capture in which two effects lie furthest apart."""
     held = [Hypothesis(e.name, (e,), CAMERA) for e in hypotheses]
 
     def distance(predict: object, covariance: np.ndarray) -> float:
         apart = predict(held[0]) - predict(held[1])  # type: ignore[operator]
         return float(apart @ np.linalg.solve(covariance, apart))
 
-    found = list(designs(SET, "left", _model()))
+    found = list(candidate_captures(SET, "left", _model()))
     return max(found, key=lambda d: distance(d.predict, d.covariance)).words
 
 
-def test_the_design_follows_what_the_rivals_differ_in() -> None:
+def test_the_proposed_capture_varies_what_the_rivals_differ_in() -> None:
     drift, bend = SourceDrift(), Nonlinearity()
     quantity = next(iter(SourceDrift.quantities()))
     drift = SourceDrift(**{quantity: 0.3})
@@ -88,15 +88,15 @@ def test_the_design_follows_what_the_rivals_differ_in() -> None:
     assert "dark frames" in _best(level, BlackLevelDrift())
 
 
-def test_distance_is_what_decides() -> None:
+def test_the_stated_probability_of_deciding_rightly_holds() -> None:
     """Numbers drawn under one rival are nearer to it than to the other with the probability that is stated: Phi(sqrt(D
     / 2)); 3 sigma of a binomial of 4000 draws are 3 sqrt(p (1 - p) / 4000) < 0.024."""
     first, second = (
         Hypothesis("a", (InfraredCutFilter(cut_wavelength_nm=nm, width_nm=4.0),), CAMERA) for nm in (650.0, 650.02)
     )
-    design = next(d for d in designs(SET, "left", _model()) if d.words == "narrowband light at 650 nm")
-    a, b = design.predict(first), design.predict(second)
-    lower = np.linalg.cholesky(design.covariance)
+    candidate = next(d for d in candidate_captures(SET, "left", _model()) if d.words == "narrowband light at 650 nm")
+    a, b = candidate.predict(first), candidate.predict(second)
+    lower = np.linalg.cholesky(candidate.covariance)
     apart = np.linalg.solve(lower, a - b)
     d = 0.5 * float(apart @ apart)
     assert 0.02 < d < 4.0  # else nothing is tested
@@ -115,7 +115,7 @@ def test_proposals_are_sorted_and_name_their_nearest_rivals() -> None:
     assert all(c.told_apart == pytest.approx(norm.cdf(np.sqrt(0.5 * c.distance))) for c in found)
 
 
-def test_nothing_undecided_needs_no_capture() -> None:
+def test_without_rivals_no_capture_is_proposed() -> None:
     assert proposals(SET, "left", _undecided(Nonlinearity(), ("unknown", 0.02)), DecisionPolicy()) == ()
     assert next_sentence((), None, DecisionPolicy()) is None
 
@@ -123,7 +123,7 @@ def test_nothing_undecided_needs_no_capture() -> None:
 @pytest.mark.parametrize(
     ("distance", "words"), [(8.0, "would tell defocus from vibration_blur"), (0.5, "may tell them apart")]
 )
-def test_the_sentence_says_what_can_be_hoped(distance: float, words: str) -> None:
+def test_the_sentence_states_how_often_the_capture_decides_rightly(distance: float, words: str) -> None:
     told = float(norm.cdf(np.sqrt(0.5 * distance)))
     capture = NextCapture(
         side="left",
@@ -201,7 +201,7 @@ def test_more_darks_are_asked_for_where_they_are_few(repeats: int, told: bool) -
     """Eight times as many repeats have an eighth of the variance."""
     recordings = _dark_set(repeats)
     model = _dark_model(recordings)
-    again = [d for d in designs(recordings, "left", model) if "again" in d.words]
+    again = [d for d in candidate_captures(recordings, "left", model) if "again" in d.words]
     assert len(again) == 1
     assert ("16 at each setting in place of 2" in again[0].words) == told
     assert again[0].covariance[0, 0] == pytest.approx(repeats / 16 if told else 1.0)
@@ -216,7 +216,7 @@ def _left(measurement: str, axis: str, captures: tuple[str, ...], check: str = "
 
 
 @pytest.mark.parametrize(
-    ("repeats", "words"), [(2, "16 dark frames at each setting (there are 2)"), (12, "temperature of the sensor")]
+    ("repeats", "words"), [(2, "16 dark frames at each setting (there are 2)"), (12, "another sensor temperature")]
 )
 def test_a_mismatch_in_darks_asks_for_darks(repeats: int, words: str) -> None:
     recordings = _dark_set(repeats)

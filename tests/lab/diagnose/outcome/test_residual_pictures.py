@@ -1,4 +1,4 @@
-"""Residual pictures of recordings: what the model lacks, and noise once it has it."""
+"""Residual pictures of recordings: structure without the effect in the model, noise with it."""
 
 from __future__ import annotations
 

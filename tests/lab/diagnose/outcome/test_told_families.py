@@ -1,4 +1,4 @@
-"""What is told of a named family: its identifier, its members, the nearest law's parameters, and what tells the members apart."""
+"""A named family in the result: its identifier, members, the nearest law's parameters, and the capture that tells members apart."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_an_inexact_family_says_its_nearest_law_and_what_is_left() -> None:
     assert result.verdict == "partly_explained"
 
 
-def test_a_tie_says_which_capture_tells_its_members_apart() -> None:
+def test_an_undecided_family_names_the_capture_that_tells_its_members_apart() -> None:
     result = _told(("left", replace(HOT, is_closed=True)))
     assert result.effects[0].law == "exact"
     assert "can't tell hot_pixels (90 %) from random_telegraph_noise (7 %)" in result.effects[0].statement

@@ -1,4 +1,4 @@
-"""Views and corners that do not fit, and views that do not determine a camera."""
+"""Views and corners that don't fit are left out; views that don't determine a camera are refused."""
 
 from __future__ import annotations
 

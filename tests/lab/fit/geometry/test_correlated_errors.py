@@ -1,4 +1,4 @@
-"""Errors that neighbouring corners share: found where they are, absent where they are not, and as large as stated."""
+"""Errors that neighbouring corners share: found where they exist, absent where they don't, and of the stated size."""
 
 from __future__ import annotations
 

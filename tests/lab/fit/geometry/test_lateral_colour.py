@@ -12,7 +12,7 @@ from tests.lab.fit.projected import SHAPE, poses, seen
 
 
 def test_lateral_colour_of_drawn_corners():
-    """Red grown by 0.03 % and displaced by (0.02, -0.01) px beside green."""
+    """Red is magnified by 0.03 % and displaced by (0.02, -0.01) px against green."""
     rng = np.random.default_rng(6)
     calibration = calibrate_robustly(seen(rng, poses(12), noise_px=0.02), SHAPE)
     corners = []

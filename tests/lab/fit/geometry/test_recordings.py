@@ -81,7 +81,7 @@ def test_too_few_views_are_not_determined(boards):
 
 
 def edited(recordings: RecordingSet, frames=None, **keys) -> RecordingSet:
-    """The same recordings with other words about the board, or other frames."""
+    """The same recordings with other metadata of the board, or other frames."""
     captures = tuple(capture.model_copy(update=keys) for capture in recordings.manifest.captures)
     pictures = {
         c.frame: recordings.frame(c) if frames is None else np.ascontiguousarray(frames(recordings.frame(c)))
@@ -98,7 +98,7 @@ def edited(recordings: RecordingSet, frames=None, **keys) -> RecordingSet:
         ({"dictionary": "DICT_NO"}, "OpenCV knows no dictionary"),
     ],
 )
-def test_wrong_words_about_the_board_are_refused(boards, keys, reason):
+def test_wrong_metadata_of_the_board_are_refused(boards, keys, reason):
     with pytest.raises(NotDetermined, match=reason):
         fit_geometry(edited(boards(poses=1, sides=("left",)), **keys), "left")
 

@@ -91,7 +91,7 @@ def test_no_noise_floor_above_nyquist():
 
 
 def test_a_prediction_through_the_operator_is_what_the_estimator_reports():
-    """An asymmetric line spread with long tails, which the truncated tails of any estimator bend: the operator bends it alike."""
+    """An asymmetric line spread with long tails, which every estimator truncates: the operator has the same bias."""
 
     def profile(d):
         return 0.9 * 0.5 * (1 + erf(d / 0.6 / np.sqrt(2))) + 0.1 * (0.5 + np.arctan(d / 3.0 - 0.2) / np.pi)

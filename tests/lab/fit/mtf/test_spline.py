@@ -1,4 +1,4 @@
-"""The spline's shortcuts against the plain formulas, to rounding."""
+"""The spline's fast formulas against the plain ones, to rounding errors."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ TRUTHS = {
 
 
 def scores(fit: NoiseFit, sensor: Sensor) -> dict[str, float]:
-    """Error over stated uncertainty of each number."""
+    """Error over stated uncertainty of each figure."""
     return {key: (getattr(fit, key) - truth(sensor)) / getattr(fit, key + "_std") for key, truth in TRUTHS.items()}
 
 

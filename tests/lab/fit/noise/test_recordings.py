@@ -97,7 +97,7 @@ def test_rounding_hides_a_small_read_noise_and_that_is_said() -> None:
 
 @pytest.mark.parametrize("black", [5.0, 5.3, 5.5])
 def test_eight_bits_say_what_they_hide(black: float) -> None:
-    """Dark noise of 0.13 DN: whether 5.5 flickers between two codes or 5.0 stands still, the figures aren't there."""
+    """Dark noise of 0.13 DN: whether codes alternate (mean 5.5) or stay (mean 5.0), the figures aren't determined."""
     sensor = Sensor(cfa="MONO", gain=0.025, read=5.0, black=black, dark_rate=20.0, dsnu=1.0, full=9500.0, white=255)
     ladder = [(float(t), 2) for t in np.linspace(0.05, 1.0, 20)]
     darks = [(float(t), 2) for t in (0.01, 0.3, 0.6, 1.0)]

@@ -1,4 +1,4 @@
-"""Levels whose stated light is wrong are found among others; sound ones aren't accused; uncertainties stay true."""
+"""Levels with wrongly stated light are found; right ones aren't reported; uncertainties stay right."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_scatter_of_sound_levels_is_told() -> None:
     assert series(rng, 50, 0, 0.0)[0].scatter == 0.0
 
 
-def test_two_levels_decide_nothing_against_each_other() -> None:
+def test_two_contradicting_levels_alone_exclude_neither() -> None:
     light, rng = np.array([1.0, 2.0, 3.0, 40.0]), np.random.default_rng(0)
     assert robust_response(light, np.array([0.1, 0.2, 0.3, 0.4]), np.full(4, 1e-4), 1.0, np.zeros(4, bool), rng) is None
 
@@ -111,7 +111,7 @@ def test_a_bad_level_costs_one_level(factors: dict[int, float]) -> None:
     assert not any("lamp" in remark for remark in fit.remarks)
 
 
-def test_uncertainties_hold_what_the_levels_scatter() -> None:
+def test_uncertainties_include_the_scatter_of_the_levels() -> None:
     fits = [photon_fit(100 + seed, {}, scatter=5e-3) for seed in range(25)]
     for figure in ("quantum_efficiency", "responsivity_dn_per_photon"):
         truth = 0.6 if figure == "quantum_efficiency" else 0.3
@@ -123,7 +123,7 @@ def test_uncertainties_hold_what_the_levels_scatter() -> None:
     assert all("it is in the uncertainties" in " ".join(fit.remarks) for fit in fits if fit.response_scatter_percent)
 
 
-def test_a_bend_that_the_levels_do_not_tell_is_not_given() -> None:
+def test_a_curvature_that_the_levels_do_not_determine_is_not_reported() -> None:
     rng = np.random.default_rng(6)
     fit = photon_fit(7, dict(zip(range(20), np.exp(rng.uniform(-1.5, 1.5, 20)), strict=True)))
     assert fit.response_bend_percent is None and fit.brighter_fatter_percent is None

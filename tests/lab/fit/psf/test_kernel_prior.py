@@ -1,4 +1,4 @@
-"""The prior's shortcuts, an axis at a time, against the whole matrices."""
+"""The prior's computation axis by axis against whole matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bands in which fitted curves differ from stated ones."""
+"""Bands of wavelength in which fitted curves differ from the maker's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One picture of a slanted edge or a ColorChecker: nothing is guessed, and what comes out is what went in."""
+"""One picture of a slanted edge or a ColorChecker: nothing is assumed, and known truths are recovered."""
 
 from collections.abc import Callable
 from pathlib import Path
