@@ -36,6 +36,7 @@ from api.schemas import (
     Me,
     PipelineResults,
     PipelineStart,
+    PlanAsked,
     QueuePlace,
     Recordings,
     SentAs,
@@ -47,6 +48,8 @@ from api.schemas import (
 )
 from lab.calibration.life import CalibrationRecord, History
 from lab.calibration.limits import CalibrationLimits
+from lab.capture.catalogue import PlanEstimate, SequenceDescription
+from lab.capture.plan import Parameters
 from lab.capture.queue import QueuedSession
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves
@@ -202,6 +205,14 @@ class ServiceClient:
         """What went over an instrument's wire in the latest check that kept it."""
         return self.request("GET", f"/stations/{station}/devices/{device}/transcript").text
 
+    def sequences(self) -> list[SequenceDescription]:
+        """The catalogue of sequences."""
+        return list(self._pages(SequenceDescription, "/sequences"))
+
+    def estimate(self, station: str, asked: PlanAsked | None = None) -> PlanEstimate:
+        """What a session would take on a station: captures and time."""
+        return self._post(PlanEstimate, f"/stations/{station}/estimate", asked or PlanAsked())
+
     def sessions(self) -> Iterator[StoredSession]:
         """All sessions, the newest first."""
         return self._pages(StoredSession, "/sessions")
@@ -256,13 +267,21 @@ class ServiceClient:
         *,
         quick: bool = False,
         sequences: tuple[str, ...] | None = None,
+        parameters: Parameters | None = None,
         name: str = "",
         demands_certified: bool = False,
         patience_s: float = PATIENCE_S,
     ) -> SessionDetail:
-        """Start a session and wait for its end."""
-        start = SessionStart(
-            station=station, quick=quick, sequences=sequences, name=name, demands_certified=demands_certified
+        """Start a session and wait for its end. `parameters`: values in place of a full session's, as `{"narrowband": {"step_nm": 5}}`."""
+        start = SessionStart.model_validate(
+            {
+                "station": station,
+                "quick": quick,
+                "sequences": sequences,
+                "parameters": parameters or {},
+                "name": name,
+                "demands_certified": demands_certified,
+            }
         )
         return self.wait_session(self.start_session(start).id, patience_s)
 

@@ -10,8 +10,10 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from api.keys import Permission
 from lab.calibration.limits import CalibrationLimits
+from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import RunRecord
 from lab.capture.session import Progress
+from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.formats.importers import KINDS
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
@@ -91,16 +93,40 @@ class StationState(Schema):
     problem: str | None = None
 
 
-class CaptureStart(Schema):
+class PlanAsked(Schema):
+    """Which sequences to take, and how."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "quick": True,
+                "sequences": ["dark", "narrowband"],
+                "parameters": {"narrowband": {"step_nm": 5}},
+            }
+        }
+    )
+
+    quick: bool = Field(default=False, description="fewer frames of each")
+    sequences: tuple[SequenceName, ...] | None = Field(
+        default=None, min_length=1, description="only these; without it, all that the station can do"
+    )
+    parameters: dict[SequenceName, dict[str, int | float | tuple[float, ...]]] = Field(
+        default={},
+        description="values in place of those that a full session has: sequence, parameter, a number or several; "
+        "`GET /sequences` lists them with unit and bounds",
+    )
+
+    def plan(self, station: Station) -> CapturePlan:
+        """The plan on a station. Raises InputError."""
+        return full_plan(station, self.quick, self.sequences, self.parameters)
+
+
+class CaptureStart(PlanAsked):
     """What to capture, and on which station."""
 
     station: str = Field(max_length=100)
     name: str = Field(default="", max_length=120)
     notes: str = Field(default="", max_length=4000)
-    quick: bool = Field(default=False, description="fewer frames of each")
-    sequences: tuple[SequenceName, ...] | None = Field(
-        default=None, min_length=1, description="only these; without it, all that the station can do"
-    )
     demands_certified: bool = Field(
         default=False, description="end the run when it has connected, unless the cameras have a certified calibration"
     )

@@ -21,7 +21,7 @@ from lab.errors import Cancelled, InputError
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from lab.capture.plan import CapturePlan
+    from lab.capture.plan import CapturePlan, Parameters
     from lab.capture.session import Progress as CaptureProgress
     from lab.capture.station import Drivers, Station
     from lab.capture.store import Store
@@ -68,6 +68,7 @@ class CaptureRequest:
     plan : the sequences of a new session; None: all that the station has the instruments and targets for
     quick : fewer exposures and repeats, where `plan` is None
     only : names of the sequences to take, where `plan` is None; empty: all
+    parameters : values of the sequences' parameters in place of a full session's, where `plan` is None
     demands_certified : a new session runs only with cameras that have a certified calibration
     """
 
@@ -75,6 +76,7 @@ class CaptureRequest:
     plan: CapturePlan | None = None
     quick: bool = False
     only: tuple[str, ...] = ()
+    parameters: Parameters = field(default_factory=dict)
     name: str = ""
     notes: str = ""
     demands_certified: bool = False
@@ -230,8 +232,7 @@ def capture_here(
         session = CaptureSession.start(
             store,
             station,
-            request.plan or (full_plan(station, request.quick, request.only) if request.only else None),
-            quick=request.quick,
+            request.plan or full_plan(station, request.quick, request.only or None, request.parameters),
             name=request.name,
             notes=request.notes,
             demands_certified=request.demands_certified,

@@ -16,7 +16,6 @@ from api.routes.sessions import state_now
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
-from lab.capture.plan import full_plan
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
 
@@ -81,7 +80,7 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     session, which can be followed, paused and aborted as any other. 409 while another runs on the same instruments. The key's
     scope has to be `admin`, for this captures and computes."""
     station = service.station(start.station)
-    plan = full_plan(station, start.quick, start.sequences)
+    plan = start.plan(station)
     session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
     return _accepted(service, job_id, response)

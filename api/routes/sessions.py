@@ -119,7 +119,7 @@ def start_session(service: Here, start: SessionStart, response: Response) -> Sto
     """Start a session, which runs in the background. 409 while another session runs on the same instruments; with `queue` it waits for its turn
     instead."""
     station = service.station(start.station)
-    plan = full_plan(station, start.quick, start.sequences)
+    plan = start.plan(station)
     if start.queue:
         session_id = CaptureSession.start(
             service.store,
