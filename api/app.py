@@ -57,7 +57,7 @@ ASSETS = {
     "operator.css": "text/css",
     "operator.js": "text/javascript",
     **dict.fromkeys(
-        ("page.js", "charts.js", "stations.js", "queue.js", "watch.js", "recordings.js", "calibrations.js", "docs.js"),
+        ("page.js", "charts.js", "stations.js", "plan.js", "queue.js", "watch.js", "recordings.js", "calibrations.js", "docs.js"),
         "text/javascript",
     ),
 }

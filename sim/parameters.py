@@ -55,15 +55,17 @@ class Quantity:
                 check_one(one)
             return value
 
+        unit = "" if self.unit == "1" else f" {self.unit}"
+
         def check_one(value: Any) -> None:
             if isinstance(value, int | float):
                 if self.lower is not None and value < self.lower:
                     raise ValueError(
-                        f"{self.meaning}: {value} {self.unit} is below the lower limit {self.lower} {self.unit}; give a value within the limits"
+                        f"{self.meaning}: {value}{unit} is below the lower limit {self.lower}{unit}; give a value within the limits"
                     )
                 if self.upper is not None and value > self.upper:
                     raise ValueError(
-                        f"{self.meaning}: {value} {self.unit} is above the upper limit {self.upper} {self.unit}; give a value within the limits"
+                        f"{self.meaning}: {value}{unit} is above the upper limit {self.upper}{unit}; give a value within the limits"
                     )
 
         return core_schema.no_info_after_validator_function(check, handler(source))
