@@ -27,7 +27,7 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
-from api.routes import calibrations, jobs, knowledge, queue, recordings, sessions
+from api.routes import calibrations, camera_models, jobs, knowledge, queue, recordings, sessions
 from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -57,7 +57,17 @@ ASSETS = {
     "operator.css": "text/css",
     "operator.js": "text/javascript",
     **dict.fromkeys(
-        ("page.js", "charts.js", "stations.js", "plan.js", "queue.js", "watch.js", "recordings.js", "calibrations.js", "docs.js"),
+        (
+            "page.js",
+            "charts.js",
+            "stations.js",
+            "plan.js",
+            "queue.js",
+            "watch.js",
+            "recordings.js",
+            "calibrations.js",
+            "docs.js",
+        ),
         "text/javascript",
     ),
 }
@@ -68,7 +78,10 @@ TAGS = [
     {"name": "captures", "description": "What was captured: pictures and raw frames."},
     {"name": "recordings", "description": "Recording sets that are sent in."},
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
-    {"name": "calibrations", "description": "Candidate, certified, superseded, expired; figures and their history."},
+    {
+        "name": "calibrations",
+        "description": "Candidate, certified, superseded, expired; figures and their history; camera models; comparisons.",
+    },
     {"name": "knowledge", "description": "What the models know."},
 ]
 #: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that is too large,
@@ -239,7 +252,7 @@ def create_app(
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
     app.include_router(stations_router, prefix=PREFIX)
-    for part in (knowledge, sessions, queue, recordings, jobs, calibrations):
+    for part in (knowledge, sessions, queue, recordings, jobs, calibrations, camera_models):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, TypeAdapter
 
 from api.schemas import (
+    CameraModels,
     Certify,
+    Comparison,
     ConnectedDevice,
     DeviceCheck,
     DeviceState,
@@ -389,6 +391,22 @@ class ServiceClient:
         """Certify a candidate, against `limits` or those of the service's data folder."""
         asked = Certify(limits=limits, accept_warnings=accept_warnings)
         return self._post(CalibrationRecord, f"/calibrations/{calibration_id}/certify", asked)
+
+    def camera_models(self) -> Iterator[CameraModels]:
+        """The camera models of fits and diagnoses, the newest first."""
+        return self._pages(CameraModels, "/camera-models")
+
+    def camera_model(self, model_id: str) -> CameraModels:
+        """One camera model, with the parameters of each camera."""
+        return self._get(CameraModels, f"/camera-models/{model_id}")
+
+    def fetch_camera_model(self, model_id: str, file: Path) -> Path:
+        """Write the camera files of a model to `file`, a .zip."""
+        return self._fetched(f"/camera-models/{model_id}/archive.zip", file)
+
+    def compare(self, a: str, b: str, fail_on: Sequence[str] = ()) -> Comparison:
+        """Two calibrations, by id, compared as `calibench compare` does."""
+        return self._get(Comparison, "/comparisons", a=a, b=b, fail_on=list(fail_on))
 
     def history(self, camera: str, figure: str, place: str = "") -> History:
         """A figure of a camera over its calibrations."""

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from api.keys import Permission
+from lab.calibration.camera_models import Kind as CameraModelKind
+from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.limits import CalibrationLimits
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import RunRecord
@@ -16,7 +18,7 @@ from lab.capture.session import Progress
 from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
 from lab.formats.importers import KINDS
-from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ValidationResult
 from sim.camera import Side
 
 #: Databases that forget the time zone give back UTC.
@@ -184,6 +186,25 @@ class Certify(Schema):
 
     limits: CalibrationLimits | None = Field(default=None, description="null: those of the data folder, `limits.toml`")
     accept_warnings: bool = Field(default=False, description="certify with figures in the warning band")
+
+
+class CameraModels(Schema):
+    """The camera models of a result: `fitted` by a fit, or `improved` with what a diagnosis named."""
+
+    id: str
+    kind: CameraModelKind
+    session_id: str | None
+    recordings_id: str | None
+    created: Utc
+    sides: tuple[Side, ...]
+    cameras: dict[Side, ModelOfCamera] = Field(default={}, description="what each is; empty in a list")
+
+
+class Comparison(Schema):
+    """Two calibrations compared, and the changes that fail the rules of the request, by name."""
+
+    comparison: ComparisonResult
+    failing: tuple[str, ...] = ()
 
 
 class FigureName(Schema):

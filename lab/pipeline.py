@@ -343,6 +343,13 @@ class _Pipeline:
         job_id = self.request.job_id if kind == self.request.goal else None
         self._results[kind] = self.store.add_result(kind, self._source, result.model_dump(mode="json"), job_id)
 
+    def _keep_improved(self, examined: Diagnosis) -> None:
+        """Keep the camera files of the diagnosis that was kept just now."""
+        if self.store is not None and "diagnose" in self._results:
+            from lab.calibration.camera_models import keep
+
+            keep(self.store, self._results["diagnose"], examined.improved)
+
     def _kept(self, kind: Goal, model: type[M]) -> M | None:
         """The newest kept result of a kind, where it may be reused: a folder, unlike a finished session, may have changed."""
         if not self.request.reuse or kind == self.request.goal or self.store is None or self._session is None:
@@ -399,6 +406,10 @@ class _Pipeline:
             )
             if whole:
                 self._keep("fit", self._fit)
+                if self.store is not None and "fit" in self._results:
+                    from lab.calibration.camera_models import keep_fitted
+
+                    keep_fitted(self.store, self._results["fit"], self.recordings, self._fit)
 
     def _validate_step(self) -> None:
         from lab.formats.results import ValidationResult
@@ -422,6 +433,7 @@ class _Pipeline:
             self._examined = self._diagnosed(self.recordings, "diagnose")
             self._diagnosis = self._examined.result
             self._keep("diagnose", self._diagnosis)
+            self._keep_improved(self._examined)
 
     def _diagnosed(self, recordings: RecordingSet, step: Step) -> Diagnosis:
         from lab.diagnose import examine
@@ -470,6 +482,7 @@ class _Pipeline:
             examined = replace(again, result=again.result.model_copy(update={"resolutions": tuple(resolutions)}))
             self._examined, self._diagnosis = examined, examined.result
             self._keep("diagnose", examined.result)
+            self._keep_improved(examined)
         self._say("resolve", "done", 1.0, remark=ties.verdict(examined.proposals))
 
     def _report_step(self) -> None:

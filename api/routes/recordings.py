@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
-from api.archives import Zip, zipped
+from api.archives import Zip, zipped_set
 from api.errors import answers
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Recordings, SentAs
@@ -149,7 +149,7 @@ def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
 def recordings_archive(service: Here, recordings_id: HexId) -> Response:
     """The recording set as a .zip, as `POST /recordings` takes it: sent while it is packed, without a stated length."""
     service.recordings(recordings_id)
-    return zipped(service.inbox.recordings(recordings_id), f"recordings-{recordings_id}")
+    return zipped_set(service.inbox.recordings(recordings_id), f"recordings-{recordings_id}")
 
 
 @router.delete(

@@ -11,7 +11,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
-from api.archives import Zip, zipped
+from api.archives import Zip, zipped_set
 from api.errors import Conflict, answers, known
 from api.events import described, event, stream, watched
 from api.live import LiveSession
@@ -191,7 +191,7 @@ def session_archive(service: Here, session_id: SessionId) -> Response:
     recordings = service.store.recording_set(session_id)
     if not recordings.captures():
         raise Conflict(f"session {session_id}: nothing was captured yet; resume it")
-    return zipped(recordings, f"session-{session_id}")
+    return zipped_set(recordings, f"session-{session_id}")
 
 
 @router.post(
