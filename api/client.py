@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import httpx
 import numpy as np
@@ -25,6 +25,9 @@ from pydantic import BaseModel, TypeAdapter
 from api.schemas import (
     CameraModels,
     Certify,
+    Challenge,
+    ChallengeJobStart,
+    ChallengeStart,
     Comparison,
     ConnectedDevice,
     DeviceCheck,
@@ -53,6 +56,8 @@ from lab.calibration.limits import CalibrationLimits
 from lab.capture.catalogue import PlanEstimate, SequenceDescription
 from lab.capture.plan import Parameters
 from lab.capture.queue import QueuedSession
+from lab.challenge.score import ChallengeScore
+from lab.challenge.truth import Truths
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves
 
@@ -378,6 +383,40 @@ class ServiceClient:
     def report(self, job_id: str) -> str:
         """The page of a job of the kind `report` or `pipeline`."""
         return self.request("GET", f"/jobs/{job_id}/report").text
+
+    # --- challenges ------------------------------------------------------------------------------------------------------
+
+    def make_challenge(self, start: ChallengeStart) -> Job:
+        """Make a challenge; the job's `challenge_id` is the challenge."""
+        return self._post(Job, "/challenges", start)
+
+    def start_challenge_job(self, kind: Literal["make", "score"], challenge_id: str) -> Job:
+        """Go on making a challenge, or score it."""
+        return self._post(Job, f"/challenges/{challenge_id}/jobs", ChallengeJobStart(kind=kind))
+
+    def challenges(self) -> Iterator[Challenge]:
+        """All challenges, the newest first."""
+        return self._pages(Challenge, "/challenges")
+
+    def challenge(self, challenge_id: str) -> Challenge:
+        """One challenge."""
+        return self._get(Challenge, f"/challenges/{challenge_id}")
+
+    def fetch_case(self, challenge_id: str, case: str, file: Path) -> Path:
+        """Write the recordings of a case to `file`, a .zip of a recording set."""
+        return self._fetched(f"/challenges/{challenge_id}/cases/{case}/archive.zip", file)
+
+    def challenge_score(self, challenge_id: str) -> ChallengeScore:
+        """The score of a challenge that is scored."""
+        return self._get(ChallengeScore, f"/challenges/{challenge_id}/score")
+
+    def challenge_truths(self, challenge_id: str) -> Truths:
+        """The truths of a challenge that is scored."""
+        return self._get(Truths, f"/challenges/{challenge_id}/truths")
+
+    def delete_challenge(self, challenge_id: str) -> None:
+        """Delete a challenge for ever."""
+        self.request("DELETE", f"/challenges/{challenge_id}")
 
     # --- calibrations ----------------------------------------------------------------------------------------------------
 

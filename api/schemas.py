@@ -17,9 +17,11 @@ from lab.capture.records import RunRecord
 from lab.capture.session import Progress
 from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
+from lab.challenge.kept import ChallengeWork
+from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
 from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ValidationResult
-from sim.camera import Side
+from sim.camera import Cfa, Side
 
 #: Databases that forget the time zone give back UTC.
 Utc = Annotated[datetime, AfterValidator(lambda at: at if at.tzinfo else at.replace(tzinfo=UTC))]
@@ -52,6 +54,7 @@ SessionState = Literal[
     "failed",
     "finished",
 ]
+#: Work on a session or on recordings.
 JobKind = Literal["fit", "validate", "diagnose", "report", "pipeline"]
 JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 
@@ -326,7 +329,7 @@ class PipelineResults(Schema):
 
 
 class Job(Schema):
-    """A job on one source: a session, or recordings that were sent in."""
+    """A job on one source: a session, recordings that were sent in, or a challenge."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -335,6 +338,7 @@ class Job(Schema):
                 "kind": "fit",
                 "session_id": "20300101-120000-abcdef",
                 "recordings_id": None,
+                "challenge_id": None,
                 "state": "running",
                 "progress": 0.4,
                 "message": "noise of the left camera",
@@ -347,9 +351,10 @@ class Job(Schema):
     )
 
     id: str
-    kind: JobKind
+    kind: JobKind | ChallengeWork
     session_id: str | None
     recordings_id: str | None
+    challenge_id: str | None = None
     state: JobState
     progress: float = Field(ge=0, le=1)
     message: str
@@ -405,6 +410,43 @@ class Recordings(Schema):
     cameras: tuple[Side, ...]
     captures: int
     warnings: tuple[str, ...] = ()
+
+
+# --- challenges -------------------------------------------------------------------------------------------------------
+
+
+class ChallengeStart(Schema):
+    """A challenge to be made: recording sets of cameras that conceal something, their truths sealed until it is scored."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"cases": 20, "size": "small", "name": "since the upgrade"}}
+    )
+
+    cases: int = Field(ge=1, le=1000, description="how many recording sets")
+    size: Annotated[str, _one_of("size", SIZES), Field(json_schema_extra={"enum": list(SIZES)})] = Field(
+        default="medium", description="of the frames; foreign: frames, converters and screens of all sizes"
+    )
+    cfa: Cfa | None = Field(default=None, description="of all cases; null: as drawn")
+    name: str = Field(default="", max_length=120)
+
+
+class ChallengeJobStart(Schema):
+    """What to do with a challenge: `make` what is missing of it, or `score` it."""
+
+    kind: Literal["make", "score"]
+
+
+class Challenge(Schema):
+    """A challenge. Its truths, and the seed that they follow from, can't be read before it is scored."""
+
+    id: str
+    name: str
+    created: Utc
+    cases: int
+    size: str
+    cfa: Cfa | None
+    seals: dict[str, str] = Field(description="case -> SHA-256 of a salt and its truth, of the cases that are made")
+    scored: Utc | None = Field(description="when it was scored; null: its truths are sealed")
 
 
 # --- a station's devices ----------------------------------------------------------------------------------------------
