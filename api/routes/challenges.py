@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi import Path as PathParameter
 
-from api.archives import Zip, zipped_set
+from api.archives import Zip
 from api.errors import Conflict, answers, known
+from api.kept_sets import challenge_folder
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.routes.jobs import accepted
 from api.schemas import Challenge, ChallengeJobStart, ChallengeStart, Job
@@ -30,13 +31,6 @@ def _challenge(kept: KeptChallenge) -> Challenge:
 def _known(service: Service, challenge_id: str) -> KeptChallenge:
     missing = f"no challenge {challenge_id!r}; GET /api/v1/challenges lists them"
     return known(missing, lambda: service.challenges.challenge(challenge_id))
-
-
-def _free(service: Service, challenge_id: str) -> str:
-    """The folder of a challenge that no job works on."""
-    folder = str(service.challenges.folder(challenge_id))
-    service.check_no_job(folder, f"challenge {challenge_id}")
-    return folder
 
 
 @router.post("/challenges", status_code=202, dependencies=[CALIBRATE], responses=answers(401, 403, 422))
@@ -72,9 +66,7 @@ def get_challenge(service: Here, challenge_id: HexId) -> Challenge:
 )
 def delete_challenge(service: Here, challenge_id: HexId) -> None:
     """Delete a challenge for ever: its recordings, its truths, its score. 409 while a job works on it."""
-    _known(service, challenge_id)
-    _free(service, challenge_id)
-    service.challenges.remove(challenge_id)
+    challenge_folder(service, challenge_id).delete(service)
 
 
 @router.post(
@@ -87,7 +79,8 @@ def start_challenge_job(service: Here, challenge_id: HexId, start: ChallengeJobS
     """`make` goes on where a job was stopped. `score` diagnoses every case that has no diagnosis yet, then opens the seals and scores; 409 until
     all cases are made, and while another job works on the challenge."""
     kept = _known(service, challenge_id)
-    folder = _free(service, challenge_id)
+    folder = str(service.challenges.folder(challenge_id))
+    service.check_no_job(folder, f"challenge {challenge_id}")
     if start.kind == "score" and len(kept.seals) < kept.order.cases:
         raise Conflict(
             f"challenge {challenge_id}: {len(kept.seals)} of {kept.order.cases} cases are made; start a job of the kind make"
@@ -103,10 +96,7 @@ def start_challenge_job(service: Here, challenge_id: HexId, start: ChallengeJobS
 )
 def challenge_case(service: Here, challenge_id: HexId, case: CaseName) -> Response:
     """The recordings of a case, a recording set as a .zip: for other programs, or for a diagnosis of one's own."""
-    _known(service, challenge_id)
-    missing = f"challenge {challenge_id}: no case {case!r} is made; its `seals` list those that are"
-    recordings = known(missing, lambda: service.challenges.recordings(challenge_id, case))
-    return zipped_set(recordings, f"{challenge_id}-{case}")
+    return challenge_folder(service, challenge_id, case).archive()
 
 
 def _opened(service: Service, challenge_id: str, what: Literal["score", "truths"]) -> Response:

@@ -12,7 +12,6 @@ from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
 from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
-from api.routes.sessions import state_now
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
@@ -61,7 +60,7 @@ def start_session_job(
             raise HTTPException(422, f"station: a job of the kind {start.kind} doesn't capture; leave it out")
         if info.state != "finished":  # its frames would be packed away under the job
             raise Conflict(
-                f"session {session_id} is {state_now(info, service.live.find(session_id))}, not finished; wait for its end "
+                f"session {session_id} is {service.state(info)}, not finished; wait for its end "
                 "or resume it, then start the job; a pipeline does both"
             )
         return accepted(service, service.jobs.submit(start.kind, session_id, resolve=start.resolve), response)

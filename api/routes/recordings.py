@@ -10,8 +10,9 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
-from api.archives import Zip, zipped_set
+from api.archives import Zip
 from api.errors import answers
+from api.kept_sets import sent_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Recordings, SentAs
 from api.service import CALIBRATE, READ, Here, HexId
@@ -148,8 +149,7 @@ def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
 )
 def recordings_archive(service: Here, recordings_id: HexId) -> Response:
     """The recording set as a .zip, as `POST /recordings` takes it: sent while it is packed, without a stated length."""
-    service.recordings(recordings_id)
-    return zipped_set(service.inbox.recordings(recordings_id), f"recordings-{recordings_id}")
+    return sent_set(service, recordings_id).archive()
 
 
 @router.delete(
@@ -161,6 +161,4 @@ def recordings_archive(service: Here, recordings_id: HexId) -> Response:
 )
 def delete_recordings(service: Here, recordings_id: HexId) -> None:
     """Delete a recording set for ever. Results and reports of it stay. 409 while a job works on it."""
-    folder = service.recordings(recordings_id)
-    service.check_no_job(str(folder), f"recordings {recordings_id}")
-    service.inbox.remove(recordings_id)
+    sent_set(service, recordings_id).delete(service)

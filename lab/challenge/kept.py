@@ -99,11 +99,15 @@ class Challenges:
             scored=datetime.fromtimestamp(score.stat().st_mtime, now().tzinfo) if score.is_file() else None,
         )
 
-    def recordings(self, id: str, case: str) -> RecordingSet:
-        """The recording set of a case, whose files are read when they are asked for. Raises InputError where it isn't made."""
-        if case not in self.challenge(id).seals:
+    def case(self, id: str, case: str) -> Path:
+        """The folder of a case. Raises InputError where it isn't made."""
+        if case not in self.challenge(id).seals:  # looked up, never joined: a name can't leave the folder
             raise InputError(f"challenge {id}: no case {case[:20]!r}; `seals` lists those that are made")
-        return recording_set.read(self.folder(id) / "set" / case)
+        return self.folder(id) / "set" / case
+
+    def recordings(self, id: str, case: str) -> RecordingSet:
+        """The recording set of a case. Raises InputError where it isn't made."""
+        return recording_set.read(self.case(id, case))
 
     def opened(self, id: str, what: Literal["score", "truths"]) -> str:
         """Score or truths of a challenge that is scored, as JSON. Raises InputError before that."""
