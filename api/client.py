@@ -309,8 +309,9 @@ class ServiceClient:
     # --- recordings and jobs ---------------------------------------------------------------------------------------------
 
     def send_recordings(self, archive: Path, asked: SentAs | None = None) -> Recordings:
-        """Send in a recording set, a .zip; with `asked`, recordings of another format, which become one."""
-        headers = {"Content-Type": "application/zip", "Content-Length": str(archive.stat().st_size)}
+        """Send in a recording set, a .zip, .tar or .tar.gz; with `asked`, recordings of another format, which become one."""
+        sent = {".zip": "application/zip", ".tar": "application/x-tar"}.get(archive.suffix, "application/gzip")
+        headers = {"Content-Type": sent, "Content-Length": str(archive.stat().st_size)}
         stated = {} if asked is None else asked.model_dump(mode="json", exclude_unset=True)
         with archive.open("rb") as file:  # sent piece by piece: a set may be larger than the memory
             response = self.request("POST", "/recordings", content=file, headers=headers, params=stated)

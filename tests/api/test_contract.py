@@ -17,7 +17,7 @@ from tests.api.conftest import Running
 DESCRIPTION = Path(__file__).parents[2] / "docs" / "reference" / "openapi.json"
 
 
-@schemathesis.serializer("application/zip")
+@schemathesis.serializer("application/zip", "application/x-tar", "application/gzip")
 def as_sent(context: object, value: object) -> bytes:
     """A body that is bytes already."""
     return value if isinstance(value, bytes) else str(value).encode()
