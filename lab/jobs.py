@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import sqlalchemy as sa
 from pydantic import ConfigDict
 
-from lab.capture.durable_files import Lock
+from lab.capture.file_lock import Lock
 from lab.capture.records import JobState, now
 from lab.capture.store import Store
 from lab.capture.tables import JobRow

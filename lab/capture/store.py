@@ -29,7 +29,8 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session, defer, sessionmaker
 
-from lab.capture.durable_files import Lock, npy_bytes, write_durably
+from lab.capture.durable_files import npy_bytes, write_durably
+from lab.capture.file_lock import Lock
 from lab.capture.nexus import write_nexus
 from lab.capture.queue import hold_queue, release_held_by
 from lab.capture.records import (

@@ -13,7 +13,7 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from lab.capture.durable_files import Lock
+from lab.capture.file_lock import Lock
 from lab.errors import InputError
 
 
