@@ -27,7 +27,7 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
-from api.routes import calibrations, jobs, knowledge, queue, recordings, sessions
+from api.routes import calibrations, camera_models, challenges, jobs, knowledge, queue, recordings, sessions
 from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -47,6 +47,7 @@ from lab.capture.recovery import Recovery
 from lab.capture.session import Progress
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
+from lab.challenge.kept import Challenges
 from lab.jobs import JobRunner
 from lab.quick_look.process import QuickLook
 
@@ -57,7 +58,17 @@ ASSETS = {
     "operator.css": "text/css",
     "operator.js": "text/javascript",
     **dict.fromkeys(
-        ("page.js", "charts.js", "stations.js", "queue.js", "watch.js", "recordings.js", "calibrations.js", "docs.js"),
+        (
+            "page.js",
+            "charts.js",
+            "stations.js",
+            "plan.js",
+            "queue.js",
+            "watch.js",
+            "recordings.js",
+            "calibrations.js",
+            "docs.js",
+        ),
         "text/javascript",
     ),
 }
@@ -68,7 +79,11 @@ TAGS = [
     {"name": "captures", "description": "What was captured: pictures and raw frames."},
     {"name": "recordings", "description": "Recording sets that are sent in."},
     {"name": "jobs", "description": "Fits, validations, diagnoses, reports, whole pipelines."},
-    {"name": "calibrations", "description": "Candidate, certified, superseded, expired; figures and their history."},
+    {
+        "name": "calibrations",
+        "description": "Candidate, certified, superseded, expired; figures and their history; camera models; comparisons.",
+    },
+    {"name": "challenges", "description": "Concealed-effect data with sealed truths, and its scoring."},
     {"name": "knowledge", "description": "What the models know."},
 ]
 #: Statuses that the service answers before a route is asked: a foreign Host, a method that the path hasn't, a body that is too large,
@@ -226,6 +241,7 @@ def create_app(
         pictures=Pictures(store),
         jobs=jobs_of,
         inbox=Inbox(store.root / "recordings"),
+        challenges=Challenges(store.root / "challenges"),
         gate=gate,
         public=app.state.public,
         limits=caps,
@@ -239,7 +255,7 @@ def create_app(
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
     app.include_router(stations_router, prefix=PREFIX)
-    for part in (knowledge, sessions, queue, recordings, jobs, calibrations):
+    for part in (knowledge, sessions, queue, recordings, jobs, calibrations, camera_models, challenges):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -1,4 +1,4 @@
-"""Recording sets as a .zip in the body of an answer, packed while it is sent."""
+"""Files as a .zip in the body of an answer, packed while it is sent."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ class Zip(Response):
     media_type = "application/zip"
 
 
-def zipped(recordings: RecordingSet, name: str) -> Response:
-    """The set as an answer. Its first file is read before the answer begins, so that a set without files is refused; where a later one is
+def zipped(pieces: Iterator[bytes], name: str) -> Response:
+    """The pieces of a .zip as an answer. The first is made before the answer begins, so that what has no files is refused; where a later one is
     damaged, the answer breaks off."""
-    recordings.cache_bytes = 0
-    pieces = archive(recordings)
     first = next(pieces)
 
     def every() -> Iterator[bytes]:
@@ -27,3 +25,9 @@ def zipped(recordings: RecordingSet, name: str) -> Response:
 
     headers = {"Content-Disposition": f'attachment; filename="{name}.zip"'}
     return StreamingResponse(every(), media_type=Zip.media_type, headers=headers)
+
+
+def zipped_set(recordings: RecordingSet, name: str) -> Response:
+    """A recording set as an answer."""
+    recordings.cache_bytes = 0
+    return zipped(archive(recordings), name)

@@ -12,10 +12,10 @@ from __future__ import annotations
 import io
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import httpx
 import numpy as np
@@ -23,7 +23,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, TypeAdapter
 
 from api.schemas import (
+    CameraModels,
     Certify,
+    Challenge,
+    ChallengeJobStart,
+    ChallengeStart,
+    Comparison,
     ConnectedDevice,
     DeviceCheck,
     DeviceState,
@@ -36,6 +41,7 @@ from api.schemas import (
     Me,
     PipelineResults,
     PipelineStart,
+    PlanAsked,
     QueuePlace,
     Recordings,
     SentAs,
@@ -47,7 +53,11 @@ from api.schemas import (
 )
 from lab.calibration.life import CalibrationRecord, History
 from lab.calibration.limits import CalibrationLimits
+from lab.capture.catalogue import PlanEstimate, SequenceDescription
+from lab.capture.plan import Parameters
 from lab.capture.queue import QueuedSession
+from lab.challenge.score import ChallengeScore
+from lab.challenge.truth import Truths
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves
 
@@ -202,6 +212,14 @@ class ServiceClient:
         """What went over an instrument's wire in the latest check that kept it."""
         return self.request("GET", f"/stations/{station}/devices/{device}/transcript").text
 
+    def sequences(self) -> list[SequenceDescription]:
+        """The catalogue of sequences."""
+        return list(self._pages(SequenceDescription, "/sequences"))
+
+    def estimate(self, station: str, asked: PlanAsked | None = None) -> PlanEstimate:
+        """What a session would take on a station: captures and time."""
+        return self._post(PlanEstimate, f"/stations/{station}/estimate", asked or PlanAsked())
+
     def sessions(self) -> Iterator[StoredSession]:
         """All sessions, the newest first."""
         return self._pages(StoredSession, "/sessions")
@@ -256,13 +274,21 @@ class ServiceClient:
         *,
         quick: bool = False,
         sequences: tuple[str, ...] | None = None,
+        parameters: Parameters | None = None,
         name: str = "",
         demands_certified: bool = False,
         patience_s: float = PATIENCE_S,
     ) -> SessionDetail:
-        """Start a session and wait for its end."""
-        start = SessionStart(
-            station=station, quick=quick, sequences=sequences, name=name, demands_certified=demands_certified
+        """Start a session and wait for its end. `parameters`: values in place of a full session's, as `{"narrowband": {"step_nm": 5}}`."""
+        start = SessionStart.model_validate(
+            {
+                "station": station,
+                "quick": quick,
+                "sequences": sequences,
+                "parameters": parameters or {},
+                "name": name,
+                "demands_certified": demands_certified,
+            }
         )
         return self.wait_session(self.start_session(start).id, patience_s)
 
@@ -283,8 +309,9 @@ class ServiceClient:
     # --- recordings and jobs ---------------------------------------------------------------------------------------------
 
     def send_recordings(self, archive: Path, asked: SentAs | None = None) -> Recordings:
-        """Send in a recording set, a .zip; with `asked`, recordings of another format, which become one."""
-        headers = {"Content-Type": "application/zip", "Content-Length": str(archive.stat().st_size)}
+        """Send in a recording set, a .zip, .tar or .tar.gz; with `asked`, recordings of another format, which become one."""
+        sent = {".zip": "application/zip", ".tar": "application/x-tar"}.get(archive.suffix, "application/gzip")
+        headers = {"Content-Type": sent, "Content-Length": str(archive.stat().st_size)}
         stated = {} if asked is None else asked.model_dump(mode="json", exclude_unset=True)
         with archive.open("rb") as file:  # sent piece by piece: a set may be larger than the memory
             response = self.request("POST", "/recordings", content=file, headers=headers, params=stated)
@@ -358,6 +385,40 @@ class ServiceClient:
         """The page of a job of the kind `report` or `pipeline`."""
         return self.request("GET", f"/jobs/{job_id}/report").text
 
+    # --- challenges ------------------------------------------------------------------------------------------------------
+
+    def make_challenge(self, start: ChallengeStart) -> Job:
+        """Make a challenge; the job's `challenge_id` is the challenge."""
+        return self._post(Job, "/challenges", start)
+
+    def start_challenge_job(self, kind: Literal["make", "score"], challenge_id: str) -> Job:
+        """Go on making a challenge, or score it."""
+        return self._post(Job, f"/challenges/{challenge_id}/jobs", ChallengeJobStart(kind=kind))
+
+    def challenges(self) -> Iterator[Challenge]:
+        """All challenges, the newest first."""
+        return self._pages(Challenge, "/challenges")
+
+    def challenge(self, challenge_id: str) -> Challenge:
+        """One challenge."""
+        return self._get(Challenge, f"/challenges/{challenge_id}")
+
+    def fetch_case(self, challenge_id: str, case: str, file: Path) -> Path:
+        """Write the recordings of a case to `file`, a .zip of a recording set."""
+        return self._fetched(f"/challenges/{challenge_id}/cases/{case}/archive.zip", file)
+
+    def challenge_score(self, challenge_id: str) -> ChallengeScore:
+        """The score of a challenge that is scored."""
+        return self._get(ChallengeScore, f"/challenges/{challenge_id}/score")
+
+    def challenge_truths(self, challenge_id: str) -> Truths:
+        """The truths of a challenge that is scored."""
+        return self._get(Truths, f"/challenges/{challenge_id}/truths")
+
+    def delete_challenge(self, challenge_id: str) -> None:
+        """Delete a challenge for ever."""
+        self.request("DELETE", f"/challenges/{challenge_id}")
+
     # --- calibrations ----------------------------------------------------------------------------------------------------
 
     def calibrations(self) -> Iterator[CalibrationRecord]:
@@ -370,6 +431,22 @@ class ServiceClient:
         """Certify a candidate, against `limits` or those of the service's data folder."""
         asked = Certify(limits=limits, accept_warnings=accept_warnings)
         return self._post(CalibrationRecord, f"/calibrations/{calibration_id}/certify", asked)
+
+    def camera_models(self) -> Iterator[CameraModels]:
+        """The camera models of fits and diagnoses, the newest first."""
+        return self._pages(CameraModels, "/camera-models")
+
+    def camera_model(self, model_id: str) -> CameraModels:
+        """One camera model, with the parameters of each camera."""
+        return self._get(CameraModels, f"/camera-models/{model_id}")
+
+    def fetch_camera_model(self, model_id: str, file: Path) -> Path:
+        """Write the camera files of a model to `file`, a .zip."""
+        return self._fetched(f"/camera-models/{model_id}/archive.zip", file)
+
+    def compare(self, a: str, b: str, fail_on: Sequence[str] = ()) -> Comparison:
+        """Two calibrations, by id, compared as `calibench compare` does."""
+        return self._get(Comparison, "/comparisons", a=a, b=b, fail_on=list(fail_on))
 
     def history(self, camera: str, figure: str, place: str = "") -> History:
         """A figure of a camera over its calibrations."""

@@ -9,13 +9,19 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from api.keys import Permission
+from lab.calibration.camera_models import Kind as CameraModelKind
+from lab.calibration.camera_models import ModelOfCamera
 from lab.calibration.limits import CalibrationLimits
+from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import RunRecord
 from lab.capture.session import Progress
+from lab.capture.station import Station
 from lab.capture_kinds.base import CAPTURES, SEQUENCES
+from lab.challenge.kept import ChallengeWork
+from lab.challenge.truth import SIZES
 from lab.formats.importers import KINDS
-from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
-from sim.camera import Side
+from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, ValidationResult
+from sim.camera import Cfa, Side
 
 #: Databases that forget the time zone give back UTC.
 Utc = Annotated[datetime, AfterValidator(lambda at: at if at.tzinfo else at.replace(tzinfo=UTC))]
@@ -48,6 +54,7 @@ SessionState = Literal[
     "failed",
     "finished",
 ]
+#: Work on a session or on recordings.
 JobKind = Literal["fit", "validate", "diagnose", "report", "pipeline"]
 JobState = Literal["queued", "running", "done", "failed", "cancelled"]
 
@@ -91,16 +98,40 @@ class StationState(Schema):
     problem: str | None = None
 
 
-class CaptureStart(Schema):
+class PlanAsked(Schema):
+    """Which sequences to take, and how."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "quick": True,
+                "sequences": ["dark", "narrowband"],
+                "parameters": {"narrowband": {"step_nm": 5}},
+            }
+        }
+    )
+
+    quick: bool = Field(default=False, description="fewer frames of each")
+    sequences: tuple[SequenceName, ...] | None = Field(
+        default=None, min_length=1, description="only these; without it, all that the station can do"
+    )
+    parameters: dict[SequenceName, dict[str, int | float | tuple[float, ...]]] = Field(
+        default={},
+        description="values in place of those that a full session has: sequence, parameter, a number or several; "
+        "`GET /sequences` lists them with unit and bounds",
+    )
+
+    def plan(self, station: Station) -> CapturePlan:
+        """The plan on a station. Raises InputError."""
+        return full_plan(station, self.quick, self.sequences, self.parameters)
+
+
+class CaptureStart(PlanAsked):
     """What to capture, and on which station."""
 
     station: str = Field(max_length=100)
     name: str = Field(default="", max_length=120)
     notes: str = Field(default="", max_length=4000)
-    quick: bool = Field(default=False, description="fewer frames of each")
-    sequences: tuple[SequenceName, ...] | None = Field(
-        default=None, min_length=1, description="only these; without it, all that the station can do"
-    )
     demands_certified: bool = Field(
         default=False, description="end the run when it has connected, unless the cameras have a certified calibration"
     )
@@ -158,6 +189,25 @@ class Certify(Schema):
 
     limits: CalibrationLimits | None = Field(default=None, description="null: those of the data folder, `limits.toml`")
     accept_warnings: bool = Field(default=False, description="certify with figures in the warning band")
+
+
+class CameraModels(Schema):
+    """The camera models of a result: `fitted` by a fit, or `improved` with what a diagnosis named."""
+
+    id: str
+    kind: CameraModelKind
+    session_id: str | None
+    recordings_id: str | None
+    created: Utc
+    sides: tuple[Side, ...]
+    cameras: dict[Side, ModelOfCamera] = Field(default={}, description="what each is; empty in a list")
+
+
+class Comparison(Schema):
+    """Two calibrations compared, and the changes that fail the rules of the request, by name."""
+
+    comparison: ComparisonResult
+    failing: tuple[str, ...] = ()
 
 
 class FigureName(Schema):
@@ -279,7 +329,7 @@ class PipelineResults(Schema):
 
 
 class Job(Schema):
-    """A job on one source: a session, or recordings that were sent in."""
+    """A job on one source: a session, recordings that were sent in, or a challenge."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -288,6 +338,7 @@ class Job(Schema):
                 "kind": "fit",
                 "session_id": "20300101-120000-abcdef",
                 "recordings_id": None,
+                "challenge_id": None,
                 "state": "running",
                 "progress": 0.4,
                 "message": "noise of the left camera",
@@ -300,9 +351,10 @@ class Job(Schema):
     )
 
     id: str
-    kind: JobKind
+    kind: JobKind | ChallengeWork
     session_id: str | None
     recordings_id: str | None
+    challenge_id: str | None = None
     state: JobState
     progress: float = Field(ge=0, le=1)
     message: str
@@ -358,6 +410,43 @@ class Recordings(Schema):
     cameras: tuple[Side, ...]
     captures: int
     warnings: tuple[str, ...] = ()
+
+
+# --- challenges -------------------------------------------------------------------------------------------------------
+
+
+class ChallengeStart(Schema):
+    """A challenge to be made: recording sets of cameras that conceal something, their truths sealed until it is scored."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"cases": 20, "size": "small", "name": "since the upgrade"}}
+    )
+
+    cases: int = Field(ge=1, le=1000, description="how many recording sets")
+    size: Annotated[str, _one_of("size", SIZES), Field(json_schema_extra={"enum": list(SIZES)})] = Field(
+        default="medium", description="of the frames; foreign: frames, converters and screens of all sizes"
+    )
+    cfa: Cfa | None = Field(default=None, description="of all cases; null: as drawn")
+    name: str = Field(default="", max_length=120)
+
+
+class ChallengeJobStart(Schema):
+    """What to do with a challenge: `make` what is missing of it, or `score` it."""
+
+    kind: Literal["make", "score"]
+
+
+class Challenge(Schema):
+    """A challenge. Its truths, and the seed that they follow from, can't be read before it is scored."""
+
+    id: str
+    name: str
+    created: Utc
+    cases: int
+    size: str
+    cfa: Cfa | None
+    seals: dict[str, str] = Field(description="case -> SHA-256 of a salt and its truth, of the cases that are made")
+    scored: Utc | None = Field(description="when it was scored; null: its truths are sealed")
 
 
 # --- a station's devices ----------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import functools
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
 from fastapi import Path as PathParameter
@@ -24,10 +24,14 @@ from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
 from lab.capture.store import Store
+from lab.challenge.kept import Challenges
 from lab.errors import InputError
 from lab.formats.results import ReportFile
 from lab.jobs import JobInfo, JobRunner
 from lab.quick_look.process import QuickLook
+
+#: States of a session that nothing works on.
+OVER = frozenset({"created", "queued", "interrupted", "failed", "finished"})
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class Service:
     pictures: Pictures
     jobs: JobRunner
     inbox: Inbox
+    challenges: Challenges
     gate: Gate
     limits: Limits
     public: PublicText
@@ -80,6 +85,15 @@ class Service:
     def session(self, session_id: str) -> SessionInfo:
         """A session; 404 where there is none."""
         return known(missing_session(session_id), lambda: self.store.session(session_id))
+
+    def state(self, info: SessionInfo) -> Any:
+        """What state a session is in: as this service runs it, else as the registry has it."""
+        live = self.live.find(info.id)
+        if live is None:
+            return info.state
+        if live.latest is None:
+            return "connecting"
+        return "pausing" if live.pausing and live.latest.state == "running" else live.latest.state
 
     def job(self, job_id: str) -> JobInfo:
         """A job; 404 where there is none."""

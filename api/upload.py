@@ -1,59 +1,32 @@
-"""Recording sets that are sent in: streamed to the disk and unpacked, both with upper limits, into a folder of their own.
+"""Recording sets that are sent in: streamed to the disk and unpacked, both with upper limits, into a folder of their own, and checked there.
 
-Nothing that an archive states is trusted. Its list of files is read under a cap. Every name, kind, compression and stated size, the
-sum of all sizes and the room on the disk are checked before the first byte is written; sizes are counted again while they are
-written. Names that lead out of the folder, links and devices are refused. The reader of recording sets then checks the content.
+`api.unpacking` looks at what the archive states before it writes a byte; the reader of recording sets then checks the content.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import re
 import secrets
 import shutil
-import stat
 import time
-import zipfile
-import zlib
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, BinaryIO
 
+from api.unpacking import TooMuch, inside, unpack
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.importers.import_options import ImportOptions
 from lab.formats.recording_set import FolderFiles, RecordingSet
 
-_CHUNK = 1 << 20
 _ID = re.compile(r"[0-9a-f]{16}")
 _MANIFEST = "manifest.json"
-#: Bytes of an archive's list of files, per file that is allowed: a name of 200 and what `zip` writes beside it.
-_LISTED_BYTES = 400
-#: Bytes of the disk that uploads leave free: captures come first.
-RESERVE_BYTES = 1 << 30
 #: A folder of an upload that a crash left behind is removed when it is older than this (s).
 _STALE_S = 86400.0
-
-
-class TooMuch(InputError):
-    """More than the upper limit."""
-
-
-class NoRoom(Exception):
-    """The data folder's disk hasn't the room."""
-
-
-def check_room(folder: Path, wanted_bytes: int) -> None:
-    """Raises NoRoom where `wanted_bytes` more would leave less than the reserve on the disk of `folder`."""
-    free = shutil.disk_usage(folder).free
-    if free - wanted_bytes < RESERVE_BYTES:
-        raise NoRoom(
-            f"the data folder has {free} bytes free, {wanted_bytes} are needed and {RESERVE_BYTES} are kept for captures; make room"
-        )
 
 
 def check_size(size_bytes: int, limit_bytes: int) -> None:
@@ -70,109 +43,6 @@ async def receive(body: AsyncIterator[bytes], file: BinaryIO, limit_bytes: int) 
         check_size(taken, limit_bytes)
         file.write(chunk)
     return taken
-
-
-def _inside(name: str) -> PurePosixPath:
-    """A member's name as a path in the folder. Raises InputError for a path that leads out of it."""
-    path = PurePosixPath(name)
-    parts = path.parts
-    if (
-        not parts
-        or path.is_absolute()
-        or ".." in parts
-        or "\\" in name
-        or any(":" in part or any(ord(letter) < 32 for letter in part) or len(part.encode()) > 200 for part in parts)
-        or len(parts) > 10
-    ):
-        raise InputError(f"archive: {name[:80]!r} isn't a path inside it; pack the recording set's folder itself")
-    return path
-
-
-def _plain_file(member: zipfile.ZipInfo) -> None:
-    """Raises InputError for a link or a device, and for a compression that could take any amount of memory to undo."""
-    if stat.S_IFMT(member.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
-        raise InputError(f"archive: {member.filename[:80]!r} is a link or a device; pack plain files only")
-    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise InputError(f"archive: {member.filename[:80]!r} is neither stored nor deflated; pack it so")
-
-
-class _ListedArchive(io.FileIO):
-    """An archive whose list of files is read at once only up to `limit_bytes`: `zipfile` reads as much as the archive states."""
-
-    def __init__(self, file: Path, limit_bytes: int) -> None:
-        super().__init__(file)
-        self._limit_bytes = limit_bytes
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """The next bytes. Raises TooMuch where more are asked for than the limit."""
-        if size is None or size < 0:
-            at = self.tell()
-            size = self.seek(0, io.SEEK_END) - at
-            self.seek(at)
-        if size > self._limit_bytes:
-            raise TooMuch("archive: its list of files is too long; pack fewer captures")
-        return super().read(size) or b""
-
-
-def _checked(
-    packed: zipfile.ZipFile, room: Path, limit_bytes: int, limit_files: int
-) -> list[tuple[zipfile.ZipInfo, PurePosixPath]]:
-    """The archive's members and their paths, all checked by what the archive states of them."""
-    members = packed.infolist()
-    if len(members) > limit_files:
-        raise TooMuch(f"archive: {len(members)} files, {limit_files} at most; pack fewer captures")
-    checked = [(member, _inside(member.filename)) for member in members]
-    for member in members:
-        _plain_file(member)
-    stated = sum(member.file_size for member in members)
-    if stated > limit_bytes:
-        raise TooMuch(f"archive: {stated} bytes unpacked, {limit_bytes} at most; pack fewer captures")
-    check_room(room, stated)
-    return checked
-
-
-def _write_members(packed: zipfile.ZipFile, folder: Path, limit_bytes: int, limit_files: int) -> None:
-    members = _checked(packed, folder.parent, limit_bytes, limit_files)
-    folder.mkdir(parents=True)
-    left = limit_bytes
-    for member, inside in members:
-        path = folder / inside
-        if member.is_dir():
-            path.mkdir(parents=True, exist_ok=True)
-            continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with packed.open(member) as source, path.open("xb") as made:
-            while chunk := source.read(_CHUNK):
-                left -= len(chunk)
-                if left < 0:
-                    raise TooMuch(f"archive: more than {limit_bytes} bytes unpacked; pack fewer captures")
-                made.write(chunk)
-
-
-#: What `zipfile` raises for a damaged archive.
-_BROKEN = (
-    zipfile.BadZipFile,
-    zlib.error,
-    RuntimeError,  # a password, NotImplementedError for an unknown compression
-    EOFError,
-    ValueError,
-    FileExistsError,
-    NotADirectoryError,
-    IsADirectoryError,
-)
-
-
-def unpack(archive: Path, folder: Path, limit_bytes: int, limit_files: int) -> None:
-    """Unpack a .zip into `folder`, which must not exist. Raises InputError, and TooMuch beyond a limit."""
-    try:
-        listed_bytes = max(_CHUNK, limit_files * _LISTED_BYTES)
-        with _ListedArchive(archive, listed_bytes) as file, zipfile.ZipFile(file) as packed:
-            _write_members(packed, folder, limit_bytes, limit_files)
-    except _BROKEN as error:
-        said = " ".join(str(error).replace(str(folder), "").split())[:120]
-        raise InputError(
-            f"archive: can't be unpacked ({said}); send a .zip with each file once, deflated, without a password"
-        ) from error
 
 
 @dataclass(frozen=True)
@@ -206,7 +76,7 @@ class Foreign:
     @staticmethod
     def _located(folder: Path, name: str, path: str, a_file: bool = True) -> Path:
         """A file or folder of the archive. Raises InputError where it isn't in it."""
-        found = folder / _inside(path)
+        found = folder / inside(path)
         if not (found.is_file() or (found.is_dir() and not a_file)):
             raise InputError(f"{name} {path[:80]!r}: isn't in the archive; name it as in the archive")
         return found

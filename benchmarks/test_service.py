@@ -166,7 +166,14 @@ def filled(data: Path, sessions: int, captures: int) -> None:
         for at in range(sessions):
             id = f"20300101-{at:06d}-abcdef"
             with store.transaction() as db:
-                row = template | {"id": id, "name": f"night {at}", "state": "finished", "packed": True, "runs": [run]}
+                row = template | {
+                    "id": id,
+                    "name": f"night {at}",
+                    "state": "finished",
+                    "packed": True,
+                    "runs": [run],
+                    "steps": captures,
+                }
                 db.execute(sa.insert(SessionRow), row | {"created": began - timedelta(minutes=at)})
                 steps = [
                     {"session_id": id, "position": n, "step_id": str(n), "spec": {}, "finished": began}

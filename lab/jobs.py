@@ -1,4 +1,4 @@
-"""Long work as jobs: every goal of `lab.pipeline`, in the background, with a row each in a table of the registry.
+"""Long work as jobs: every goal of `lab.pipeline` and the work on challenges, in the background, with a row each in a table of the registry.
 
 The table holds state, progress and error; results are kept under the job's id. A job that needs no instrument runs on Dask: in
 this process by default, or on a cluster whose address the settings give. A job that captures runs in a thread of this process,
@@ -14,16 +14,18 @@ import threading
 import time
 from datetime import datetime
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Any, cast
 from urllib.parse import urlsplit
 
 import sqlalchemy as sa
 from pydantic import ConfigDict
 
-from lab.capture.durable_files import Lock
+from lab.capture.file_lock import Lock
 from lab.capture.records import JobState, now
 from lab.capture.store import Store
 from lab.capture.tables import JobRow
+from lab.challenge.kept import WORK, ChallengeWork, carry_out
 from lab.errors import Cancelled, DeviceError, InputError, NotDetermined
 from lab.pipeline import (
     STEPS,
@@ -38,6 +40,9 @@ from lab.pipeline import (
 from lab.workers import dask_client
 from sim.parameters import Frozen
 
+JobKind = Goal | ChallengeWork
+KINDS = (*STEPS, *WORK)
+
 #: The least time (s) between two rows of progress.
 _WRITE_EVERY_S = 0.2
 
@@ -48,7 +53,7 @@ class JobInfo(Frozen):
     model_config = ConfigDict(frozen=True, extra="ignore", from_attributes=True)
 
     id: str
-    kind: Goal
+    kind: JobKind
     source: str
     state: JobState
     progress: float
@@ -76,7 +81,12 @@ class _Reporter:
         self._written_s = 0.0
         self._lock = threading.Lock()
 
-    def __call__(self, progress: PipelineProgress) -> None:
+    def pipeline(self, progress: PipelineProgress) -> None:
+        """Progress of a pipeline."""
+        words = ": ".join(part for part in (progress.step, progress.remark or progress.what) if part)
+        self(words, progress.share)
+
+    def __call__(self, message: str, share: float) -> None:
         with self._lock:
             if time.monotonic() - self._written_s < _WRITE_EVERY_S:
                 return
@@ -85,8 +95,8 @@ class _Reporter:
             row = db.get_one(JobRow, self.job_id, with_for_update=True)
             if row.cancel_requested:
                 raise Cancelled
-            row.progress = min(max(progress.share, 0.0), 1.0)
-            row.message = ": ".join(part for part in (progress.step, progress.remark or progress.what) if part)
+            row.progress = min(max(share, 0.0), 1.0)
+            row.message = message
 
 
 def run_job(
@@ -103,10 +113,14 @@ def run_job(
                 row.state, row.finished = "cancelled", now()
                 return
             row.state, row.started = "running", now()
-            kind, source = cast(Goal, row.kind), row.source
+            kind, source = cast(JobKind, row.kind), row.source
+        tell = _Reporter(store, job_id)
         try:
-            request = _request(store, kind, source, job_id, resolve)
-            run_pipeline(request, _Reporter(store, job_id), store=store, capturer=capturer)
+            if kind in WORK:
+                carry_out(kind, Path(source), tell)
+            else:
+                request = _request(store, cast(Goal, kind), source, job_id, resolve)
+                run_pipeline(request, tell.pipeline, store=store, capturer=capturer)
         except Cancelled:
             _over(store, job_id, "cancelled", None)
         except (InputError, DeviceError, NotDetermined) as error:
@@ -232,15 +246,15 @@ class JobRunner:
                     )
             return self._client
 
-    def submit(self, kind: Goal, source: str, *, resolve: bool = False, capturer: Capturer | None = None) -> str:
-        """Queue a job on a session's id or a recording set's folder; returns the job's id.
+    def submit(self, kind: JobKind, source: str, *, resolve: bool = False, capturer: Capturer | None = None) -> str:
+        """Queue a job on a session's id, a recording set's folder, or a challenge's; returns the job's id.
 
         `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`: of a
         pipeline, take the captures that tell the remaining rivals apart. Raises InputError for an unknown kind, and for
         `resolve` where the job can't capture.
         """
-        if kind not in STEPS:
-            raise InputError(f"job {kind!r}: no such work; choose from {', '.join(STEPS)}")
+        if kind not in KINDS:
+            raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")
         if resolve and (kind != "pipeline" or capturer is None):
             raise InputError(f"job {kind}: only a pipeline on a session's station can resolve; leave resolve out")
         client = self._dask() if capturer is None else None

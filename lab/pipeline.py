@@ -21,7 +21,7 @@ from lab.errors import Cancelled, InputError
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from lab.capture.plan import CapturePlan
+    from lab.capture.plan import CapturePlan, Parameters
     from lab.capture.session import Progress as CaptureProgress
     from lab.capture.station import Drivers, Station
     from lab.capture.store import Store
@@ -68,6 +68,7 @@ class CaptureRequest:
     plan : the sequences of a new session; None: all that the station has the instruments and targets for
     quick : fewer exposures and repeats, where `plan` is None
     only : names of the sequences to take, where `plan` is None; empty: all
+    parameters : values of the sequences' parameters in place of a full session's, where `plan` is None
     demands_certified : a new session runs only with cameras that have a certified calibration
     """
 
@@ -75,6 +76,7 @@ class CaptureRequest:
     plan: CapturePlan | None = None
     quick: bool = False
     only: tuple[str, ...] = ()
+    parameters: Parameters = field(default_factory=dict)
     name: str = ""
     notes: str = ""
     demands_certified: bool = False
@@ -230,8 +232,7 @@ def capture_here(
         session = CaptureSession.start(
             store,
             station,
-            request.plan or (full_plan(station, request.quick, request.only) if request.only else None),
-            quick=request.quick,
+            request.plan or full_plan(station, request.quick, request.only or None, request.parameters),
             name=request.name,
             notes=request.notes,
             demands_certified=request.demands_certified,
@@ -342,6 +343,13 @@ class _Pipeline:
         job_id = self.request.job_id if kind == self.request.goal else None
         self._results[kind] = self.store.add_result(kind, self._source, result.model_dump(mode="json"), job_id)
 
+    def _keep_improved(self, examined: Diagnosis) -> None:
+        """Keep the camera files of the diagnosis that was kept just now."""
+        if self.store is not None and "diagnose" in self._results:
+            from lab.calibration.camera_models import keep
+
+            keep(self.store, self._results["diagnose"], examined.improved)
+
     def _kept(self, kind: Goal, model: type[M]) -> M | None:
         """The newest kept result of a kind, where it may be reused: a folder, unlike a finished session, may have changed."""
         if not self.request.reuse or kind == self.request.goal or self.store is None or self._session is None:
@@ -398,6 +406,10 @@ class _Pipeline:
             )
             if whole:
                 self._keep("fit", self._fit)
+                if self.store is not None and "fit" in self._results:
+                    from lab.calibration.camera_models import keep_fitted
+
+                    keep_fitted(self.store, self._results["fit"], self.recordings, self._fit)
 
     def _validate_step(self) -> None:
         from lab.formats.results import ValidationResult
@@ -421,6 +433,7 @@ class _Pipeline:
             self._examined = self._diagnosed(self.recordings, "diagnose")
             self._diagnosis = self._examined.result
             self._keep("diagnose", self._diagnosis)
+            self._keep_improved(self._examined)
 
     def _diagnosed(self, recordings: RecordingSet, step: Step) -> Diagnosis:
         from lab.diagnose import examine
@@ -469,6 +482,7 @@ class _Pipeline:
             examined = replace(again, result=again.result.model_copy(update={"resolutions": tuple(resolutions)}))
             self._examined, self._diagnosis = examined, examined.result
             self._keep("diagnose", examined.result)
+            self._keep_improved(examined)
         self._say("resolve", "done", 1.0, remark=ties.verdict(examined.proposals))
 
     def _report_step(self) -> None:

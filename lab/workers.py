@@ -8,7 +8,7 @@ computes in one at a time, and CPU time and memory are measured by the process.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, TypeVar
@@ -18,6 +18,7 @@ from lab.errors import InputError
 R = TypeVar("R")
 
 CONNECT_TIMEOUT_S = 10.0
+TICK_S = 1.0
 
 
 def dask_client(scheduler: str, timeout_s: float) -> Any:
@@ -34,10 +35,13 @@ def dask_client(scheduler: str, timeout_s: float) -> Any:
 
 @dataclass(frozen=True)
 class Workers:
-    """`jobs` processes of this computer, 1: this one; or with `scheduler` the workers of a Dask cluster, however many those are."""
+    """`jobs` processes of this computer, 1: this one unless it is to be `apart`; or with `scheduler` the workers of a Dask cluster, however many
+    those are. `tick` is called every second while processes of this computer work; what it raises ends them at once."""
 
     jobs: int = 1
     scheduler: str | None = None
+    apart: bool = False
+    tick: Callable[[], None] | None = None
 
     def done(self, work: Callable[..., R], items: Sequence[Any], *shared: Any) -> Iterator[tuple[int, R]]:
         """Number and result of `work(item, *shared)` of every item, as they get ready.
@@ -46,23 +50,35 @@ class Workers:
         """
         if self.scheduler is not None and items:
             yield from self._on_cluster(self.scheduler, work, items, shared)
-        elif self.jobs == 1 or len(items) < 2:
+        elif not items or (not self.apart and (self.jobs == 1 or len(items) < 2)):
             for number, item in enumerate(items):
                 yield number, work(item, *shared)
         else:
-            with ProcessPoolExecutor(min(self.jobs, len(items)), mp_context=get_context("spawn")) as pool:
-                running = {pool.submit(work, item, *shared): number for number, item in enumerate(items)}
-                try:
-                    for ready in as_completed(running):
-                        yield running[ready], ready.result()
-                finally:
-                    for left in running:
-                        left.cancel()
+            yield from self._here(work, items, shared)
 
     def in_order(self, work: Callable[..., R], items: Sequence[Any], *shared: Any) -> list[R]:
         """The results of `done`, in the order of the items."""
         found = dict(self.done(work, items, *shared))
         return [found[number] for number in range(len(items))]
+
+    def _here(self, work: Callable[..., R], items: Sequence[Any], shared: Sequence[Any]) -> Iterator[tuple[int, R]]:
+        with ProcessPoolExecutor(min(self.jobs, len(items)), mp_context=get_context("spawn")) as pool:
+            running = {pool.submit(work, item, *shared): number for number, item in enumerate(items)}
+            left = set(running)
+            try:
+                while left:
+                    ready, left = wait(left, TICK_S, FIRST_COMPLETED)
+                    for one in ready:
+                        yield running[one], one.result()
+                    if self.tick is not None:
+                        self.tick()
+            except BaseException:  # nobody waits for the rest
+                for process in list(pool._processes.values()):  # Python 3.14 has `kill_workers`
+                    process.kill()
+                raise
+            finally:
+                for future in left:
+                    future.cancel()
 
     @staticmethod
     def _on_cluster(

@@ -36,7 +36,8 @@ class Quantity:
     `prior` is (centre, one standard deviation) of a normal distribution in the parameter's own unit, or None for a
     flat prior between the bounds. `absent` is the value that means that the effect isn't there. `linear_power` says in
     which power of the parameter the prediction has a slope at `absent`: 2 for a displacement d, which acts as d^2.
-    `dispensable`: a refinement, that stays at `absent` where a fit without it is worth nearly as much.
+    `dispensable`: a refinement, that stays at `absent` where a fit without it is worth nearly as much. Of a tuple, each value is within the
+    bounds.
     """
 
     unit: str
@@ -50,27 +51,34 @@ class Quantity:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
         def check(value: Any) -> Any:
+            for one in value if isinstance(value, tuple) else (value,):
+                check_one(one)
+            return value
+
+        unit = "" if self.unit == "1" else f" {self.unit}"
+
+        def check_one(value: Any) -> None:
             if isinstance(value, int | float):
                 if self.lower is not None and value < self.lower:
                     raise ValueError(
-                        f"{self.meaning}: {value} {self.unit} is below the lower limit {self.lower} {self.unit}; give a value within the limits"
+                        f"{self.meaning}: {value}{unit} is below the lower limit {self.lower}{unit}; give a value within the limits"
                     )
                 if self.upper is not None and value > self.upper:
                     raise ValueError(
-                        f"{self.meaning}: {value} {self.unit} is above the upper limit {self.upper} {self.unit}; give a value within the limits"
+                        f"{self.meaning}: {value}{unit} is above the upper limit {self.upper}{unit}; give a value within the limits"
                     )
-            return value
 
         return core_schema.no_info_after_validator_function(check, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         described = dict(handler(schema))
         described |= {"description": self.meaning, "unit": self.unit}
-        if self.lower is not None:
-            described["minimum"] = self.lower
-        if self.upper is not None:
-            described["maximum"] = self.upper
-        return described
+        bounds = {"minimum": self.lower, "maximum": self.upper}
+        limits = {name: bound for name, bound in bounds.items() if bound is not None}
+        if isinstance(described.get("items"), dict):  # several values: each has the bounds
+            described["items"] = described["items"] | limits
+            return described
+        return described | limits
 
 
 def declared(model: type[BaseModel]) -> dict[str, Quantity]:

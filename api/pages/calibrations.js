@@ -1,7 +1,7 @@
 // Calibrations: their states, certifying one, and the history of a figure with its bands.
 
 import { number, svg, ticks } from "./charts.js";
-import { $, ask, element, post, show, time, told } from "./page.js";
+import { $, api, ask, element, post, show, time, told } from "./page.js";
 
 const HEIGHT = 240;
 const LEFT = 76;
@@ -11,8 +11,16 @@ const BOTTOM = 34;
 
 const measured = (value, std) => (value == null ? "" : `${number(value, 6)} ± ${number(std, 2)}`);
 
+const rig = (one) => JSON.stringify(Object.entries(one.cameras).sort());
+
 function row(one) {
   const actions = element("td");
+  const links = one.certified_id ? [["Compare", `${api}/comparisons/page?${new URLSearchParams({ a: one.certified_id, b: one.id })}`]] : [];
+  for (const [label, href] of [...links, ["Cameras", `${api}/camera-models/${one.id}/archive.zip`]]) {
+    const link = element("a", { href, textContent: label, ...(label === "Compare" ? { target: "_blank", rel: "noopener" } : {}) });
+    link.setAttribute("aria-label", label === "Compare" ? `Compare ${one.name} with the certified calibration` : `Camera files of ${one.name}`);
+    actions.append(link, " ");
+  }
   if (one.state === "candidate") {
     const button = element("button", { textContent: "Certify …" });
     button.setAttribute("aria-label", `Certify ${one.name}`);
@@ -166,7 +174,10 @@ form.addEventListener("submit", (event) => event.preventDefault());
 
 export async function showCalibrations() {
   const [known, named] = await Promise.all([ask("/calibrations?limit=50"), ask("/figures")]);
-  show("calibrations", known, row);
+  // What others of the same cameras are compared with.
+  const certifiedOf = new Map(known.filter((one) => one.state === "certified").map((one) => [rig(one), one.id]));
+  const others = (one) => (certifiedOf.get(rig(one)) === one.id ? undefined : certifiedOf.get(rig(one)));
+  show("calibrations", known.map((one) => ({ ...one, certified_id: others(one) })), row);
   $("no-calibrations").hidden = known.length > 0;
   $("history-part").hidden = named.length === 0;
   figures = named;

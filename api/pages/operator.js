@@ -2,6 +2,7 @@
 
 import { showCalibrations } from "./calibrations.js";
 import { $, Problem, api, ask, element, post, put, show, time, told } from "./page.js";
+import { asked as planned, showPlan } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";
 import { recordingsAre, showRecordings } from "./recordings.js";
 import { leaveStations, showStations, stationsAre } from "./stations.js";
@@ -63,7 +64,9 @@ function showStart() {
   $("no-station").hidden = problems.length === 0;
   $("no-station").textContent = problems.join(" ");
   $("start-form").hidden = usable.length === 0 || !["operate", "admin"].includes(scope);
-  showStartButton(usable.find((s) => s.name === select.value));
+  const chosen = usable.find((s) => s.name === select.value);
+  showStartButton(chosen);
+  showPlan(chosen, $("start-form").elements.quick.checked).catch((error) => ($("plan-problem").textContent = error.message));
 }
 
 // A station that is busy, or a time, makes it a place in the queue.
@@ -79,7 +82,7 @@ $("start-form").addEventListener(
     const fields = event.target.elements;
     const at = fields.not_before.value ? new Date(fields.not_before.value).toISOString() : null;
     const queued = Boolean(at || stations.find((s) => s.name === fields.station.value)?.busy_with);
-    const asked = { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked, demands_certified: fields.certified.checked };
+    const asked = { station: fields.station.value, name: fields.name.value, quick: fields.quick.checked, demands_certified: fields.certified.checked, ...planned() };
     const session = await post("/sessions", { ...asked, queue: queued, not_before: at });
     fields.name.value = fields.not_before.value = "";
     if (!queued) await select(session);

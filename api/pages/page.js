@@ -46,6 +46,12 @@ export function show(place, items, row) {
   [...(again?.querySelectorAll("a, button") ?? [])].find((one) => one.textContent === label)?.focus();
 }
 
+export function duration(seconds) {
+  const s = Math.round(seconds);
+  if (s < 90) return `${s} s`;
+  return s < 5400 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
+}
+
 export const time = (text) => (text ? text.replace("T", " ").slice(0, 19) : "");
 
 // A button's or form's action: what goes wrong stands in `place`, an element or the id of one.

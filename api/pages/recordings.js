@@ -17,7 +17,7 @@ function send(file, tell) {
     const request = new XMLHttpRequest();
     const format = $("drop-format").value;
     request.open("POST", `${api}/recordings${format ? `?format=${format}` : ""}`);
-    request.setRequestHeader("Content-Type", "application/zip");
+    request.setRequestHeader("Content-Type", file.name.endswith(".tar") ? "application/x-tar" : /\.(tgz|gz)$/.test(file.name) ? "application/gzip" : "application/zip");
     request.upload.addEventListener("progress", (event) => event.lengthComputable && tell(event.loaded / event.total));
     request.addEventListener("error", () => reject(new Problem(`${file.name}: the connection broke off; send it again`)));
     request.addEventListener("load", () => {
@@ -61,7 +61,7 @@ for (const name of ["dragover", "dragleave", "drop"]) {
 }
 zone.addEventListener("drop", told("recordings-problem", (event) => {
   const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry?.());
-  if (entries.some((entry) => entry?.isDirectory)) throw new Problem("pack the folder as a .zip and drop that");
+  if (entries.some((entry) => entry?.isDirectory)) throw new Problem("pack the folder as a .zip or .tar and drop that");
   return sendAll([...event.dataTransfer.files]);
 }));
 $("drop-file").addEventListener("change", told("recordings-problem", async (event) => {

@@ -1,6 +1,6 @@
 // Stations at a glance: a card each, with what runs there, its shutter, light and temperature, and a halt.
 
-import { $, LIVE, api, ask, element, post, told } from "./page.js";
+import { $, LIVE, api, ask, duration, element, post, told } from "./page.js";
 
 // A browser keeps six connections to a service open; the streams leave some of them for requests.
 const STREAMS = 3;
@@ -19,11 +19,7 @@ export function leaveStations() {
   streams.clear();
 }
 
-function duration(seconds) {
-  if (seconds == null) return "";
-  const s = Math.round(seconds);
-  return s < 90 ? `${s} s left` : `${Math.round(s / 60)} min left`;
-}
+const left = (seconds) => (seconds == null ? "" : `${duration(seconds)} left`);
 
 function card(name, title) {
   const at = (tag, className, ...children) => element(tag, { className }, ...children);
@@ -75,7 +71,7 @@ function showProgress(parts, p) {
   parts.bar.max = p.total || 1;
   parts.bar.value = p.done;
   const step = p.total && p.state === "running" ? `step ${Math.min(p.done + 1, p.total)} of ${p.total}` : "";
-  parts.step.textContent = [p.what, step, duration(p.left_s)].filter(Boolean).join(" · ");
+  parts.step.textContent = [p.what, step, left(p.left_s)].filter(Boolean).join(" · ");
   if (p.bench) showBench(parts, p.bench);
   if (p.remark) parts.remarks.prepend(element("li", { textContent: `${p.what}: ${p.remark}` }));
 }

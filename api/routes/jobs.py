@@ -12,11 +12,10 @@ from api.errors import Conflict, answers, known
 from api.events import described, stream, watched
 from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
-from api.routes.sessions import state_now
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
 from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
-from lab.capture.plan import full_plan
+from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
 
@@ -25,16 +24,19 @@ router = APIRouter()
 
 def _job(service: Service, info: JobInfo) -> Job:
     recordings_id = service.inbox.id_of(info.source)
+    challenge_id = service.challenges.id_of(info.source)
     return Job(
         **info.model_dump(exclude={"source", "message", "error", "cancel_requested"}),
         message=service.public(info.message),
         error=service.public.or_none(info.error),
-        session_id=info.source if recordings_id is None else None,
+        session_id=info.source if recordings_id is None and challenge_id is None else None,
         recordings_id=recordings_id,
+        challenge_id=challenge_id,
     )
 
 
-def _accepted(service: Service, job_id: str, response: Response) -> Job:
+def accepted(service: Service, job_id: str, response: Response) -> Job:
+    """A job that was started just now, and where to look for it."""
     response.headers["Location"] = f"/api/v1/jobs/{job_id}"
     return _job(service, service.jobs.job(job_id))
 
@@ -58,15 +60,15 @@ def start_session_job(
             raise HTTPException(422, f"station: a job of the kind {start.kind} doesn't capture; leave it out")
         if info.state != "finished":  # its frames would be packed away under the job
             raise Conflict(
-                f"session {session_id} is {state_now(info, service.live.find(session_id))}, not finished; wait for its end "
+                f"session {session_id} is {service.state(info)}, not finished; wait for its end "
                 "or resume it, then start the job; a pipeline does both"
             )
-        return _accepted(service, service.jobs.submit(start.kind, session_id, resolve=start.resolve), response)
+        return accepted(service, service.jobs.submit(start.kind, session_id, resolve=start.resolve), response)
     if start.resolve or info.state != "finished":
         Demand(Permission.ADMIN)(request, None, None)
     station = service.station(start.station) if start.station is not None else service.store.station(session_id)
     job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
-    return _accepted(service, job_id, response)
+    return accepted(service, job_id, response)
 
 
 @router.post(
@@ -81,10 +83,10 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     session, which can be followed, paused and aborted as any other. 409 while another runs on the same instruments. The key's
     scope has to be `admin`, for this captures and computes."""
     station = service.station(start.station)
-    plan = full_plan(station, start.quick, start.sequences)
+    plan = start.plan(station)
     session_id = service.live.start(station, plan, start.name, start.notes, start.demands_certified)
     job_id = service.jobs.submit("pipeline", session_id, resolve=start.resolve, capturer=service.live.capturer(station))
-    return _accepted(service, job_id, response)
+    return accepted(service, job_id, response)
 
 
 @router.post(
@@ -99,7 +101,7 @@ def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, r
     folder = str(service.recordings(recordings_id))
     if start.station is not None:
         raise HTTPException(422, "station: recordings that were sent in have none; leave it out")
-    return _accepted(service, service.jobs.submit(start.kind, folder, resolve=start.resolve), response)
+    return accepted(service, service.jobs.submit(start.kind, folder, resolve=start.resolve), response)
 
 
 @router.get(
@@ -179,6 +181,8 @@ def job_result(service: Here, job_id: HexId) -> Response:
     kind = _done(service, job_id).kind
     if kind == "report":
         raise HTTPException(404, f"job {job_id} made a report; GET /api/v1/jobs/{job_id}/report")
+    if kind in WORK:
+        raise HTTPException(404, f"job {job_id} worked on a challenge; GET /api/v1/challenges/ID has it")
     # As it was stored: no second serialisation that could differ.
     document = service.store.result(job_id).document
     if kind == "pipeline":

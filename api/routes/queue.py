@@ -8,10 +8,9 @@ from fastapi import APIRouter, Depends
 
 from api.errors import Conflict, answers
 from api.keys import Permission, StoredKey
-from api.routes.sessions import OVER, state_now
 from api.schemas import Halt, Halted, QueuePlace
 from api.security import Demand
-from api.service import OPERATE, READ, Here, Service, SessionId
+from api.service import OPERATE, OVER, READ, Here, Service, SessionId
 from lab.capture.queue import QueuedSession, hold_queue, leave_queue, put_into_queue, queue
 from lab.errors import InputError
 
@@ -39,7 +38,7 @@ def queue_session(service: Here, session_id: SessionId, asked: QueuePlace) -> li
     """Let a session wait for its turn, move one that waits to another place or time, and release one that is held. The queue as it is then.
     409 for a session that runs or is finished."""
     info = service.session(session_id)
-    state = state_now(info, service.live.find(session_id))
+    state = service.state(info)
     if state not in OVER or state == "finished":
         raise Conflict(f"session {session_id} is {state}; only one that can be started or resumed can wait")
     put_into_queue(service.store, session_id, asked.not_before, asked.place)

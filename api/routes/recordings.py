@@ -10,17 +10,21 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
-from api.archives import Zip, zipped
+from api.archives import Zip
 from api.errors import answers
+from api.kept_sets import sent_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Recordings, SentAs
 from api.service import CALIBRATE, READ, Here, HexId
-from api.upload import Foreign, NoRoom, TooMuch, as_in_archive, check_room, check_size, receive
+from api.unpacking import NoRoom, TooMuch, check_room
+from api.upload import Foreign, as_in_archive, check_size, receive
 from lab.errors import InputError
 from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
 
 router = APIRouter()
-TYPES = ("application/zip", "application/x-zip-compressed", "application/octet-stream")
+#: What an archive may be; its own first bytes say which it is.
+ARCHIVES = ("application/zip", "application/x-tar", "application/gzip")
+TYPES = (*ARCHIVES, "application/x-zip-compressed", "application/x-gzip", "application/octet-stream")
 
 
 def _recordings(id: str, manifest: dict[str, Any], warnings: tuple[str, ...] = ()) -> Recordings:
@@ -74,24 +78,24 @@ def _foreign(asked: SentAs) -> Foreign | None:
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+            "content": {archive: {"schema": {"type": "string", "format": "binary"}} for archive in ARCHIVES},
         }
     },
 )
 async def send_recordings(
     service: Here, request: Request, response: Response, asked: Annotated[SentAs, Query()]
 ) -> Recordings:
-    """Send in a recording set: its folder as a .zip, as the body. It is checked completely before it is kept. With `format`, the
+    """Send in a recording set: its folder as a .zip, .tar or .tar.gz, as the body. It is checked completely before it is kept. With `format`, the
     archive holds recordings as `calibench import` takes them, which become a recording set; the other parameters state what that format
     doesn't."""
     foreign = _foreign(asked)
     sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if sent not in TYPES:
-        raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the .zip itself as application/zip")
+        raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the archive itself, as {', '.join(ARCHIVES)}")
     limits = service.limits
     stated = request.headers.get("content-length", "0")
     with service.inbox.receiving() as place:
-        archive = place / "archive.zip"
+        archive = place / "archive"
         try:
             stated_bytes = int(stated) if stated.isdecimal() else 0
             check_size(stated_bytes, limits.upload_bytes)
@@ -148,8 +152,7 @@ def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
 )
 def recordings_archive(service: Here, recordings_id: HexId) -> Response:
     """The recording set as a .zip, as `POST /recordings` takes it: sent while it is packed, without a stated length."""
-    service.recordings(recordings_id)
-    return zipped(service.inbox.recordings(recordings_id), f"recordings-{recordings_id}")
+    return sent_set(service, recordings_id).archive()
 
 
 @router.delete(
@@ -161,6 +164,4 @@ def recordings_archive(service: Here, recordings_id: HexId) -> Response:
 )
 def delete_recordings(service: Here, recordings_id: HexId) -> None:
     """Delete a recording set for ever. Results and reports of it stay. 409 while a job works on it."""
-    folder = service.recordings(recordings_id)
-    service.check_no_job(str(folder), f"recordings {recordings_id}")
-    service.inbox.remove(recordings_id)
+    sent_set(service, recordings_id).delete(service)

@@ -11,10 +11,10 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
-from api.archives import Zip, zipped
-from api.errors import Conflict, answers, known
+from api.archives import Zip
+from api.errors import answers, known
 from api.events import described, event, stream, watched
-from api.live import LiveSession
+from api.kept_sets import session_set
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, NumberCursor, page_headers
 from api.schemas import (
     CaptureCount,
@@ -26,8 +26,7 @@ from api.schemas import (
     StoredCapture,
     StoredSession,
 )
-from api.service import ADMIN, OPERATE, READ, Here, RegistryId, Service, SessionId, missing_session
-from lab.calibration.life import check_nothing_rests_on
+from api.service import ADMIN, OPERATE, OVER, READ, Here, RegistryId, Service, SessionId, missing_session
 from lab.capture.durable_files import npy_bytes
 from lab.capture.plan import full_plan
 from lab.capture.queue import put_into_queue
@@ -39,7 +38,6 @@ from lab.quick_look.frame_figures import FrameFigures
 from sim.camera import Side
 
 router = APIRouter()
-OVER = frozenset({"created", "queued", "interrupted", "failed", "finished"})
 #: A capture never changes, and its path has its session's random id in it.
 FOR_EVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
@@ -73,20 +71,11 @@ def list_stations(service: Here) -> list[StationState]:
 # --- sessions ----------------------------------------------------------------------------------------------------------
 
 
-def state_now(info: SessionInfo, live: LiveSession | None) -> Any:
-    """What state a session is in: as this service runs it, else as the registry has it."""
-    if live is None:
-        return info.state
-    if live.latest is None:
-        return "connecting"
-    return "pausing" if live.pausing and live.latest.state == "running" else live.latest.state
-
-
 def _fields(service: Service, info: SessionInfo) -> dict[str, Any]:
-    live = service.live.find(info.id)
-    fields = info.model_dump(exclude={"packed"}) | {"state": state_now(info, live)}
+    fields = info.model_dump(exclude={"packed"}) | {"state": service.state(info)}
     # The error of an earlier run doesn't concern this one.
-    return fields | {"error": None if live is not None else service.public.or_none(info.error)}
+    runs = service.live.find(info.id) is not None
+    return fields | {"error": None if runs else service.public.or_none(info.error)}
 
 
 def _session(service: Service, session_id: str) -> StoredSession:
@@ -119,7 +108,7 @@ def start_session(service: Here, start: SessionStart, response: Response) -> Sto
     """Start a session, which runs in the background. 409 while another session runs on the same instruments; with `queue` it waits for its turn
     instead."""
     station = service.station(start.station)
-    plan = full_plan(station, start.quick, start.sequences)
+    plan = start.plan(station)
     if start.queue:
         session_id = CaptureSession.start(
             service.store,
@@ -163,15 +152,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
 def delete_session(service: Here, session_id: SessionId) -> None:
     """Delete a session for ever: its captures and its files. Results, reports and calibrations of it stay. 409 while it runs, while a job
     works on it, and while a certified calibration rests on it. The key's scope has to be `admin`."""
-    state = state_now(service.session(session_id), service.live.find(session_id))
-    if state not in OVER:
-        raise Conflict(f"session {session_id} is {state}; abort it first")
-    service.check_no_job(session_id, f"session {session_id}")
-    try:
-        check_nothing_rests_on(service.store, session_id)
-        service.store.delete_session(session_id)
-    except InputError as error:
-        raise Conflict(str(error)) from None
+    session_set(service, session_id).delete(service)
 
 
 @router.get(
@@ -184,14 +165,7 @@ def delete_session(service: Here, session_id: SessionId) -> None:
 def session_archive(service: Here, session_id: SessionId) -> Response:
     """The session as a recording set, a .zip as `POST /recordings` takes it: sent while it is packed, without a stated length. 409 while it
     runs, because what it has is still changing, and where it has captured nothing."""
-    info = service.session(session_id)
-    state = state_now(info, service.live.find(session_id))
-    if state not in OVER:
-        raise Conflict(f"session {session_id} is {state}; wait for its end or abort it")
-    recordings = service.store.recording_set(session_id)
-    if not recordings.captures():
-        raise Conflict(f"session {session_id}: nothing was captured yet; resume it")
-    return zipped(recordings, f"session-{session_id}")
+    return session_set(service, session_id).archive()
 
 
 @router.post(

@@ -1,4 +1,4 @@
-"""A station, its devices, and their self-tests."""
+"""A station, its devices and their self-tests, the catalogue of sequences, and what a session would take."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from fastapi import APIRouter, HTTPException, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import PlainTextResponse
 
-from api.errors import answers
+from api.errors import answers, known
 from api.routes.sessions import station_state
-from api.schemas import ConnectedDevice, DeviceCheck, DeviceState, StationState
+from api.schemas import ConnectedDevice, DeviceCheck, DeviceState, PlanAsked, StationState
 from api.service import OPERATE, READ, Here, Service
 from drivers import discovery
 from drivers.errors import InstrumentError
+from lab.capture.catalogue import PlanEstimate, SequenceDescription, catalogue, described, estimate, step_times
 from lab.capture.station import Station
 from lab.errors import DeviceError
 
@@ -84,6 +85,27 @@ def list_devices(service: Here, name: StationName) -> list[DeviceState]:
 def get_device(service: Here, name: StationName, device: DeviceName) -> DeviceState:
     """One instrument of a station."""
     return _device(service, name, service.station(name), device)
+
+
+@router.get("/sequences", dependencies=[READ], responses=answers(401))
+def list_sequences() -> list[SequenceDescription]:
+    """The catalogue: what each sequence is for, what it needs, its parameters with unit and bounds."""
+    return list(catalogue())
+
+
+@router.get("/sequences/{sequence}", dependencies=[READ], responses=answers(401, 404, 422))
+def get_sequence(sequence: str) -> SequenceDescription:
+    """One sequence."""
+    missing = f"no sequence {sequence[:60]!r}; GET /api/v1/sequences lists them"
+    return known(missing, lambda: described(sequence))
+
+
+@router.post("/stations/{name}/estimate", dependencies=[READ], responses=answers(401, 404, 422))
+def estimate_session(service: Here, name: StationName, asked: PlanAsked) -> PlanEstimate:
+    """What a session would take on a station: each sequence with the values of its parameters, its captures and its time, learned from the
+    sessions that the station has finished. Nothing is started."""
+    station = service.station(name)
+    return estimate(asked.plan(station), station, step_times(service.store, station))
 
 
 @router.post(

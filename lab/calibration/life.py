@@ -18,7 +18,7 @@ from scipy import special
 
 from lab.calibration.figures import Figure, figures_of
 from lab.calibration.limits import CalibrationLimits, Judgement, Limit, Mark, judged
-from lab.capture.records import now
+from lab.capture.records import RunRecord, now
 from lab.capture.station import Station
 from lab.capture.store import Store
 from lab.capture.tables import CalibrationRow, FigureRow, ResultRow, SessionRow
@@ -28,6 +28,8 @@ from lab.formats.results import FitResult
 from sim.camera import Side
 from sim.parameters import Frozen
 
+#: Fits that are entered as calibrations in one transaction.
+TOGETHER = 100
 CalibrationState = Literal["candidate", "certified", "superseded", "expired"]
 
 
@@ -135,47 +137,58 @@ def check_nothing_rests_on(store: Store, session_id: str) -> None:
 def register(store: Store) -> None:
     """Enter the fits of sessions that aren't in the registry of calibrations yet, with their figures."""
     with store.reading() as db:
-        missing = db.execute(
-            sa.select(ResultRow.id, ResultRow.source)
+        missing = db.scalars(
+            sa.select(ResultRow.id)
             .join(SessionRow, SessionRow.id == ResultRow.source)
             .outerjoin(CalibrationRow, CalibrationRow.id == ResultRow.id)
             .where(ResultRow.kind == "fit", CalibrationRow.id.is_(None))
         ).all()
-    for result_id, session_id in missing:
-        _register_one(store, result_id, session_id)
+    for begin in range(0, len(missing), TOGETHER):
+        _register(store, missing[begin : begin + TOGETHER])
 
 
-def _register_one(store: Store, result_id: str, session_id: str) -> None:
-    found = store.result(result_id)
-    runs = store.runs(session_id)
-    cameras = cameras_of(runs[-1].instruments if runs else {}, store.station(session_id))
-    rig = rig_of(cameras)
-    figures = figures_of(FitResult.model_validate(found.document))
+def _register(store: Store, missing: Sequence[str]) -> None:
+    """Enter some fits in one transaction: each of its own would wait for the disk."""
+    columns = (ResultRow.id, ResultRow.created, ResultRow.document, SessionRow.id, SessionRow.station, SessionRow.runs)
+    asked = sa.select(*columns).join(SessionRow, SessionRow.id == ResultRow.source).where(ResultRow.id.in_(missing))
+    with store.reading() as db:
+        entries = [_entry(*found) for found in db.execute(asked)]
     with store.transaction() as db:
-        if db.get(CalibrationRow, result_id) is not None:  # another process was faster
-            return
-        db.add(
-            CalibrationRow(
-                id=result_id,
-                session_id=session_id,
-                created=found.created,
-                rig=rig,
-                cameras={str(side): name for side, name in cameras.items()},
-            )
-        )
-        db.flush()
-        db.add_all(
-            FigureRow(
-                calibration_id=result_id,
-                camera=cameras.get(figure.side, rig) if figure.side else rig,
-                side=figure.side,
-                name=figure.name[:200],
-                place=figure.place[:60],
-                value=figure.value,
-                std=figure.std,
-            )
-            for figure in figures
-        )
+        known = set(db.scalars(sa.select(CalibrationRow.id).where(CalibrationRow.id.in_(missing))))
+        fresh = [entry for entry in entries if entry[0]["id"] not in known]  # else another process was faster
+        if fresh:
+            db.execute(sa.insert(CalibrationRow), [row for row, _ in fresh])
+        if of_them := [figure for _, figures in fresh for figure in figures]:
+            db.execute(sa.insert(FigureRow), of_them)
+
+
+def _entry(
+    result_id: str, created: datetime, document: Any, session_id: str, station: Any, runs: Sequence[Any]
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The rows of a calibration and of its figures."""
+    run = RunRecord.model_validate(runs[-1]) if runs else None
+    cameras = cameras_of(run.instruments if run is not None else {}, Station.model_validate(station))
+    rig = rig_of(cameras)
+    row = {
+        "id": result_id,
+        "session_id": session_id,
+        "created": created,
+        "rig": rig,
+        "cameras": {str(side): name for side, name in cameras.items()},
+    }
+    figures = [
+        {
+            "calibration_id": result_id,
+            "camera": cameras.get(figure.side, rig) if figure.side else rig,
+            "side": figure.side,
+            "name": figure.name[:200],
+            "place": figure.place[:60],
+            "value": figure.value,
+            "std": figure.std,
+        }
+        for figure in figures_of(FitResult.model_validate(document))
+    ]
+    return row, figures
 
 
 # --- reading -------------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from drivers.monochromator.base import Monochromator
 from drivers.photodiode.base import IrradianceMeasurement, Photodiode
 from drivers.spectroradiometer.base import Spectroradiometer
 from drivers.stage.base import Stage
-from lab.capture.blocking_calls import STOP_S, Status, bounded
+from lab.capture.blocking_calls import STOP_S, Status, bounded, in_thread
 from lab.capture.records import StoredFile
 from lab.formats.recording_set import DataSheet
 from sim.camera import Side
@@ -376,12 +377,24 @@ class CamerasDevice(Device):
                         f"camera {side}: a frame of {frame.raw.shape[0]} x {frame.raw.shape[1]} pixels came, the data sheet in "
                         f"the station file says {sheet.rows} x {sheet.cols}; correct rows and cols there, or the camera's region"
                     )
-            self.levels = {side: level_of(frame.raw, self.sheets[side]) for side, frame in frames.items()}
-            self.stored = {side: self.write(path, side, frames[side].raw) for side, path in shot.paths.items()}
+            self._keep(frames, shot)
             self.frames = frames
             self.in_series = bool(shot.paths)
 
         return Status("cameras", take, (1 + MOST_LOST) * max(shot.exposure_s.values()) + READOUT_S)
+
+    def _keep(self, frames: Mapping[Side, Frame], shot: Shot) -> None:
+        """Levels of the frames, and the files of those that are kept, all sides at once: hashing and the disk wait for nobody."""
+
+        def kept(side: Side) -> tuple[float, StoredFile | None]:
+            raw, path = frames[side].raw, shot.paths.get(side)
+            stored = None if path is None else self.write(path, side, raw)
+            return level_of(raw, self.sheets[side]), stored
+
+        found = {side: in_thread(partial(kept, side)) for side in frames}
+        results = {side: future.result() for side, future in found.items()}
+        self.levels = {side: level for side, (level, _) in results.items()}
+        self.stored = {side: stored for side, (_, stored) in results.items() if stored is not None}
 
     async def pause(self) -> None:
         await bounded("cameras", self.end_stream)

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import ValidationError
+
 from lab.capture_kinds.base import SEQUENCES, Cells, Equipment, Sequence, Step
 from lab.errors import InputError
+from sim.parameters import declared
+
+#: Values of sequences' parameters: sequence -> parameter -> a number, or several.
+Parameters = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -22,8 +29,12 @@ class CapturePlan:
         return tuple(sequence.name for sequence in self.sequences)
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
-        """All steps. Raises InputError if the station lacks what one of them needs."""
-        return tuple(step for sequence in self.sequences for step in sequence.steps(station))
+        """All steps. Raises InputError if the station lacks what one of them needs, and where a step is there twice."""
+        made = tuple(step for sequence in self.sequences for step in sequence.steps(station))
+        for step_id, times in Counter(step.id for step in made).items():
+            if times > 1:
+                raise InputError(f"sequences: the step {step_id} is there {times} times; give every value once")
+        return made
 
     def patterns(self, station: Equipment) -> dict[str, Cells]:
         """The cells (rows, cols) of all patterns that the screen is to show, by path in the session."""
@@ -34,14 +45,41 @@ class CapturePlan:
         return {sequence.name: sequence.model_dump(mode="json", exclude_none=True) for sequence in self.sequences}
 
 
-def full_plan(station: Equipment, quick: bool = False, only: Collection[str] | None = None) -> CapturePlan:
+def full_plan(
+    station: Equipment, quick: bool = False, only: Collection[str] | None = None, parameters: Parameters | None = None
+) -> CapturePlan:
     """Every sequence whose instruments and targets the station has. `quick` takes fewer frames of each.
 
-    `only`: names of the sequences to take. Raises InputError where the station can't take one of them.
+    `only`: names of the sequences to take. `parameters`: values in place of those that a full session has. Raises InputError where the
+    station can't take one of the sequences, and for a parameter that none of them has or that is out of its bounds.
     """
     possible = [planned for kind in SEQUENCES.values() if (planned := kind.planned(station, quick)) is not None]
-    if only is None:
-        return CapturePlan(tuple(possible))
+    taken = possible if only is None else _only(possible, only)
+    wanted = parameters or {}
+    if idle := wanted.keys() - {sequence.name for sequence in taken}:
+        raise InputError(
+            f"parameters: {', '.join(sorted(idle))} isn't taken; name some of {', '.join(one.name for one in taken)}"
+        )
+    return CapturePlan(tuple(_with(sequence, wanted.get(sequence.name, {})) for sequence in taken))
+
+
+def _with(sequence: Sequence, values: Mapping[str, Any]) -> Sequence:
+    """The sequence with other values of its parameters. Raises InputError."""
+    known = declared(type(sequence))
+    if unknown := values.keys() - known.keys():
+        raise InputError(f"{sequence.name}.{min(unknown)}: isn't a parameter; {sequence.name} has {', '.join(known)}")
+    if not values:
+        return sequence
+    try:
+        return type(sequence).model_validate(sequence.model_dump() | dict(values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join((sequence.name, *map(str, first["loc"])))
+        raise InputError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from error
+
+
+def _only(possible: list[Sequence], only: Collection[str]) -> list[Sequence]:
+    """Those of these names. Raises InputError where one isn't possible, or isn't at all."""
     if unknown := set(only) - SEQUENCES.keys():
         raise InputError(f"sequences: there is no {', '.join(sorted(unknown))}; name some of {', '.join(SEQUENCES)}")
     if missing := set(only) - {sequence.name for sequence in possible}:
@@ -49,4 +87,4 @@ def full_plan(station: Equipment, quick: bool = False, only: Collection[str] | N
             f"sequences: the station lacks instruments or targets for {', '.join(sorted(missing))}; "
             "leave it out or add them to the station file"
         )
-    return CapturePlan(tuple(sequence for sequence in possible if sequence.name in only))
+    return [sequence for sequence in possible if sequence.name in only]

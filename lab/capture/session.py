@@ -96,20 +96,28 @@ class _Writes:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._change = threading.Condition()
+        self._under_way = 0
         self._over = False
 
     def do(self, write: Callable[[], T]) -> T:
-        """Write now. Raises InstrumentError after `close`."""
-        with self._lock:
+        """Write now, several at once. Raises InstrumentError after `close`."""
+        with self._change:
             if self._over:
                 raise InstrumentError("came back after the run had ended; what it brought is dropped")
+            self._under_way += 1
+        try:
             return write()
+        finally:
+            with self._change:
+                self._under_way -= 1
+                self._change.notify_all()
 
     def close(self) -> None:
-        """Wait for the current write, and refuse all later ones."""
-        with self._lock:
+        """Refuse all later writes, and wait for those that are under way."""
+        with self._change:
             self._over = True
+            self._change.wait_for(lambda: self._under_way == 0)
 
 
 class CaptureSession:

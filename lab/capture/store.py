@@ -29,7 +29,8 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session, defer, sessionmaker
 
-from lab.capture.durable_files import Lock, npy_bytes, write_durably
+from lab.capture.durable_files import npy_bytes, write_durably
+from lab.capture.file_lock import Lock
 from lab.capture.nexus import write_nexus
 from lab.capture.queue import hold_queue, release_held_by
 from lab.capture.records import (
@@ -147,6 +148,7 @@ class Store:
                     calibration=dict(plan or {}),
                     cameras=cameras,
                     runs=[],
+                    steps=len(steps),
                     demands_certified=demands_certified,
                 )
             )
@@ -165,34 +167,27 @@ class Store:
         return row
 
     def _infos(self, db: Session, rows: Sequence[SessionRow]) -> list[SessionInfo]:
-        """The sessions of these rows, their steps counted in one query."""
-        counts = {
-            session_id: (steps, done)
-            for session_id, steps, done in db.execute(
-                sa.select(StepRow.session_id, sa.func.count(), sa.func.count(StepRow.finished))
-                .where(StepRow.session_id.in_([row.id for row in rows]))
-                .group_by(StepRow.session_id)
+        """The sessions of these rows. Of one that is packed, all steps are done; those of the others are counted in one query."""
+        counted = sa.select(StepRow.session_id, sa.func.count(StepRow.finished)).group_by(StepRow.session_id)
+        open_ones = [row.id for row in rows if not row.packed]
+        asked = db.execute(counted.where(StepRow.session_id.in_(open_ones))) if open_ones else ()
+        done = {session_id: number for session_id, number in asked}  # noqa: C416  (rows, not pairs, to a type checker)
+        return [
+            SessionInfo(
+                id=row.id,
+                name=row.name,
+                notes=row.notes,
+                created=_aware(row.created),
+                closed=row.closed and _aware(row.closed),
+                state=row.state,  # type: ignore[arg-type]
+                error=row.error,
+                packed=row.packed,
+                demands_certified=row.demands_certified,
+                steps=row.steps,
+                steps_done=row.steps if row.packed else done.get(row.id, 0),
             )
-        }
-        found = []
-        for row in rows:
-            steps, done = counts.get(row.id, (0, 0))
-            found.append(
-                SessionInfo(
-                    id=row.id,
-                    name=row.name,
-                    notes=row.notes,
-                    created=_aware(row.created),
-                    closed=row.closed and _aware(row.closed),
-                    state=row.state,  # type: ignore[arg-type]
-                    error=row.error,
-                    packed=row.packed,
-                    demands_certified=row.demands_certified,
-                    steps=steps,
-                    steps_done=done,
-                )
-            )
-        return found
+            for row in rows
+        ]
 
     def _info(self, db: Session, row: SessionRow) -> SessionInfo:
         return self._infos(db, [row])[0]
@@ -217,7 +212,8 @@ class Store:
 
     def sessions(self, after: str | None = None, limit: int | None = None) -> list[SessionInfo]:
         """Sessions, the newest first: `limit` at most, those that follow the session `after` in this order."""
-        asked = sa.select(SessionRow).options(defer(SessionRow.station), defer(SessionRow.cameras))
+        documents = (SessionRow.station, SessionRow.cameras, SessionRow.calibration, SessionRow.runs)
+        asked = sa.select(SessionRow).options(*map(defer, documents))
         with self.reading() as db:
             if after is not None:
                 last = self._row(db, after)

@@ -13,7 +13,7 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from lab.capture.durable_files import Lock
+from lab.capture.file_lock import Lock
 from lab.errors import InputError
 
 
@@ -39,6 +39,7 @@ class SessionRow(Base):
     runs: Mapped[list[Any]]
     packed: Mapped[bool] = mapped_column(default=False)
     demands_certified: Mapped[bool] = mapped_column(default=False, server_default=sa.false())
+    steps: Mapped[int] = mapped_column(default=0, server_default="0")
     queue_place: Mapped[int | None] = mapped_column(index=True)
     not_before: Mapped[datetime | None]
 

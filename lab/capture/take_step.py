@@ -1,4 +1,7 @@
-"""The plan that takes one step: set the bench, measure the light, find the exposure, expose."""
+"""The plan that takes one step: set the bench, measure the light, find the exposure, expose.
+
+It yields bluesky's messages itself: each of the library's plan stubs formats the whole call stack, for a warning that is never needed here.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import bluesky.plan_stubs as bps
 import numpy as np
 from bluesky.utils import Msg
 
@@ -59,20 +61,25 @@ def arrange(step: Step, instruments: Instruments) -> Plan[None]:
         moves.append((instruments.screen, ShownPattern(setting.pattern, setting.cell_px if setting.pattern else 1)))
     moves = [(device, value) for device, value in moves if device.value != value]
     for device, value in moves:
-        yield from bps.abs_set(device, value, group="arrange")
-    yield from bps.wait(group="arrange")
+        yield Msg("set", device, value, group="arrange")
+    yield Msg("wait", None, group="arrange")
     # Last: before the grating has arrived, the light has another wavelength.
     opens = instruments.shutter is not None and setting.wavelength_nm is not None and not instruments.shutter.value
     if opens:
-        yield from bps.abs_set(instruments.shutter, True, wait=True)
+        yield from _set_shutter(instruments, True)
     cameras.in_series = cameras.in_series and not moves and not opens
+
+
+def _set_shutter(instruments: Instruments, opened: bool) -> Plan[None]:
+    yield Msg("set", instruments.shutter, opened, group="shutter")
+    yield Msg("wait", None, group="shutter")
 
 
 def _shoot(instruments: Instruments, shot: Shot) -> Plan[None]:
     yield Msg("prepare", instruments.cameras, shot, group="shoot")
-    yield from bps.wait(group="shoot")
-    yield from bps.trigger(instruments.cameras, group="shoot")
-    yield from bps.wait(group="shoot")
+    yield Msg("wait", None, group="shoot")
+    yield Msg("trigger", instruments.cameras, group="shoot")
+    yield Msg("wait", None, group="shoot")
 
 
 def find_exposure(
@@ -160,8 +167,8 @@ def take(
         if radiometer is None:
             raise InputError(f"station: step {step.id!r} needs a [spectroradiometer]; add it to the station file")
         yield Msg("prepare", radiometer, step.radiance, group="radiance")
-        yield from bps.trigger(radiometer, group="radiance")
-        yield from bps.wait(group="radiance")
+        yield Msg("trigger", radiometer, group="radiance")
+        yield Msg("wait", None, group="radiance")
         if radiometer.stored is None:
             reason = radiometer.refused or "spectroradiometer: gave no spectrum"
             if not step.captures:
@@ -194,25 +201,25 @@ def take(
         result |= {"level": dict(cameras.levels)}
         if retaken:
             result["retaken"] = retaken
-    yield from bps.create(name=step.sequence)
+    yield Msg("create", None, name=step.sequence)
     for device in instruments.devices:
-        yield from bps.read(device)
-    yield from bps.save()
+        yield Msg("read", device)
+    yield Msg("save")
     return Taken(result, tuple(files), captures)
 
 
 def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | None) -> Plan[None]:
     """Measure the irradiance of light of one wavelength; with None, the photodiode's dark current."""
     yield Msg("prepare", photodiode, wavelength_nm, group="irradiance")
-    yield from bps.trigger(photodiode, group="irradiance")
-    yield from bps.wait(group="irradiance")
+    yield Msg("trigger", photodiode, group="irradiance")
+    yield Msg("wait", None, group="irradiance")
 
 
 def _dark_current(instruments: Instruments) -> Plan[None]:
     """Close the shutter and measure the photodiode's dark current."""
     assert instruments.photodiode is not None
     if instruments.shutter is not None and instruments.shutter.value is not False:
-        yield from bps.abs_set(instruments.shutter, False, wait=True)
+        yield from _set_shutter(instruments, False)
     yield from _measure_irradiance(instruments.photodiode, None)
 
 

@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from lab.capture_kinds.registry import ByKind
 from lab.errors import InputError
 from sim.camera import Side
-from sim.parameters import Frozen
+from sim.parameters import Frozen, Quantity
 from sim.scene.scenes import Scene
 from sim.spectrum import Spectrum
 
@@ -251,10 +251,23 @@ class Step(Frozen):
         return self.id.partition("/")[0]
 
 
+Level = Annotated[
+    float,
+    Quantity(
+        "1",
+        "level that the exposure is found for, a share of the range from black to saturation",
+        lower=0.06,
+        upper=0.94,
+    ),
+]
+
+
 class Sequence(Frozen):
-    """The specification of a measurement. Its fields are the measurement's parameters; its steps follow from them."""
+    """The specification of a measurement. Its fields are the measurement's parameters, those with a `Quantity` an operator's to set; its
+    steps follow from them."""
 
     name: ClassVar[str]
+    purpose: ClassVar[str]  # what is determined with it, in words
     instruments: ClassVar[tuple[str, ...]] = ()  # families of the station file that it can't do without
     targets: ClassVar[tuple[type[Target], ...]] = ()  # kinds of target that it puts before the cameras
 
@@ -284,6 +297,16 @@ class Sequence(Frozen):
                 f"station: the sequence {cls.name!r} needs a {' and a '.join(missing)}; "
                 f"add [{missing[0]}] to the station file or leave the sequence out"
             )
+
+
+#: Steps of one sequence, at most: each is a row of the journal.
+MOST_STEPS = 50_000
+
+
+def check_number(steps: float) -> None:
+    """Raises ValueError for more steps than a sequence may have."""
+    if steps > MOST_STEPS:
+        raise ValueError(f"{steps:g} steps are more than the limit of {MOST_STEPS}; give fewer frames, or fewer places")
 
 
 SEQUENCES: dict[str, type[Sequence]] = {}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Literal, Self
-
-from pydantic import Field
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
+    Level,
     RelativeExposure,
     Sequence,
     Setting,
@@ -21,7 +20,7 @@ from lab.capture_kinds.base import (
     spectrum_path,
 )
 from lab.errors import InputError
-from sim.parameters import Frozen
+from sim.parameters import Frozen, Quantity
 from sim.scene.scenes import Corners, ReflectanceChart, Scene
 from sim.spectrum import Spectrum
 
@@ -52,11 +51,12 @@ class ChartSequence(Sequence):
     """`frames` of the chart in white light, after a measurement of the radiance of a white diffuser."""
 
     name: ClassVar[str] = "chart"
+    purpose: ClassVar[str] = "check of colour and linearity that no fit uses"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
     targets: ClassVar[tuple[type[Target], ...]] = (ChartTarget,)
 
-    frames: int = Field(default=4, ge=1)
-    level: float = 0.75
+    frames: Annotated[int, Quantity("1", "frames of the chart", lower=1, upper=1000)] = 4
+    level: Level = 0.75
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:

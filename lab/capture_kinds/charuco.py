@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
+    Level,
     PoseName,
     RelativeExposure,
     Sequence,
@@ -19,6 +20,7 @@ from lab.capture_kinds.base import (
     exposure_step,
     planned_keys,
 )
+from sim.parameters import Quantity
 
 
 class BoardTarget(Target):
@@ -43,12 +45,16 @@ class StereoSequence(Sequence):
     """
 
     name: ClassVar[str] = "stereo"
+    purpose: ClassVar[str] = "camera matrix, distortion, pose of one camera to the other"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator",)
     targets: ClassVar[tuple[type[Target], ...]] = (BoardTarget,)
 
-    poses: int | None = Field(default=None, ge=1)
-    frames: int = Field(default=1, ge=1)
-    level: float = 0.7
+    poses: Annotated[
+        int | None,
+        Quantity("1", "poses of the board, the first ones of the station; without it all", lower=1, upper=1000),
+    ] = None
+    frames: Annotated[int, Quantity("1", "frames of each pose", lower=1, upper=1000)] = 1
+    level: Level = 0.7
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:

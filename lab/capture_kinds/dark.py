@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from lab.capture_kinds.base import Capture, Equipment, FixedExposure, Sequence, Setting, Step, Target, planned_keys
+from lab.capture_kinds.base import (
+    Capture,
+    Equipment,
+    FixedExposure,
+    Sequence,
+    Setting,
+    Step,
+    Target,
+    check_number,
+    planned_keys,
+)
+from sim.parameters import Quantity
 from sim.scene.scenes import Darkness
 from sim.spectrum import Spectrum
 
@@ -32,10 +43,18 @@ class DarkSequence(Sequence):
     """
 
     name: ClassVar[str] = "dark"
+    purpose: ClassVar[str] = "black level, read noise, DSNU, dark current"
     targets: ClassVar[tuple[type[Target], ...]] = (CapTarget,)
 
-    exposures_s: tuple[float, ...] = Field(min_length=1)
-    frames: int = Field(ge=1)
+    exposures_s: Annotated[tuple[float, ...], Quantity("s", "exposures of the ladder", lower=1e-6, upper=3600.0)] = (
+        Field(min_length=1, max_length=200)
+    )
+    frames: Annotated[int, Quantity("1", "frames at each exposure", lower=1, upper=20_000)]
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        check_number(len(self.exposures_s) * self.frames)
+        return self
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:

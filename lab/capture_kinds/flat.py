@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
+    Level,
     RelativeExposure,
     Sequence,
     Setting,
     SpectrumPath,
     Step,
     Target,
+    check_number,
     exposure_step,
     planned_keys,
     spectrum_path,
 )
+from sim.parameters import Quantity
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
 
@@ -47,12 +50,20 @@ class FlatSequence(Sequence):
     """
 
     name: ClassVar[str] = "flat"
+    purpose: ClassVar[str] = "conversion gain, PRNU, full well, linearity (photon transfer)"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
     targets: ClassVar[tuple[type[Target], ...]] = (SphereTarget,)
 
-    levels: tuple[float, ...] = Field(min_length=1)
-    frames: int = Field(ge=1)
-    level_found: float = 0.75
+    levels: Annotated[
+        tuple[float, ...], Quantity("1", "levels of the ladder, shares of saturation", lower=1e-4, upper=20.0)
+    ] = Field(min_length=1, max_length=200)
+    frames: Annotated[int, Quantity("1", "frames at each level", lower=1, upper=20_000)]
+    level_found: Level = 0.75
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        check_number(len(self.levels) * self.frames)
+        return self
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy import constants
 
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
+    Level,
     Reading,
     RelativeExposure,
     Sequence,
@@ -18,11 +19,13 @@ from lab.capture_kinds.base import (
     SpectrumPath,
     Step,
     Target,
+    check_number,
     exposure_step,
     planned_keys,
     spectrum_path,
 )
 from lab.capture_kinds.flat import SphereTarget
+from sim.parameters import Quantity
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
 
@@ -34,14 +37,22 @@ class NarrowbandSequence(Sequence):
     """
 
     name: ClassVar[str] = "narrowband"
+    purpose: ClassVar[str] = "spectral sensitivity, quantum efficiency"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
     targets: ClassVar[tuple[type[Target], ...]] = (SphereTarget,)
 
-    from_nm: float = Field(default=400.0, gt=0)
-    to_nm: float = Field(default=720.0, gt=0)
-    step_nm: float = Field(default=10.0, gt=0)
-    passes: int = Field(default=2, ge=1)
-    level: float = 0.7
+    from_nm: Annotated[float, Quantity("nm", "first wavelength", lower=150.0, upper=3000.0)] = 400.0
+    to_nm: Annotated[float, Quantity("nm", "last wavelength", lower=150.0, upper=3000.0)] = 720.0
+    step_nm: Annotated[float, Quantity("nm", "from one wavelength to the next", lower=0.1, upper=500.0)] = 10.0
+    passes: Annotated[int, Quantity("1", "times that every wavelength is visited", lower=1, upper=20)] = 2
+    level: Level = 0.7
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        if self.to_nm < self.from_nm:
+            raise ValueError(f"to_nm: {self.to_nm:g} nm is below from_nm, {self.from_nm:g} nm; exchange them")
+        check_number((self.to_nm - self.from_nm) / self.step_nm * (self.passes + 1))
+        return self
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:

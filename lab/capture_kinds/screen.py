@@ -7,7 +7,7 @@ which cells are lit. `ScreenSequence` takes every pattern that is registered, in
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -17,6 +17,7 @@ from lab.capture_kinds.base import (
     Capture,
     Cells,
     Equipment,
+    Level,
     Open,
     PoseName,
     RelativeExposure,
@@ -31,7 +32,7 @@ from lab.capture_kinds.base import (
     spectrum_path,
 )
 from lab.errors import InputError
-from sim.parameters import Frozen
+from sim.parameters import Frozen, Quantity
 
 #: Side of a square of the checkerboard that aligns the screen, in cells. The pattern has whole squares.
 SQUARE_CELLS = 8
@@ -75,13 +76,16 @@ class ScreenSequence(Sequence):
     """
 
     name: ClassVar[str] = "screen"
+    purpose: ClassVar[str] = "point-spread function, crosstalk"
     instruments: ClassVar[tuple[str, ...]] = ("display", "spectroradiometer")
     targets: ClassVar[tuple[type[Target], ...]] = (ScreenTarget,)
 
-    frames: int = Field(default=4, ge=1)
-    cell_camera_px: float = Field(default=4.0, gt=0)
-    seed: int = 1
-    level: float = 0.75
+    frames: Annotated[int, Quantity("1", "frames of each pattern", lower=1, upper=1000)] = 4
+    cell_camera_px: Annotated[
+        float, Quantity("px", "side of a cell of the patterns, on the sensor", lower=0.5, upper=200.0)
+    ] = 4.0
+    seed: Annotated[int, Quantity("1", "what random patterns are drawn from", lower=0, upper=2**31 - 1)] = 1
+    level: Level = 0.75
     pose: str = "screen-1"
 
     @classmethod

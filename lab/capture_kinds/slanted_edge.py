@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar, Literal, Self
-
-from pydantic import Field
+from typing import Annotated, ClassVar, Literal, Self
 
 from lab.capture_kinds.base import (
     Capture,
     Equipment,
+    Level,
     RelativeExposure,
     Sequence,
     Setting,
@@ -20,7 +19,7 @@ from lab.capture_kinds.base import (
     planned_keys,
     spectrum_path,
 )
-from sim.parameters import Frozen
+from sim.parameters import Frozen, Quantity
 
 
 class EdgeLayout(Frozen):
@@ -56,11 +55,12 @@ class EdgeSequence(Sequence):
     """`frames` of every knife edge of the station. A frame shows the edge in several regions; each region is a capture of its own."""
 
     name: ClassVar[str] = "edge"
+    purpose: ClassVar[str] = "MTF over the field and over orientations"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
     targets: ClassVar[tuple[type[Target], ...]] = (EdgeTarget,)
 
-    frames: int = Field(default=4, ge=1)
-    level: float = 0.7
+    frames: Annotated[int, Quantity("1", "frames of each edge", lower=1, upper=1000)] = 4
+    level: Level = 0.7
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:

@@ -12,18 +12,11 @@ import numpy as np
 from lab.challenge.faults import FAULTS, spoilt
 from lab.challenge.noncentrality import FairStrength, fair_strengths, library_changes, noncentrality, summaries
 from lab.challenge.recordings import recording_set
-from lab.challenge.truth import CaseTruth, Concealed, Kind
+from lab.challenge.truth import SIZES, CaseTruth, Concealed, Kind
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.formats.recording_set import RecordingSet
 from mocks.former import BIT_DEPTH, LISTED, OUTSIDE, ConcealedCamera, DrawnSession, Law, Plan, record
 
-#: (rows, cols) of frames by the name of their size; None: each case has a frame of its own, see `DrawnFrame.drawn`.
-SIZES: dict[str, tuple[int, int] | None] = {
-    "small": (96, 128),
-    "medium": (192, 256),
-    "full": (384, 512),
-    "foreign": None,
-}
 #: Of twenty cases: 30 % healthy, 35 % one effect, 15 % two, 20 % outside the library.
 SHARES: tuple[tuple[Kind, int], ...] = (("healthy", 6), ("single", 7), ("compound", 3), ("outside", 4))
 FOREIGN_FRAMES = ((24, 32), (48, 64), (96, 128), (192, 256), (384, 512))

@@ -7,8 +7,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from lab.challenge.draw import SIZES, draw
-from lab.challenge.truth import CaseTruth, Seals, Truths, digest, load, purpose_of, salted, seal, store
+from lab.challenge.draw import draw
+from lab.challenge.truth import SIZES, CaseTruth, Seals, Truths, digest, load, purpose_of, salted, seal, store
 from lab.errors import InputError
 from lab.formats import recording_set
 from lab.one_blas_thread import one_blas_thread

@@ -18,6 +18,13 @@ from sim.parameters import Frozen
 #: Seeds below are for tuning, from here on for proofs; those of the everyday tests lie above both.
 FIRST_PROOF_SEED = 1_000_000
 FIRST_FRESH_SEED = 1 << 32
+#: (rows, cols) of frames by the name of their size; None: each case has a frame of its own, see `lab.challenge.draw.DrawnFrame.drawn`.
+SIZES: dict[str, tuple[int, int] | None] = {
+    "small": (96, 128),
+    "medium": (192, 256),
+    "full": (384, 512),
+    "foreign": None,
+}
 Kind = Literal["healthy", "single", "compound", "outside"]
 Purpose = Literal["tuning", "proof", "fresh"]
 Model = TypeVar("Model", bound=BaseModel)

@@ -11,9 +11,9 @@ import typer
 from rich.markup import escape
 
 from lab.cli.bench_process import mock_bench
-from lab.cli.console import err, out
-from lab.cli.sources import open_store, run_here
-from lab.cli.tables import print_fit
+from lab.cli.console import check_writable, err, out, write_json
+from lab.cli.sources import Json, StoreFolder, open_store, run_here
+from lab.cli.tables import print_fit, print_sequences
 from lab.errors import InputError
 from lab.pipeline import Capturer, CaptureRequest, PipelineRequest, capture_here
 
@@ -36,6 +36,14 @@ Only = Annotated[
     list[str] | None,
     typer.Option(metavar="SEQUENCE", help="take this sequence only (dark, flat, ...); may be repeated"),
 ]
+Set = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="SEQUENCE.PARAMETER=VALUE[,VALUE]",
+        help="another value of a sequence's parameter, as `calibench sequences` lists them; may be repeated",
+    ),
+]
 Certified = Annotated[
     bool, typer.Option("--certified", help="refuse cameras without a certified calibration that isn't expired")
 ]
@@ -56,15 +64,23 @@ def capture(
     name: Name = "",
     resume: Resume = "",
     only: Only = None,
+    parameters: Set = None,
     certified: Certified = False,
     conceal: Conceal = None,
 ) -> None:
     """Run the sequences of a station and store the captures. Without a station file: on the mock bench."""
+    from lab.capture.catalogue import parse_parameters
+
     store = open_store(out_folder)
     request = PipelineRequest(
         "capture",
         capture=CaptureRequest(
-            session=resume, quick=quick, only=tuple(only or ()), name=name, demands_certified=certified
+            session=resume,
+            quick=quick,
+            only=tuple(only or ()),
+            parameters=parse_parameters(parameters or ()),
+            name=name,
+            demands_certified=certified,
         ),
     )
     out.print(f"session: {run_here(request, store, _capturer(store, station, conceal)).session}")
@@ -84,14 +100,22 @@ def run(
         ),
     ] = False,
     only: Only = None,
+    parameters: Set = None,
     conceal: Conceal = None,
 ) -> None:
     """The main job: capture, fit, validate, diagnose, report. Without a station file: on the mock bench."""
+    from lab.capture.catalogue import parse_parameters
     from lab.report import words
     from lab.report.answers import answers
 
     store = open_store(out_folder)
-    session = CaptureRequest(session=resume, quick=quick, only=tuple(only or ()), name=name)
+    session = CaptureRequest(
+        session=resume,
+        quick=quick,
+        only=tuple(only or ()),
+        parameters=parse_parameters(parameters or ()),
+        name=name,
+    )
     request = PipelineRequest("pipeline", capture=session, resolve=resolve)
     found = run_here(request, store, _capturer(store, station, conceal))
     assert found.fit is not None
@@ -108,6 +132,37 @@ def run(
         out.print(f"Resolved with: {escape(taken.capture)} (session {taken.session})")
     out.print(f"\nsession: {found.session}")
     out.print(f"report: {found.report}")
+
+
+@commands.command()
+def sequences(
+    station: Annotated[
+        Path | None, typer.Option("--station", metavar="FILE", help="what they take on this station: captures and time")
+    ] = None,
+    quick: Quick = False,
+    only: Only = None,
+    parameters: Set = None,
+    json: Json = None,
+    data: StoreFolder = None,
+) -> None:
+    """The sequences: what each is for, its parameters with unit and bounds; with a station file, their values, captures and time there."""
+    from lab.capture.catalogue import catalogue, estimate, parse_parameters, step_times
+    from lab.capture.plan import full_plan
+    from lab.capture.station import read_station
+
+    check_writable(json)
+    if station is None and (quick or only or parameters):
+        raise InputError("--quick, --only, --set: go with a station file; give --station")
+    found = None
+    if station is not None:
+        there = read_station(station)
+        plan = full_plan(there, quick, only, parse_parameters(parameters or ()))
+        found = estimate(plan, there, step_times(open_store(data), there))
+        write_json(found, json)
+    elif json is not None:
+        raise InputError("--json: writes what the sequences take on a station; give --station")
+    if str(json) != "-":
+        print_sequences(catalogue(), found)
 
 
 def _capturer(store: Store, station_file: Path | None, conceal: list[str] | None) -> Capturer:

@@ -14,6 +14,7 @@ from lab.cli.sources import (
     FitFile,
     Json,
     Model,
+    Scheduler,
     Source,
     camera_path,
     existing_store,
@@ -65,14 +66,7 @@ def diagnose(
             help=f"simulate N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
         ),
     ] = 0,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            envvar="CALIBENCH_SCHEDULER",
-            help="a Dask scheduler (tcp://HOST:PORT) whose workers draw the cameras of --bootstrap; they have to see the recordings under the same path",
-        ),
-    ] = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Name the physics that the camera model lacks and the recordings show. Exit code 2 if they determine no measurement."""
     if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:

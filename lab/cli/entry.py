@@ -8,8 +8,8 @@ import traceback
 import typer
 from rich.markup import escape
 
-from lab.challenge.command import commands as challenge
 from lab.cli import calibrations, capturing, devices, diagnosis, effects, fitting, kinds, recordings, simulation
+from lab.cli.challenge import commands as challenge
 from lab.cli.console import err
 from lab.cli.exit_codes import EXIT_INPUT, EXIT_INTERNAL, EXIT_INTERRUPTED
 from lab.errors import DeviceError, InputError

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from lab.cli.console import check_writable, out, warn, write_json
 from lab.cli.progress import progress_bar
-from lab.cli.sources import Json
+from lab.cli.sources import Json, Scheduler
 from lab.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,14 +36,7 @@ def lens(
     glass: Annotated[
         list[str] | None, typer.Option(metavar="NAME=OTHER", help="a glass for another: NAME=OTHER or NAME=nd,Vd")
     ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            envvar="CALIBENCH_SCHEDULER",
-            help="a Dask scheduler (tcp://HOST:PORT) whose workers trace the field points, in place of this computer",
-        ),
-    ] = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Evaluate a lens prescription: first-order quantities, illumination, distortion, MTF, PSF."""
     from lab.predict.lens import parse_glasses, trace_prescription

@@ -28,6 +28,15 @@ Model = Annotated[
     Path | None,
     typer.Option("--model", metavar="DIR", help="take the cameras of DIR/SIDE.toml, with their effects, as they are"),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        envvar="CALIBENCH_SCHEDULER",
+        help="a Dask scheduler (tcp://HOST:PORT) whose workers do the parallel work in place of this computer; they have to see its files under the same path",
+    ),
+]
 FitFile = Annotated[Path | None, typer.Option("--fit", metavar="FILE", help="a fit's JSON, in place of fitting again")]
 
 

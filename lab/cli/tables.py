@@ -10,8 +10,50 @@ from rich.table import Table
 from lab.cli.console import out
 
 if TYPE_CHECKING:
+    from lab.capture.catalogue import PlanEstimate, SequenceDescription
     from lab.formats.recording_set import RecordingSet
     from lab.formats.results import ComparisonResult, DiagnosisResult, FitResult, Skipped, ValidationResult
+
+
+def print_sequences(catalogue: tuple[SequenceDescription, ...], found: PlanEstimate | None) -> None:
+    """The catalogue; with `found`, the sequences of a plan with their values, captures and time."""
+    planned = {one.name: one for one in found.sequences} if found is not None else {}
+    for sequence in catalogue:
+        if found is not None and sequence.name not in planned:
+            continue
+        there = planned.get(sequence.name)
+        takes = ""
+        if there is not None:
+            takes = f": {there.captures} captures, {_duration(there.estimated_s, there.learned)}"
+        out.print(f"[bold]{sequence.name}[/]{takes}: {escape(sequence.purpose)}")
+        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 2), show_header=False)
+        for one in sequence.parameters:
+            value = "" if there is None else _values(there.parameters[one.name])
+            unit = "" if one.unit == "1" else one.unit
+            bounds = " .. ".join("" if bound is None else f"{bound:g}" for bound in (one.lower, one.upper))
+            table.add_row(one.name, value, unit, escape(one.meaning), f"({bounds})")
+        out.print(table)
+    if found is not None:
+        learned = all(one.learned for one in found.sequences)
+        out.print(f"{found.captures} captures in {found.steps} steps, {_duration(found.estimated_s, learned)}")
+
+
+def _values(value: float | tuple[float, ...] | None) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(f"{one:g}" for one in value)
+    return "all" if value is None else f"{value:g}"
+
+
+def _duration(seconds: float, learned: bool) -> str:
+    """A time in words; one that no session of the station showed is called a guess."""
+    words = (
+        f"{seconds:.0f} s"
+        if seconds < 90
+        else f"{seconds / 60:.0f} min"
+        if seconds < 5400
+        else f"{seconds / 3600:.1f} h"
+    )
+    return f"about {words}" if learned else f"perhaps {words}"
 
 
 def print_skipped(skipped: tuple[Skipped, ...]) -> None:

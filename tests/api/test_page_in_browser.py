@@ -289,3 +289,24 @@ def test_a_missing_browser_fails_in_ci_and_is_skipped_on_a_desk(monkeypatch: pyt
     monkeypatch.delenv("CI")
     with pytest.raises(pytest.skip.Exception):
         chromium()
+
+
+def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
+    """The estimate changes with a parameter, and the session that is started takes it."""
+    watched = Watched(browser, lab)
+    watched.log_in(lab, "operate")
+    page = watched.page
+    page.wait_for_selector("#plan-words:has-text('3 sequences')")
+    page.press("#plan-words", "Enter")
+    for name in ("flat", "narrowband"):
+        page.uncheck(f"#plan-rows li:has(strong:text-is('{name}')) input[type=checkbox]")
+    page.wait_for_selector("#plan-words:has-text('1 sequence, 40 captures')")
+    page.click("#plan-rows li:first-child summary")
+    assert watched.serious() == []
+    page.fill("#plan-rows li:first-child label:has-text('frames at each exposure') input", "2")
+    page.press("#plan-rows li:first-child label:has-text('frames at each exposure') input", "Tab")
+    page.wait_for_selector("#plan-words:has-text('1 sequence, 20 captures')")
+    page.fill("#start-form input[name=name]", "as planned")
+    page.click("#start")
+    page.wait_for_selector("#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.close()

@@ -40,6 +40,8 @@ def test_after_kill_9_of_the_service_the_shutter_is_closed_at_its_next_start(sta
     with served(data) as (url, process, output), httpx.Client(base_url=url, headers=headers, timeout=30.0) as client:
         found = until_state(client, session_id, "interrupted", patience_s=30.0)
         assert "kill -9" in found["error"] and "made safe" in found["error"]
+        # Before the service was loaded, and before what it prints then.
+        assert output.read_text().startswith(f"session {session_id}: its process ended without a word; its shutter was")
         assert not shutter_is_open(stations / "bench.toml")
         assert client.post(f"/api/v1/sessions/{session_id}/resume").status_code == 202
         until_state(client, session_id, "finished", patience_s=60.0)

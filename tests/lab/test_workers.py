@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import operator
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ from lab.challenge.truth import FIRST_FRESH_SEED
 from lab.cli import main
 from lab.diagnose.inference.bootstrap import healthy_draws
 from lab.diagnose.measurements.blocks import measurement_model
-from lab.errors import InputError
+from lab.errors import Cancelled, InputError
 from lab.formats import recording_set
 from lab.workers import Workers
 from mocks.former import ConcealedCamera, Plan
@@ -120,3 +123,12 @@ def test_drawn_healthy_cameras_are_the_same(cluster: Workers, tmp_path: Path, mo
     assert len(here) == 3
     assert len({draw.top_score for draw in here}) == 3
     assert there == here
+
+
+def test_what_a_tick_raises_ends_the_processes() -> None:
+    """Somebody cancels while a process works: nobody waits for it."""
+    before = set(multiprocessing.active_children())
+    work = Workers(jobs=1, apart=True, tick=Mock(side_effect=Cancelled))
+    with pytest.raises(Cancelled):
+        list(work.done(time.sleep, [600.0]))
+    assert set(multiprocessing.active_children()) <= before

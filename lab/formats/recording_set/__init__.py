@@ -3,7 +3,7 @@
 `read` checks a whole folder and reports all problems at once, one line each. `write` writes a folder completely or not at all. The kinds of capture are in `lab.capture_kinds`.
 """
 
-from lab.formats.recording_set.archive import archive
+from lab.formats.recording_set.archive import archive, packed
 from lab.formats.recording_set.checks import inspect
 from lab.formats.recording_set.clipping import clipped_share
 from lab.formats.recording_set.files import FolderFiles, RecordingFiles
@@ -28,6 +28,7 @@ __all__ = [
     "inspect",
     "load_frame",
     "manifest_json",
+    "packed",
     "parse_manifest",
     "read",
     "write",

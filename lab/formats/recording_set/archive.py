@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from lab.formats.recording_set.recordings import RecordingSet
 from lab.formats.recording_set.writing import contents
@@ -30,16 +30,19 @@ class _Sent(io.RawIOBase):
         return held
 
 
-def archive(recordings: RecordingSet) -> Iterator[bytes]:
-    """The pieces of a .zip of the set: one file of it in memory at a time, stored without compression.
-
-    Raises InputError where a frame is missing or damaged; the archive then has no list of files, so nobody takes it for a whole one.
-    """
+def packed(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
+    """The pieces of a .zip of files, (path, content) each: one of them in memory at a time, stored without compression. Where `files` raises,
+    the archive has no list of files, so nobody takes it for a whole one."""
     sent = _Sent()
     with zipfile.ZipFile(
         sent, "w", zipfile.ZIP_STORED
-    ) as packed:  # closed after an error, too; what that writes isn't sent
-        for path, content in contents(recordings):
-            packed.writestr(zipfile.ZipInfo(path), content)
+    ) as made:  # closed after an error, too; what that writes isn't sent
+        for path, content in files:
+            made.writestr(zipfile.ZipInfo(path), content)
             yield sent.taken()
     yield sent.taken()
+
+
+def archive(recordings: RecordingSet) -> Iterator[bytes]:
+    """The pieces of a .zip of the set, as `packed` makes it. Raises InputError where a frame is missing or damaged."""
+    return packed(contents(recordings))

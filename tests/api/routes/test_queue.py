@@ -153,7 +153,7 @@ def test_a_session_is_fetched_as_a_recording_set(shared: Running, tmp_path: Path
         sent = client.send_recordings(archive)
         client.delete_recordings(sent.id)
     assert sent.captures == sum(shared.store.count_captures(session.id).values())
-    from api.upload import unpack
+    from api.unpacking import unpack
 
     unpack(archive, tmp_path / "set", 1 << 28, 10_000)
     there, here = recording.read(tmp_path / "set"), shared.store.recording_set(session.id)

@@ -27,7 +27,7 @@ import lab.fit
 from api.client import ServiceClient, ServiceProblem
 from api.schemas import SentAs
 from api.service import Limits
-from api.upload import RESERVE_BYTES, TooMuch, unpack
+from api.unpacking import RESERVE_BYTES, TooMuch, unpack
 from lab.errors import InputError
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import RecordingSet

@@ -5,15 +5,18 @@ from __future__ import annotations
 import re
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from api.client import ServiceClient, ServiceProblem
+from api.schemas import PlanAsked
 from drivers import discovery
 from drivers.contract.scripted import ScriptedPeer
 from drivers.discovery import Found
 from drivers.errors import Disconnected
-from tests.api.conftest import Running
+from lab.capture_kinds.base import SEQUENCES
+from tests.api.conftest import Running, until_state
 from tests.lab.fake_bench import Bench, FakeMonochromator
 
 GOLDEN = Path(__file__).parents[2] / "wire"
@@ -154,3 +157,57 @@ def test_missing_stations_and_devices_are_refused_in_one_line(
         (shared.store.root / "stations" / "broken.toml").unlink()
     assert response.status_code == status
     assert said in response.json()["detail"] and "\n" not in response.json()["detail"]
+
+
+# --- the catalogue -----------------------------------------------------------------------------------------------------
+
+
+def test_the_catalogue_is_told(shared: Running) -> None:
+    with shared.client("read") as client:
+        listed = client.get("/api/v1/sequences").json()
+        assert [one["name"] for one in listed] == list(SEQUENCES)
+        assert client.get("/api/v1/sequences/dark").json() == listed[0]
+        assert client.get("/api/v1/sequences/magic").status_code == 404
+
+
+def test_a_session_takes_what_was_estimated(running: Running) -> None:
+    asked = {"quick": True, "sequences": ["dark"], "parameters": {"dark": {"exposures_s": [0.001, 0.002], "frames": 3}}}
+    with running.client("operate") as client:
+        told = client.post("/api/v1/stations/fakes/estimate", json=asked).json()
+        assert (told["steps"], told["captures"]) == (6, 12)
+        assert not told["sequences"][0]["learned"]
+        assert told["sequences"][0]["parameters"] == {"exposures_s": [0.001, 0.002], "frames": 3}
+        session = client.post("/api/v1/sessions", json=asked | {"station": "fakes"}).json()
+        assert until_state(client, session["id"], "finished")["captures"] == [
+            {"kind": "dark", "side": side, "captures": 6} for side in ("left", "right")
+        ]
+        assert client.post("/api/v1/stations/fakes/estimate", json=asked).json()["sequences"][0]["learned"]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [
+        ({"dark": {"frames": 0}}, "dark.frames"),
+        ({"dark": {"magic": 1}}, "dark.magic"),
+        ({"dark": {"frames": "many"}}, "parameters.dark.frames"),
+        ({"narrowband": {"step_nm": 5}}, "parameters: narrowband"),  # which isn't among the sequences
+        ({"magic": {}}, "parameters.magic"),
+    ],
+)
+def test_wrong_parameters_start_nothing(shared: Running, parameters: dict[str, Any], named: str) -> None:
+    asked = {"sequences": ["dark"], "parameters": parameters}
+    with shared.client("operate") as client:
+        before = client.get("/api/v1/sessions").json()
+        for path, more in (("stations/fakes/estimate", {}), ("sessions", {"station": "fakes"})):
+            refused = client.post(f"/api/v1/{path}", json=asked | more)
+            assert refused.status_code == 422 and refused.json()["detail"].startswith(named), refused.text
+        assert client.get("/api/v1/sessions").json() == before
+
+
+def test_the_typed_client_estimates(shared: Running) -> None:
+    with client_of(shared, "read") as client:
+        assert [one.name for one in client.sequences()] == list(SEQUENCES)
+        found = client.estimate("fakes", PlanAsked(quick=True))
+        assert [one.name for one in found.sequences] == list(client.station("fakes").sequences)
+        with pytest.raises(ServiceProblem, match="no station 'none'"):
+            client.estimate("none")

@@ -16,7 +16,8 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
-from lab.capture.durable_files import Lock, npy_bytes, write_durably
+from lab.capture.durable_files import npy_bytes, write_durably
+from lab.capture.file_lock import Lock
 from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.session_files import PACK

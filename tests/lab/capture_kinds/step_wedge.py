@@ -51,6 +51,7 @@ class WedgeSequence(Sequence):
     """`frames` of the wedge in white light."""
 
     name: ClassVar[str] = "wedge"
+    purpose: ClassVar[str] = "linearity over densities"
     instruments: ClassVar[tuple[str, ...]] = ("monochromator", "spectroradiometer")
     targets: ClassVar[tuple[type[Target], ...]] = (WedgeTarget,)
 

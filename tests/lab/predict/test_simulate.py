@@ -253,7 +253,7 @@ ERRORS: list[tuple[tuple[str, ...], str]] = [
     (("uniform", "--out", "{}/a.npy", "--exposure-s", "-1"), ": -1.0 s is below the lower limit 0.0 s"),
     (("uniform", "--out", "{}/a.npy", "--luminance-cd-m2", "1e9"), "beyond the limits of 1e-06 and 3600 s"),
     (("uniform", "--out", "{}/a.npy", "--distance-mm", "5"), "distance 5.0 mm is not above the limit of the focal length"),
-    (("slanted-edge", "--out", "{}/a.npy", "--set", "contrast=2"), ": 2.0 1 is above the upper limit"),
+    (("slanted-edge", "--out", "{}/a.npy", "--set", "contrast=2"), ": 2.0 is above the upper limit"),
     (("slanted-edge", "--out", "{}/a.npy", "--set", "size=2"), "has no parameter 'size': it has angle_deg"),
     (("slanted-edge", "--out", "{}/a.npy", "--set", "contrast"), "isn't KEY=VALUE"),
     (("uniform", "--out", "{}/a.npy", "--lens", "{}/none.zmx"), "none.zmx: can't be read"),

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lab.cli.exit_codes import EXIT_CHECK
+from lab.cli.sources import Scheduler
 from lab.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,15 +25,6 @@ commands = typer.Typer(
 )
 
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, metavar="N", help="processes (all cores)")]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        envvar="CALIBENCH_SCHEDULER",
-        help="a Dask scheduler (tcp://HOST:PORT), in place of processes here; its workers have to see DIR under the same path",
-    ),
-]
-EXIT_CHECK = 4
 #: The list of scored seeds, in a checkout of the project; an installation has none.
 PROOF_PAGE = Path(__file__).resolve().parents[2] / "docs" / "proof.md"
 

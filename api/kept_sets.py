@@ -1,0 +1,90 @@
+"""What the service keeps as a recording set and hands out as one: sessions, recordings that were sent in, the cases of challenges. Handing out
+and deleting is one shape for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fastapi import Response
+
+from api.archives import zipped_set
+from api.errors import Conflict, known
+from api.service import OVER, Service
+from lab.calibration.life import check_nothing_rests_on
+from lab.errors import InputError
+from lab.formats.recording_set import RecordingSet
+
+
+@dataclass(frozen=True)
+class KeptSet:
+    """`what` it is, in words; `source`: what jobs on it are registered under; `read` and `remove` raise InputError where that can't be now."""
+
+    what: str
+    source: str
+    read: Callable[[], RecordingSet]
+    remove: Callable[[], None]
+
+    def archive(self) -> Response:
+        """The set as a .zip. Raises Conflict where it can't be handed out now."""
+        try:
+            recordings = self.read()
+        except InputError as error:
+            raise Conflict(str(error)) from None
+        return zipped_set(recordings, self.what.replace(" ", "-"))
+
+    def delete(self, service: Service) -> None:
+        """Delete it for ever. Raises Conflict while a job works on it, or where it can't be deleted now."""
+        service.check_no_job(self.source, self.what)
+        try:
+            self.remove()
+        except InputError as error:
+            raise Conflict(str(error)) from None
+
+
+def session_set(service: Service, session_id: str) -> KeptSet:
+    """A session; 404 where there is none, Conflict where it is under way: what it has is still changing."""
+    state = service.state(service.session(session_id))
+    if state not in OVER:
+        raise Conflict(f"session {session_id} is {state}; wait for its end or abort it")
+
+    def read() -> RecordingSet:
+        found = service.store.recording_set(session_id)
+        if not found.captures():
+            raise InputError(f"session {session_id}: nothing was captured yet; resume it")
+        return found
+
+    def remove() -> None:
+        check_nothing_rests_on(service.store, session_id)
+        service.store.delete_session(session_id)
+
+    return KeptSet(f"session {session_id}", session_id, read, remove)
+
+
+def sent_set(service: Service, recordings_id: str) -> KeptSet:
+    """Recordings that were sent in; 404 where there are none of that id."""
+    folder = service.recordings(recordings_id)
+    inbox = service.inbox
+    return KeptSet(
+        f"recordings {recordings_id}",
+        str(folder),
+        lambda: inbox.recordings(recordings_id),
+        lambda: inbox.remove(recordings_id),
+    )
+
+
+def challenge_folder(service: Service, challenge_id: str, case: str = "") -> KeptSet:
+    """A challenge, or with `case` one of its recording sets; 404 where there is none."""
+    kept = service.challenges
+    folder = known(
+        f"no challenge {challenge_id!r}; GET /api/v1/challenges lists them", lambda: kept.folder(challenge_id)
+    )
+    if case:
+        missing = f"challenge {challenge_id}: no case {case!r} is made; its `seals` list those that are"
+        known(missing, lambda: kept.case(challenge_id, case))
+    return KeptSet(
+        f"challenge {challenge_id} {case}".strip(),
+        str(folder),
+        lambda: kept.recordings(challenge_id, case),
+        lambda: kept.remove(challenge_id),
+    )

@@ -1,0 +1,91 @@
+// What a session will take: the sequences of a station with their parameters, and the service's estimate of captures and time.
+
+import { $, ask, duration, element, post } from "./page.js";
+
+let catalogue = null;
+let shown = ""; // the station and the mode whose sequences stand there
+let latest = 0; // the newest question: an answer to an older one comes too late
+const rows = new Map(); // sequence -> its parts
+
+const about = (seconds, learned) => `${learned ? "about" : "perhaps"} ${duration(seconds)}`;
+const text = (value) => (value == null ? "all" : [value].flat().map((one) => Number(one.toPrecision(6))).join(", "));
+
+function parameterField(parameter) {
+  const { name, unit, meaning, lower, upper, several } = parameter;
+  const bounds = [lower, upper].map((bound) => bound ?? "").join(" … ");
+  const field = element("input", { type: "text", inputMode: "decimal", title: `${bounds}${several ? ", several with commas between" : ""}` });
+  return { field, parameter, label: element("label", {}, element("span", { textContent: `${meaning}${unit === "1" ? "" : `, ${unit}`}`, title: name }), field) };
+}
+
+function row(sequence, changed) {
+  const taken = element("input", { type: "checkbox", checked: true });
+  const takes = element("span", { className: "hint" });
+  const fields = sequence.parameters.map(parameterField);
+  const part = { taken, takes, fields };
+  for (const field of [taken, ...fields.map((one) => one.field)]) field.addEventListener("change", changed);
+  const details = element("details", {}, element("summary", { textContent: `${sequence.purpose}` }), element("div", { className: "fields" }, ...fields.map((one) => one.label)));
+  part.whole = element("li", {}, element("label", { className: "check" }, taken, element("strong", { textContent: sequence.name })), takes, details);
+  return part;
+}
+
+// What `POST /sessions` takes of the plan.
+export function asked() {
+  const chosen = [...rows].filter(([, part]) => part.taken.checked);
+  const parameters = {};
+  for (const [name, part] of chosen) {
+    for (const { field, parameter } of part.fields) {
+      if (!field.value.trim()) continue;
+      const numbers = field.value.split(",").map(Number);
+      (parameters[name] ??= {})[parameter.name] = parameter.several ? numbers : numbers[0];
+    }
+  }
+  return { sequences: rows.size && chosen.length < rows.size ? chosen.map(([name]) => name) : null, parameters };
+}
+
+async function showEstimate(station, quick) {
+  const number = ++latest;
+  const wanted = asked();
+  if (wanted.sequences?.length === 0) {
+    $("plan-words").textContent = "No sequence is chosen";
+    for (const part of rows.values()) part.takes.textContent = "";
+    return;
+  }
+  let found;
+  try {
+    found = await post(`/stations/${encodeURIComponent(station)}/estimate`, { quick, ...wanted });
+  } catch (error) {
+    if (number !== latest) return;
+    $("plan-words").textContent = "Sequences";
+    $("plan-problem").textContent = error.message;
+    return;
+  }
+  if (number !== latest) return;
+  $("plan-problem").textContent = "";
+  const learned = found.sequences.every((one) => one.learned);
+  $("plan-words").textContent = `${found.sequences.length} sequence${found.sequences.length === 1 ? "" : "s"}, ${found.captures} captures, ${about(found.estimated_s, learned)}`;
+  $("plan-learned").textContent = learned ? "" : "“Perhaps”: this station hasn't shown yet how long its steps take.";
+  const planned = new Map(found.sequences.map((one) => [one.name, one]));
+  for (const [name, part] of rows) {
+    const one = planned.get(name);
+    part.takes.textContent = one ? `${one.captures} captures, ${about(one.estimated_s, one.learned)}` : "left out";
+    for (const { field, parameter } of part.fields) if (one && !field.value) field.placeholder = text(one.parameters[parameter.name]);
+  }
+}
+
+// The plan of a station, as `quick` or not; drawn anew only where one of them changed.
+export async function showPlan(station, quick) {
+  $("plan").hidden = !station;
+  const wanted = station ? JSON.stringify([station.name, station.sequences]) : "";
+  const of = `${wanted} ${quick}`;
+  if (of === shown || !station) return;
+  const same = shown.startsWith(`${wanted} `);
+  shown = of;
+  catalogue ??= await ask("/sequences");
+  if (!same) {
+    rows.clear();
+    const changed = () => showEstimate(station.name, $("start-form").elements.quick.checked);
+    for (const one of catalogue.filter((known) => station.sequences.includes(known.name))) rows.set(one.name, row(one, changed));
+    $("plan-rows").replaceChildren(...[...rows.values()].map((part) => part.whole));
+  }
+  await showEstimate(station.name, quick);
+}
