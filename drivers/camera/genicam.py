@@ -82,6 +82,7 @@ class GenicamCamera(StreamingCamera):
         self._exposure_s: float | None = None
         self._gain_db = 0.0
         self._fired: datetime | None = None
+        self._owed = 0  # frames of software triggers that didn't come yet
         self._before: tuple[int, int | None] | None = (
             None  # number and time of the frame before, since acquisition started
         )
@@ -135,6 +136,10 @@ class GenicamCamera(StreamingCamera):
         set_if_there(features, "ExposureMode", "Timed")
         switch_processing_off(features, self._who)
         set_if_there(features, "TriggerSelector", "FrameStart")
+        if not features.has("TriggerMode"):
+            raise InstrumentError(
+                f"{self._who}: it has no TriggerMode, so that it can't be told when to expose; use a camera that can be triggered"
+            )
         features.set("TriggerMode", "On")
         offered = features.entries("PixelFormat")
         names = [item.name for item in PREFERENCE] if self._wanted_format is None else [self._wanted_format]
@@ -203,7 +208,7 @@ class GenicamCamera(StreamingCamera):
                 if trigger == "line" and not self.follows_by_software:
                     line = trigger_line(features, self._who, self._wanted_line)
                 features.set("TriggerSource", line)
-                self._before = None
+                self._before, self._owed = None, 0
                 self._start()
                 self._armed = trigger
             self._fired = datetime.now(UTC)
@@ -215,6 +220,7 @@ class GenicamCamera(StreamingCamera):
             self._await_trigger_ready()
             self._fired = datetime.now(UTC)
             self._give_trigger(features)
+            self._owed += 1
 
     def follow(self) -> None:
         if self.follows_by_software:
@@ -236,12 +242,19 @@ class GenicamCamera(StreamingCamera):
 
     def _next_frame(self, temperature_ns: int) -> Frame:
         with self._used() as features:
-            if self._armed is None or self._exposure_s is None or self._fired is None:
+            by_software = self._armed == "software" or self.follows_by_software
+            if (
+                self._armed is None
+                or self._exposure_s is None
+                or self._fired is None
+                or (by_software and not self._owed)
+            ):
                 raise InstrumentError(f"{self._who}: no frame was asked for; call arm and fire first")
             grabbed = self._await_frame(self._exposure_s)
             try:
                 if not grabbed.damage:
                     self._refuse_repeated(grabbed)
+                self._owed = max(0, self._owed - 1)
                 raw, pixel_format = grabbed.unpacked(self._who)
             finally:
                 grabbed.give_back()
