@@ -15,6 +15,7 @@ from lab.capture.devices import LightSetting, PhotodiodeDevice, Shot, ShownPatte
 from lab.capture.instruments import Instruments
 from lab.capture.records import StoredFile
 from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
+from lab.capture_kinds.irradiance import IrradianceCapture
 from lab.errors import DeviceError, InputError
 from sim.camera import Side
 
@@ -148,8 +149,7 @@ def take(
     without captures the refusal is a DeviceError, as later steps use the spectrum.
     """
     wavelength_nm = step.setting.wavelength_nm or 0.0
-    # One responsivity: light of one wavelength.
-    photodiode = instruments.photodiode if step.radiance and step.captures and wavelength_nm > 0.0 else None
+    photodiode = _irradiance_meter(step, instruments)
     if photodiode is not None and photodiode.dark_a is None:
         yield from _dark_current(instruments)
     yield from arrange(step, instruments)
@@ -201,6 +201,16 @@ def take(
     return Taken(result, tuple(files), captures)
 
 
+def _irradiance_meter(step: Step, instruments: Instruments) -> PhotodiodeDevice | None:
+    """The photodiode, for a step with captures in light of one wavelength: it has one responsivity."""
+    photodiode = instruments.photodiode
+    if photodiode is None:
+        return None
+    photodiode.measured = None  # that of an earlier step
+    lit = (step.setting.wavelength_nm or 0.0) > 0.0
+    return photodiode if lit and any(isinstance(one, IrradianceCapture) for one in step.captures) else None
+
+
 def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | None) -> Plan[None]:
     """Irradiance of light of a wavelength; of None, the dark current."""
     yield Msg("prepare", photodiode, wavelength_nm, group="irradiance")
@@ -237,7 +247,13 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
 
 def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
     """The step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
-    readings = {key: value for device in instruments.devices for key, value in device.readings().items()}
+    without = instruments.photodiode if instruments.photodiode and instruments.photodiode.measured is None else None
+    readings = {
+        key: value
+        for device in instruments.devices
+        if device is not without
+        for key, value in device.readings().items()
+    }
     completed = []
     for capture in step.captures:
         frame = instruments.cameras.frames[capture.side]

@@ -163,12 +163,13 @@ AnyTarget = Annotated[Target, TARGETS]
 
 
 class CaptureLimits(Frozen):
-    """The exposures, the gain and the slits that sequences keep to."""
+    """The exposures, the gain, the slits and the light of flats that sequences keep to."""
 
     exposure_min_s: float = Field(default=20e-6, gt=0)
     exposure_max_s: float = Field(default=10.0, gt=0)
     gain_db: float = 0.0
     slit_um: float | None = Field(default=None, gt=0)  # None: as the instrument stands
+    flat_wavelength_nm: float | None = Field(default=None, gt=0)  # None: white light
 
 
 class Equipment(Protocol):

@@ -6,10 +6,8 @@ from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
-from scipy import constants
 
 from lab.capture_kinds.base import (
-    Capture,
     Equipment,
     Reading,
     RelativeExposure,
@@ -23,6 +21,7 @@ from lab.capture_kinds.base import (
     spectrum_path,
 )
 from lab.capture_kinds.flat import SphereTarget
+from lab.capture_kinds.irradiance import IrradianceCapture
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
 
@@ -84,9 +83,9 @@ class NarrowbandSequence(Sequence):
         return tuple(made)
 
 
-class NarrowbandCapture(Capture):
+class NarrowbandCapture(IrradianceCapture):
     """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured; `irradiance_w_m2` and its
-    standard uncertainty as a reference photodiode measured them at its place, where the station has one."""
+    standard uncertainties as a reference photodiode measured them at its place, where the station has one."""
 
     shows: ClassVar[str] = "uniform diffuse light from the monochromator, filling the field"
     sequence: ClassVar[type[Sequence] | None] = NarrowbandSequence
@@ -95,15 +94,6 @@ class NarrowbandCapture(Capture):
     wavelength_nm: float = Field(gt=0)
     bandwidth_nm: Annotated[float | None, Reading("bandwidth_nm")] = Field(default=None, ge=0)
     radiance: SpectrumPath
-    irradiance_w_m2: Annotated[float | None, Reading("irradiance_w_m2")] = None
-    sd_irradiance_w_m2: Annotated[float | None, Reading("sd_irradiance_w_m2")] = Field(default=None, ge=0)
-
-    @property
-    def photon_irradiance_per_m2_s(self) -> float | None:
-        """Photons a second and square metre where the photodiode is, E wavelength / (h c) (EMVA 1288 release 4.0, eq. 3); None without one."""
-        if self.irradiance_w_m2 is None:
-            return None
-        return self.irradiance_w_m2 * self.wavelength_nm * 1e-9 / (constants.h * constants.c)
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
         return UniformField(spectrum(self.radiance), self.kind)
