@@ -272,6 +272,7 @@ class CaptureSession:
                 check_certified(
                     self.store, cameras_of({name: vars(one) for name, one in identities.items()}, self.station)
                 )
+            instruments.check([entry.step for entry in self._entries if entry.finished is None])
             self.store.set_state(self.id, "running", run=_provenance(identities, self._done), station=self.station)
             self._drive(instruments)
         except BaseException as error:
