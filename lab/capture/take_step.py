@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -125,25 +124,31 @@ def _stuck(
     return shortened < 0.9 and levels[side] / before[1][side] > np.sqrt(shortened)
 
 
-def repeats_of(step: Step, following: Iterable[Step]) -> int:
-    """How many of the steps that follow at once only repeat a step's exposure."""
-    same = itertools.takewhile(
-        lambda other: (
-            bool(step.captures and other.captures)
-            and other.radiance is None
-            and other.setting == step.setting
-            and other.exposure == step.exposure
-        ),
-        following,
+def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
+    """How many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
+    found = [0] * len(steps)
+    for at in range(len(steps) - 2, -1, -1):
+        step, other = steps[at], steps[at + 1]
+        if step is not None and other is not None and _repeats(step, other):
+            found[at] = found[at + 1] + 1
+    return found
+
+
+def _repeats(step: Step, other: Step) -> bool:
+    """Whether the second step does nothing but expose as the first did."""
+    return (
+        bool(step.captures and other.captures)
+        and other.radiance is None
+        and other.setting == step.setting
+        and other.exposure == step.exposure
     )
-    return sum(1 for _ in same)
 
 
 def take(
     step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]], repeats: int = 0
 ) -> Plan[Taken]:
-    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`:
-    `repeats_of` the step.
+    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`: its number
+    in `repeats_ahead`.
 
     A step with captures whose light the spectroradiometer refuses to measure is left out, with the reason in its result. In a step
     without captures the refusal is a DeviceError, as later steps use the spectrum.
