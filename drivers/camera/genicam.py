@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from typing import Protocol
 
@@ -19,6 +19,7 @@ from drivers.camera.base import TEMPERATURE_NS, Frame, SensorInfo, StreamingCame
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam_settings import (
     Features,
+    Setting,
     black_level,
     give_pulses,
     set_if_there,
@@ -48,6 +49,35 @@ class CameraFeatures(Features, Protocol):
         """Run a command."""
 
 
+class _Transcribed:
+    """Features whose values go into a transcript: what a library puts on the wire nobody sees."""
+
+    def __init__(self, features: CameraFeatures, recorder: Recorder) -> None:
+        self._features, self._record = features, recorder
+
+    def has(self, name: str) -> bool:
+        return self._features.has(name)
+
+    def get(self, name: str) -> Setting:
+        value = self._features.get(name)
+        self._record("received", f"{name} = {value}".encode())
+        return value
+
+    def set(self, name: str, value: Setting) -> None:
+        self._record("sent", f"{name} = {value}".encode())
+        self._features.set(name, value)
+
+    def entries(self, name: str) -> Collection[str]:
+        return self._features.entries(name)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        return self._features.limits(name)
+
+    def execute(self, name: str) -> None:
+        self._record("sent", name.encode())
+        self._features.execute(name)
+
+
 class GenicamCamera(StreamingCamera):
     """One camera at an `address` of whatever reaches it.
 
@@ -56,6 +86,9 @@ class GenicamCamera(StreamingCamera):
     `Software`: none is wired, the computer triggers it right after the other, milliseconds apart. `output_line`: the output of the
     camera that leads, on which `output_source` gives the pulses; None: it gives none.
     """
+
+    #: Whether the recorder is given the bytes on the wire; otherwise it is given the features that are read and written.
+    _records_bytes = False
 
     def __init__(
         self,
@@ -124,7 +157,10 @@ class GenicamCamera(StreamingCamera):
         with self._lock:
             self._drop()
             try:
-                self._features, self._identity = self._open()
+                features, self._identity = self._open()
+                if self._recorder is not None and not self._records_bytes:
+                    features = _Transcribed(features, self._recorder)
+                self._features = features
                 self._who = f"camera {self._identity.serial_number or self.address}"
                 self._prepare(self._features)
             except InstrumentError:

@@ -90,6 +90,7 @@ class U3vCamera(GenicamCamera):
     `settings`: those of `GenicamCamera`.
     """
 
+    _records_bytes = True
     nodes: NodeMap
     _control: GenCp
 

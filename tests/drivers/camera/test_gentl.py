@@ -63,6 +63,16 @@ def test_what_bends_the_codes_is_switched_off_and_limits_are_the_cameras_own(vik
             camera.collect()
 
 
+def test_a_transcript_tells_the_features_that_were_written_and_read(viky: VikyCamera) -> None:
+    pieces: list[tuple[str, bytes]] = []
+    with GentlCamera(RED, **viky.settings, recorder=lambda way, data: pieces.append((way, data))) as camera:
+        camera.configure(0.002)
+        camera.capture()
+    written = [("sent", b"GammaEnable = False"), ("sent", b"ExposureTime = 2000.0"), ("sent", b"TriggerSoftware")]
+    assert [piece for piece in pieces if piece in written] == written
+    assert ("received", b"ExposureTime = 2000.0") in pieces
+
+
 def test_ctrl_c_stays_pythons(viky: VikyCamera) -> None:
     before = signal.getsignal(signal.SIGINT)
     with GentlCamera(RED, **viky.settings):
