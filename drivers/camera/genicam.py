@@ -116,9 +116,7 @@ class GenicamCamera(StreamingCamera):
         self._gain_db = 0.0
         self._fired: datetime | None = None
         self._owed = 0  # frames of software triggers that didn't come yet
-        self._before: tuple[int, int | None] | None = (
-            None  # number and time of the frame before, since acquisition started
-        )
+        self._before: tuple[int, int | None] | None = None  # number and time of the frame before
         self._has_temperature = False
         self._temperature: tuple[int, float] | None = None  # when (ns of the camera's clock), and degrees
 

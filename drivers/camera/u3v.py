@@ -66,7 +66,9 @@ class _Interfaces:
             if (interface.bInterfaceClass, interface.bInterfaceSubClass) == (0xEF, 0x05):
                 found.setdefault(interface.bInterfaceProtocol, interface)
         if 0 not in found or 2 not in found:
-            raise InstrumentError(f"{who}: this USB device is no USB3 Vision camera with a stream")
+            raise InstrumentError(
+                f"{who}: this USB device is no USB3 Vision camera with a stream; correct the address in the station file"
+            )
 
         def endpoint(interface: usb.core.Interface, incoming: bool) -> int:
             for item in interface:
