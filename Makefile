@@ -19,10 +19,10 @@ $(STAMP): pyproject.toml constraints.txt
 	rm -rf calibench.egg-info  # pytest would rewrite the assertions of every module that it lists
 	touch $@
 
-# A day in virtual time on a bench whose instruments fail at 1 % of their answers; takes hours. ARGS as pytest's.
+# A day in virtual time on a bench whose instruments fail at 1 % of their answers. ARGS as pytest's. Its logging keeps every failed run in memory: off.
 SOAK_CAPTURES ?= 20000
 soak: $(STAMP)
-	SOAK_CAPTURES=$(SOAK_CAPTURES) $(BIN)/python -m pytest tests/soak/test_soak.py -m slow -s $(ARGS)
+	SOAK_CAPTURES=$(SOAK_CAPTURES) $(BIN)/python -m pytest tests/soak/test_soak.py -m slow -s -p no:logging $(ARGS)
 
 # kill -9 of service, worker and bench at random moments, KILLS of them; about ten seconds each.
 KILLS ?= 20

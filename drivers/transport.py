@@ -166,10 +166,11 @@ class Transport:
             if left <= 0:
                 question = f" to {asked!r}" if asked else ""
                 got = f"only {shown(bytes(self._received))}" if self._received else "no answer"
+                remedy = "the power, the cable and that nothing else talks to it"
+                if self._received:
+                    remedy = "that it is this instrument that is connected there, and that nothing else talks to it"
                 since = f"then nothing for {BETWEEN_S:g} s" if begun else f"within {wait_s:g} s"
-                raise NoAnswer(
-                    f"{self.name}: {got}{', ' if begun else ' '}{since}{question}; check the power, the cable and that nothing else talks to it"
-                )
+                raise NoAnswer(f"{self.name}: {got}{', ' if begun else ' '}{since}{question}; check {remedy}")
 
     def _receive(self, timeout_s: float) -> bool:
         """Read the available bytes, waiting for at most `timeout_s`; False if there were none."""

@@ -470,7 +470,9 @@ class UsbIpBackend(PipeBackend):
         try:
             connection = socket.create_connection((self.host, self.port), self.timeout_s)
         except OSError as error:
-            raise failed(errno.ENODEV, f"no USB/IP server at {self.host}:{self.port} ({error})") from error
+            raise failed(
+                errno.ENODEV, f"no USB/IP server at {self.host}:{self.port} ({error}): start it, or correct the address"
+            ) from error
         try:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.sendall(OP_HEADER.pack(VERSION, command, 0) + body)

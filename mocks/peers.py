@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -276,6 +277,23 @@ class EmulatedBasler(RealInstrument):
         super().__init__("0815-0000", {})
 
 
+class VikyCamera(RealInstrument):
+    """The first of the three cameras of GenICam's own GenTL producer, described as one that can be triggered (`viky.xml`).
+
+    The package `genicam` brings the producer. It can't be silenced or unplugged.
+    """
+
+    def __init__(self) -> None:
+        found = find_spec("genicam")
+        if found is None or found.origin is None:
+            raise InstrumentError("GenTL cameras: genicam isn't installed; install calibench[gentl]")
+        producer = Path(found.origin).with_name("viky.cti")
+        if not producer.is_file():
+            raise InstrumentError(f"{producer} isn't there: this build of genicam has no producer")
+        description = Path(__file__).with_name("viky.xml")
+        super().__init__("VikyTL_DEV_red", {"producer": str(producer), "description": str(description)})
+
+
 class AravisFakeCamera(Peer):
     """The fake GigE camera of the package aravis-tools, a process of its own, on loopback; one at a time on this computer."""
 
@@ -363,6 +381,10 @@ def u3v() -> Peer:
 
 def basler() -> Peer:
     return EmulatedBasler()
+
+
+def gentl() -> Peer:
+    return VikyCamera()
 
 
 def aravis() -> Peer:

@@ -15,7 +15,7 @@ from importlib.util import module_from_spec
 from typing import Any, TypeVar
 
 from drivers.camera.buffers import Grabbed
-from drivers.camera.genicam_library import LibraryCamera
+from drivers.camera.genicam import GenicamCamera
 from drivers.camera.genicam_settings import Setting
 from drivers.errors import Disconnected, InstrumentError, InUse, NoAnswer
 from drivers.instrument import Identity
@@ -137,7 +137,7 @@ class _AravisFeatures:
         self.do(f"executing {name}", lambda: self._camera.execute_command(name))
 
 
-class AravisCamera(LibraryCamera):
+class AravisCamera(GenicamCamera):
     """The camera that Aravis knows as `address`: its identifier, or its IP address."""
 
     _camera: Any = None
@@ -190,9 +190,6 @@ class AravisCamera(LibraryCamera):
     def _halt(self) -> None:
         self._stream = None
         self._nodes.do("stopping", self._camera.stop_acquisition)
-
-    def _await_trigger_ready(self) -> None:
-        """A GigE camera hears triggers from the start of its acquisition."""
 
     def _grab(self, timeout_s: float) -> Grabbed | None:
         buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))

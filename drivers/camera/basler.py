@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Any, TypeVar
 
 from drivers.camera.buffers import Grabbed
-from drivers.camera.genicam_library import LibraryCamera
+from drivers.camera.genicam import GenicamCamera
 from drivers.camera.genicam_settings import Setting
 from drivers.errors import Disconnected, InstrumentError, InUse
 from drivers.instrument import Identity
@@ -72,7 +72,7 @@ class _PylonNodes:
         self._do(name, lambda node: node.Execute())
 
 
-class BaslerCamera(LibraryCamera):
+class BaslerCamera(GenicamCamera):
     """The Basler camera with the serial number `address`."""
 
     _camera: Any = None
@@ -119,7 +119,7 @@ class BaslerCamera(LibraryCamera):
         self._library(self._camera.StopGrabbing)
 
     def _await_trigger_ready(self) -> None:
-        """Cameras that can't tell when they are ready hear a trigger from the start of their acquisition."""
+        """Where the camera tells when it is ready, that is waited for."""
         pylon = pylon_library()
 
         def wait() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,8 @@ from drivers.errors import Garbled
 class Grabbed:
     """The payload, its layout, and what is wrong with it; nothing if it is whole.
 
-    `camera_time_ns`: start of the exposure on the camera's own clock; None where it doesn't tell.
+    `camera_time_ns`: start of the exposure on the camera's own clock; None where it doesn't tell. `give_back`: called once the codes
+    are unpacked; the payload's memory may be filled again.
     """
 
     payload: Payload
@@ -26,6 +28,7 @@ class Grabbed:
     padding: int = 0
     damage: str = ""
     camera_time_ns: int | None = None
+    give_back: Callable[[], None] = lambda: None
 
     def unpacked(self, who: str) -> tuple[NDArray[np.uint16], PixelFormat]:
         """The codes, (rows, cols) DN, in memory of their own, and the pixel format.

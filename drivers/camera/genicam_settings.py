@@ -47,9 +47,16 @@ PROCESSING: tuple[tuple[str, Setting], ...] = (
 
 
 def set_if_there(features: Features, name: str, value: Setting) -> None:
-    """Set a feature that the camera has, an enumeration's entry that it offers."""
-    if features.has(name) and (not isinstance(value, str) or value in features.entries(name)):
+    """Set a feature that the camera has, an enumeration's entry that it offers; some can't be written, and have the value already."""
+    if not features.has(name) or (isinstance(value, str) and value not in features.entries(name)):
+        return
+    try:
         features.set(name, value)
+    except (NoAnswer, Disconnected):
+        raise
+    except InstrumentError:
+        if features.get(name) != value:
+            raise
 
 
 def switch_processing_off(features: Features, who: str) -> None:

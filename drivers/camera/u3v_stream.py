@@ -81,13 +81,13 @@ class U3vStream:
         self._free: queue.LifoQueue[NDArray[np.uint8]] = queue.LifoQueue()
         for _ in range(BUFFERS):
             self._free.put(np.empty(sum(layout.transfers), np.uint8))
-        self._came: queue.SimpleQueue[tuple[Grabbed, NDArray[np.uint8]] | usb.core.USBError] = queue.SimpleQueue()
+        self._came: queue.SimpleQueue[Grabbed | usb.core.USBError] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="u3v-stream", daemon=True)
         self._thread.start()
 
-    def get(self, timeout_s: float) -> tuple[Grabbed, NDArray[np.uint8]] | None:
-        """The next frame and its buffer, to be given back by `done`; None if none came in time. Raises the `USBError` that ended the stream."""
+    def get(self, timeout_s: float) -> Grabbed | None:
+        """The next frame; None if none came in time. Raises the `USBError` that ended the stream."""
         with contextlib.suppress(queue.Empty):
             came = self._came.get(timeout=timeout_s)
             if isinstance(came, usb.core.USBError):
@@ -95,10 +95,6 @@ class U3vStream:
                 raise came
             return came
         return None
-
-    def done(self, buffer: NDArray[np.uint8]) -> None:
-        """Queue a buffer again whose frame was unpacked."""
-        self._free.put(buffer)
 
     def close(self) -> None:
         """End the thread."""
@@ -113,7 +109,7 @@ class U3vStream:
                 leader = self._next_leader()
                 buffer = None if leader is None else self._next_buffer()
                 if leader is not None and buffer is not None:
-                    self._came.put((self._frame(leader, buffer), buffer))
+                    self._came.put(self._frame(leader, buffer))
         except usb.core.USBError as error:
             self._came.put(error)
 
@@ -168,6 +164,7 @@ class U3vStream:
             padding=leader.padding,
             damage=_damage(leader, at, trailer, late),
             camera_time_ns=leader.camera_time_ns,
+            give_back=lambda: self._free.put(buffer),
         )
 
     @staticmethod

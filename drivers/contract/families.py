@@ -74,6 +74,7 @@ class MonochromatorContract(FamilyContract):
 
     def settings(self, driver: Monochromator) -> None:
         for wavelength_nm in (450.0, 632.8, 0.0):
+            driver.check_nm(wavelength_nm)
             driver.move_nm(wavelength_nm)
             found = driver.wavelength_nm()
             require(abs(found - wavelength_nm) <= 0.5, f"told to go to {wavelength_nm} nm it stands at {found} nm")

@@ -85,6 +85,10 @@ class Monochromator(Instrument):
     def move_nm(self, wavelength_nm: float) -> None:
         """Go to a wavelength (nm; 0 is zero order, white light) with its order-sorting filter; returns on arrival."""
 
+    def check_nm(self, wavelength_nm: float) -> None:
+        """Raise `InstrumentError` for a wavelength (nm) that `move_nm` would refuse, as far as the driver knows; nothing moves."""
+        return
+
     @abstractmethod
     def wavelength_nm(self) -> float:
         """Wavelength (nm) that the instrument reports."""

@@ -84,6 +84,9 @@ class Cornerstone260(WireInstrument, Monochromator):
         with self._conversation():
             return self._identity
 
+    def check_nm(self, wavelength_nm: float) -> None:
+        filter_place(self.filters, checked_wavelength_nm(wavelength_nm, self.upper_nm))
+
     def move_nm(self, wavelength_nm: float) -> None:
         wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
         with self._conversation():

@@ -12,7 +12,8 @@ from drivers.instrument import Instrument
 class IrradianceMeasurement:
     """Irradiance (W/m2) of light of one wavelength (nm), and what it was made of: current above dark (A) and its number of readings.
 
-    `sd_irradiance_w_m2` holds the scatter of the readings and of the dark readings, and the calibration's own uncertainty.
+    `sd_irradiance_w_m2` holds the scatter of the readings and of the dark readings, and the calibration's own uncertainty;
+    `calibration_sd` is the latter, relative: all measurements with this photodiode have it in common.
     """
 
     irradiance_w_m2: float
@@ -20,6 +21,7 @@ class IrradianceMeasurement:
     wavelength_nm: float
     current_a: float
     readings: int
+    calibration_sd: float = 0.0
 
 
 class Photodiode(Instrument):

@@ -107,7 +107,9 @@ class ScpiPhotodiode(Photodiode):
             var = (_variance_of_mean(found) + self._var_dark) * watts_per_amp_m2**2 + (
                 self.calibration_sd * irradiance
             ) ** 2
-            return IrradianceMeasurement(irradiance, math.sqrt(var), wavelength_nm, current_a, self.readings)
+            return IrradianceMeasurement(
+                irradiance, math.sqrt(var), wavelength_nm, current_a, self.readings, self.calibration_sd
+            )
 
     def stop(self) -> None:
         """End a measurement after the reading under way; the meter emits nothing and moves nothing."""

@@ -257,6 +257,7 @@ class PhotodiodeDevice(Device):
         return {
             "irradiance_w_m2": found.irradiance_w_m2 if found else 0.0,
             "sd_irradiance_w_m2": found.sd_irradiance_w_m2 if found else 0.0,
+            "irradiance_calibration_sd_percent": 100.0 * found.calibration_sd if found else 0.0,
             "photodiode_dark_a": self.dark_a or 0.0,
         }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 
 import numpy as np
@@ -25,7 +25,7 @@ from lab.capture.devices import (
     WriteSpectrum,
 )
 from lab.capture.station import Drivers, Station
-from lab.capture_kinds.base import CaptureLimits
+from lab.capture_kinds.base import CaptureLimits, FixedExposure, Step
 from lab.errors import DeviceError
 from sim.camera import Side
 from sim.parameters import Frozen
@@ -108,6 +108,20 @@ class Instruments:
                     f"{sheet.cfa}; correct cfa there"
                 )
         return found
+
+    def check(self, steps: Sequence[Step]) -> None:
+        """Raise DeviceError for a wavelength, an exposure or a gain of these steps that an instrument can't be set to; nothing moves."""
+        wavelengths = {nm for step in steps if (nm := step.setting.wavelength_nm) is not None}
+        exposures = {step.exposure.exposure_s for step in steps if isinstance(step.exposure, FixedExposure)}
+        try:
+            if self.light is not None:
+                for wavelength_nm in sorted(wavelengths):
+                    self.light.monochromator.check_nm(wavelength_nm)
+            for camera in self.drivers.cameras.values():
+                for exposure_s in sorted({min(exposures), max(exposures)} if exposures else ()):
+                    camera.configure(exposure_s, self.limits.gain_db)
+        except InstrumentError as error:
+            raise DeviceError(f"{error}; the plan needs it: see [limits] in the station file") from error
 
     def make_safe(self) -> list[str]:
         """Close the shutter, darken the screen, stop all motion: every instrument at once, within `STOP_S`.

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import json
 import logging
 import platform
 import signal
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,7 +23,6 @@ from typing import Any, Literal, TypeVar
 
 import bluesky.preprocessors as bpp
 import bluesky.run_engine
-import numpy as np
 from bluesky.run_engine import RunEngine
 from bluesky.utils import DuringTask, FailedStatus, Msg, RunEngineInterrupted, TransitionError
 
@@ -36,7 +34,7 @@ from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.records import JournalEntry, RunRecord, SessionInfo, now
 from lab.capture.station import Drivers, Station, drivers_of
 from lab.capture.store import Store
-from lab.capture.take_step import Taken, repeats_of, take
+from lab.capture.take_step import Taken, repeats_ahead, take
 from lab.capture_kinds.base import Step
 from lab.errors import DeviceError, InputError
 from sim.parameters import Frozen
@@ -74,19 +72,20 @@ class _Pace:
     """Estimates the time left (s) from the mean duration of this run's steps, sequence by sequence."""
 
     def __init__(self) -> None:
-        self.spent: dict[str, list[float]] = defaultdict(list)
+        self._spent_s: dict[str, float] = defaultdict(float)
+        self._steps: Counter[str] = Counter()
 
     def add(self, step: Step, seconds: float) -> None:
-        self.spent[step.sequence].append(seconds)
+        self._spent_s[step.sequence] += seconds
+        self._steps[step.sequence] += 1
 
-    def left_s(self, to_do: list[Step]) -> float | None:
-        every = [seconds for spent in self.spent.values() for seconds in spent]
-        if not every:
+    def left_s(self, to_do: Counter[str]) -> float | None:
+        """Seconds for the steps that are left, `to_do` of them by sequence; None before the first step is done."""
+        if not self._steps:
             return None
-        mean = float(np.mean(every))
-        return float(
-            sum(float(np.mean(self.spent[step.sequence])) if step.sequence in self.spent else mean for step in to_do)
-        )
+        mean_s = sum(self._spent_s.values()) / self._steps.total()
+        own_s = {name: self._spent_s[name] / count for name, count in self._steps.items()}
+        return sum(count * own_s.get(name, mean_s) for name, count in to_do.items())
 
 
 class _Writes:
@@ -280,6 +279,7 @@ class CaptureSession:
                 check_certified(
                     self.store, cameras_of({name: vars(one) for name, one in identities.items()}, self.station)
                 )
+            instruments.check([entry.step for entry in self._entries if entry.finished is None])
             self.store.set_state(self.id, "running", run=_provenance(identities, self._done), station=self.station)
             self._drive(instruments)
         except BaseException as error:
@@ -353,22 +353,22 @@ class CaptureSession:
 
         def steps() -> Generator[Msg, Any, None]:
             yield Msg("open_run", None)
-            for at, entry in enumerate(entries):
+            results.update({entry.step.id: entry.result for entry in entries if entry.finished is not None})
+            to_do = Counter(entry.step.sequence for entry in entries if entry.finished is None)
+            repeats = repeats_ahead([None if entry.finished else entry.step for entry in entries])
+            for entry, following in zip(entries, repeats, strict=True):
                 step = entry.step
                 if entry.finished is not None:
-                    results[step.id] = entry.result
                     continue
                 yield Msg("checkpoint")  # a pause takes effect here, between steps
                 if self._ended_by is not None:
                     break
-                self._tell("running", step.what, step.sequence, [other.step for other in entries[at:]])
+                self._tell("running", step.what, step.sequence, to_do)
                 started, began_s = now(), time.monotonic()
-                later = (entries[place] for place in range(at + 1, len(entries)))
-                after = itertools.takewhile(lambda other: other.finished is None, later)
-                repeats = repeats_of(step, (other.step for other in after))
-                taken: Taken = yield from take(step, instruments, results, repeats)
+                taken: Taken = yield from take(step, instruments, results, following)
                 yield Msg("in_a_thread", None, call=lambda s=step, t=taken, b=started: self._keep(s, t, b))
                 results[step.id] = taken.result
+                to_do[step.sequence] -= 1
                 self._done += 1
                 self._pace.add(step, time.monotonic() - began_s)
                 if "skipped" in taken.result:
@@ -392,7 +392,7 @@ class CaptureSession:
         state: Any,
         what: str,
         sequence: str = "",
-        to_do: list[Step] | None = None,
+        to_do: Counter[str] | None = None,
         remark: str | None = None,
         quietly: bool = False,
     ) -> None:

@@ -5,8 +5,7 @@ It yields bluesky's messages itself: each of the library's plan stubs formats th
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -17,6 +16,7 @@ from lab.capture.devices import LightSetting, PhotodiodeDevice, Shot, ShownPatte
 from lab.capture.instruments import Instruments
 from lab.capture.records import StoredFile
 from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
+from lab.capture_kinds.irradiance import IrradianceCapture
 from lab.errors import DeviceError, InputError
 from sim.camera import Side
 
@@ -131,32 +131,37 @@ def _stuck(
     return shortened < 0.9 and levels[side] / before[1][side] > np.sqrt(shortened)
 
 
-def repeats_of(step: Step, following: Iterable[Step]) -> int:
-    """Number of steps directly after `step` that repeat its setting and exposure without a measurement of the light."""
-    same = itertools.takewhile(
-        lambda other: (
-            bool(step.captures and other.captures)
-            and other.radiance is None
-            and other.setting == step.setting
-            and other.exposure == step.exposure
-        ),
-        following,
+def repeats_ahead(steps: Sequence[Step | None]) -> list[int]:
+    """How many of the steps that follow each at once only repeat its exposure; None: a step that isn't taken."""
+    found = [0] * len(steps)
+    for at in range(len(steps) - 2, -1, -1):
+        step, other = steps[at], steps[at + 1]
+        if step is not None and other is not None and _repeats(step, other):
+            found[at] = found[at + 1] + 1
+    return found
+
+
+def _repeats(step: Step, other: Step) -> bool:
+    """Whether the second step does nothing but expose as the first did."""
+    return (
+        bool(step.captures and other.captures)
+        and other.radiance is None
+        and other.setting == step.setting
+        and other.exposure == step.exposure
     )
-    return sum(1 for _ in same)
 
 
 def take(
     step: Step, instruments: Instruments, results: Mapping[str, Mapping[str, Any]], repeats: int = 0
 ) -> Plan[Taken]:
-    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`:
-    `repeats_of` the step.
+    """Take one step: set the bench, measure the light, find exposures or expose. `results`: those of earlier steps, by id; `repeats`: its number
+    in `repeats_ahead`.
 
     If the spectroradiometer refuses to measure the light (too dark, too bright), a step with captures is skipped, with the reason in its
     result; in a step without captures this raises DeviceError, as later steps need the spectrum. Raises InputError for a missing instrument.
     """
     wavelength_nm = step.setting.wavelength_nm or 0.0
-    # The photodiode's responsivity is known for light of one wavelength only.
-    photodiode = instruments.photodiode if step.radiance and step.captures and wavelength_nm > 0.0 else None
+    photodiode = _irradiance_meter(step, instruments)
     if photodiode is not None and photodiode.dark_a is None:
         yield from _dark_current(instruments)
     yield from arrange(step, instruments)
@@ -208,6 +213,16 @@ def take(
     return Taken(result, tuple(files), captures)
 
 
+def _irradiance_meter(step: Step, instruments: Instruments) -> PhotodiodeDevice | None:
+    """The photodiode, for a step with captures in light of one wavelength: it has one responsivity."""
+    photodiode = instruments.photodiode
+    if photodiode is None:
+        return None
+    photodiode.measured = None  # that of an earlier step
+    lit = (step.setting.wavelength_nm or 0.0) > 0.0
+    return photodiode if lit and any(isinstance(one, IrradianceCapture) for one in step.captures) else None
+
+
 def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | None) -> Plan[None]:
     """Measure the irradiance of light of one wavelength; with None, the photodiode's dark current."""
     yield Msg("prepare", photodiode, wavelength_nm, group="irradiance")
@@ -243,8 +258,14 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
 
 
 def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
-    """The step's captures, completed by what the frames, the number of dummy frames and the instruments' readings tell."""
-    readings = {key: value for device in instruments.devices for key, value in device.readings().items()}
+    """The step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
+    without = instruments.photodiode if instruments.photodiode and instruments.photodiode.measured is None else None
+    readings = {
+        key: value
+        for device in instruments.devices
+        if device is not without
+        for key, value in device.readings().items()
+    }
     completed = []
     for capture in step.captures:
         frame = instruments.cameras.frames[capture.side]

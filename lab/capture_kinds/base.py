@@ -165,12 +165,13 @@ AnyTarget = Annotated[Target, TARGETS]
 
 
 class CaptureLimits(Frozen):
-    """Limits of the exposure (s), the gain (dB) and the slit width (um) of all sequences."""
+    """Limits of all sequences: the exposure (s), the gain (dB), the slit width (um) and the light of flats."""
 
     exposure_min_s: float = Field(default=20e-6, gt=0)
     exposure_max_s: float = Field(default=10.0, gt=0)
     gain_db: float = 0.0
     slit_um: float | None = Field(default=None, gt=0)  # None: as the instrument stands
+    flat_wavelength_nm: float | None = Field(default=None, gt=0)  # None: white light
 
 
 class Equipment(Protocol):

@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from lab.capture_kinds.base import (
-    Capture,
     Equipment,
     Level,
     RelativeExposure,
@@ -22,6 +21,7 @@ from lab.capture_kinds.base import (
     planned_keys,
     spectrum_path,
 )
+from lab.capture_kinds.irradiance import IrradianceCapture
 from sim.parameters import Quantity
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
@@ -46,7 +46,8 @@ class FlatSequence(Sequence):
     """`frames` flats at each of `levels`, shares of the exposure at which the brightest channel saturates.
 
     Each camera has exposures of its own, scaled from that found for `level_found`. The series of levels is taken upwards and downwards in
-    turn. The radiance is measured before each turn, so that a drift of the lamp shows as a difference between turns.
+    turn. The radiance is measured before each turn, so that a drift of the lamp shows as a difference between turns. `wavelength_nm`: of the
+    light, 0 is white; with one wavelength a photodiode measures the irradiance before each frame (EMVA 1288).
     """
 
     name: ClassVar[str] = "flat"
@@ -59,6 +60,7 @@ class FlatSequence(Sequence):
     ] = Field(min_length=1, max_length=200)
     frames: Annotated[int, Quantity("1", "frames at each level", lower=1, upper=20_000)]
     level_found: Level = 0.75
+    wavelength_nm: Annotated[float, Quantity("nm", "wavelength of the light; 0: white", lower=0.0, upper=5000.0)] = 0.0
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
@@ -69,21 +71,24 @@ class FlatSequence(Sequence):
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
         if station.lacks(*cls.instruments):
             return None
-        return cls(levels=QUICK_LEVELS if quick else LEVELS, frames=4)
+        levels = QUICK_LEVELS if quick else LEVELS
+        return cls(levels=levels, frames=4, wavelength_nm=station.limits.flat_wavelength_nm or 0.0)
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         self.check_instruments(station)
-        lit = Setting(target=station.one(SphereTarget), wavelength_nm=0.0)
-        found = exposure_step("flat", "flat field", lit, self.level_found, measures_light=False)
+        slit_um = station.limits.slit_um if self.wavelength_nm else None
+        lit = Setting(target=station.one(SphereTarget), wavelength_nm=self.wavelength_nm, slit_um=slit_um)
+        stem = f"flat/{self.wavelength_nm:g}nm" if self.wavelength_nm else "flat"
+        found = exposure_step(stem, "flat field", lit, self.level_found, measures_light=False)
         made = [found]
         for frame in range(1, self.frames + 1):
-            light = f"flat/light/{frame}"
+            light = f"{stem}/light/{frame}"
             made.append(
                 Step(id=light, what="flat field: measuring the light", setting=lit, radiance=spectrum_path(light))
             )
             numbered = list(enumerate(self.levels, start=1))
             for number, level in numbered if frame % 2 else numbered[::-1]:
-                id = f"flat/level-{number:02d}/{frame}"
+                id = f"{stem}/level-{number:02d}/{frame}"
                 made.append(
                     Step(
                         id=id,
@@ -91,7 +96,12 @@ class FlatSequence(Sequence):
                         setting=lit,
                         exposure=RelativeExposure(of=found.id, factor=level / self.level_found),
                         captures=tuple(
-                            FlatCapture(kind="flat", radiance=spectrum_path(light), **planned_keys(id, side))
+                            FlatCapture(
+                                kind="flat",
+                                radiance=spectrum_path(light),
+                                wavelength_nm=self.wavelength_nm or None,
+                                **planned_keys(id, side),
+                            )
                             for side in station.sides
                         ),
                     )
@@ -99,8 +109,9 @@ class FlatSequence(Sequence):
         return tuple(made)
 
 
-class FlatCapture(Capture):
-    """Uniform light: `radiance` (CSV, W sr^-1 m^-2 nm^-1), or `photons_per_pixel` in this exposure at `wavelength_nm`."""
+class FlatCapture(IrradianceCapture):
+    """Uniform light: `radiance` (CSV, W sr^-1 m^-2 nm^-1), or `photons_per_pixel` in this exposure at `wavelength_nm`, or `irradiance_w_m2`
+    with its standard uncertainties, of light of this wavelength where the sensor is."""
 
     shows: ClassVar[str] = "uniform diffuse light filling the field"
     sequence: ClassVar[type[Sequence] | None] = FlatSequence
@@ -108,10 +119,11 @@ class FlatCapture(Capture):
     kind: Literal["flat"]
     radiance: SpectrumPath | None = None
     photons_per_pixel: float | None = Field(default=None, ge=0)
-    wavelength_nm: float | None = Field(default=None, gt=0)
 
     def remarks(self) -> Iterator[str]:
-        if self.radiance is None and self.photons_per_pixel is None:
+        if self.irradiance_w_m2 is not None and self.wavelength_nm is None:
+            yield "irradiance_w_m2 without wavelength_nm: the number of photons isn't known; add the wavelength"
+        if self.radiance is None and self.photons_per_pixel is None and self.irradiance_w_m2 is None:
             yield "neither radiance nor photons_per_pixel: it determines noise, but no sensitivity; add what is known"
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:

@@ -6,10 +6,8 @@ from collections.abc import Callable
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
-from scipy import constants
 
 from lab.capture_kinds.base import (
-    Capture,
     Equipment,
     Level,
     Reading,
@@ -25,6 +23,7 @@ from lab.capture_kinds.base import (
     spectrum_path,
 )
 from lab.capture_kinds.flat import SphereTarget
+from lab.capture_kinds.irradiance import IrradianceCapture
 from sim.parameters import Quantity
 from sim.scene.scenes import Scene, UniformField
 from sim.spectrum import Spectrum
@@ -95,11 +94,9 @@ class NarrowbandSequence(Sequence):
         return tuple(made)
 
 
-class NarrowbandCapture(Capture):
-    """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured.
-
-    `irradiance_w_m2` and `sd_irradiance_w_m2`, its standard uncertainty: at the place of the reference photodiode, where the station has one.
-    """
+class NarrowbandCapture(IrradianceCapture):
+    """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured; `irradiance_w_m2` and its
+    standard uncertainties as a reference photodiode measured them at its place, where the station has one."""
 
     shows: ClassVar[str] = "uniform diffuse light from the monochromator, filling the field"
     sequence: ClassVar[type[Sequence] | None] = NarrowbandSequence
@@ -108,15 +105,6 @@ class NarrowbandCapture(Capture):
     wavelength_nm: float = Field(gt=0)
     bandwidth_nm: Annotated[float | None, Reading("bandwidth_nm")] = Field(default=None, ge=0)
     radiance: SpectrumPath
-    irradiance_w_m2: Annotated[float | None, Reading("irradiance_w_m2")] = None
-    sd_irradiance_w_m2: Annotated[float | None, Reading("sd_irradiance_w_m2")] = Field(default=None, ge=0)
-
-    @property
-    def photon_irradiance_per_m2_s(self) -> float | None:
-        """Photon irradiance (s^-1 m^-2) at the photodiode, E wavelength / (h c) (EMVA 1288 release 4.0, eq. 3); None without a photodiode."""
-        if self.irradiance_w_m2 is None:
-            return None
-        return self.irradiance_w_m2 * self.wavelength_nm * 1e-9 / (constants.h * constants.c)
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
         return UniformField(spectrum(self.radiance), self.kind)

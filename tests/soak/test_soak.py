@@ -34,6 +34,8 @@ from mocks.usb import serve_usbip, stereo_pair
 from mocks.wire import FRAME_KINDS, KINDS, Endpoint, Fault, Grammar, Pty, Tcp, serve
 
 CAPTURES = int(os.environ.get("SOAK_CAPTURES", "48"))
+#: Rows and columns of a frame: small, as drawing and writing them takes most of the time.
+SHAPE = (240, 320)
 #: Share of the answers that break.
 RATE = 0.01
 #: Exposures of the darks, half of the pairs: with these 10,000 pairs take 24 h.
@@ -57,7 +59,7 @@ class _Bench:
     """The mock bench in this process, its faults, and its station."""
 
     def __init__(self, folder: Path, running: contextlib.ExitStack) -> None:
-        self.place = Bench(seed=11)
+        self.place = Bench(seed=11, shape=SHAPE)
         stop = threading.Event()
         running.callback(stop.set)
         answers = 60 * CAPTURES + 1000

@@ -94,9 +94,10 @@ class EmvaLevels:
         self.below_mean = self.below(self.dark_mean, self.mean_line)
         self.below_variance = self.below(self.dark_variance, self.variance_line)
         self.signal = self.mean - self.below_mean
+        lamp_error = np.maximum(given.lamp_error, [level.light_std for level in self.flats])
         self.signal_std = np.hypot(
             [plane.mean_std for plane in own],
-            np.hypot(self.below(self.dark_mean_std, None), given.lamp_error * self.signal),
+            np.hypot(self.below(self.dark_mean_std, None), lamp_error * self.signal),
         )
 
     def _taken(self, exposure_s: float) -> int | None:
@@ -211,6 +212,7 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
     found |= _spatial(given.plane, stacks, gain)
     values_of = {name: value.value for name, value in found.items()}
     values_of |= {f"{name}_std": value.std for name, value in found.items()}
+    values_of |= _calibration(at, found, remarks)
     return Emva1288(
         **values_of,
         system_gain_dn_per_e=gain.value,
@@ -220,6 +222,21 @@ def emva1288_figures(given: EmvaInput) -> Emva1288 | str:
         points=_plotted(at, given, deviation, stacks),
         remarks=tuple(remarks),
     )
+
+
+def _calibration(at: EmvaLevels, found: Figures, remarks: list[str]) -> dict[str, float]:
+    """What the calibration of the reference that measured the light adds: a factor common to all numbers of photons."""
+    relative = max((level.light_calibration_std for level in at.flats), default=0.0)
+    if not relative or "quantum_efficiency" not in found:
+        return {}
+    remarks.append(
+        f"the photodiode's calibration has a standard uncertainty of {100.0 * relative:.2g} %: it is a factor common to all numbers of photons, "
+        "and in none of the standard deviations beside them"
+    )
+    return {
+        "photons_systematic_std_percent": 100.0 * relative,
+        "quantum_efficiency_systematic_std": relative * found["quantum_efficiency"].value,
+    }
 
 
 def _saturation(at: EmvaLevels, given: EmvaInput, remarks: list[str]) -> tuple[float, int | None]:

@@ -149,7 +149,8 @@ class PlaneStatistics:
 class MeasuredLevel:
     """One level of light (0: dark): its setting, and the statistics of its planes by name.
 
-    `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames.
+    `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames. `light_std`,
+    `light_calibration_std`: relative standard uncertainties of `light`, of its own, and common to all levels of the lamp.
     """
 
     exposure_s: float
@@ -158,6 +159,8 @@ class MeasuredLevel:
     plane: dict[str, PlaneStatistics]
     temperature_c: float | None = None
     captures: tuple[str, ...] = ()
+    light_std: float = 0.0
+    light_calibration_std: float = 0.0
 
     @property
     def repeats(self) -> int:

@@ -53,14 +53,11 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
     remark_on_levels(e)
     remark_on_shading(e)
     principal = principal_figures(e)
-    qe, qe_std, qe_at = quantum_efficiency(e)
     from_variance, from_variance_std = dark_current_from_variance(e)
     dark = pixels is not None and e.levels.darks
     return NoiseFit(
         **principal,
-        quantum_efficiency=qe,
-        quantum_efficiency_std=qe_std,
-        quantum_efficiency_wavelength_nm=qe_at,
+        **quantum_efficiency(e),
         conversion_gain_at_zero_dn_per_e=t.curve_gain * scale,
         conversion_gain_at_zero_dn_per_e_std=t.curve_gain_std * scale,
         variance_model_error_percent=100.0 * t.model_error,

@@ -15,8 +15,9 @@ from lab.fit.noise.dark_pixels import DarkPixels, stack_of
 from lab.fit.noise.defective_pixels import defective_pixels
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.noise_fit import noise_fit
+from lab.fit.noise.photon_numbers import PhotonNumber, photon_numbers, why_not
 from lab.fit.noise.recorded_levels import rounded_c
-from lab.fit.noise.stated_light import stated_light
+from lab.fit.noise.stated_light import StatedLight, stated_light
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from sim.camera import Side
@@ -48,19 +49,32 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in recordings.captures(DarkCapture, side) if (dark.gain_db or 0.0) == gain_db]
     dark_levels, pixels = _dark_levels(recordings, darks, camera)
-    lamps = _lamps_of(recordings, flats)
+    measured = photon_numbers(flats, camera)
+    light = {
+        flat.id: StatedLight(measured[flat.id].photons, "photons", flat.wavelength_nm)
+        if flat.id in measured
+        else stated_light(flat)
+        for flat in flats
+    }
+    lamps = _lamps_of(recordings, [flat for flat in flats if flat.id not in measured])
+    lamps |= {id: (None, *light[id].lamp) for id in measured}
+    unknown = PhotonNumber(0.0, 0.0, 0.0)
     flat_levels = [
         MeasuredLevel(
             group[0].exposure_s,
-            stated_light(group[0]).amount,
+            light[group[0].id].amount,
             lamps[group[0].id],
             stack_of(recordings, group, pixels.bad).statistics(),
             group[0].temperature_c,
             tuple(flat.id for flat in group),
+            measured.get(group[0].id, unknown).std,
+            measured.get(group[0].id, unknown).calibration_std,
         )
-        for group in _grouped(flats, lambda flat: (flat.exposure_s, stated_light(flat).amount, lamps[flat.id]))
+        for group in _grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
-    return noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
+    fitted = noise_fit(dark_levels, flat_levels, camera, gain_db, pixels=pixels)
+    reason = why_not(flats, camera)
+    return fitted if reason is None else fitted.model_copy(update={"remarks": (*fitted.remarks, reason)})
 
 
 def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C]]:

@@ -65,7 +65,8 @@ def response_to_light(
     noise = np.array([level.plane[name].mean_std for level in levels])
     shot = e.transfer.gain * np.maximum(signal, 0.0) + QUANTISATION_DN2
     noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
-    return np.array([level.light for level in levels]), signal, np.hypot(noise, e.light_scatter * signal)
+    beyond = np.maximum(e.light_scatter, [level.light_std for level in levels])
+    return np.array([level.light for level in levels]), signal, np.hypot(noise, beyond * signal)
 
 
 def full_well(e: Evaluation) -> tuple[float | None, float | None]:
@@ -89,24 +90,30 @@ def full_well(e: Evaluation) -> tuple[float | None, float | None]:
     return in_electrons(e, value, np.sqrt(QUANTISATION_DN2))
 
 
-def quantum_efficiency(e: Evaluation) -> tuple[float | None, float | None, float | None]:
-    """Quantum efficiency of a MONO camera, its standard deviation and wavelength (nm), by EMVA 1288: responsivity over
+def quantum_efficiency(e: Evaluation) -> dict[str, float | None]:
+    """Quantum efficiency of a MONO camera, its standard deviations and wavelength (nm), by EMVA 1288: responsivity over
     K.
 
-    The responsivity is the slope of the signal against photons, to 70 % of saturation. None without a stated number of
+    The responsivity is the slope of the signal against photons, to 70 % of saturation. Empty without a number of
     photons.
     """
     levels = main_lamp_levels(e)
     lamp = levels[0].lamp
     if e.levels.camera.cfa != "MONO" or not (isinstance(lamp, tuple) and lamp[1]):
-        return None, None, None
+        return {}
     chosen = levels_in_range(e, "Y", 0.0, LINE_LIMIT)
     chosen = [level for level in chosen if level.light > 0]
     if len({level.light for level in chosen}) < 3:
-        return None, None, None
+        return {}
     line = linearity(*response_to_light(e, "Y", chosen))
     value, std = in_electrons(e, line.slope, line.slope_std)
-    return value, std, lamp[2]
+    calibration = max(level.light_calibration_std for level in chosen)
+    return {
+        "quantum_efficiency": value,
+        "quantum_efficiency_std": std,
+        "quantum_efficiency_systematic_std": calibration * value if calibration and value is not None else None,
+        "quantum_efficiency_wavelength_nm": lamp[2],
+    }
 
 
 def remark_on_scatter(e: Evaluation) -> None:

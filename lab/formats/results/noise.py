@@ -31,9 +31,11 @@ class ChannelNoise(Frozen):
 class NoiseFit(ChannelNoise):
     """Photon transfer of the whole sensor by the definitions of EMVA 1288 release 4.0; `channels`: of each channel."""
 
-    #: EMVA's total quantum efficiency, of a mono camera whose flats state `photons_per_pixel`.
+    #: EMVA's total quantum efficiency, of a mono camera whose flats state `photons_per_pixel`, or have a photodiode's irradiance.
+    #: `_systematic_std`: by the photodiode's calibration, apart from `_std`.
     quantum_efficiency: float | None = None
     quantum_efficiency_std: float | None = None
+    quantum_efficiency_systematic_std: float | None = None
     quantum_efficiency_wavelength_nm: float | None = None
     #: Slope at zero signal of the curve of variance against mean. `conversion_gain_dn_per_e` is this slope, or that of EMVA's
     #: line where the bend of the curve isn't significant.
@@ -153,6 +155,10 @@ class Emva1288(Frozen):
     responsivity_dn_per_photon_std: float | None = None
     quantum_efficiency: float | None = None
     quantum_efficiency_std: float | None = None
+    #: By the calibration of the photodiode that measured the irradiance, apart from `_std`: a factor common to every figure in photons,
+    #: `photons_systematic_std_percent` of it. `None` where the numbers of photons are stated.
+    quantum_efficiency_systematic_std: float | None = None
+    photons_systematic_std_percent: float | None = None
     wavelength_nm: float | None = None
     #: Slope of the temporal variance against the signal, both less dark, through the origin, up to 70 % of saturation.
     system_gain_dn_per_e: float

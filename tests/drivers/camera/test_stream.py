@@ -84,8 +84,8 @@ def test_pairs_come_in_the_order_of_their_triggers(pair: Pair, in_flight: int) -
 def test_the_temperature_is_read_beside_the_stream(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     nodes = pair.cameras[0].nodes
-    number = nodes.number
-    monkeypatch.setattr(nodes, "number", lambda name: (asked.append(name), number(name))[1])
+    get = nodes.get
+    monkeypatch.setattr(nodes, "get", lambda name: (asked.append(name), get(name))[1])
     clock = pair.devices[0]._bench.clock
     at_s = [0.0]
     monkeypatch.setattr(clock, "now", lambda: at_s[0])
@@ -103,8 +103,8 @@ LOST = {
     "short": r"frame \d is torn: 2048 of 4096 bytes came",
     "lost-trailer": r"frame \d is torn: its trailer was lost",
     "damaged": r"frame \d is torn: data discarded",
-    "never": r"no answer while reading a frame|1 frame before frame \d got lost",
-    "missed": "no answer while reading a frame|it didn't hear a trigger",
+    "never": r"no frame within|1 frame before frame \d got lost",
+    "missed": "no frame within|it didn't hear a trigger",
     "repeated": r"frame \d came twice; it is dropped",
     "halt": "halted its endpoint",
 }
@@ -226,7 +226,7 @@ def test_series_of_emulated_cameras_with_a_torn_frame() -> None:
 def test_a_series_that_nobody_answers_ends(pair: Pair) -> None:
     pair.impatient()
     pair.devices[0].fail(parse_faults("never@1+"))
-    with pytest.raises(NoAnswer, match=r"no answer while reading a frame of 0\.001 s"):
+    with pytest.raises(NoAnswer, match=r"no frame within 0\.3 s of its exposure of 0\.001 s"):
         pair.series(2).next()
 
 

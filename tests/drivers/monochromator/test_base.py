@@ -16,6 +16,8 @@ from drivers.monochromator.base import (
     filter_place,
     order_sorting_filters,
 )
+from drivers.monochromator.cornerstone260 import Cornerstone260
+from drivers.monochromator.cornerstone260b import Cornerstone260B
 from mocks.light_path import FILTER_CUT_ON_NM
 
 
@@ -62,3 +64,15 @@ def test_a_table_that_cannot_be_used_is_refused(table: list[object], complaint: 
 def test_wavelengths_out_of_range_are_refused(wavelength_nm: float) -> None:
     with pytest.raises(InstrumentError, match=r"outside 0\.\.1400 nm"):
         checked_wavelength_nm(wavelength_nm, 1400.0)
+
+
+@pytest.mark.parametrize("made", [Cornerstone260, Cornerstone260B])
+def test_a_wavelength_is_checked_without_the_instrument(made: type[Cornerstone260 | Cornerstone260B]) -> None:
+    driver = made("nowhere")
+    driver.check_nm(500.0)
+    for wrong_nm, message in (
+        (5000.0, r"5000\.0 nm is outside 0\.\.1400 nm"),
+        (1400.0, "no order-sorting filter for 1400 nm"),
+    ):
+        with pytest.raises(InstrumentError, match=message):
+            driver.check_nm(wrong_nm)

@@ -14,7 +14,7 @@ from lab.capture.plan import CapturePlan
 from lab.capture.session import CaptureSession, Progress
 from lab.capture.station import Drivers, Station
 from lab.capture.store import Store
-from lab.capture.take_step import DUMMY_FRAMES, repeats_of
+from lab.capture.take_step import DUMMY_FRAMES, repeats_ahead
 from lab.capture_kinds.dark import DarkSequence
 from mocks.ready_frames import ReadyFrames
 from mocks.u3v import TriggerLine, U3vDevice
@@ -96,6 +96,8 @@ def test_frames_that_get_lost_are_taken_again_and_told(store: Store, devices: tu
 def test_repeats_of_a_step_are_counted() -> None:
     station = fake_station()
     first, *others = DarkSequence(exposures_s=(0.001, 0.01), frames=2).steps(station)
-    assert repeats_of(others[0], others[1:]) == 1  # the ladder turns: 0.01 s twice
-    assert repeats_of(first, others) == 0
-    assert repeats_of(first, [first.model_copy(update={"radiance": "spectra/x.csv"})]) == 0
+    assert repeats_ahead([first, *others]) == [0, 1, 0, 0]  # the ladder turns: 0.01 s twice
+    assert repeats_ahead([first, first, first]) == [2, 1, 0]
+    assert repeats_ahead([first, None, first]) == [0, 0, 0]
+    assert repeats_ahead([first, first.model_copy(update={"radiance": "spectra/x.csv"})]) == [0, 0]
+    assert repeats_ahead([]) == []

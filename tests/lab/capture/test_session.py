@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import NoAnswer
+from drivers.errors import InstrumentError, NoAnswer
 from drivers.instrument import Identity
 from lab.capture.plan import CapturePlan, full_plan
 from lab.capture.session import CaptureSession, Progress
@@ -219,6 +219,30 @@ def test_an_instrument_that_is_not_there_fails_before_anything_is_taken(store: S
     with pytest.raises(DeviceError, match="spectroradiometer at here"):
         session.run()
     assert bench.shots == 0
+    assert store.session(session.id).steps_done == 0
+
+
+@pytest.mark.parametrize(
+    ("method", "of", "message"),
+    [
+        ("configure", fake_bench.FakeCamera, "camera left: Gain 90 dB is outside 0..24 dB"),
+        ("check_nm", fake_bench.FakeMonochromator, "monochromator: 5000 nm is outside 0..1400 nm"),
+    ],
+)
+def test_what_the_plan_needs_and_an_instrument_refuses_is_told_before_anything_moves(
+    store: Store, monkeypatch: pytest.MonkeyPatch, method: str, of: type, message: str
+) -> None:
+    def refuse(instrument: Any, *asked: float) -> None:
+        raise InstrumentError(message)
+
+    bench = Bench()
+    monkeypatch.setattr(of, method, refuse)
+    monkeypatch.setattr(fake_bench.FakeStage, "place", lambda stage, target: bench.log.append("moved"))
+    session = begin(store, bench, LIT)
+    with pytest.raises(DeviceError, match=f"{message}; the plan needs it: see \\[limits\\]"):
+        session.run()
+    assert bench.shots == 0
+    assert "moved" not in bench.log
     assert store.session(session.id).steps_done == 0
 
 

@@ -1,7 +1,7 @@
-"""What cameras have in common that a GenICam library reaches: pypylon (`drivers.camera.basler`), Aravis (`drivers.camera.aravis`).
+"""What all GenICam cameras have in common, whatever reaches them: the project's own USB3 Vision (`drivers.camera.u3v`), or a library.
 
-The library finds the camera, reads its XML and queues the buffers. What is asked of the camera, in which order, and what counts as a
-good frame is here.
+What reaches the camera finds it, reads its XML and queues the buffers. What is asked of the camera, in which order, and what counts as
+a good frame is here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from typing import Protocol
 
@@ -19,6 +19,7 @@ from drivers.camera.base import TEMPERATURE_NS, Frame, SensorInfo, StreamingCame
 from drivers.camera.buffers import Grabbed
 from drivers.camera.genicam_settings import (
     Features,
+    Setting,
     black_level,
     give_pulses,
     set_if_there,
@@ -34,12 +35,12 @@ _LOOK_S = 0.1
 _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
 
 
-class _NoFrame(NoAnswer):
+class NoFrame(NoAnswer):
     """A frame is missing from a camera that answers otherwise."""
 
 
-class LibraryFeatures(Features, Protocol):
-    """A camera's features, as a library gives them."""
+class CameraFeatures(Features, Protocol):
+    """A camera's features, with limits and commands."""
 
     def limits(self, name: str) -> tuple[float, float]:
         """Least and greatest value of a number."""
@@ -48,13 +49,46 @@ class LibraryFeatures(Features, Protocol):
         """Run a command."""
 
 
-class LibraryCamera(StreamingCamera):
-    """One camera at the library's own `address`.
+class _Transcribed:
+    """Features whose values go into a transcript: what a library puts on the wire nobody sees."""
 
-    `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits. `timeout_s`: longest time beyond the exposure.
-    `trigger_line`: the input wired to the camera that leads, None: Line0; `Software`: none is wired, the computer triggers it right
-    after the other, milliseconds apart. `output_line`, `output_source`: on which the camera that leads gives its pulses.
+    def __init__(self, features: CameraFeatures, recorder: Recorder) -> None:
+        self._features, self._record = features, recorder
+
+    def has(self, name: str) -> bool:
+        return self._features.has(name)
+
+    def get(self, name: str) -> Setting:
+        value = self._features.get(name)
+        self._record("received", f"{name} = {value}".encode())
+        return value
+
+    def set(self, name: str, value: Setting) -> None:
+        self._record("sent", f"{name} = {value}".encode())
+        self._features.set(name, value)
+
+    def entries(self, name: str) -> Collection[str]:
+        return self._features.entries(name)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        return self._features.limits(name)
+
+    def execute(self, name: str) -> None:
+        self._record("sent", name.encode())
+        self._features.execute(name)
+
+
+class GenicamCamera(StreamingCamera):
+    """One camera at an `address` of whatever reaches it.
+
+    `pixel_format`: a format's name, or None for the deepest raw one of up to 14 bits (16 only if it has no other). `timeout_s`: longest
+    time beyond the exposure until a frame has arrived. `trigger_line`: the input wired to the camera that leads, None: Line0;
+    `Software`: none is wired, the computer triggers it right after the other, milliseconds apart. `output_line`: the output of the
+    camera that leads, on which `output_source` gives the pulses; None: it gives none.
     """
+
+    #: Whether the recorder is given the bytes on the wire; otherwise it is given the features that are read and written.
+    _records_bytes = False
 
     def __init__(
         self,
@@ -70,26 +104,27 @@ class LibraryCamera(StreamingCamera):
         self.address = address
         self._wanted_format, self._timeout_s = pixel_format, timeout_s
         self._wanted_line, self._output_line, self._output_source = trigger_line, output_line, output_source
-        self._record = recorder or (lambda direction, data: None)
+        self._recorder = recorder
         self._who = f"camera {address}"
         self._lock = threading.RLock()
         self._stopped = threading.Event()
-        self._features: LibraryFeatures | None = None
+        self._features: CameraFeatures | None = None
         self._identity = Identity("", "")
         self._format: PixelFormat = PREFERENCE[0]
         self._armed: Trigger | None = None
         self._exposure_s: float | None = None
         self._gain_db = 0.0
         self._fired: datetime | None = None
-        self._frame_id: int | None = None  # of the frame before, since acquisition started
+        self._owed = 0  # frames of software triggers that didn't come yet
+        self._before: tuple[int, int | None] | None = None  # number and time of the frame before
         self._has_temperature = False
         self._temperature: tuple[int, float] | None = None  # when (ns of the camera's clock), and degrees
 
-    # --- what a library does ----------------------------------------------------------------------------------------
+    # --- what reaches the camera --------------------------------------------------------------------------------------
 
     @abstractmethod
-    def _open(self) -> tuple[LibraryFeatures, Identity]:
-        """Find and open the camera."""
+    def _open(self) -> tuple[CameraFeatures, Identity]:
+        """Find and open the camera, and end an acquisition that was left running."""
 
     @abstractmethod
     def _start(self) -> None:
@@ -100,10 +135,6 @@ class LibraryCamera(StreamingCamera):
         """Stop acquisition, discard what is queued."""
 
     @abstractmethod
-    def _await_trigger_ready(self) -> None:
-        """Return once a software trigger will be heard."""
-
-    @abstractmethod
     def _grab(self, timeout_s: float) -> Grabbed | None:
         """The next buffer; None if none came in time."""
 
@@ -111,24 +142,38 @@ class LibraryCamera(StreamingCamera):
     def _release(self) -> None:
         """Let the camera go; may raise whatever the library raises."""
 
+    def _await_trigger_ready(self) -> None:
+        """Return once a software trigger will be heard: from the start of acquisition, where the camera says no more."""
+
+    def _give_trigger(self, features: CameraFeatures) -> None:
+        """The software trigger."""
+        features.execute("TriggerSoftware")
+
     # --- the abstraction --------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
         with self._lock:
             self._drop()
             try:
-                self._features, self._identity = self._open()
+                features, self._identity = self._open()
+                if self._recorder is not None and not self._records_bytes:
+                    features = _Transcribed(features, self._recorder)
+                self._features = features
                 self._who = f"camera {self._identity.serial_number or self.address}"
                 self._prepare(self._features)
             except InstrumentError:
                 self._drop()
                 raise
 
-    def _prepare(self, features: LibraryFeatures) -> None:
+    def _prepare(self, features: CameraFeatures) -> None:
         set_if_there(features, "AcquisitionMode", "Continuous")
         set_if_there(features, "ExposureMode", "Timed")
         switch_processing_off(features, self._who)
         set_if_there(features, "TriggerSelector", "FrameStart")
+        if not features.has("TriggerMode"):
+            raise InstrumentError(
+                f"{self._who}: it has no TriggerMode, so that it can't be told when to expose; use a camera that can be triggered"
+            )
         features.set("TriggerMode", "On")
         offered = features.entries("PixelFormat")
         names = [item.name for item in PREFERENCE] if self._wanted_format is None else [self._wanted_format]
@@ -178,7 +223,7 @@ class LibraryCamera(StreamingCamera):
             self._exposure_s = float(features.get(name)) * 1e-6
             self._gain_db = float(features.get("Gain")) if features.has("Gain") else 0.0
 
-    def _set_within(self, features: LibraryFeatures, name: str, value: float, unit: str) -> None:
+    def _set_within(self, features: CameraFeatures, name: str, value: float, unit: str) -> None:
         low, high = features.limits(name)
         if not low <= value <= high:  # a library may clamp it without a word
             raise InstrumentError(
@@ -197,7 +242,7 @@ class LibraryCamera(StreamingCamera):
                 if trigger == "line" and not self.follows_by_software:
                     line = trigger_line(features, self._who, self._wanted_line)
                 features.set("TriggerSource", line)
-                self._frame_id = None
+                self._before, self._owed = None, 0
                 self._start()
                 self._armed = trigger
             self._fired = datetime.now(UTC)
@@ -208,7 +253,8 @@ class LibraryCamera(StreamingCamera):
                 raise InstrumentError(f"{self._who}: it isn't armed for a software trigger; call arm first")
             self._await_trigger_ready()
             self._fired = datetime.now(UTC)
-            features.execute("TriggerSoftware")
+            self._give_trigger(features)
+            self._owed += 1
 
     def follow(self) -> None:
         if self.follows_by_software:
@@ -230,14 +276,22 @@ class LibraryCamera(StreamingCamera):
 
     def _next_frame(self, temperature_ns: int) -> Frame:
         with self._used() as features:
-            if self._armed is None or self._exposure_s is None or self._fired is None:
+            by_software = self._armed == "software" or self.follows_by_software
+            if (
+                self._armed is None
+                or self._exposure_s is None
+                or self._fired is None
+                or (by_software and not self._owed)
+            ):
                 raise InstrumentError(f"{self._who}: no frame was asked for; call arm and fire first")
             grabbed = self._await_frame(self._exposure_s)
-            if not grabbed.damage:
-                if grabbed.frame_id == self._frame_id != 0:  # 0 again: a camera that doesn't count
-                    raise Repeated(f"{self._who}: frame {grabbed.frame_id} came twice; it is dropped")
-                self._frame_id = grabbed.frame_id
-            raw, pixel_format = grabbed.unpacked(self._who)
+            try:
+                if not grabbed.damage:
+                    self._refuse_repeated(grabbed)
+                self._owed = max(0, self._owed - 1)
+                raw, pixel_format = grabbed.unpacked(self._who)
+            finally:
+                grabbed.give_back()
             return Frame(
                 raw,
                 self._exposure_s,
@@ -249,7 +303,14 @@ class LibraryCamera(StreamingCamera):
                 grabbed.camera_time_ns,
             )
 
-    def _temperature_c(self, features: LibraryFeatures, time_ns: int | None, most_ns: int) -> float | None:
+    def _refuse_repeated(self, grabbed: Grabbed) -> None:
+        """Raise `Repeated` for the frame before once more. A camera that doesn't count says 0: its clock tells then."""
+        now = grabbed.frame_id, grabbed.camera_time_ns
+        before, self._before = self._before, now
+        if before is not None and before[0] == now[0] and (now[0] != 0 or before[1] == now[1] is not None):
+            raise Repeated(f"{self._who}: frame {grabbed.frame_id} came twice; it is dropped")
+
+    def _temperature_c(self, features: CameraFeatures, time_ns: int | None, most_ns: int) -> float | None:
         """The sensor's temperature, read again where the one before is `most_ns` older than the frame."""
         if not self._has_temperature:
             return None
@@ -281,8 +342,8 @@ class LibraryCamera(StreamingCamera):
                 waited = ""
                 if self._armed == "line" and not self.follows_by_software:
                     waited = f"; it waited for {self._wanted_line or 'Line0'}: the camera that leads needs output_line"
-                raise _NoFrame(
-                    f"{self._who}: no frame within {self._timeout_s:g} s of its exposure of {exposure_s:g} s; check the cable{waited}"
+                raise NoFrame(
+                    f"{self._who}: no frame within {self._timeout_s:g} s of its exposure of {exposure_s:g} s; check the cable and the power{waited}"
                 )
 
     def stop(self) -> None:
@@ -301,7 +362,7 @@ class LibraryCamera(StreamingCamera):
     # --- inside -----------------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def _used(self) -> Iterator[LibraryFeatures]:
+    def _used(self) -> Iterator[CameraFeatures]:
         """The camera, connected anew after a failure, with the exposure it had."""
         with self._lock:
             if self._features is None:
@@ -311,7 +372,7 @@ class LibraryCamera(StreamingCamera):
             assert self._features is not None
             try:
                 yield self._features
-            except _NoFrame:
+            except NoFrame:
                 raise
             except (Disconnected, NoAnswer):
                 self._drop()

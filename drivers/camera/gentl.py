@@ -1,0 +1,333 @@
+"""Cameras of any maker through its GenTL producer (a `.cti` file), by harvesters: `calibench[gentl]`.
+
+Makers install their producers with their software, and name the folders in the environment variable GENICAM_GENTL64_PATH. A producer
+can be opened once in a process, and looking for cameras anew lets all of its cameras go: drivers share it, and it is closed with the
+last camera.
+
+Source: EMVA, GenICam GenTL 1.6; `harvesters` 1.4.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from drivers.camera.buffers import Grabbed
+from drivers.camera.genicam import GenicamCamera
+from drivers.camera.genicam_settings import Setting
+from drivers.errors import Disconnected, InstrumentError, InUse
+from drivers.instrument import Identity
+
+_T = TypeVar("_T")
+_logger = logging.getLogger(__name__)  # the library tells here what it also raises
+_logger.addHandler(logging.NullHandler())
+SEARCH_PATH = "GENICAM_GENTL64_PATH"
+_BUFFERS = 4
+#: The library asks a producer with Python's lock held: it is asked for so long (s), and again after so long.
+_ASK_S, _REST_S = 1e-4, 2e-3
+
+
+def _library() -> Any:
+    """The module `harvesters.core`. Raises `InstrumentError` where it isn't installed."""
+    try:
+        from harvesters import core
+    except ImportError as error:
+        raise InstrumentError("GenTL cameras: harvesters isn't installed; install calibench[gentl]") from error
+    return core
+
+
+def _said(error: Exception) -> str:
+    """What the library says, without its numbers and the place in its sources."""
+    said = str(error).removeprefix("GenTL exception: ").split(" : ")[0].split(" (Message from the source")[0]
+    return " ".join(said.split())
+
+
+class _Nodes:
+    """A camera's features through GenICam's reference GenApi."""
+
+    def __init__(self, nodes: Any, who: str) -> None:
+        from genicam import genapi, gentl
+
+        self._nodes, self._who, self._genapi, self._gentl = nodes, who, genapi, gentl
+
+    def _do(self, name: str, action: Callable[[Any], _T]) -> _T:
+        try:
+            return action(self._nodes.get_node(name))
+        except self._gentl.GenericException as error:
+            raise Disconnected(
+                f"{self._who}: feature {name}: {_said(error)}; plug it in again, the next call reconnects"
+            ) from error
+        except self._genapi.GenericException as error:
+            raise InstrumentError(
+                f"{self._who}: feature {name}: {_said(error)}; check that the camera is there and has it"
+            ) from error
+
+    def has(self, name: str) -> bool:
+        return bool(self._nodes.has_node(name)) and self._do(name, lambda node: bool(self._genapi.is_available(node)))
+
+    def get(self, name: str) -> Setting:
+        return self._do(name, lambda node: node.value)
+
+    def set(self, name: str, value: Setting) -> None:
+        self._do(name, lambda node: setattr(node, "value", value))
+
+    def entries(self, name: str) -> Collection[str]:
+        return self._do(name, lambda node: tuple(node.symbolics))
+
+    def limits(self, name: str) -> tuple[float, float]:
+        return self._do(name, lambda node: (float(node.min), float(node.max)))
+
+    def execute(self, name: str) -> None:
+        self._do(name, lambda node: node.execute())
+
+
+class _Producer:
+    """One producer and its cameras, shared by the drivers of this process; open while one of them has a camera."""
+
+    _all: dict[Path, _Producer] = {}
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._lock = threading.RLock()
+        self._harvester: Any = None
+        self._taken = 0
+
+    @classmethod
+    def of(cls, file: Path) -> _Producer:
+        """The producer of a file."""
+        return cls._all.setdefault(file.resolve(), cls(file.resolve()))
+
+    @contextmanager
+    def _open(self) -> Iterator[list[Any]]:
+        """What it says of its cameras. Raises `InstrumentError` for a file that is none."""
+        with self._lock:
+            if self._harvester is None:
+                core = _library()
+                harvester = core.Harvester(config=core.ParameterSet({core.ParameterKey.LOGGER: _logger}))
+                try:
+                    harvester.add_file(str(self._file), check_existence=True, check_validity=True)
+                except OSError as error:
+                    raise InstrumentError(
+                        f"{self._file}: it isn't a GenTL producer ({' '.join(str(error).split()) or 'no such file'}); "
+                        "correct producer in the station file"
+                    ) from error
+                harvester.update()
+                self._harvester = harvester
+            try:
+                yield self._harvester.device_info_list
+            finally:
+                self._close_unused()
+
+    def _close_unused(self) -> None:
+        if self._taken == 0 and self._harvester is not None:
+            harvester, self._harvester = self._harvester, None
+            harvester.reset()
+
+    def cameras(self) -> list[tuple[str, str]]:
+        """(address, what it is) of each."""
+        with self._open() as found:
+            return [
+                (
+                    _told(one, "serial_number") or one.id_,
+                    " ".join(filter(None, (_told(one, name) for name in ("vendor", "model", "serial_number")))),
+                )
+                for one in found
+            ]
+
+    def take(self, address: str, description: str | None) -> Any:
+        """The camera with this serial number, identifier or name, opened; None if it has none such."""
+        core = _library()
+        key = core.ParameterKey
+        asked: dict[Any, Any] = {
+            key.NUM_BUFFERS_FOR_FETCH_CALL: _BUFFERS,
+            key.TIMEOUT_PERIOD_ON_UPDATE_EVENT_DATA_CALL: 0,
+            key.ENABLE_AUTO_CHUNK_DATA_UPDATE: False,
+        }
+        if description is not None:
+            asked[key.REMOTE_DEVICE_SOURCE_XML_FILE_PATH] = description
+        with self._open() as found:
+            for one in found:
+                if address in (_told(one, name) for name in ("serial_number", "id_", "user_defined_name")):
+                    with _interrupts_kept():
+                        acquirer = self._harvester.create(one, config=core.ParameterSet(asked))
+                    self._taken += 1
+                    return acquirer
+        return None
+
+    def give_back(self, acquirer: Any) -> None:
+        """Let a camera go."""
+        with self._lock:
+            self._taken -= 1
+            try:
+                self._harvester.image_acquirers.remove(acquirer)
+                acquirer.destroy()
+            finally:
+                self._close_unused()
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """The library puts a handler of its own in the place of Ctrl-C's; take it away again."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    kept = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, kept)
+
+
+def _producers(file: str | None) -> list[_Producer]:
+    """That of a file, or all that are installed."""
+    if file is not None:
+        return [_Producer.of(Path(file).expanduser())]
+    folders = [Path(one) for one in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if one]
+    return [_Producer.of(found) for folder in folders for found in sorted(folder.glob("*.cti"))]
+
+
+class GentlCamera(GenicamCamera):
+    """The camera that a producer knows by the serial number, identifier or name `address`.
+
+    `producer`: its `.cti` file; None: all in the folders of GENICAM_GENTL64_PATH. `description`: a GenICam XML file to be taken instead
+    of the camera's own. `settings`: those of `GenicamCamera`.
+    """
+
+    _producer: _Producer
+    _acquirer: Any = None
+    _incomplete = False
+
+    def __init__(
+        self, address: str, *, producer: str | None = None, description: str | None = None, **settings: Any
+    ) -> None:
+        super().__init__(address, **settings)
+        self._producer_file, self._description = producer, description
+
+    @staticmethod
+    def enumerate_cameras() -> Iterator[tuple[str, str]]:
+        """(address, what it is) of every camera that the installed producers find."""
+        _library()
+        for producer in _producers(None):
+            yield from producer.cameras()
+
+    def _open(self) -> tuple[_Nodes, Identity]:
+        core = _library()
+        producers = _producers(self._producer_file)
+        if not producers:
+            raise InstrumentError(
+                f"camera {self.address}: no GenTL producer is installed; install the maker's software, which names it in {SEARCH_PATH}, or "
+                "name its .cti file as producer in the station file"
+            )
+        self._acquirer = next((found for found in map(self._take_from, producers) if found is not None), None)
+        if self._acquirer is None:
+            there = ", ".join(address for producer in producers for address, _ in producer.cameras()) or "none"
+            raise Disconnected(
+                f"camera {self.address}: the GenTL producers find no such camera; there are: {there}; is it plugged in?"
+            )
+        note = core.Callback()
+        note.emit = self._note_incomplete
+        self._acquirer.add_callback(self._acquirer.Events.INCOMPLETE_BUFFER, note)
+        nodes = _Nodes(self._acquirer.remote_device.node_map, f"camera {self.address}")
+        told = self._acquirer.device
+        versions = (name for name in ("DeviceFirmwareVersion", "DeviceVersion") if nodes.has(name))
+        firmware = next((str(nodes.get(name)) for name in versions), "")
+        return nodes, Identity(
+            _told(told, "vendor") or "", _told(told, "model") or "", _told(told, "serial_number") or told.id_, firmware
+        )
+
+    def _take_from(self, producer: _Producer) -> Any:
+        from genicam import genapi, gentl
+
+        self._producer = producer
+        try:
+            return producer.take(self.address, self._description)
+        except (gentl.ResourceInUseException, gentl.AccessDeniedException) as error:
+            raise InUse(
+                f"camera {self.address}: in use by another program or another instrument of the station; close that one"
+            ) from error
+        except (gentl.GenericException, genapi.GenericException) as error:
+            raise Disconnected(
+                f"camera {self.address}: can't be opened ({_said(error)}); plug it in again, and close other programs that use it"
+            ) from error
+
+    def _start(self) -> None:
+        self._do("starting", self._acquirer.start)
+
+    def _halt(self) -> None:
+        self._do("stopping", self._acquirer.stop)
+
+    def _grab(self, timeout_s: float) -> Grabbed | None:
+        until = time.monotonic() + timeout_s
+        while True:
+            self._incomplete = False
+            grabbed = self._do("reading a frame", self._asked)
+            if grabbed is not None:
+                return grabbed
+            if self._incomplete:
+                return Grabbed(b"", 0, 0, 0, 0, damage="the producer says that it is incomplete")
+            if time.monotonic() >= until:
+                return None
+            time.sleep(_REST_S)
+
+    def _asked(self) -> Grabbed | None:
+        buffer = self._acquirer.try_fetch(timeout=_ASK_S, is_raw=True)
+        return None if buffer is None else self._grabbed(buffer)
+
+    def _grabbed(self, buffer: Any) -> Grabbed:
+        """Its memory is the library's own: it is filled again once it is given back."""
+        from genicam import gentl
+
+        kinds = gentl.PAYLOADTYPE_INFO_IDS
+        whole = buffer.payload_type in (kinds.PAYLOAD_TYPE_IMAGE, kinds.PAYLOAD_TYPE_CHUNK_DATA)
+        return Grabbed(
+            payload=np.frombuffer(
+                buffer.raw_buffer, np.uint8, offset=(_told(buffer, "image_offset") or 0) if whole else 0
+            ),
+            rows=int(buffer.height) if whole else 0,
+            cols=int(buffer.width) if whole else 0,
+            code=_told(buffer, "pixel_format") or self._format.code,
+            frame_id=int(buffer.frame_id),
+            padding=_told(buffer, "padding_x") or 0,
+            damage=""
+            if whole
+            else f"it isn't one picture (payload type {buffer.payload_type}): switch other components off",
+            camera_time_ns=_told(buffer, "timestamp_ns"),
+            give_back=lambda: self._do("queueing a buffer", lambda: buffer.parent.queue_buffer(buffer)),
+        )
+
+    def _note_incomplete(self, context: object = None) -> None:
+        self._incomplete = True
+
+    def _do(self, doing: str, action: Callable[[], _T]) -> _T:
+        from genicam import genapi, gentl
+
+        try:
+            return action()
+        except (gentl.GenericException, genapi.GenericException) as error:
+            raise Disconnected(
+                f"{self._who}: {doing} failed ({_said(error)}); plug it in again, the next call reconnects"
+            ) from error
+
+    def _release(self) -> None:
+        acquirer, self._acquirer = self._acquirer, None
+        if acquirer is not None:
+            self._producer.give_back(acquirer)
+
+
+def _told(of: Any, name: str) -> Any:
+    """What a producer says of a camera or a buffer; None where it doesn't."""
+    from genicam import gentl
+
+    try:
+        return getattr(of, name)
+    except gentl.GenericException:
+        return None

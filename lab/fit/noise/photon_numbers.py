@@ -1,0 +1,84 @@
+"""Photons on a pixel by the irradiance that a reference photodiode measured, for flats whose manifest states no number of photons.
+
+    n = E A t wavelength / (h c)
+
+E: irradiance in the plane of the sensor; A: area of a pixel, the square of the pitch; t: exposure. Source: EMVA 1288 release 4.0, eq. 3.
+The photodiode stands where the sensor is, and the camera has no lens: behind one the sensor's irradiance is another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lab.capture_kinds.flat import FlatCapture
+from lab.formats.recording_set import DataSheet
+
+#: Irradiances of one exposure that differ by less are one level: sd of their readings, and a share that lamps move by.
+SAME_SIGMA, SAME_SHARE = 4.0, 0.005
+
+
+@dataclass(frozen=True)
+class PhotonNumber:
+    """Photons on a pixel in one exposure, with relative standard uncertainties: `std` by the readings of the irradiance, `calibration_std`
+    by the photodiode's calibration, which is common to all numbers of its captures."""
+
+    photons: float
+    std: float
+    calibration_std: float
+
+
+def why_not(flats: Sequence[FlatCapture], camera: DataSheet) -> str | None:
+    """Why measured irradiances give no numbers of photons; None where they do, or where none was measured."""
+    if not any(flat.photon_irradiance_per_m2_s and flat.photons_per_pixel is None for flat in flats):
+        return None
+    if camera.f_number is not None:
+        return (
+            f"the flats' irradiances give no numbers of photons: the data sheet states a lens (f/{camera.f_number:g}), and the photodiode "
+            "doesn't look through it; take the lens off for them, and f_number out of the data sheet"
+        )
+    if camera.pixel_pitch_um is None:
+        return (
+            "the flats' irradiances give no numbers of photons: pixel_pitch_um is unknown; state it in the data sheet"
+        )
+    return None
+
+
+def photon_numbers(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str, PhotonNumber]:
+    """Photons by the id of the capture, of flats that have an irradiance and state no photons. Flats of one exposure whose irradiances
+    agree are one level, and have its mean."""
+    if why_not(flats, camera) is not None or camera.pixel_pitch_um is None:
+        return {}
+    area_m2 = (camera.pixel_pitch_um * 1e-6) ** 2
+    measured = [
+        (flat, rate * area_m2 * flat.exposure_s)
+        for flat in flats
+        if flat.photons_per_pixel is None and (rate := flat.photon_irradiance_per_m2_s) is not None and rate > 0.0
+    ]
+    measured.sort(key=lambda one: (one[0].exposure_s, one[0].wavelength_nm or 0.0, one[1]))
+    levels: list[list[tuple[FlatCapture, float]]] = []
+    for flat, photons in measured:
+        if levels and _same_level(levels[-1][-1], (flat, photons)):
+            levels[-1].append((flat, photons))
+        else:
+            levels.append([(flat, photons)])
+    found: dict[str, PhotonNumber] = {}
+    for level in levels:
+        numbers = np.array([photons for _, photons in level])
+        mean = float(numbers.mean())
+        told = math.sqrt(sum(flat.irradiance_readings_sd**2 for flat, _ in level)) / len(level)
+        seen = float(numbers.std(ddof=1)) / mean / math.sqrt(len(level)) if len(level) > 1 else 0.0
+        calibration = max(flat.irradiance_calibration_sd for flat, _ in level)
+        found |= {flat.id: PhotonNumber(mean, max(told, seen), calibration) for flat, _ in level}
+    return found
+
+
+def _same_level(before: tuple[FlatCapture, float], now: tuple[FlatCapture, float]) -> bool:
+    (first, fewer), (second, more) = before, now
+    if (first.exposure_s, first.wavelength_nm) != (second.exposure_s, second.wavelength_nm):
+        return False
+    sd = math.hypot(first.irradiance_readings_sd, second.irradiance_readings_sd)
+    return more - fewer <= max(SAME_SIGMA * sd, SAME_SHARE) * fewer

@@ -1,0 +1,171 @@
+"""Clients that know nothing of calibench, on each mock after the project's driver has used the instrument and let it go.
+
+They are packages of the index (the extra `dev`). For the specbos, the CR-250 and USB3 Vision cameras it has none that this environment
+takes; seabreeze is what the driver of the Ocean Optics spectrometers stands on.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import usb.core
+
+from drivers.monochromator.cornerstone260 import Cornerstone260
+from drivers.monochromator.cornerstone260b import Cornerstone260B
+from drivers.photodiode.scpi import ScpiPhotodiode
+from drivers.spectroradiometer.ocean_optics import OceanOptics
+from drivers.spectroradiometer.pr655 import Pr655
+from mocks.bench import Bench
+from mocks.cornerstone260 import MockCornerstone260
+from mocks.cornerstone260b import MockCornerstone260B
+from mocks.lamp import Lamp
+from mocks.pr655 import PhotoResearch
+from mocks.scpi_meter import AREA_M2, DARK_A, NOISE_A, MockScpiMeter
+from mocks.scpi_meter import calibration_csv as diode_calibration
+from mocks.usb import InProcessBackend
+from mocks.usb2000plus import PIXELS, MockUsb2000Plus, calibration_csv
+from mocks.wire import Pty, Tcp
+from tests.peers import missing
+
+
+def client(name: str) -> Any:
+    """The module of that name."""
+    try:
+        __import__(name)
+    except ImportError as error:
+        missing(f"{error}; install calibench[dev]")
+    return sys.modules[name]
+
+
+def test_cornerstone260_by_oriel_cornerstone_260(served: Callable[..., str], tmp_path: Path) -> None:
+    other = client("oriel_cornerstone_260")
+    address = served(MockCornerstone260(Bench()), Pty(tmp_path / "mono"))
+    with Cornerstone260(address) as mono:
+        mono.move_nm(500.0)
+        mono.open_shutter()
+    theirs = other.Monochromator(address)
+    try:
+        # were the handshake still on, a stray status byte would stand in the place of an answer
+        assert theirs.position == pytest.approx(500.0)
+        assert theirs.shuttered
+        assert theirs.goto(632.8) == pytest.approx(632.8, abs=0.1)
+        theirs.shutter(close=False)
+        assert not theirs.shuttered
+        theirs.set_filter(3)
+        assert theirs.filter == 3
+        assert theirs.slit_width(1, 800) == 800
+        assert theirs.grating["lines"] == 1200
+    finally:
+        theirs.disconnect()
+    with Cornerstone260(address) as mono:
+        assert mono.wavelength_nm() == pytest.approx(632.8, abs=0.1)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_cornerstone260b_by_python_usbtmc() -> None:
+    other = client("usbtmc")
+    backend = InProcessBackend([MockCornerstone260B(Bench())])
+    device = usb.core.find(backend=backend)
+    with Cornerstone260B("usb://mock", device=device) as mono:
+        mono.move_nm(500.0)
+    theirs = other.Instrument(usb.core.find(backend=backend))
+    try:
+        assert "CS260B" in theirs.ask("*idn?")
+        assert float(theirs.ask("wave?")) == pytest.approx(500.0, abs=0.1)
+        theirs.write("gowave 600")
+        assert theirs.ask("*opc?").strip() == "1"
+        assert float(theirs.ask("wave?")) == pytest.approx(600.0, abs=0.1)
+        assert theirs.ask("system:error?").startswith("0")
+    finally:
+        theirs.close()
+    with Cornerstone260B("usb://mock", device=usb.core.find(backend=backend)) as mono:
+        assert mono.wavelength_nm() == pytest.approx(600.0, abs=0.1)
+
+
+@pytest.fixture
+def psychopy_logging(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client wants nothing of PsychoPy (1 GB) but its logger."""
+    stub = types.ModuleType("psychopy")
+    stub.logging = logging.getLogger("psychopy")  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "psychopy", stub)
+
+
+@pytest.mark.usefixtures("psychopy_logging")
+@pytest.mark.parametrize(("model", "step_nm"), [("PR-655", 4.0), ("PR-670", 2.0)])
+def test_pr655_by_psychopy_photoresearch(
+    served: Callable[..., str], tmp_path: Path, model: str, step_nm: float
+) -> None:
+    other = client("psychopy_photoresearch")
+    address = served(PhotoResearch(Lamp(20.0), model=model), Pty(tmp_path / "pr"))
+    with Pr655(address) as ours:
+        expected = ours.measure().radiance_w_sr_m2_nm
+    theirs = other.PR655(address)
+    try:
+        assert theirs.OK
+        assert theirs.getDeviceType() == model
+        theirs.measure()
+        wavelength_nm, power = theirs.lastSpectrum
+        assert theirs.lastLum > 0.0
+    finally:
+        theirs.endRemoteMode()
+        theirs.com.close()
+    # the client drops two lines of a header that has one or two, so that the first wavelength may be missing
+    assert np.diff(wavelength_nm) == pytest.approx(step_nm)
+    own_nm, own = expected.arrays
+    # two measurements of one lamp: 1 % of the spectrum's mean
+    assert power == pytest.approx(np.interp(wavelength_nm, own_nm, own), abs=0.01 * own.mean())
+    with Pr655(address) as ours:
+        assert ours.identity().model == model
+
+
+def test_scpi_meter_by_pyvisa(served: Callable[..., str], tmp_path: Path) -> None:
+    other = client("pyvisa")
+    host, _, port = served(MockScpiMeter(Lamp(0.0)), Tcp("127.0.0.1", 0)).removeprefix("socket://").partition(":")
+    address = f"TCPIP0::{host}::{port}::SOCKET"
+    file = tmp_path / "diode.csv"
+    file.write_text(diode_calibration())
+    with ScpiPhotodiode(address, calibration=str(file), area_mm2=1e6 * AREA_M2, calibration_sd_percent=0.5) as ours:
+        ours.measure_dark()
+    manager = other.ResourceManager("@py")
+    theirs = manager.open_resource(address, read_termination="\n", write_termination="\n", timeout=5000)
+    try:
+        assert theirs.query("*IDN?").split(",")[1] == "MODEL 6485"
+        # 5 standard deviations of one reading
+        assert float(theirs.query("READ?").split("A")[0]) == pytest.approx(DARK_A, abs=5.0 * NOISE_A)
+        assert theirs.query("SYST:ERR?").startswith("0")
+    finally:
+        theirs.close()
+        manager.close()
+
+
+def test_usb2000plus_by_seabreeze(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from seabreeze import pyseabreeze
+    from seabreeze.pyseabreeze.devices import SeaBreezeDevice
+    from seabreeze.pyseabreeze.transport import USBTransportHandle
+    from seabreeze.spectrometers import Spectrometer
+
+    monkeypatch.setattr(Spectrometer, "_backend", pyseabreeze)  # that of pyusb, which takes a device
+    backend = InProcessBackend([MockUsb2000Plus(Lamp(20.0))])
+    file = tmp_path / "response.csv"
+    file.write_text(calibration_csv())
+    with OceanOptics("usb://mock", calibration=str(file), device=usb.core.find(backend=backend), averages=1) as ours:
+        serial_number = ours.identity().serial_number
+        ours.measure()
+    theirs = Spectrometer(SeaBreezeDevice(USBTransportHandle(usb.core.find(backend=backend))))
+    try:
+        assert (theirs.model, theirs.serial_number) == ("USB2000PLUS", serial_number)
+        theirs.integration_time_micros(1_000_000)
+        counts = theirs.intensities()
+        assert counts.size == PIXELS
+        assert counts.max() > 2.0 * counts.min() > 0.0
+    finally:
+        theirs.close()
+    with OceanOptics("usb://mock", calibration=str(file), device=usb.core.find(backend=backend), averages=1) as ours:
+        assert ours.identity().serial_number == serial_number
