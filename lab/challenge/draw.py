@@ -125,7 +125,7 @@ def draw(
         session = spoilt(session, fault, rng)
     concealed = tuple(
         Concealed(
-            name=one.name, effect=one.effect, variant=one.variant, strength=one.strength, unit=one.unit,
+            name=one.name, effect=one.listed_effect, variant=one.variant, strength=one.strength, unit=one.unit,
             parameters=one.library_parameters(), noncentrality=size, conditional=fair.conditional, separability=fair.separability,
             nearest_rival=fair.rival,
         )
@@ -220,7 +220,7 @@ def _sized(
     fair, oracle = [FairStrength(None, None, None) for _ in laws], None
     if against is not None:
         accepts, rng = against
-        effects = [one.effect for one in laws]
+        effects = [one.listed_effect for one in laws]
         library = library_changes(none[0])
         fair, oracle = fair_strengths(whole, without, library, effects, accepts, rng)
         ratios = [t / max(f.conditional or t, INVISIBLE) for t, f in zip(targets, fair, strict=True)]

@@ -61,6 +61,8 @@ class Linearity:
     """The linearity line of EMVA 1288: offset + slope light.
 
     `deviation_percent` (n,): deviations from the line, relative to it. `error_percent`: their mean modulus.
+    `error_noise_percent`: its standard deviation from recording to recording. `error_bias_percent`: by how much noise
+    raises it on average, as a modulus has no sign.
     """
 
     offset: float
@@ -68,34 +70,66 @@ class Linearity:
     slope_std: float
     deviation_percent: FloatArray
     error_percent: float
-    error_percent_std: float
+    error_noise_percent: float
+    error_bias_percent: float
+
+    @property
+    def error_percent_std(self) -> float:
+        """Root mean square error of `error_percent` about that of the response without noise."""
+        return float(np.hypot(self.error_noise_percent, self.error_bias_percent))
 
 
-def linearity(light: FloatArray, signal: FloatArray, signal_std: FloatArray) -> Linearity:
+def linearity(light: FloatArray, signal: FloatArray, covariance_dn2: FloatArray) -> Linearity:
     """The line through (light, signal), each (n,), of least relative deviations, and the linearity error (EMVA 1288
     release 4.0).
 
     The error is the mean modulus of the relative deviations in percent. All points are used: give those within 5..95 %
-    of saturation. The uncertainty holds the noise of the points `signal_std`, and what that noise adds to a modulus on
-    average.
+    of saturation. Its uncertainty holds the noise of the points, of `covariance_dn2` (n, n), less what the line takes
+    of it, and what that noise adds to a modulus on average (`_mean_modulus_errors`).
     """
     basis = np.stack([np.ones_like(light), light], axis=1)
     solution, covariance, chi2 = least_squares(basis, signal, signal)
     model = basis @ solution
     deviation = 100.0 * (signal - model) / model
-    std = 100.0 * signal_std / model
-    error = np.abs(deviation)
-    z = error / np.maximum(std, 1e-12)
-    folded = std * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z**2) + error * (1.0 - 2.0 * special.ndtr(-z))
+    # The line takes two degrees of freedom of the relative noise
+    directions, _ = np.linalg.qr(basis / signal[:, None])
+    rest = np.eye(light.size) - directions @ directions.T
+    noise, bias = _mean_modulus_errors(deviation, rest @ (1e4 * covariance_dn2 / np.outer(model, model)) @ rest)
     reduced_chi2 = chi2 / max(len(light) - 2, 1)
     return Linearity(
         float(solution[0]),
         float(solution[1]),
         float(np.sqrt(covariance[1, 1] * reduced_chi2)),
         deviation,
-        float(error.mean()),
-        float(np.hypot(np.sqrt(np.sum(std**2)) / len(std), np.mean(folded - error))),
+        float(np.abs(deviation).mean()),
+        noise,
+        bias,
     )
+
+
+def _mean_modulus_errors(values: FloatArray, covariance: FloatArray) -> tuple[float, float]:
+    """Standard deviation of mean |x|, and its bias, for normal x (n,) of `covariance` (n, n), drawn once as `values`.
+
+    The mean of |x| for x ~ N(m, s^2) is m (2 Phi(m / s) - 1) + 2 s phi(m / s) (the folded normal distribution), and
+    the covariance of two moduli, after Price's theorem, the series of c^k / k! times the means of their k-th
+    derivatives, of which the first two orders are taken. m isn't known. `values` stand for it, scaled to the part of
+    their mean square that noise doesn't explain, less one standard deviation of that part: so noise isn't taken for
+    a departure, and what it adds to the modulus isn't understated.
+    """
+    square = float(values @ values)
+    std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    excess = max(square - float(std @ std), 0.0)
+    scaled = values * np.sqrt(excess / max(square, 1e-300))
+    excess -= float(np.sqrt(2.0 * np.sum(covariance**2) + 4.0 * scaled @ covariance @ scaled))
+    mean = values * np.sqrt(max(excess, 0.0) / max(square, 1e-300))
+    z = mean / std
+    first = 2.0 * special.ndtr(z) - 1.0
+    second = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z**2) / std
+    folded = mean * first + std**2 * second
+    of_moduli = np.outer(first, first) * covariance + 0.5 * np.outer(second, second) * covariance**2
+    np.fill_diagonal(of_moduli, np.maximum(mean**2 + std**2 - folded**2, 0.0))
+    noise = float(np.sqrt(max(of_moduli.sum(), 0.0))) / values.size
+    return noise, float(np.mean(folded - np.abs(mean)))
 
 
 def root(square: float, square_std: float) -> tuple[float, float]:

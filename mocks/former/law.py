@@ -64,6 +64,11 @@ class Law:
         """A generator of the law's own; the same key gives the same numbers."""
         return np.random.default_rng([self.seed, 78, *key])
 
+    @property
+    def listed_effect(self) -> str | None:
+        """Name of this variant in the list of effects; None where that list has none."""
+        return self.effect
+
     def library_parameters(self) -> dict[str, float]:
         """True values of the parameters that the library's effect of this name has, where the variant defines the same quantity."""
         return {}

@@ -37,13 +37,25 @@ class AdcNonlinearity(Effect):
     second_dn: Annotated[
         float,
         Quantity(
-            "DN", "error of the second-highest bit's weight", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0
+            "DN",
+            "error of the second-highest bit's weight",
+            lower=-50.0,
+            upper=50.0,
+            prior=(0.0, 1.0),
+            absent=0.0,
+            dispensable=True,
         ),
     ] = 0.0
     third_dn: Annotated[
         float,
         Quantity(
-            "DN", "error of the third-highest bit's weight", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0
+            "DN",
+            "error of the third-highest bit's weight",
+            lower=-50.0,
+            upper=50.0,
+            prior=(0.0, 1.0),
+            absent=0.0,
+            dispensable=True,
         ),
     ] = 0.0
 

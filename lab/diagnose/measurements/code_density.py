@@ -6,6 +6,7 @@ a finer scale comes from the converter (differential nonlinearity), or from proc
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -32,13 +33,12 @@ LEAST_COUNT = 30.0  # of a code that is looked at
 WIDEST = 24  # codes on either side of a smooth curve
 DEGREE = 4
 LEAST_CODES = 24
-#: Boundaries at which the highest bits change, and what a step there is worth at least (DN): smooth curves' own error.
-SIXTEENTHS = 16
-NEAR, FAR = (
-    4,
-    1.3,
-)  # codes about a boundary; of the noise's standard deviation, the distance over which the curve is fitted
-STEP_FLOOR = 0.02
+PLACES = 128  # parts of the converter's range, at whose borders steps are looked for
+LEAST_SPACING = 4  # codes from one place to the next
+FAR = 1.3  # of the noise's standard deviation: distance over which the curve beside a place is fitted
+DEGREE_BESIDE = 1
+STEP_COUNT = 3.0  # of each code about a place; the sum over a place has a hundred times as many
+STEP_FLOOR = 0.02  # what a step is worth at least (DN): smooth curves' own error
 COMB_FLOOR = 3e-4
 VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
 #: Frequencies of the combs, cycles a code.
@@ -64,8 +64,8 @@ class _Codes:
 
 
 def code_block(study: Study) -> Block:
-    """Code-density test of all uniform light: steps (DN) where a high bit changes, combs of a few codes' period, and the variance of the
-    counts about a smooth curve."""
+    """Code-density test of all uniform light: steps (DN) by the code, combs of a few codes' period, and the variance of the counts about a
+    smooth curve."""
     counts = _counted(study)
     joined = int(np.bitwise_or.reduce(np.flatnonzero(sum(c.count for c in counts.values()))))
     apart = joined & -joined  # the largest power of two that divides every code
@@ -93,7 +93,7 @@ def code_block(study: Study) -> Block:
         linear = np.vstack([steps, combs])
         floor = np.concatenate([np.full(len(steps), STEP_FLOOR), np.full(len(combs), COMB_FLOOR)])
         covariances += [
-            (linear * np.maximum(codes.expected, 1.0)) @ linear.T + np.diag(np.square(floor)),
+            _covariance(linear, codes, counts[held_out]) + np.diag(np.square(floor)),
             np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
         ]
         members = tuple(counts[held_out].captures)
@@ -118,7 +118,7 @@ def code_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         found = []
         for codes, linear, parts in sets:
-            change = codes.smooth * (_widths(codes, effects, study) - 1.0)
+            change = codes.expected * (_widths(codes, effects, study) - 1.0)
             moved = codes.rough @ change
             found += [linear @ change, np.array([p.excess(moved) for p in parts])]
         return Prediction(np.concatenate(found), {})
@@ -132,23 +132,28 @@ def code_block(study: Study) -> Block:
 
 @dataclass(frozen=True)
 class _Counts:
-    """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal converter."""
+    """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal converter; `groups`: pixels
+    of one level, as their first code, their number, and the probabilities of their codes."""
 
     count: FloatArray
     expected: FloatArray
     captures: list[str]
+    groups: list[tuple[int, int, FloatArray]]
 
     def take(self, study: Study, capture: Any) -> None:
         """Add a capture's frame."""
         frame = study.recordings.frame(capture)
         self.count[:] += np.bincount(frame.ravel(), minlength=len(self.count))[: len(self.count)]
         for plane in mosaic.planes(frame, study.camera.cfa).values():
-            _expect(np.asarray(plane, np.float32), study, self.expected)
+            for first, number, probability in _levels(np.asarray(plane, np.float32), study):
+                last = min(first + len(probability), len(self.expected))
+                self.expected[first:last] += number * probability[: last - first]
+                self.groups.append((first, number, probability))
         self.captures.append(capture.id)
 
 
-def _expect(plane: Any, study: Study, expected: FloatArray) -> None:
-    """Add the expected counts of a plane's pixels to `expected`.
+def _levels(plane: Any, study: Study) -> Iterator[tuple[int, int, FloatArray]]:
+    """A plane's pixels by level, as `_Counts.groups`.
 
     Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels. Its variance is proportional to the signal above
     black, and scaled so that its mean is the measured mean square of the departures from the local mean.
@@ -169,16 +174,15 @@ def _expect(plane: Any, study: Study, expected: FloatArray) -> None:
         if n == 0:
             continue
         sigma = np.sqrt(max(variance * max(middle - study.noise.black, 1.0) / signal + added, 1e-2))
-        low, high = max(int(middle - 6.0 * sigma), 0), min(int(middle + 6.0 * sigma) + 1, len(expected) - 1)
-        if low < high:
-            edges = (np.arange(low, high + 2) - 0.5 - middle) / sigma
-            expected[low : high + 1] += n * np.diff(ndtr(edges))
+        low = max(int(middle - 6.0 * sigma), 0)
+        edges = (np.arange(low, int(middle + 6.0 * sigma) + 3) - 0.5 - middle) / sigma
+        yield low, int(n), np.diff(ndtr(edges))
 
 
 def _counted(study: Study) -> dict[bool, _Counts]:
     """Counts of all flat and narrowband frames without gain in dB: seen (False) and held out (True)."""
     size = int(study.camera.white_level_dn) + 1
-    counts = {out: _Counts(np.zeros(size), np.zeros(size), []) for out in (False, True)}
+    counts = {out: _Counts(np.zeros(size), np.zeros(size), [], []) for out in (False, True)}
     out = set(study.once(held_out_flats))
     groups = study.groups(NarrowbandCapture, lambda c: (c.wavelength_nm, c.exposure_s, c.radiance))
     out |= set().union(*(held_out_of(g, i, len(groups)) for i, g in enumerate(groups))) if groups else set()
@@ -230,6 +234,18 @@ def _smoothing(half: int) -> FloatArray:
     return np.asarray(np.linalg.pinv(np.vander(x, DEGREE + 1, increasing=True))[0])
 
 
+def _covariance(linear: FloatArray, codes: _Codes, counts: _Counts) -> FloatArray:
+    """Covariance of `linear` (m, codes) @ counts. Each pixel has one code: the counts of a group's pixels are multinomial."""
+    found = (linear * np.maximum(codes.expected, 1.0)) @ linear.T
+    means = []
+    for first, number, probability in counts.groups:
+        low, high = max(first, codes.first), min(first + len(probability), codes.first + len(codes.count))
+        if low < high:
+            part = linear[:, low - codes.first : high - codes.first] @ probability[low - first : high - first]
+            means.append(np.sqrt(number) * part)
+    return np.asarray(found - np.transpose(means) @ np.array(means))
+
+
 def _combs(codes: _Codes) -> tuple[FloatArray, list[tuple[float, str]]]:
     """Weights (combs, codes) of the counts that give the combs' amplitudes relative to the mean count, and (mean code, words) of each.
 
@@ -250,30 +266,35 @@ def _combs(codes: _Codes) -> tuple[FloatArray, list[tuple[float, str]]]:
 
 
 def _steps(study: Study, codes: _Codes) -> tuple[FloatArray, list[int]]:
-    """Weights of the counts that give how many codes' worth is missing in 2 `NEAR` codes about a multiple of a sixteenth of the
-    converter's range, against the parabola through what counts and `expected` differ by on either side; and these codes."""
+    """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's range, and these
+    codes.
+
+    Codes count the less, the further they are from the place, and not at all from the next place on: what is missing anywhere is shared by
+    the two places beside it. It is missing against `expected` and the parabola that it lacks on either side of both neighbours.
+    """
     full = 2.0**study.camera.bit_depth
+    spacing = max(round(full / PLACES), LEAST_SPACING)
     table, at = [], []
-    for k in range(1, SIXTEENTHS):
-        boundary = int(k * full / SIXTEENTHS) - codes.first
-        if not 0 <= boundary < len(codes.count):
+    for k in range(1, int(full / spacing)):
+        place = k * spacing - codes.first
+        if not 0 <= place < len(codes.count):
             continue
-        far = max(8, round(FAR * float(codes.noise[boundary])))
-        low, high = boundary - NEAR - far, boundary + NEAR + far
-        if low < 0 or high > len(codes.count) or codes.expected[low:high].min() < LEAST_COUNT:
+        far = max(8, round(FAR * float(codes.noise[place])))
+        low, high = place - spacing - far, place + spacing + far
+        if low < 0 or high > len(codes.count) or codes.expected[low:high].min() < STEP_COUNT:
             continue
-        x = (np.arange(low, high) - boundary + 0.5) / (NEAR + far)
-        outer = np.abs(x) * (NEAR + far) > NEAR
-        basis = np.vander(x, 3, increasing=True)
+        x = np.arange(low, high) - place + 0.5
+        near = np.maximum(1.0 - np.abs(x) / spacing, 0.0)
+        beside = np.minimum(1.0 - near, np.maximum((spacing + far - np.abs(x)) / far, 0.0))
+        basis = np.vander(x / (spacing + far), DEGREE_BESIDE + 1, increasing=True)
         expected = codes.expected[low:high]
-        weight = np.sqrt(expected[outer])
-        fit = (basis[~outer] @ np.linalg.pinv(basis[outer] * weight[:, None]) * weight).sum(0)
-        share = np.empty(len(x))
-        share[~outer], share[outer] = -1.0, fit
+        # the curve's coefficients are `of_counts` @ counts
+        of_counts = np.linalg.solve((basis.T * (beside * expected)) @ basis, basis.T * beside)
         weights = np.zeros(len(codes.count))
-        weights[low:high] = share / expected
+        share = (near * expected) @ basis @ of_counts - near
+        weights[low:high] = share * near.sum() / (near * expected).sum()
         table.append(weights)
-        at.append(boundary)
+        at.append(place)
     return np.array(table).reshape(len(table), len(codes.count)), at
 
 

@@ -26,10 +26,27 @@ class DarkSignal:
 
     def mean_dn(self, name: str, exposure_s: float) -> float:
         """Mean of a dark frame of a plane: of the darks of that exposure where there are any, else by the line."""
-        for level in self.darks:
-            if abs(level.exposure_s - exposure_s) <= 1e-6 * exposure_s:
-                return level.plane[name].mean
-        return self.lines[name].at(exposure_s)
+        own = self._own(exposure_s)
+        return own.plane[name].mean if own is not None else self.lines[name].at(exposure_s)
+
+    def mean_covariance_dn2(self, name: str, exposures_s: Sequence[float]) -> FloatArray:
+        """Covariance of `mean_dn` at several exposures (n, n): those of one dark share its error, those of the line its
+        covariance.
+        """
+        own = [self._own(exposure_s) for exposure_s in exposures_s]
+        on_line = np.array([level is None for level in own], float)
+        gradient = on_line[:, None] * np.stack([np.ones(len(own)), np.array(exposures_s)], axis=1)
+        found = gradient @ self.lines[name].covariance @ gradient.T
+        for level in {id(level): level for level in own if level is not None}.values():
+            shared = np.array([each is level for each in own], float)
+            std = level.plane[name].mean_std
+            found += np.outer(shared, shared) * (std**2 if np.isfinite(std) else 0.0)
+        return np.asarray(found)
+
+    def _own(self, exposure_s: float) -> MeasuredLevel | None:
+        """Darks of that exposure, the first where there are several."""
+        alike = (level for level in self.darks if abs(level.exposure_s - exposure_s) <= 1e-6 * exposure_s)
+        return next(alike, None)
 
 
 def mean_and_std(levels: Sequence[MeasuredLevel], names: Sequence[str]) -> tuple[FloatArray, FloatArray]:

@@ -95,10 +95,8 @@ class EmvaLevels:
         self.below_variance = self.below(self.dark_variance, self.variance_line)
         self.signal = self.mean - self.below_mean
         lamp_error = np.maximum(given.lamp_error, [level.light_std for level in self.flats])
-        self.signal_std = np.hypot(
-            [plane.mean_std for plane in own],
-            np.hypot(self.below(self.dark_mean_std, None), lamp_error * self.signal),
-        )
+        self.light_mean_std = np.hypot([plane.mean_std for plane in own], lamp_error * self.signal)
+        self.signal_std = np.hypot(self.light_mean_std, self.below(self.dark_mean_std, None))
 
     def _taken(self, exposure_s: float) -> int | None:
         if not self.dark_exposure.size:
@@ -118,6 +116,16 @@ class EmvaLevels:
                 for source, exposure in zip(self.source, self.exposure, strict=True)
             ]
         )
+
+    def signal_covariance(self) -> FloatArray:
+        """Covariance of the signals (levels, levels), DN^2: levels share the error of a dark that both are less."""
+        found = np.diag(self.light_mean_std**2)
+        for number, std in enumerate(self.dark_mean_std):
+            shared = np.array([source == number for source in self.source], float)
+            found += std**2 * np.outer(shared, shared)
+        line = np.array([source is None for source in self.source], float)
+        gradient = line[:, None] * np.stack([np.ones_like(self.exposure), self.exposure], axis=1)
+        return found + gradient @ self.mean_line.covariance @ gradient.T
 
     def gain(self, used: BoolArray) -> Measured:
         """System gain K: slope through the origin of the variance against the signal, over the levels `used`
@@ -365,7 +373,7 @@ def _linearity(at: EmvaLevels, saturation: float, remarks: list[str]) -> tuple[F
     if np.unique(at.light[chosen]).size < 4:
         remarks.append("fewer than four levels between 5 and 95 % of saturation: no linearity error")
         return {}, deviation
-    line = linearity(at.light[chosen], at.signal[chosen], at.signal_std[chosen])
+    line = linearity(at.light[chosen], at.signal[chosen], at.signal_covariance()[np.ix_(chosen, chosen)])
     deviation[chosen] = line.deviation_percent
     return {"linearity_error_percent": Measured(line.error_percent, line.error_percent_std)}, deviation
 

@@ -18,6 +18,7 @@ from lab.fit.noise.read_noise import black_level, read_noise
 from lab.fit.noise.response import (
     full_well,
     linearity_by_plane,
+    linearity_error,
     main_lamp_levels,
     quantum_efficiency,
     remark_on_scatter,
@@ -79,9 +80,6 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
 def principal_figures(e: Evaluation) -> dict[str, float | None]:
     """The figures that stand for the sensor and for each channel, with their standard deviations."""
     scale = 10.0 ** (-e.levels.gain_db / 20.0)
-    errors = list(linearity_by_plane(e)[0].values())
-    # Planes see the same lamp: where it drifts, their errors are fully correlated
-    together = 1.0 if e.light_scatter > 0 else float(np.sqrt(max(len(errors), 1)))
     found: dict[str, tuple[float | None, float | None]] = {
         "conversion_gain_dn_per_e": (e.transfer.gain * scale, e.transfer.gain_std * scale),
         "read_noise_e": read_noise(e),
@@ -90,10 +88,7 @@ def principal_figures(e: Evaluation) -> dict[str, float | None]:
         "dsnu_e": dsnu(e),
         "prnu_percent": prnu(e),
         "full_well_e": full_well(e),
-        "linearity_error_percent": (
-            float(np.mean([e.error_percent for e in errors])) if errors else None,
-            float(np.mean([e.error_percent_std for e in errors])) / together if errors else None,
-        ),
+        "linearity_error_percent": linearity_error(e),
     }
     values = {name: value for name, (value, _) in found.items()}
     return values | {f"{name}_std": std for name, (_, std) in found.items()}

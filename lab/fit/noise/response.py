@@ -24,8 +24,7 @@ def linearity_by_plane(e: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[
         chosen = levels_in_range(e, name, *LINEARITY_RANGE)
         if len({level.light for level in chosen}) < 4:
             continue
-        light, signal, std = response_to_light(e, name, chosen)
-        found[name] = linearity(light, signal, std)
+        found[name] = _line(e, name, chosen)
         for level, percent in zip(chosen, found[name].deviation_percent, strict=True):
             deviation[id(level), name] = float(percent)
     if not found:
@@ -33,6 +32,21 @@ def linearity_by_plane(e: Evaluation) -> tuple[dict[str, Linearity], dict[tuple[
             "fewer than four levels of one lamp between 5 and 95 % of saturation: the linearity error isn't determined"
         )
     return found, deviation
+
+
+def linearity_error(e: Evaluation) -> tuple[float | None, float | None]:
+    """Mean of the planes' linearity errors, %, and its standard deviation.
+
+    Planes see the same lamp: where it drifts, their errors are fully correlated. So is always what noise adds to a
+    modulus.
+    """
+    errors = list(linearity_by_plane(e)[0].values())
+    if not errors:
+        return None, None
+    independent = 1 if e.light_scatter > 0 else len(errors)
+    noise = np.mean([error.error_noise_percent for error in errors]) / np.sqrt(independent)
+    bias = np.mean([error.error_bias_percent for error in errors])
+    return float(np.mean([error.error_percent for error in errors])), float(np.hypot(noise, bias))
 
 
 def main_lamp_levels(e: Evaluation) -> list[MeasuredLevel]:
@@ -59,7 +73,7 @@ def response_to_light(
     e: Evaluation, name: str, levels: Sequence[MeasuredLevel]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Light, signal (DN above dark) and its standard deviation, (levels,) each: by noise, and by what the levels
-    scatter beyond it.
+    scatter beyond it; that of the darks isn't in it.
     """
     signal = np.array([level.plane[name].mean - e.dark.mean_dn(name, level.exposure_s) for level in levels])
     noise = np.array([level.plane[name].mean_std for level in levels])
@@ -67,6 +81,12 @@ def response_to_light(
     noise = np.where(np.isfinite(noise), noise, np.sqrt(shot / levels[0].plane[name].pixels))
     beyond = np.maximum(e.light_scatter, [level.light_std for level in levels])
     return np.array([level.light for level in levels]), signal, np.hypot(noise, beyond * signal)
+
+
+def _line(e: Evaluation, name: str, levels: Sequence[MeasuredLevel]) -> Linearity:
+    light, signal, std = response_to_light(e, name, levels)
+    of_darks = e.dark.mean_covariance_dn2(name, [level.exposure_s for level in levels])
+    return linearity(light, signal, np.diag(std**2) + of_darks)
 
 
 def full_well(e: Evaluation) -> tuple[float | None, float | None]:
@@ -105,7 +125,7 @@ def quantum_efficiency(e: Evaluation) -> dict[str, float | None]:
     chosen = [level for level in chosen if level.light > 0]
     if len({level.light for level in chosen}) < 3:
         return {}
-    line = linearity(*response_to_light(e, "Y", chosen))
+    line = _line(e, "Y", chosen)
     value, std = in_electrons(e, line.slope, line.slope_std)
     calibration = max(level.light_calibration_std for level in chosen)
     return {

@@ -48,6 +48,10 @@ class AdcNonlinearityLaw(Law):
     name = effect = "adc_nonlinearity"
     variants, unit, nominal, limits, signed = 5, "DN", 3.0, (0.05, 20.0), True
 
+    @property
+    def listed_effect(self) -> str | None:
+        return {2: "adc_ripple", 4: "adc_step"}.get(self.variant, self.effect)
+
     def adc_output(self, dn: Array) -> Array:
         full = self.camera.full_code_dn + 1.0
         error, share = self.signed_strength * full / 4096.0, dn / full

@@ -44,17 +44,23 @@ def test_even_converters_show_nothing(seed: int) -> None:
 
 
 def test_steps_are_measured_where_they_stand() -> None:
-    """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale, and none elsewhere: within 3.5 of the standard
-    uncertainties, seen and held out."""
+    """A highest bit that is 3 DN too heavy leaves 3 codes out at half scale: within 3.5 of the standard uncertainties and its law's
+    tolerance, seen and held out. Places at 8 DN of 4096 and more beyond it see none of it."""
     law = AdcNonlinearityLaw(3.0, 0, 2)
-    block = code_block(_study(772302, (law,)))
+    study = _study(772302, (law,))
+    block = code_block(study)
     std = np.sqrt(np.diag(block.covariance))
-    steps = [
-        (label, v, s) for label, v, s in zip(block.labels, block.value, std, strict=True) if label.channel == "step"
-    ]
-    assert any(label.x == 2048.0 for label, _, _ in steps)
-    for label, value, s in steps:
-        assert abs(value - (law.signed_strength if label.x == 2048.0 else 0.0)) < 3.5 * s
+    expected = block.predict((effect("adc_nonlinearity")(error_dn=law.signed_strength),)).mean
+    spacing = 4096 / 128
+    steps = [i for i, label in enumerate(block.labels) if label.channel == "step"]
+    beside = [i for i in steps if abs(block.labels[i].x - 2048.0) <= 4 * spacing]
+    middle = [i for i in steps if block.labels[i].x == 2048.0]
+    assert len(middle) == 2
+    # half of a hat of 32 codes about the gap's two halves: all but 1.5 of 32 codes of it
+    assert expected[middle] == pytest.approx(law.signed_strength, rel=0.3)
+    for i in steps:
+        allowed = np.hypot(3.5 * std[i], 0.2 * expected[i])
+        assert abs(block.value[i] - (expected[i] if i in beside else 0.0)) < allowed, block.labels[i]
 
 
 @pytest.mark.parametrize("variant", [0, 1])
@@ -67,6 +73,19 @@ def test_wrong_bits_are_named(variant: int) -> None:
     found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std["error_dn"]
     assert std is not None
     assert abs(found["error_dn"] - law.signed_strength) < 3.0 * std
+
+
+def test_a_step_at_any_code_is_named() -> None:
+    """A comparator that is off by 4 DN at 1664 codes: no bit stands there, and no response to light does that to histograms."""
+    law = AdcNonlinearityLaw(4.0, 4, 7)
+    place = 4096.0 * (0.15 + 0.6 * law.uniform[1])
+    study = _study(772302, (law,))
+    blocks = (linearity_block(study), variance_block(study), code_block(study))
+    verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
+    assert [c.told_name for c in verdict.named] == ["adc_step"]
+    found = verdict.named[0].effect.model_dump()
+    assert found["code_dn"] == pytest.approx(place, abs=4096 / 128)
+    assert abs(found["step_dn"] - law.signed_strength) < 3.0 * (verdict.named[0].std["step_dn"] or 0.0)
 
 
 @pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)

@@ -1,0 +1,67 @@
+"""Converter step: one decision level is off, so that all codes from there on are shifted."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+
+from sim.camera import CameraModel
+from sim.effects.base import Effect
+from sim.effects.families import Family
+from sim.parameters import Quantity
+from sim.spectrum import FloatArray
+from sim.stages import Codes
+
+PLACES = 64  # parts of the range, at whose borders a step is looked for first
+
+
+class AdcStep(Effect):
+    """Code + s from one code on; offset and gain as without: nothing at codes 0 and 2^bits.
+
+    A comparator of a flash or subranging converter is off, or two ranges of a dual-gain read-out don't join. Unlike a bit's, its step may
+    stand at any code.
+    """
+
+    name: ClassVar[str] = "adc_step"
+    family: ClassVar[Family] = Family.CONVERTER
+    reference: ClassVar[str] = (
+        "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"
+    )
+    form_tolerance: ClassVar[float] = 0.1
+    invariances: ClassVar[frozenset[str]] = frozenset(
+        {"f_number", "exposure", "wavelength", "field", "orientation", "time"}
+    )
+    shapes: ClassVar[frozenset[str]] = frozenset({"code_dn"})
+    sentence: ClassVar[str] = (
+        "The converter's characteristic has a step at one code: levels on either side don't join, and codes are missing or come twice there."
+    )
+
+    step_dn: Annotated[
+        float, Quantity("DN", "height of the step", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0)
+    ] = 0.0
+    code_dn: Annotated[float, Quantity("DN", "code at which it stands", lower=0.0, upper=65536.0, absent=2048.0)] = (
+        2048.0
+    )
+
+    def log_prior(self) -> float:
+        """Bits change at known codes: a step elsewhere may stand at any of the places that histograms tell apart."""
+        return -float(np.log(2.0 * PLACES))
+
+    @classmethod
+    def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:
+        full = 2.0**camera.bit_depth
+        return tuple(
+            (cls(step_dn=0.3, code_dn=full * k / PLACES), cls(step_dn=-0.3, code_dn=full * k / PLACES))
+            for k in range(1, PLACES)
+        )
+
+    def on_codes(self, codes: Codes) -> Codes:
+        if self.step_dn == 0.0:
+            return codes
+        full = 2.0**codes.camera.bit_depth
+
+        def converted(dn: FloatArray) -> FloatArray:
+            return np.asarray(dn * (1.0 - self.step_dn / full) + self.step_dn * (dn >= self.code_dn))
+
+        return codes.adding(codes=converted)
