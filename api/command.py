@@ -28,7 +28,7 @@ Folder = Annotated[
 FIRST_KEY = "first"
 #: Longest wait (s), before the service is loaded, for the stations of sessions whose process died to be made safe.
 RESCUE_FIRST_S = 4.0
-#: Switch interval (s) of Python's threads: short, as a session's steps and the service's answers alternate often.
+#: How long (s) a thread computes while others wait, at most: a session's steps and the answers hand over to each other often.
 SWITCH_S = 0.001
 _ANY = ("0.0.0.0", "::", "")  # addresses that listen everywhere and name no computer
 

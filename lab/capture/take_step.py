@@ -125,7 +125,7 @@ def _stuck(
 
 
 def repeats_of(step: Step, following: Iterable[Step]) -> int:
-    """Number of steps directly after `step` that repeat its setting and exposure without a measurement of the light."""
+    """How many of the steps that follow at once only repeat a step's exposure."""
     same = itertools.takewhile(
         lambda other: (
             bool(step.captures and other.captures)
@@ -148,7 +148,7 @@ def take(
     result; in a step without captures this raises DeviceError, as later steps need the spectrum. Raises InputError for a missing instrument.
     """
     wavelength_nm = step.setting.wavelength_nm or 0.0
-    # The photodiode's responsivity is known for light of one wavelength only.
+    # One responsivity: light of one wavelength.
     photodiode = instruments.photodiode if step.radiance and step.captures and wavelength_nm > 0.0 else None
     if photodiode is not None and photodiode.dark_a is None:
         yield from _dark_current(instruments)
@@ -236,7 +236,7 @@ def _exposures(step: Step, instruments: Instruments, results: Mapping[str, Mappi
 
 
 def _completed(step: Step, instruments: Instruments, dummies: int) -> tuple[Capture, ...]:
-    """The step's captures, completed by what the frames, the number of dummy frames and the instruments' readings tell."""
+    """The step's captures with the keys that the trigger, the `dummies` before it, and the instruments tell."""
     readings = {key: value for device in instruments.devices for key, value in device.readings().items()}
     completed = []
     for capture in step.captures:

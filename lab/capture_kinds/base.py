@@ -165,7 +165,7 @@ AnyTarget = Annotated[Target, TARGETS]
 
 
 class CaptureLimits(Frozen):
-    """Limits of the exposure (s), the gain (dB) and the slit width (um) of all sequences."""
+    """The exposures, the gain and the slits that sequences keep to."""
 
     exposure_min_s: float = Field(default=20e-6, gt=0)
     exposure_max_s: float = Field(default=10.0, gt=0)

@@ -42,8 +42,8 @@ class SphereTarget(Target):
 class FlatSequence(Sequence):
     """`frames` flats at each of `levels`, shares of the exposure at which the brightest channel saturates.
 
-    Each camera has exposures of its own, scaled from that found for `level_found`. The series of levels is taken upwards and downwards in
-    turn. The radiance is measured before each turn, so that a drift of the lamp shows as a difference between turns.
+    Each camera has exposures of its own, found at `level_found`. The ladder is taken upwards and downwards in turn, and the
+    radiance is measured before each turn: a drift of the lamp is a difference between the turns.
     """
 
     name: ClassVar[str] = "flat"
@@ -101,7 +101,7 @@ class FlatCapture(Capture):
 
     def remarks(self) -> Iterator[str]:
         if self.radiance is None and self.photons_per_pixel is None:
-            yield "neither radiance nor photons_per_pixel: it determines noise, but no sensitivity; add what is known"
+            yield "neither radiance nor photons_per_pixel: it tells of noise, not of sensitivity; add what is known"
 
     def scene(self, spectrum: Callable[[str], Spectrum]) -> Scene | None:
         return None if self.radiance is None else UniformField(spectrum(self.radiance), self.kind)

@@ -85,10 +85,8 @@ class NarrowbandSequence(Sequence):
 
 
 class NarrowbandCapture(Capture):
-    """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured.
-
-    `irradiance_w_m2` and `sd_irradiance_w_m2`, its standard uncertainty: at the place of the reference photodiode, where the station has one.
-    """
+    """Uniform light of one wavelength: `wavelength_nm` and `bandwidth_nm` (FWHM) as set, `radiance` as measured; `irradiance_w_m2` and its
+    standard uncertainty as a reference photodiode measured them at its place, where the station has one."""
 
     shows: ClassVar[str] = "uniform diffuse light from the monochromator, filling the field"
     sequence: ClassVar[type[Sequence] | None] = NarrowbandSequence
@@ -102,7 +100,7 @@ class NarrowbandCapture(Capture):
 
     @property
     def photon_irradiance_per_m2_s(self) -> float | None:
-        """Photon irradiance (s^-1 m^-2) at the photodiode, E wavelength / (h c) (EMVA 1288 release 4.0, eq. 3); None without a photodiode."""
+        """Photons a second and square metre where the photodiode is, E wavelength / (h c) (EMVA 1288 release 4.0, eq. 3); None without one."""
         if self.irradiance_w_m2 is None:
             return None
         return self.irradiance_w_m2 * self.wavelength_nm * 1e-9 / (constants.h * constants.c)

@@ -59,7 +59,7 @@ def capture(
     certified: Certified = False,
     conceal: Conceal = None,
 ) -> None:
-    """Run the sequences of a station and store the captures. Without a station file: on the mock bench."""
+    """Run the sequences of a station and keep what was captured. Without a station file: on the mock bench."""
     store = open_store(out_folder)
     request = PipelineRequest(
         "capture",

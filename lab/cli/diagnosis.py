@@ -62,7 +62,7 @@ def diagnose(
         int,
         typer.Option(
             metavar="N",
-            help=f"simulate N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
+            help=f"draw N healthy cameras (at least {FEWEST_DRAWS}) frame by frame for the threshold of a false alarm",
         ),
     ] = 0,
     scheduler: Annotated[

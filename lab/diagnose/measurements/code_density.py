@@ -132,7 +132,7 @@ def code_block(study: Study) -> Block:
 
 @dataclass(frozen=True)
 class _Counts:
-    """Counts of every code in some frames, (white level + 1,), and the counts that light and noise give an ideal converter."""
+    """Counts of each code in some frames, and the counts expected from the light's own course and noise."""
 
     count: FloatArray
     expected: FloatArray
@@ -148,11 +148,8 @@ class _Counts:
 
 
 def _expect(plane: Any, study: Study, expected: FloatArray) -> None:
-    """Add the expected counts of a plane's pixels to `expected`.
-
-    Each pixel is normal about the local mean over `AROUND` x `AROUND` pixels. Its variance is proportional to the signal above
-    black, and scaled so that its mean is the measured mean square of the departures from the local mean.
-    """
+    """Add a plane's pixels, spread normally about the mean over those around: by what they depart from it, in proportion to the root of
+    the signal."""
     surface = ndimage.uniform_filter(plane, AROUND, mode="reflect")
     own = AROUND**2 / (AROUND**2 - 1.0)
     signal = max(float(surface.mean()) - study.noise.black, 1.0)

@@ -34,11 +34,10 @@ from sim.spectrum import FloatArray
 
 TEMPERATURE_STEP_C = 1.0  # dark frames whose temperatures differ by no more are repeats
 CELLS = 4, 6  # of a frame: rows, columns
-LEAST_CELL_PX = 2  # least side of a cell
-CELL_FLOOR_DN = 0.005  # standard deviation of a cell's mean beside noise
-MOST_CONDITIONS = 3  # conditions whose fixed pattern is measured: the shortest, the longest, the warmest
-#: Lower edges of the bins in which outlying pixels are counted, in standard deviations of a pixel's fixed pattern. The first two count
-#: dark pixels as well, below their negatives.
+LEAST_CELL_PX = 2  # a side of the smallest frame's cells
+CELL_FLOOR_DN = 0.005
+MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
+#: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
 TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
 
 

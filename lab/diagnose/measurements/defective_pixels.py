@@ -27,9 +27,8 @@ LEAST_COUNTED_DN = 0.6  # temporal noise of a pixel below which codes are too co
 #: Lower edges of the bins of temporal variance, over the first one, which a healthy pixel passes with the probability `FLICKER_CHANCE`.
 FLICKER_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
 FLICKER_CHANCE = 1e-5
-#: Telegraph noise: draws of the frames in which a pixel is at its higher level, and the shares of such frames.
-JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)
-#: Standard deviation of a rooted count beside chance (about 1 for large counts): one more defective pixel is no finding.
+JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)  # draws of which frames of a jumping pixel are high
+#: Standard deviation of a count's root beside chance (which is about 1 where many are expected): one defective pixel more is no finding.
 COUNT_STD = 0.6
 
 
@@ -51,9 +50,8 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
 def defective_pixel_block(study: Study) -> Block:
     """Anscombe-transformed numbers of pixels by their deviation from their surroundings in the median of repeats, by exposure.
 
-    The bins are `TAIL_EDGES`, in standard deviations of single pixels. Hot pixels are the same in every frame, and as bright as the exposure is long. Telegraph noise
-    is predicted where the temporal noise exceeds `LEAST_COUNTED_DN`: with less, all repeats of a pixel have one code. Raises
-    NotDetermined without dark captures.
+    Hot pixels are the same in every frame, and bright in proportion to the exposure. Jumps between two levels count where the temporal
+    noise is fine enough to tell them from a fixed level, as for `flickering_pixel_block`: below, all repeats of a pixel have one code.
     """
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
