@@ -62,10 +62,6 @@ class Screen(Frozen):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        for name, values, low, high in (("gamma", self.gamma, 0.2, 5.0), ("black_code", self.black_code, 0.0, 0.9)):
-            for value in values:
-                if not low <= value <= high:
-                    raise ValueError(f"the screen's {name} is {value}, outside the limits {low}..{high}: correct it")
         for what, curve in (
             ("black", self.black_radiance),
             *zip(("red", "green", "blue"), self.primaries, strict=True),

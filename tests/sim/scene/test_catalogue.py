@@ -123,7 +123,7 @@ def test_what_is_not_a_scene_is_refused(camera: CameraModel) -> None:
         ("moon", {}, "name one of uniform, colorchecker24"),
         ("uniform", {"cell_px": 1}, "no parameter 'cell_px': it has none"),
         ("zone-plate", {"highest": 1}, "it has highest_cy_per_px, fill, contrast"),
-        ("slanted-edge", {"contrast": 1.5}, "1.5 1 is above the upper limit 1.0 1"),
+        ("slanted-edge", {"contrast": 1.5}, "1.5 is above the upper limit 1.0"),
         ("slanted-edge", {"angle_deg": float("nan")}, "finite"),
     ):
         with pytest.raises(ValueError, match=says) as error:

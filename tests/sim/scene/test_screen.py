@@ -53,8 +53,8 @@ def test_stripes_do_not_overlap() -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"gamma": (2.2, 9.0, 2.2)}, "gamma is 9.0, outside the limits"),
-        ({"black_code": (-0.1, 0.0, 0.0)}, "black_code is -0.1"),
+        ({"gamma": (2.2, 9.0, 2.2)}, "9.0 is above the upper limit 5.0"),
+        ({"black_code": (-0.1, 0.0, 0.0)}, "-0.1 is below the lower limit 0.0"),
         ({"black_radiance": CURVE.scaled(-1.0)}, "black has a radiance of -2"),
         ({"falloff_exponent": -1.0}, "below the lower limit"),
         ({"sub_pixels": {"width": 0.5}}, "above the upper limit"),
