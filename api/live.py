@@ -27,6 +27,11 @@ POLL_S, PATIENCE_S = 0.2, 60.0
 APART_S = 0.2
 
 
+def _wake(followers: list[asyncio.Event]) -> None:
+    for one in followers:
+        one.set()
+
+
 class LiveSession:
     """One session in a thread of its own. A follower gets the latest progress first, then later ones; a slow follower misses some."""
 
@@ -35,6 +40,7 @@ class LiveSession:
         self.pausing = False
         self.capture: CaptureSession | None = None
         self._latest: Progress | None = None
+        self._made: tuple[Progress, str] | None = None
         self._number = 0
         self._ended = False
         self._lock = threading.Lock()
@@ -85,9 +91,16 @@ class LiveSession:
             self._number += 1
             self._ended = self._ended or ended
             followers = list(self._followers)
-        for loop, wake in followers:
+        for loop in {loop for loop, _ in followers}:  # one call into a loop, however many follow there
+            mine = [wake for of, wake in followers if of is loop]
             with contextlib.suppress(RuntimeError):  # that loop is closed
-                loop.call_soon_threadsafe(wake.set)
+                loop.call_soon_threadsafe(_wake, mine)
+
+    def once(self, progress: Progress, make: Callable[[Progress], str]) -> str:
+        """What `make` makes of a progress, made once for all who follow. For one thread: that of the followers' loop."""
+        if self._made is None or self._made[0] is not progress:
+            self._made = (progress, make(progress))
+        return self._made[1]
 
     def nudge(self) -> None:
         """Wake the followers, because the session's state changed without progress."""

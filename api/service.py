@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -129,7 +130,7 @@ class Service:
         texts = {"what": self.public(progress.what), "remark": self.public.or_none(progress.remark)}
         return progress.model_copy(update=texts)
 
-    def runs(self, session_id: str) -> tuple[RunRecord, ...]:
+    def public_runs(self, runs: Iterable[RunRecord]) -> tuple[RunRecord, ...]:
         """The provenance of a session. An address that is a folder of the server is only its name."""
         return tuple(
             run.model_copy(
@@ -140,7 +141,7 @@ class Service:
                     }
                 }
             )
-            for run in self.store.runs(session_id)
+            for run in runs
         )
 
 

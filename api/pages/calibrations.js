@@ -16,7 +16,8 @@ const rig = (one) => JSON.stringify(Object.entries(one.cameras).sort());
 function row(one) {
   const actions = element("td");
   const links = one.certified_id ? [["Compare", `${api}/comparisons/page?${new URLSearchParams({ a: one.certified_id, b: one.id })}`]] : [];
-  for (const [label, href] of [...links, ["Cameras", `${api}/camera-models/${one.id}/archive.zip`]]) {
+  if (one.has_cameras) links.push(["Cameras", `${api}/camera-models/${one.id}/archive.zip`]);
+  for (const [label, href] of links) {
     const link = element("a", { href, textContent: label, ...(label === "Compare" ? { target: "_blank", rel: "noopener" } : {}) });
     link.setAttribute("aria-label", label === "Compare" ? `Compare ${one.name} with the certified calibration` : `Camera files of ${one.name}`);
     actions.append(link, " ");
@@ -173,11 +174,12 @@ form.elements.figure.addEventListener("change", told("calibration-problem", show
 form.addEventListener("submit", (event) => event.preventDefault());
 
 export async function showCalibrations() {
-  const [known, named] = await Promise.all([ask("/calibrations?limit=50"), ask("/figures")]);
+  const [known, named, models] = await Promise.all([ask("/calibrations?limit=50"), ask("/figures"), ask("/camera-models?limit=200")]);
+  const kept = new Set(models.filter((one) => one.sides.length).map((one) => one.id));
   // What others of the same cameras are compared with.
   const certifiedOf = new Map(known.filter((one) => one.state === "certified").map((one) => [rig(one), one.id]));
   const others = (one) => (certifiedOf.get(rig(one)) === one.id ? undefined : certifiedOf.get(rig(one)));
-  show("calibrations", known.map((one) => ({ ...one, certified_id: others(one) })), row);
+  show("calibrations", known.map((one) => ({ ...one, certified_id: others(one), has_cameras: kept.has(one.id) })), row);
   $("no-calibrations").hidden = known.length > 0;
   $("history-part").hidden = named.length === 0;
   figures = named;

@@ -17,7 +17,7 @@ function send(file, tell) {
     const request = new XMLHttpRequest();
     const format = $("drop-format").value;
     request.open("POST", `${api}/recordings${format ? `?format=${format}` : ""}`);
-    request.setRequestHeader("Content-Type", file.name.endswith(".tar") ? "application/x-tar" : /\.(tgz|gz)$/.test(file.name) ? "application/gzip" : "application/zip");
+    request.setRequestHeader("Content-Type", file.name.endsWith(".tar") ? "application/x-tar" : /\.(tgz|gz)$/.test(file.name) ? "application/gzip" : "application/zip");
     request.upload.addEventListener("progress", (event) => event.lengthComputable && tell(event.loaded / event.total));
     request.addEventListener("error", () => reject(new Problem(`${file.name}: the connection broke off; send it again`)));
     request.addEventListener("load", () => {

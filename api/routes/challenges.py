@@ -92,7 +92,7 @@ def start_challenge_job(service: Here, challenge_id: HexId, start: ChallengeJobS
     "/challenges/{challenge_id}/cases/{case}/archive.zip",
     dependencies=[READ],
     response_class=Zip,
-    responses=answers(401, 404, 422),
+    responses=answers(401, 404, 409, 422),
 )
 def challenge_case(service: Here, challenge_id: HexId, case: CaseName) -> Response:
     """The recordings of a case, a recording set as a .zip: for other programs, or for a diagnosis of one's own."""

@@ -148,7 +148,7 @@ def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
     tags=["recordings"],
     dependencies=[READ],
     response_class=Zip,
-    responses=answers(401, 404, 422),
+    responses=answers(401, 404, 409, 422),
 )
 def recordings_archive(service: Here, recordings_id: HexId) -> Response:
     """The recording set as a .zip, as `POST /recordings` takes it: sent while it is packed, without a stated length."""

@@ -129,12 +129,12 @@ def start_session(service: Here, start: SessionStart, response: Response) -> Sto
 @router.get("/sessions/{session_id}", tags=["sessions"], dependencies=[READ], responses=answers(401, 404, 422))
 def get_session(service: Here, session_id: SessionId) -> SessionDetail:
     """One session, with its provenance."""
-    info = service.session(session_id)
+    found = known(missing_session(session_id), lambda: service.store.details(session_id))
     return SessionDetail(
-        **_fields(service, info),
-        station=service.store.station_name(session_id),
-        progress=service.progress(session_id) if info.closed is None else None,
-        runs=service.runs(session_id),
+        **_fields(service, found.info),
+        station=found.station,
+        progress=service.progress(session_id) if found.info.closed is None else None,
+        runs=service.public_runs(found.runs),
         captures=tuple(
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
@@ -222,7 +222,8 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
         return
     yield event("state", await asyncio.to_thread(look))
     async for progress in live.follow(stopping):
-        yield event("progress", service.told(progress))
+        text = live.once(progress, lambda one: service.told(one).model_dump_json())
+        yield ServerSentEvent(event="progress", data=text)
         if (progress.state, live.pausing) != seen:
             seen = (progress.state, live.pausing)
             yield event("state", await asyncio.to_thread(look))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 
 from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
 from drivers.instrument import Identity, Recorder
@@ -38,6 +39,8 @@ _FAILED = {"20", "32"}
 _NOT_UNDERSTOOD = 1
 #: Seconds between two looks at whether a motion has ended, where the instrument doesn't say so by itself.
 _LOOK_S = 0.1
+#: Longest time (s) that the status byte of HANDSHAKE itself is waited for.
+_HANDSHAKE_S = 1.0
 #: Reciprocal linear dispersion with 1200 l/mm: 1e6 nm / (1200 per mm x 260 mm) x cos(9.6 deg).
 _DISPERSION_NM_PER_MM = 3.16
 
@@ -150,8 +153,10 @@ class Cornerstone260(WireInstrument, Monochromator):
         line.drain(quiet_s=0.3)  # an instrument that moves is slow to echo
         model, _, serial_number = self._first_answer().partition(" SN ")
         self._identity = Identity("Newport", model.strip() or "Cornerstone 260", serial_number.strip())
-        line.write(b"HANDSHAKE 1\r\n")
-        line.drain(quiet_s=0.1)  # its echo, its own status byte, and an error that stood from before
+        self._say("HANDSHAKE 1")
+        with suppress(NoAnswer):  # its own status byte: waited for, as a busy computer hands it over late
+            self._line("HANDSHAKE 1", _HANDSHAKE_S)
+        line.drain(quiet_s=0.1)  # an error that stood from before
         self._ask("ERROR?")
         self._tells_idle = self._knows("IDLE?")
         self._found_units = self._found_units or self._ask("UNITS?").strip().upper()

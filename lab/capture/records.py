@@ -69,6 +69,15 @@ class RunRecord(Frozen):
 
 
 @dataclass(frozen=True)
+class SessionDetails:
+    """A session with what its station calls itself, and its runs in their order."""
+
+    info: SessionInfo
+    station: str
+    runs: tuple[RunRecord, ...]
+
+
+@dataclass(frozen=True)
 class StoredFile:
     """A file of a session on the disk: its path in the session, SHA-256 and size; `side`: of a frame."""
 

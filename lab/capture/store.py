@@ -20,6 +20,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ from lab.capture.records import (
     ResultInfo,
     Role,
     RunRecord,
+    SessionDetails,
     SessionInfo,
     SessionState,
     StoredFile,
@@ -248,10 +250,13 @@ class Store:
         with self.reading() as db:
             return Station.model_validate(self._row(db, session_id).station)
 
-    def station_name(self, session_id: str) -> str:
-        """Name of a session's station, from its station file."""
+    def details(self, session_id: str) -> SessionDetails:
+        """One session with its provenance, in one reading."""
         with self.reading() as db:
-            return str(self._row(db, session_id).station.get("name", ""))
+            row = self._row(db, session_id)
+            runs = tuple(RunRecord.model_validate(run) for run in row.runs)
+            found = SessionDetails(self._info(db, row), str(row.station.get("name", "")), runs)
+        return replace(found, info=self._now(found.info))
 
     def runs(self, session_id: str) -> list[RunRecord]:
         """Provenance: every run of a session, in order."""

@@ -25,13 +25,14 @@ class Base(DeclarativeBase):
 
 class SessionRow(Base):
     __tablename__ = "sessions"
+    __table_args__ = (sa.Index("ix_sessions_created", "created", "id"),)
 
     id: Mapped[str] = mapped_column(sa.String(40), primary_key=True)
     name: Mapped[str] = mapped_column(sa.Text, default="")
     notes: Mapped[str] = mapped_column(sa.Text, default="")
     created: Mapped[datetime]
     closed: Mapped[datetime | None]
-    state: Mapped[str] = mapped_column(sa.String(20))
+    state: Mapped[str] = mapped_column(sa.String(20), index=True)
     error: Mapped[str | None] = mapped_column(sa.Text)
     station: Mapped[dict[str, Any]]
     calibration: Mapped[dict[str, Any]]

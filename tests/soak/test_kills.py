@@ -97,6 +97,7 @@ class Laboratory:
             stuck.extend(store.under_way())
             safe_s.append(time.monotonic() - began_s)
 
+        self.output.write_text("")  # what the service said before
         watching = threading.Thread(target=watch)
         watching.start()
         try:
