@@ -132,5 +132,7 @@ def test_the_data_sheet_finds_the_levels_by_measured_photons() -> None:
     given = recorded(1.0)
     fit = FitResult(source="memory", cameras={"left": CameraFit(noise=fit_noise(given, "left"))})
     (sheet,) = data_sheets(given, fit)
+    (efficiency,) = next(row.values for row in sheet.rows if row.symbol == "η")
+    assert efficiency.endswith("(± 0.91 % by the photodiode's calibration)")  # 1.5 % of 0.606
     assert "Spectrograms of the PRNU" in [plot.title for plot in sheet.plots]
     assert any("the photodiode's calibration has a standard uncertainty of 1.5 %" in text for text in sheet.remarks)
