@@ -18,6 +18,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -157,11 +158,30 @@ class _Producer:
         with self._open() as found:
             for one in found:
                 if address in (_told(one, name) for name in ("serial_number", "id_", "user_defined_name")):
-                    with _interrupts_kept():
-                        acquirer = self._harvester.create(one, config=core.ParameterSet(asked))
+                    acquirer = self._opened(one, core.ParameterSet(asked))
                     self._taken += 1
                     return acquirer
         return None
+
+    def _opened(self, camera: Any, config: Any) -> Any:
+        """The library opens a camera, and leaves it open where what follows fails: close it then."""
+        made: list[Any] = []
+
+        def create_device() -> Any:
+            made.append(camera.module.create_device())
+            return made[-1]
+
+        camera.create_device = create_device
+        try:
+            with _interrupts_kept():
+                return self._harvester.create(camera, config=config)
+        except BaseException:
+            for device in made:
+                if device.is_open():
+                    device.close()
+            raise
+        finally:
+            del camera.create_device
 
     def give_back(self, acquirer: Any) -> None:
         """Let a camera go."""
@@ -221,6 +241,13 @@ class GentlCamera(GenicamCamera):
 
     def _open(self) -> tuple[_Nodes, Identity]:
         core = _library()
+        if self._description is not None:
+            try:
+                ElementTree.parse(self._description)
+            except (OSError, ElementTree.ParseError) as error:
+                raise InstrumentError(
+                    f"camera {self.address}: its description {self._description} can't be read ({error}); correct it in the station file"
+                ) from error
         producers = _producers(self._producer_file)
         if not producers:
             raise InstrumentError(

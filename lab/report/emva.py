@@ -126,6 +126,9 @@ def table_rows(found: dict[str, Emva1288]) -> Iterator[EmvaRow]:
             text = measured(factor * value, None if std is None else factor * std, unit)
             if field in DECIBELS and value > 0:
                 text += f" ({20.0 * np.log10(value):.1f} dB, {np.log2(value):.1f} bit)"
+            systematic = getattr(plane, f"{field}_systematic_std", None)
+            if systematic is not None:
+                text += f" (± {factor * systematic:.2g} {unit} by the photodiode's calibration)"
             texts.append(text)
         if any(text != "–" for text in texts):
             yield EmvaRow(quantity, symbol, tuple(texts))

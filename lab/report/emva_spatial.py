@@ -11,6 +11,7 @@ import numpy as np
 from lab.capture_kinds.dark import DarkCapture
 from lab.capture_kinds.flat import FlatCapture
 from lab.fit.noise.dark_pixels import stack_of
+from lab.fit.noise.photon_numbers import light_of
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import Emva1288, Emva1288Points
 from lab.report.charts import AFTER, BEFORE, Trace, axis, layout
@@ -64,14 +65,9 @@ def _stacks(recordings: RecordingSet, side: Side, points: Emva1288Points, plane:
     """The image stacks that the spatial figures were computed from."""
     darks = [c for c in recordings.captures(DarkCapture, side) if c.exposure_s == points.stack_dark_exposure_s]
 
-    def light(flat: FlatCapture) -> float:
-        return flat.photons_per_pixel if flat.photons_per_pixel is not None else flat.exposure_s
-
-    flats = [
-        c
-        for c in recordings.captures(FlatCapture, side)
-        if c.exposure_s == points.stack_exposure_s and light(c) == points.stack_light
-    ]
+    every = recordings.captures(FlatCapture, side)
+    light = light_of(every, recordings.camera(side))
+    flats = [c for c in every if c.exposure_s == points.stack_exposure_s and light[c.id].amount == points.stack_light]
     if not darks:
         return None
 

@@ -10,25 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from lab.capture_kinds.flat import FlatCapture
+from lab.fit.noise.stated_light import StatedLight, stated_light
 from lab.formats.recording_set import DataSheet
 
 #: Irradiances of one exposure that differ by less are one level: sd of their readings, and a share that lamps move by.
 SAME_SIGMA, SAME_SHARE = 4.0, 0.005
-
-
-@dataclass(frozen=True)
-class PhotonNumber:
-    """Photons on a pixel in one exposure, with relative standard uncertainties: `std` by the readings of the irradiance, `calibration_std`
-    by the photodiode's calibration, which is common to all numbers of its captures."""
-
-    photons: float
-    std: float
-    calibration_std: float
 
 
 def why_not(flats: Sequence[FlatCapture], camera: DataSheet) -> str | None:
@@ -47,7 +37,12 @@ def why_not(flats: Sequence[FlatCapture], camera: DataSheet) -> str | None:
     return None
 
 
-def photon_numbers(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str, PhotonNumber]:
+def light_of(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str, StatedLight]:
+    """The light of each flat by its id: photons, stated or else measured, or else the exposure."""
+    return {flat.id: stated_light(flat) for flat in flats} | photon_numbers(flats, camera)
+
+
+def photon_numbers(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str, StatedLight]:
     """Photons by the id of the capture, of flats that have an irradiance and state no photons. Flats of one exposure whose irradiances
     agree are one level, and have its mean."""
     if why_not(flats, camera) is not None or camera.pixel_pitch_um is None:
@@ -65,14 +60,16 @@ def photon_numbers(flats: Sequence[FlatCapture], camera: DataSheet) -> dict[str,
             levels[-1].append((flat, photons))
         else:
             levels.append([(flat, photons)])
-    found: dict[str, PhotonNumber] = {}
+    found: dict[str, StatedLight] = {}
     for level in levels:
         numbers = np.array([photons for _, photons in level])
         mean = float(numbers.mean())
         told = math.sqrt(sum(flat.irradiance_readings_sd**2 for flat, _ in level)) / len(level)
         seen = float(numbers.std(ddof=1)) / mean / math.sqrt(len(level)) if len(level) > 1 else 0.0
         calibration = max(flat.irradiance_calibration_sd for flat, _ in level)
-        found |= {flat.id: PhotonNumber(mean, max(told, seen), calibration) for flat, _ in level}
+        found |= {
+            flat.id: StatedLight(mean, "photons", flat.wavelength_nm, max(told, seen), calibration) for flat, _ in level
+        }
     return found
 
 

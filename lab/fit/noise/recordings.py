@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -15,9 +15,9 @@ from lab.fit.noise.dark_pixels import DarkPixels, stack_of
 from lab.fit.noise.defective_pixels import defective_pixels
 from lab.fit.noise.level_statistics import MeasuredLevel
 from lab.fit.noise.noise_fit import noise_fit
-from lab.fit.noise.photon_numbers import PhotonNumber, photon_numbers, why_not
+from lab.fit.noise.photon_numbers import light_of, why_not
 from lab.fit.noise.recorded_levels import rounded_c
-from lab.fit.noise.stated_light import StatedLight, stated_light
+from lab.fit.noise.stated_light import StatedLight
 from lab.formats.recording_set import DataSheet, RecordingSet
 from lab.formats.results import NoiseFit
 from sim.camera import Side
@@ -49,16 +49,8 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     flats = [flat for flat in flats if (flat.gain_db or 0.0) == gain_db]
     darks = [dark for dark in recordings.captures(DarkCapture, side) if (dark.gain_db or 0.0) == gain_db]
     dark_levels, pixels = _dark_levels(recordings, darks, camera)
-    measured = photon_numbers(flats, camera)
-    light = {
-        flat.id: StatedLight(measured[flat.id].photons, "photons", flat.wavelength_nm)
-        if flat.id in measured
-        else stated_light(flat)
-        for flat in flats
-    }
-    lamps = _lamps_of(recordings, [flat for flat in flats if flat.id not in measured])
-    lamps |= {id: (None, *light[id].lamp) for id in measured}
-    unknown = PhotonNumber(0.0, 0.0, 0.0)
+    light = light_of(flats, camera)
+    lamps = _lamps_of(recordings, flats, light)
     flat_levels = [
         MeasuredLevel(
             group[0].exposure_s,
@@ -67,8 +59,8 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
             stack_of(recordings, group, pixels.bad).statistics(),
             group[0].temperature_c,
             tuple(flat.id for flat in group),
-            measured.get(group[0].id, unknown).std,
-            measured.get(group[0].id, unknown).calibration_std,
+            light[group[0].id].std,
+            light[group[0].id].calibration_std,
         )
         for group in _grouped(flats, lambda flat: (flat.exposure_s, light[flat.id].amount, lamps[flat.id]))
     ]
@@ -84,8 +76,11 @@ def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C
     return list(groups.values())
 
 
-def _lamps_of(recordings: RecordingSet, flats: Sequence[FlatCapture]) -> dict[str, Hashable]:
-    """The light of each flat, by its id. A lamp that is measured before every pass over the levels is one lamp."""
+def _lamps_of(
+    recordings: RecordingSet, flats: Sequence[FlatCapture], light: Mapping[str, StatedLight]
+) -> dict[str, Hashable]:
+    """The lamp of each flat, by its id. A lamp that is measured before every pass over the levels is one lamp; measured photons
+    compare whatever the lamp."""
     seen: list[tuple[str, Spectrum]] = []
     names: dict[str | None, str | None] = {None: None}
     for path in dict.fromkeys(flat.radiance for flat in flats):
@@ -101,7 +96,8 @@ def _lamps_of(recordings: RecordingSet, flats: Sequence[FlatCapture]) -> dict[st
         else:
             seen.append((path, spectrum))
             names[path] = path
-    return {flat.id: (names[flat.radiance], *stated_light(flat).lamp) for flat in flats}
+    measured = {flat.id for flat in flats if light[flat.id].unit == "photons" and flat.photons_per_pixel is None}
+    return {flat.id: (None if flat.id in measured else names[flat.radiance], *light[flat.id].lamp) for flat in flats}
 
 
 def _dark_levels(

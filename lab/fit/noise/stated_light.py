@@ -10,11 +10,17 @@ from lab.capture_kinds.flat import FlatCapture
 
 @dataclass(frozen=True)
 class StatedLight:
-    """The light of one flat. Amounts of one unit and wavelength compare where the lamp is the same."""
+    """The light of one flat. Amounts of one unit and wavelength compare where the lamp is the same.
+
+    `std`, `calibration_std`: relative standard uncertainties where it was measured, by its readings, and by the reference's calibration,
+    which is common to all that it measured.
+    """
 
     amount: float
     unit: Literal["photons", "s"]
     wavelength_nm: float | None
+    std: float = 0.0
+    calibration_std: float = 0.0
 
     @property
     def lamp(self) -> tuple[bool, float | None]:

@@ -98,3 +98,18 @@ def test_what_isnt_there_is_told_in_one_line(
     with pytest.raises(InstrumentError, match=r"text\.cti: it isn't a GenTL producer"):
         GentlCamera(RED, producer=str(tmp_path / "text.cti")).connect()
     assert capfd.readouterr().err == ""
+
+
+def test_a_description_that_fails_leaves_the_camera_free(viky: VikyCamera, tmp_path: Path) -> None:
+    (tmp_path / "broken.xml").write_text("<no>")
+    (tmp_path / "other.xml").write_text("<other/>")
+    with GentlCamera(RED, **viky.settings):  # the producer stays open
+        for name, message in (
+            ("none.xml", r"its description .*none\.xml can't be read \(.*No such file"),
+            ("broken.xml", "can't be read .*; correct it in the station file"),
+            ("other.xml", "camera 1: can't be opened"),
+        ):
+            with pytest.raises(InstrumentError, match=message):
+                GentlCamera(GREEN, **viky.settings | {"description": str(tmp_path / name)}).connect()
+        with GentlCamera(GREEN, **viky.settings) as camera:
+            assert camera.identity().serial_number == "1"

@@ -10,7 +10,8 @@ from lab.capture_kinds.flat import FlatCapture
 from lab.fit.noise.photon_numbers import photon_numbers, why_not
 from lab.fit.noise.recordings import fit_noise
 from lab.formats.recording_set import DataSheet, Manifest, RecordingSet
-from lab.formats.results import NoiseFit
+from lab.formats.results import CameraFit, FitResult, NoiseFit
+from lab.report.emva import data_sheets
 
 SHAPE, PITCH_UM, WAVELENGTH_NM = (96, 96), 5.0, 530.0
 QE, K_DN_PER_E = 0.6, 0.5
@@ -36,7 +37,7 @@ def flat(number: int, exposure_s: float = 1.0, irradiance: float = IRRADIANCE, *
 def test_by_hand() -> None:
     """1 W/m2 of 555 nm on 5 um x 5 um for 10 ms: 2.5e-13 J, of 3.5792e-19 J a photon."""
     (found,) = photon_numbers([flat(0, 0.01, 1.0, wavelength_nm=555.0)], CAMERA).values()
-    assert found.photons == pytest.approx(2.5e-13 / 3.5792e-19, rel=1e-4)
+    assert (found.amount, found.unit) == (pytest.approx(2.5e-13 / 3.5792e-19, rel=1e-4), "photons")
     assert found.calibration_std == pytest.approx(0.015)
 
 
@@ -45,10 +46,10 @@ def test_irradiances_that_agree_are_one_level() -> None:
     given = [flat(0), flat(1, irradiance=1.002 * IRRADIANCE), flat(2, irradiance=1.03 * IRRADIANCE), flat(3, 2.0)]
     found = photon_numbers(given, CAMERA)
     assert found["f0"] == found["f1"]
-    assert found["f0"].photons == pytest.approx(10010.0)
+    assert found["f0"].amount == pytest.approx(10010.0)
     # two readings of 0.1 % each scatter by 0.14 %, so that their mean's is at most 0.1 %
     assert found["f0"].std == pytest.approx(0.002 / np.sqrt(2) / np.sqrt(2) / 1.001, rel=1e-6)
-    assert [found[id].photons for id in ("f2", "f3")] == pytest.approx([10300.0, 20000.0])
+    assert [found[id].amount for id in ("f2", "f3")] == pytest.approx([10300.0, 20000.0])
 
 
 def test_behind_a_lens_or_without_a_pitch_there_are_none() -> None:
@@ -65,7 +66,7 @@ def test_behind_a_lens_or_without_a_pitch_there_are_none() -> None:
     assert why_not([stated], with_lens) is None
 
 
-def fitted(calibration: float, camera: DataSheet = CAMERA) -> NoiseFit:
+def recorded(calibration: float, camera: DataSheet = CAMERA) -> RecordingSet:
     """Flats in light of one wavelength; the photodiode reads `calibration` times its irradiance, and scatters by its readings."""
     rng = np.random.default_rng(5)
     captures: list[dict[str, object]] = []
@@ -90,7 +91,11 @@ def fitted(calibration: float, camera: DataSheet = CAMERA) -> NoiseFit:
                     "frame": name,
                 }
             captures.append(capture)
-    return fit_noise(RecordingSet(Manifest(cameras={"left": camera}, captures=tuple(captures)), frames), "left")
+    return RecordingSet(Manifest(cameras={"left": camera}, captures=tuple(captures)), frames)
+
+
+def fitted(calibration: float, camera: DataSheet = CAMERA) -> NoiseFit:
+    return fit_noise(recorded(calibration, camera), "left")
 
 
 def test_the_quantum_efficiency_has_the_photodiodes_error_apart() -> None:
@@ -121,3 +126,13 @@ def test_with_a_lens_the_fit_says_why_it_has_no_quantum_efficiency() -> None:
     assert fit.quantum_efficiency is None
     assert fit.emva1288["Y"].points.light_unit == "s"
     assert any("take the lens off" in text for text in fit.remarks)
+
+
+def test_the_data_sheet_finds_the_levels_by_measured_photons() -> None:
+    given = recorded(1.0)
+    fit = FitResult(source="memory", cameras={"left": CameraFit(noise=fit_noise(given, "left"))})
+    (sheet,) = data_sheets(given, fit)
+    (efficiency,) = next(row.values for row in sheet.rows if row.symbol == "η")
+    assert efficiency.endswith("(± 0.91 % by the photodiode's calibration)")  # 1.5 % of 0.606
+    assert "Spectrograms of the PRNU" in [plot.title for plot in sheet.plots]
+    assert any("the photodiode's calibration has a standard uncertainty of 1.5 %" in text for text in sheet.remarks)
