@@ -38,7 +38,7 @@ LEAST_CELL_PX = 2  # a side of the smallest frame's cells
 CELL_FLOOR_DN = 0.005
 MOST_CONDITIONS = 3  # exposures whose fixed pattern is looked at: the shortest, the longest, the warmest
 #: Edges of the counted bins, in standard deviations of a pixel's fixed pattern; below minus the first and second the dark ones.
-TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
+TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0, 200.0, 600.0
 
 
 @dataclass(frozen=True)

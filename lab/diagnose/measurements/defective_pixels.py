@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,8 +28,11 @@ LEAST_COUNTED_DN = 0.6  # the same of single pixels, whose far tail counts
 FLICKER_EDGES = 1.0, 1.6, 2.6, 5.0, 12.0
 FLICKER_CHANCE = 1e-5
 JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)  # draws of which frames of a jumping pixel are high
-#: Standard deviation of a count's root beside chance (which is about 1 where many are expected): one defective pixel more is no finding.
+#: Standard deviation of a count's root beside chance (which is about 1 where many are expected): one defective pixel more is no finding,
 COUNT_STD = 0.6
+#: save where it stands so many standard deviations off in every one of several frames that neither a distribution's tail nor a particle
+#: explains it: that there is one at all counts as so much more, nearly seven of `COUNT_STD`.
+FAR, PRESENCE = 20.0, 4.0
 
 
 def _rooted(counts: FloatArray) -> FloatArray:
@@ -49,12 +52,27 @@ def _count_covariance(expected: FloatArray, uncertain: FloatArray | float = 0.0)
 def defective_pixel_block(study: Study) -> Block:
     """Roots of the numbers of pixels that lie far from their surroundings in the median of repeats, by how far and by exposure.
 
+    That there are any far off in several frames, where none is expected, counts as `PRESENCE` more.
+
     Hot pixels are the same in every frame, and bright in proportion to the exposure. Jumps between two levels count where the temporal
     noise is fine enough to tell them from a fixed level, as for `flickering_pixel_block`: below, all repeats of a pixel have one code.
     """
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
-    value = np.concatenate([_rooted(part.counts) for *_, part in points])
+    low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]])
+    far = [(low >= FAR) & (part.of_median > 1) for *_, part in points]
+
+    def rooted(counts: FloatArray, present: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Roots of counts (points x bins,); in a point's first bin that is far off, whether any pixel is, too."""
+        found = _rooted(counts)
+        for number, is_far in enumerate(far):
+            if is_far.any():
+                first = number * len(low)
+                anywhere = counts[first : first + len(low)][is_far].sum()
+                found[first + int(np.argmax(is_far))] += PRESENCE * present(anywhere)
+        return found
+
+    value = rooted(np.concatenate([part.counts for *_, part in points]), np.sign)
     size = study.camera.rows * study.camera.cols
     bins = len(points[0][2].counts)
     own = [_pixel_noise(study, f, part) for f, _, part in points]
@@ -71,19 +89,22 @@ def defective_pixel_block(study: Study) -> Block:
             )
         return np.concatenate(found)
 
-    low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]])
     labels = tuple(
         Label(float(low[b]), "all", f.condition.name, part.captures, out)
         for f, out, part in points
         for b in range(bins)
     )
+
+    def predict(effects: Effects) -> Prediction:
+        return Prediction(rooted(expected(effects), lambda number: -np.expm1(-number)), {})
+
     base = expected(())
     # the skewness of the bulk doesn't determine the far tail
     uncertain = np.abs(expected((), 2.0) - expected((), 0.0)) + 0.2 * base
     return Block(
         measurement=DEFECTIVE_PIXELS, reach=1.0, value=value,
         covariance=_count_covariance(base, uncertain), labels=labels, reads=DEFECTS,
-        predict=lambda effects: Prediction(_rooted(expected(effects)), {}), scale=np.full(len(value), 10.0),
+        predict=predict, scale=np.full(len(value), 10.0),
         along=np.tile(np.sign(low) * np.log(np.abs(low)), len(points)),
     )  # fmt: skip
 
@@ -296,7 +317,7 @@ DEFECTIVE_PIXELS = Measurement(
     axis="deviation",
     unit="standard deviations",
     make=defective_pixel_block,
-    quantity="number of pixels, 2 sqrt(n + 3/8)",
+    quantity="number of pixels, 2 sqrt(n + 3/8), 4 more where any lies far off",
     conditions="exposure and temperature",
 )
 
