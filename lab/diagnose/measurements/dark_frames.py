@@ -39,7 +39,7 @@ CELL_FLOOR_DN = 0.005  # standard deviation of a cell's mean beside noise
 MOST_CONDITIONS = 3  # conditions whose fixed pattern is measured: the shortest, the longest, the warmest
 #: Lower edges of the bins in which outlying pixels are counted, in standard deviations of a pixel's fixed pattern. The first two count
 #: dark pixels as well, below their negatives.
-TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0
+TAIL_EDGES = 4.5, 6.0, 10.0, 20.0, 60.0, 200.0, 600.0
 
 
 @dataclass(frozen=True)

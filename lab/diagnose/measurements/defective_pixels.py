@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,9 @@ FLICKER_CHANCE = 1e-5
 JUMPS, HIGH_SHARES = 400, (0.5, 0.15, 0.5, 0.85)
 #: Standard deviation of a rooted count beside chance (about 1 for large counts): one more defective pixel is no finding.
 COUNT_STD = 0.6
+#: A pixel that is `FAR` standard deviations off in each of several frames is neither a distribution's tail nor a particle. Whether there
+#: is any counts as `PRESENCE` more, nearly seven of `COUNT_STD`.
+FAR, PRESENCE = 20.0, 4.0
 
 
 def _rooted(counts: FloatArray) -> FloatArray:
@@ -52,12 +55,25 @@ def defective_pixel_block(study: Study) -> Block:
     """Anscombe-transformed numbers of pixels by their deviation from their surroundings in the median of repeats, by exposure.
 
     The bins are `TAIL_EDGES`, in standard deviations of single pixels. Hot pixels are the same in every frame, and as bright as the exposure is long. Telegraph noise
-    is predicted where the temporal noise exceeds `LEAST_COUNTED_DN`: with less, all repeats of a pixel have one code. Raises
-    NotDetermined without dark captures.
+    is predicted where the temporal noise exceeds `LEAST_COUNTED_DN`: with less, all repeats of a pixel have one code. That any pixel is
+    far off in several frames, where none is expected, counts as `PRESENCE` more. Raises NotDetermined without dark captures.
     """
     frames = [f for f in study.once(dark_frames) if f.fixed]
     points = [(f, out, part) for f in frames for out, part in f.fixed.items()]
-    value = np.concatenate([_rooted(part.counts) for *_, part in points])
+    low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]])
+    far = [(low >= FAR) & (part.of_median > 1) for *_, part in points]
+
+    def rooted(counts: FloatArray, present: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Roots of counts (points x bins,); in a point's first bin that is far off, whether any pixel is, too."""
+        found = _rooted(counts)
+        for number, is_far in enumerate(far):
+            if is_far.any():
+                first = number * len(low)
+                anywhere = counts[first : first + len(low)][is_far].sum()
+                found[first + int(np.argmax(is_far))] += PRESENCE * present(anywhere)
+        return found
+
+    value = rooted(np.concatenate([part.counts for *_, part in points]), np.sign)
     size = study.camera.rows * study.camera.cols
     bins = len(points[0][2].counts)
     own = [_pixel_noise(study, f, part) for f, _, part in points]
@@ -74,19 +90,22 @@ def defective_pixel_block(study: Study) -> Block:
             )
         return np.concatenate(found)
 
-    low = np.array([*TAIL_EDGES, -TAIL_EDGES[0], -TAIL_EDGES[1]])
     labels = tuple(
         Label(float(low[b]), "all", f.condition.name, part.captures, out)
         for f, out, part in points
         for b in range(bins)
     )
+
+    def predict(effects: Effects) -> Prediction:
+        return Prediction(rooted(expected(effects), lambda number: -np.expm1(-number)), {})
+
     base = expected(())
     # the skewness of most pixels doesn't determine the far tail
     uncertain = np.abs(expected((), 2.0) - expected((), 0.0)) + 0.2 * base
     return Block(
         measurement=DEFECTIVE_PIXELS, reach=1.0, value=value,
         covariance=_count_covariance(base, uncertain), labels=labels, reads=DEFECTS,
-        predict=lambda effects: Prediction(_rooted(expected(effects)), {}), scale=np.full(len(value), 10.0),
+        predict=predict, scale=np.full(len(value), 10.0),
         along=np.tile(np.sign(low) * np.log(np.abs(low)), len(points)),
     )  # fmt: skip
 
@@ -311,7 +330,7 @@ DEFECTIVE_PIXELS = Measurement(
     axis="deviation",
     unit="standard deviations",
     make=defective_pixel_block,
-    quantity="number of pixels, 2 sqrt(n + 3/8)",
+    quantity="number of pixels, 2 sqrt(n + 3/8), 4 more where any lies far off",
     conditions="exposure and temperature",
 )
 

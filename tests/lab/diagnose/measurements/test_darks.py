@@ -226,6 +226,20 @@ def test_a_concealed_law_is_named(law: Law, names: str) -> None:
     assert _names(verdict)[:1] == [names]
 
 
+def test_one_hot_pixel_of_a_small_frame_is_named() -> None:
+    """One of 768 pixels collects 150 e/s more, some 60 DN in 2 s where others lie within 3 DN: no tail and no particle does that in every
+    frame. Its healthy twin shows nothing."""
+    hot, healthy = (
+        _verdict(recordings_of(ConcealedCamera(5000, built_in, rows=24, cols=32), Plan(("dark",))))
+        for built_in in ([laws.HotPixelsLaw(150.0, 0, 11)], [])
+    )
+    assert _names(hot) == ["hot_pixels"]
+    found, std = hot.named[0].effect.model_dump(), hot.named[0].std
+    for name, truth in (("excess_e_per_s", 150.0), ("share_ppm", 1e6 / 768.0)):
+        assert abs(found[name] - truth) < 4.0 * (std[name] or 0.0), name
+    assert _names(healthy) == []
+
+
 @pytest.mark.parametrize(
     "one",
     [
