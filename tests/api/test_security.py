@@ -25,6 +25,9 @@ ROUTES = [
     ("GET", "/stations", "read"),
     ("GET", "/devices", "operate"),
     ("GET", "/stations/{name}", "read"),
+    ("GET", "/sequences", "read"),
+    ("GET", "/sequences/{sequence}", "read"),
+    ("POST", "/stations/{name}/estimate", "read"),
     ("GET", "/stations/{name}/devices", "read"),
     ("GET", "/stations/{name}/devices/{device}", "read"),
     ("POST", "/stations/{name}/devices/{device}/check", "operate"),
@@ -67,7 +70,28 @@ ROUTES = [
     ("GET", "/jobs/{job_id}/events", "read"),
     ("GET", "/jobs/{job_id}/result", "read"),
     ("GET", "/jobs/{job_id}/report", "read"),
+    ("GET", "/camera-models", "read"),
+    ("GET", "/camera-models/{model_id}", "read"),
+    ("GET", "/camera-models/{model_id}/archive.zip", "read"),
+    ("GET", "/comparisons", "read"),
+    ("GET", "/comparisons/page", "read"),
+    ("GET", "/challenges", "read"),
+    ("POST", "/challenges", "calibrate"),
+    ("GET", "/challenges/{challenge_id}", "read"),
+    ("DELETE", "/challenges/{challenge_id}", "calibrate"),
+    ("POST", "/challenges/{challenge_id}/jobs", "calibrate"),
+    ("GET", "/challenges/{challenge_id}/cases/{case}/archive.zip", "read"),
+    ("GET", "/challenges/{challenge_id}/score", "read"),
+    ("GET", "/challenges/{challenge_id}/truths", "read"),
 ]
+#: What can't be used as it is sent here: an empty upload, a query without its parameters, a challenge of no case.
+UNUSABLE = {
+    ("POST", "/recordings"),
+    ("GET", "/history"),
+    ("GET", "/comparisons"),
+    ("GET", "/comparisons/page"),
+    ("POST", "/challenges"),
+}
 BODIES: dict[str, Any] = {
     "/sessions": {"station": "nowhere"},
     "/pipelines": {"station": "nowhere"},
@@ -75,6 +99,9 @@ BODIES: dict[str, Any] = {
     "/calibrations/{calibration_id}/certify": {},
     "/halt": {"station": "nowhere"},
     "/sessions/{session_id}/queue": {},
+    "/stations/{name}/estimate": {},
+    "/challenges": {"cases": 0},
+    "/challenges/{challenge_id}/jobs": {"kind": "score"},
 }
 
 
@@ -96,6 +123,10 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         "calibration_id": "0" * 16,
         "name": "nothing",
         "device": "stage",
+        "sequence": "nothing",
+        "model_id": "0" * 16,
+        "challenge_id": "0" * 16,
+        "case": "case-0001",
     }
     asked = "/api/v1" + re.sub(r"\{(\w+)\}", lambda found: ids[found[1]], path)
     body = BODIES.get(path, BODIES["jobs"] if path.endswith("/jobs") and method == "POST" else None)
@@ -107,13 +138,9 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
             assert response.status_code == 401
             assert response.headers["www-authenticate"] == "Bearer"
         elif Permission(scope).allows(Permission(least)):
-            # What is asked for isn't there, or is an empty upload: the key was good enough to be told so.
+            # What is asked for isn't there, or can't be used: the key was good enough to be told so.
             assert response.status_code == (
-                422
-                if path in ("/recordings", "/history") and (method, path) != ("GET", "/recordings")
-                else 200
-                if "{" not in path and method == "GET"
-                else 404
+                422 if (method, path) in UNUSABLE else 200 if "{" not in path and method == "GET" else 404
             )
         else:
             assert response.status_code == 403
