@@ -38,7 +38,7 @@ LEAST_SPACING = 4  # codes from one place to the next
 FAR = 1.3  # of the noise's standard deviation: distance over which the curve beside a place is fitted
 DEGREE_BESIDE = 1
 STEP_COUNT = 3.0  # of each code about a place; the sum over a place has a hundred times as many
-STEP_FLOOR = 0.02  # what a step is worth at least (DN): smooth curves' own error
+STEP_FLOOR = 0.01  # of the codes from place to place: what smooth curves leave, most beside steep ones
 COMB_FLOOR = 3e-4
 VARIANCE_FLOOR = 0.03  # of a chi2's number of codes
 #: Frequencies of the combs, cycles a code.
@@ -91,7 +91,7 @@ def code_block(study: Study) -> Block:
             np.array([p.excess(residual) - p.number / p.chi2_std for p in parts]),
         ]
         linear = np.vstack([steps, combs])
-        floor = np.concatenate([np.full(len(steps), STEP_FLOOR), np.full(len(combs), COMB_FLOOR)])
+        floor = np.concatenate([np.full(len(steps), STEP_FLOOR * _spacing(study)), np.full(len(combs), COMB_FLOOR)])
         covariances += [
             _covariance(linear, codes, counts[held_out]) + np.diag(np.square(floor)),
             np.diag([1.0 + (VARIANCE_FLOOR * p.number / p.chi2_std) ** 2 for p in parts]),
@@ -265,6 +265,11 @@ def _combs(codes: _Codes) -> tuple[FloatArray, list[tuple[float, str]]]:
     return np.array(table).reshape(len(table), len(index)), names
 
 
+def _spacing(study: Study) -> int:
+    """Codes from one place to the next."""
+    return max(round(2.0**study.camera.bit_depth / PLACES), LEAST_SPACING)
+
+
 def _steps(study: Study, codes: _Codes) -> tuple[FloatArray, list[int]]:
     """Weights of the counts that give how many codes' worth is missing about each of `PLACES` parts of the converter's range, and these
     codes.
@@ -272,10 +277,9 @@ def _steps(study: Study, codes: _Codes) -> tuple[FloatArray, list[int]]:
     Codes count the less, the further they are from the place, and not at all from the next place on: what is missing anywhere is shared by
     the two places beside it. It is missing against `expected` and the parabola that it lacks on either side of both neighbours.
     """
-    full = 2.0**study.camera.bit_depth
-    spacing = max(round(full / PLACES), LEAST_SPACING)
+    spacing = _spacing(study)
     table, at = [], []
-    for k in range(1, int(full / spacing)):
+    for k in range(1, int(2.0**study.camera.bit_depth / spacing)):
         place = k * spacing - codes.first
         if not 0 <= place < len(codes.count):
             continue
