@@ -156,10 +156,11 @@ class FoundParameter(Frozen):
 
 class LiveRun(Frozen):
     """The outcome of a case. `named`: effects with their sides; `first_named`, `first_rivals`: names and rivals before `--resolve` took
-    its `captures`."""
+    its `captures`. `commit`: of the code, abbreviated; empty outside a checkout."""
 
     case: LiveCase
     outcome: Outcome
+    commit: str = ""
     verdict: str = ""
     named: dict[str, tuple[Side, ...]] = {}
     rivals: dict[str, tuple[str, ...]] = {}
@@ -325,9 +326,16 @@ def _reaches(name: str, sides: tuple[Side, ...], wanted: dict[str, frozenset[Sid
     return name not in wanted or set(sides) <= wanted[name]
 
 
+def _commit() -> str:
+    """Abbreviated hash of the checkout's commit, with `+` where files differ from it; empty where there is no checkout."""
+    command = ["git", "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    return done.stdout.strip()
+
+
 def run_all(cases: dict[str, LiveCase], out: Path) -> dict[str, LiveRun]:
     """Case -> result: from OUT/results where it exists, else run now, in order."""
-    runs = {}
+    runs, commit = {}, _commit()
     for name, case in cases.items():
         file = out / "results" / f"{name}.json"
         if file.exists():
@@ -335,7 +343,7 @@ def run_all(cases: dict[str, LiveCase], out: Path) -> dict[str, LiveRun]:
             if kept.case == case and kept.outcome != "failed":
                 runs[name] = kept
                 continue
-        runs[name] = run_case(case, out / "session" / name)
+        runs[name] = run_case(case, out / "session" / name).model_copy(update={"commit": commit})
         store(runs[name], file)
         print(f"{name}: {runs[name].outcome}, {runs[name].wall_s:.0f} s", flush=True)
     return runs

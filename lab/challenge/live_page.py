@@ -38,6 +38,12 @@ def summary(runs: Mapping[str, LiveRun]) -> str:
     for name, group in groups.items():
         counts = ", ".join(f"{outcome} {n}" for outcome, n in Counter(run.outcome for run in group).most_common())
         lines.append(f"| {name} | {len(group)} | {counts or '-'} |")
+    by_commit: dict[str, list[str]] = {}
+    for name, run in runs.items():
+        by_commit.setdefault(run.commit or "unknown", []).append(name)
+    usual = max(by_commit, key=lambda commit: len(by_commit[commit]), default="unknown")
+    lines.append(f"\nRun at commit {usual}" + ("." if len(by_commit) < 2 else ", except:"))
+    lines += [f"- {commit}: {', '.join(names)}" for commit, names in by_commit.items() if commit != usual]
     unseen = sorted(name for name in runs if name in library() and name not in names_of(name))
     if unseen:
         lines.append(f"\nNot looked for, or shown by no measurement, so that no name is right: {', '.join(unseen)}.")

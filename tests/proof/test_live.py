@@ -23,7 +23,7 @@ from lab.challenge.live import (
     run_case,
     typical_spec,
 )
-from lab.challenge.live_page import drawing, table, write_page
+from lab.challenge.live_page import drawing, summary, table, write_page
 from lab.challenge.truth import store
 from lab.formats.results import DiagnosisResult, NamedEffect, ParameterValue, Rival
 from mocks.conceal import NOT_SHOWN, parse
@@ -118,6 +118,9 @@ def test_results_that_are_there_are_not_run_again(tmp_path: Path) -> None:
     assert "defocus_um 21 ± 0.1 um, 22" in table(runs)
     assert drawing(runs).count("<circle") == 1
     assert (tmp_path / "page-live.svg").is_file()
+    assert "Run at commit unknown." in text
+    others = {name: kept.model_copy(update={"commit": "1234567"}) for name in ("coma", "ghost")}
+    assert "Run at commit 1234567, except:\n- unknown: defocus" in summary(runs | others)
 
 
 def test_a_bench_that_refuses_is_a_failed_case(tmp_path: Path) -> None:
