@@ -47,7 +47,9 @@ AROUND = 9  # side of the box in a plane of the mosaic whose mean is the light a
 #: Width of the levels whose pixels share one normal distribution, over the standard deviation of the noise.
 STEP_OF_LEVELS = 0.2
 PARTS = 4  # of the range of codes, each with a chi2 of its own
-FINE = 8  # samples a code at which the converter's law is evaluated
+FINE = 8  # samples a code at which the converter's law is evaluated where it isn't straight
+STRAIGHT = 1e-9  # codes: second difference of a law between codes, of rounding alone
+MARGIN = 64  # codes beyond those that are counted
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def code_block(study: Study) -> Block:
         )
     labels: list[Label] = []
     places: list[tuple[float, float]] = []
-    sets: list[tuple[_Codes, FloatArray, list[_Part]]] = []
+    sets: list[tuple[_Codes, sparse.csr_array, list[_Part]]] = []
     values, covariances = [], []
     for held_out in (False, True):
         codes = _prepared(study, counts[held_out])
@@ -109,7 +111,7 @@ def code_block(study: Study) -> Block:
         places += [(float(codes.first + b), 0.0) for b in boundaries]
         places += [(0.0, far * k) for k in range(len(names))]
         places += [(label.x, 0.0) for label in labels[len(places) :]]
-        sets.append((codes, linear, parts))
+        sets.append((codes, sparse.csr_array(linear), parts))
     if not labels:
         raise NotDetermined(
             "code_density", f"no even light over {LEAST_CODES} codes and more whose noise exceeds {LEAST_NOISE:g} codes"
@@ -336,20 +338,35 @@ def _parts(codes: _Codes) -> list[_Part]:
 
 
 def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
-    """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter."""
-    margin = 64
-    size = len(codes.count)
-    x = (np.arange((size + 2 * margin) * FINE) + 0.5) / FINE - 0.5 + codes.first - margin
-    x = Uniform(study.camera, effects).codes(x)
+    """Width (codes,) of each code: the interval of the converter's input that gives it, 1 for an ideal converter.
+
+    The input is cut at the edges of the ideal converter's codes. Where the converter's law is straight over several of these intervals, what
+    lands on each code is exact; other intervals are sampled `FINE` times.
+    """
+    size, law = len(codes.count), Uniform(study.camera, effects).codes
+    edge: FloatArray = np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN  # from the first counted code on
+    lands = law(edge + codes.first) - codes.first
+    bend = np.abs(np.diff(lands, 2)) > STRAIGHT
+    bent = np.zeros(len(edge) - 1, bool)
+    bent[:-1] |= bend
+    bent[1:] |= bend
+    found = np.zeros(size)
+    x = (edge[:-1][bent][:, None] + (np.arange(FINE) + 0.5) / FINE).ravel()
     # a sample stands for an interval of 1 / FINE of a code, which may be shared by two codes
-    top = x + 0.5 / FINE - codes.first
+    top = law(x + codes.first) - codes.first + 0.5 / FINE
     code = np.rint(top).astype(int)
     above = np.clip((top - code + 0.5) * FINE, 0.0, 1.0)
-    found = np.zeros(size + 1)
     for at, share in ((code, above), (code - 1, 1.0 - above)):
         inside = (at >= 0) & (at < size)
-        found += np.bincount(at[inside], share[inside], minlength=size + 1)
-    return found[:size] / FINE
+        found += np.bincount(at[inside], share[inside], minlength=size) / FINE
+    turns = np.flatnonzero(np.diff(np.r_[True, bent, True]))
+    for begin, end in zip(turns[::2], turns[1::2], strict=True):
+        low, high = lands[begin], lands[end]
+        first, last = (int(np.clip(np.rint(y), 0, size - 1)) for y in (low, high))
+        cuts = np.clip(np.arange(first, last + 2) - 0.5, low, high)
+        cuts[0], cuts[-1] = max(cuts[0], -0.5), min(cuts[-1], size - 0.5)
+        found[first : last + 1] += np.maximum(np.diff(cuts), 0.0) * (end - begin) / (high - low)
+    return found
 
 
 CODE_DENSITY = Measurement(

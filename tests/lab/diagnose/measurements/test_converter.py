@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.measurements.code_density import code_block
+from lab.diagnose.measurements.code_density import _widths, code_block
 from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.measurements.noise import variance_block
@@ -143,3 +144,25 @@ def test_what_the_converter_does_at_black_moves_darks_as_all_other_levels() -> N
     blurred = np.exp(-0.5 * (2.0 * np.pi * study.noise.gain * study.camera.read_noise_e / short.period_dn) ** 2)
     wanted = blurred * (0.4 * np.sin(turn) + 0.3 * np.cos(turn))
     np.testing.assert_allclose(dark.predict((short,)).mean - before, wanted, atol=1e-3)
+
+
+def test_widths_of_codes_are_what_fine_samples_of_the_input_give() -> None:
+    """A step between two codes, a step of many, a saw tooth of three bits and a ripple with a step, against 512 samples a code: an
+    interval that straddles a step is sampled 8 times, so that a width is off by 1 / 8 of a code at most, and by less than 1e-3 elsewhere."""
+    study = _study(7)
+    first, size = 300, 3000
+    codes = SimpleNamespace(count=np.zeros(size), first=first)
+    steps = effect("adc_step")
+    laws = (
+        (steps(step_dn=-2.3, code_dn=1234.2),),
+        (steps(step_dn=17.0, code_dn=2048.0),),
+        (effect("adc_nonlinearity")(error_dn=4.0),),
+        (AdcRipple(sine_dn=1.0, period_dn=256.0), steps(step_dn=0.7, code_dn=900.0)),
+    )
+    x = (np.arange((size + 200) * 512) + 0.5) / 512 - 0.5 + first - 100
+    for acting in laws:
+        landed = np.rint(Uniform(study.camera, acting).codes(x)).astype(int) - first
+        wanted = np.bincount(landed[(landed >= 0) & (landed < size)], minlength=size) / 512
+        off = np.abs(_widths(codes, acting, study) - wanted)  # type: ignore[arg-type]
+        assert off.max() < 0.126
+        assert np.sum(off > 5e-3) <= 8
