@@ -344,7 +344,7 @@ def _widths(codes: _Codes, effects: Effects, study: Study) -> FloatArray:
     lands on each code is exact; other intervals are sampled `FINE` times.
     """
     size, law = len(codes.count), Uniform(study.camera, effects).codes
-    edge: FloatArray = np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN  # from the first counted code on
+    edge = np.asarray(np.arange(size + 2 * MARGIN + 1) - 0.5 - MARGIN, float)  # from the first counted code on
     lands = law(edge + codes.first) - codes.first
     bend = np.abs(np.diff(lands, 2)) > STRAIGHT
     bent = np.zeros(len(edge) - 1, bool)
