@@ -35,6 +35,7 @@ Outcome = Literal["named", "among rivals", "not named", "wrong name", "healthy",
 #: `sim.effects.library.typical`.
 SIZES: dict[str, str] = {
     "adc_nonlinearity": "left:error_dn=4",
+    "adc_step": "left:step_dn=3,code_dn=1500",
     "ambient_light": "both:rate_e_per_s=400,red_over_blue=3",
     "amplifier_glow": "left:glow_e_per_s=60,reach_mm=0.5",
     "astigmatism": "left:defocus_x_um=22",
