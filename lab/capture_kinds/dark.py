@@ -46,7 +46,7 @@ class DarkSequence(Sequence):
     purpose: ClassVar[str] = "black level, read noise, DSNU, dark current"
     targets: ClassVar[tuple[type[Target], ...]] = (CapTarget,)
 
-    exposures_s: Annotated[tuple[float, ...], Quantity("s", "exposures of the ladder", lower=1e-6, upper=3600.0)] = (
+    exposures_s: Annotated[tuple[float, ...], Quantity("s", "exposures of the series", lower=1e-6, upper=3600.0)] = (
         Field(min_length=1, max_length=200)
     )
     frames: Annotated[int, Quantity("1", "frames at each exposure", lower=1, upper=20_000)]

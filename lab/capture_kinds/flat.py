@@ -56,7 +56,7 @@ class FlatSequence(Sequence):
     targets: ClassVar[tuple[type[Target], ...]] = (SphereTarget,)
 
     levels: Annotated[
-        tuple[float, ...], Quantity("1", "levels of the ladder, shares of saturation", lower=1e-4, upper=20.0)
+        tuple[float, ...], Quantity("1", "levels of the series, shares of saturation", lower=1e-4, upper=20.0)
     ] = Field(min_length=1, max_length=200)
     frames: Annotated[int, Quantity("1", "frames at each level", lower=1, upper=20_000)]
     level_found: Level = 0.75
