@@ -311,8 +311,14 @@ def _outcome(
     strange = [name for name, sides in named.items() if name not in allowed or not _reaches(name, sides, wanted)]
     missing = [name for name, names in right.items() if name in names and name not in named]
     if strange:
-        told = {rival for name in strange for rival in rivals[name]}
-        return "among rivals" if missing and told.issuperset(missing) else "wrong name"
+
+        def stands_for(name: str) -> set[str]:
+            """Concealed effects among a name's rivals that aren't named on its own sides."""
+            sides = set(named[name])
+            return {r for r in rivals[name] if r in wanted and sides <= wanted[r] - set(named.get(r, ()))}
+
+        told = [stands_for(name) for name in strange]
+        return "among rivals" if all(told) and set().union(*told).issuperset(missing) else "wrong name"
     return "not named" if missing else "named"
 
 

@@ -98,6 +98,22 @@ def test_a_diagnosis_is_judged(found: DiagnosisResult, outcome: str) -> None:
     assert [p.truth for p in run.parameters] == ([22.0] if found.effects and found.effects[0].parameters else [])
 
 
+@pytest.mark.parametrize(
+    ("rivals", "sides", "outcome"),
+    [
+        (("vibration_blur",), ("right",), "among rivals"),  # one camera tells the effect, the other its rival
+        ((), ("right",), "wrong name"),
+        (("coma",), ("right",), "wrong name"),
+        (("vibration_blur",), ("left", "right"), "wrong name"),  # a second name beside the effect
+    ],
+)
+def test_each_side_of_an_effect_on_both_is_judged(
+    rivals: tuple[str, ...], sides: tuple[Side, ...], outcome: str
+) -> None:
+    found = result("explained", ("optical_low_pass_filter", ("left",), {}, rivals), ("vibration_blur", sides, {}, ()))
+    assert judged(every_case()["vibration_blur"], found).outcome == outcome
+
+
 def test_a_healthy_camera_is_right_without_a_name() -> None:
     case = every_case()["healthy-11"]
     assert judged(case, result("no_mismatch")).outcome == "healthy"
