@@ -11,7 +11,7 @@ from lab.challenge.live import FoundParameter, LiveRun, every_case, names_of
 from lab.challenge.proof import ABSTAINED, RIGHT, WRONG, placed
 from sim.effects.library import effects as library
 
-ROW_PX, LABEL_PX, PLOT_PX, HEAD_PX = 18, 330, 380, 40
+ROW_PX, LABEL_PX, PLOT_PX, HEAD_PX = 18, 400, 380, 40
 #: Found over true, at the plot's ends.
 LOW, HIGH = 0.0, 2.0
 COLOURS = {"named": RIGHT, "healthy": RIGHT, "among rivals": ABSTAINED, "not named": ABSTAINED}
