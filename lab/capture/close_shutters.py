@@ -1,4 +1,4 @@
-"""The first thing of a start: the shutters of stations whose session ended without a word are closed.
+"""The first step of a start: close the shutters of stations whose session ended by a crash.
 
 It needs the standard library and the monochromator's driver alone, a tenth of a second of CPU, where the registry's own libraries take
 more than half a second: on a busy computer that is several seconds of light. `lab.capture.recovery` then does the whole work: all instruments,
@@ -57,10 +57,9 @@ def _under_way(registry: Path) -> list[tuple[str, dict[str, Any]]]:
 
 def _close(data: Path, session_id: str, station: dict[str, Any], closed: list[str]) -> None:
     entry = station.get("monochromator")
-    # The lock isn't kept: the recovery takes it while an instrument that doesn't answer is still waited for here.
-    if (
-        not entry or Lock(data / "sessions" / session_id / ".lock").is_held()
-    ):  # there is no shutter, or the session's process lives
+    # No shutter, or the session's process lives. The lock isn't kept: the recovery takes it while an instrument that doesn't answer is
+    # still waited for here.
+    if not entry or Lock(data / "sessions" / session_id / ".lock").is_held():
         return
     try:
         settings = {key: value for key, value in entry.items() if key not in ("driver", "address")}

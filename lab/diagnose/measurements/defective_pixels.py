@@ -150,7 +150,7 @@ def _defect_classes(model: Uniform, gain: float, exposure_s: float) -> list[_Def
 def _tail_shares(
     classes: Sequence[_DefectClass], moving: float, fixed: float, frames: int, spread: float, gain: float, skew: float
 ) -> FloatArray:
-    """Expected shares of all pixels in the bins of `TAIL_EDGES` and the two dark ones, (7,).
+    """Expected shares of all pixels in the bins of `TAIL_EDGES` and the two of dark pixels, (bins,).
 
     A pixel's value is the lower median of `frames` numbers with the standard deviation `moving` (DN) and the skewness `skew`, on a
     normal fixed deviation of standard deviation `fixed` (DN). It is compared with the edges times `spread` (DN).
