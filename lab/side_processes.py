@@ -94,6 +94,8 @@ class _Process:
     """A process that carries out tasks."""
 
     def __init__(self) -> None:
+        #: Held while a task is carried out: its pipes are closed before or after that, never meanwhile.
+        self._in_use = threading.Lock()
         # Of its own session: Ctrl-C is for the caller, who ends this process.
         self._process = subprocess.Popen(
             [sys.executable, "-m", "lab.side_processes"],
@@ -105,21 +107,24 @@ class _Process:
 
     def carry_out(self, task: Task[Any], say: Callable[[Any], None]) -> None:
         """Send the task, and pass on what the process says, its findings last. Raises EOFError, with how it ended, where the process
-        ends before."""
+        ends before. Does nothing after `end`: an interrupt may end the process while the thread that calls this is being started."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):
-            pickle.dump(task, self._process.stdin, pickle.HIGHEST_PROTOCOL)
-            self._process.stdin.flush()
-        try:
-            while True:
-                what = pickle.load(self._process.stdout)
-                say(what)
-                if isinstance(what, _TaskResult | BaseException):
-                    return
-        except (EOFError, pickle.UnpicklingError):
-            ended = self._process.wait()
-            raise EOFError(f"signal {-ended}" if ended < 0 else f"exit code {ended}") from None
+        with self._in_use:
+            if self._process.stdin.closed:
+                return
+            with contextlib.suppress(BrokenPipeError):
+                pickle.dump(task, self._process.stdin, pickle.HIGHEST_PROTOCOL)
+                self._process.stdin.flush()
+            try:
+                while True:
+                    what = pickle.load(self._process.stdout)
+                    say(what)
+                    if isinstance(what, _TaskResult | BaseException):
+                        return
+            except (EOFError, pickle.UnpicklingError):
+                ended = self._process.wait()
+                raise EOFError(f"signal {-ended}" if ended < 0 else f"exit code {ended}") from None
 
     @property
     def lives(self) -> bool:
@@ -129,18 +134,19 @@ class _Process:
         self._process.kill()
 
     def end(self) -> None:
-        """Let it end, as it does when it can't hear of a task any more, and wait for that."""
+        """Let it end, as it does when it can't hear of a task any more, and wait for that and for `carry_out`."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
-        self._process.wait()
-        self._process.stdout.close()
+        with self._in_use:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+            self._process.wait()
+            self._process.stdout.close()
 
 
 class _Work:
-    """One side's task in a process, and a thread that reads what the process says. Leaving the context ends the thread, and the process
-    where it isn't kept."""
+    """One side's task in a process, and a thread that reads what the process says. Leaving the context ends the process where it isn't
+    kept, and with it what the thread reads."""
 
     def __init__(self, side: Side, task: Task[Any], said: queue.SimpleQueue[tuple[Side, Any]], doing: str) -> None:
         self._side, self._task, self._said, self._doing = side, task, said, doing
@@ -163,8 +169,6 @@ class _Work:
         waiting = _waiting.get()
         if kind is not None:
             self._process.kill()
-        if self._listener.is_alive():
-            self._listener.join()
         if kind is None and waiting is not None:
             waiting.append(self._process)
         else:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab import side_processes
 from lab.diagnose import diagnose
 from lab.errors import InputError
 from lab.formats.recording_set import Manifest, RecordingSet, read, write
@@ -106,6 +107,16 @@ def test_kept_processes_take_the_next_task_and_a_dead_one_is_replaced() -> None:
         assert diagnose(recordings) == first
         assert len(_children()) == 2
         assert kept[0] not in _children()
+    assert not _children()
+
+
+def test_a_process_that_was_ended_carries_nothing_out() -> None:
+    """Ctrl-C while the listening thread is being started: the thread finds closed pipes."""
+    process = side_processes._Process()
+    process.end()
+    said: list[object] = []
+    process.carry_out(int, said.append)
+    assert not said
     assert not _children()
 
 
