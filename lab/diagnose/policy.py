@@ -286,12 +286,12 @@ class DecisionPolicy(Frozen):
             "as `least_explained_share_open`: 2 % may be left",
         ),
     ] = 0.02
-    equal_sign_log_odds: Annotated[
+    equal_mode_log_odds: Annotated[
         float,
         Rule(
             "name",
             "log odds",
-            "difference within which both signs of a parameter count as equally likely",
+            "difference within which two modes of a parameter, both signs for one, count as equally likely",
             "a likelihood ratio of two standard deviations: 2^2 / 2",
         ),
     ] = 2.0

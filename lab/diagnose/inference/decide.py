@@ -19,7 +19,7 @@ from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import named_members
 from lab.diagnose.inference.outlying import OutlyingLevel, outlying_levels
-from lab.diagnose.inference.refit import log_likelihood
+from lab.diagnose.inference.refit import log_likelihood, refit
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import ModelSet, Search
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
@@ -27,6 +27,9 @@ from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
 from sim.effects.library import candidates
 from sim.spectrum import FloatArray
+
+#: Refits that end within this share of an effect's size of each other found the same mode.
+SAME_MODE = 0.1
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def decide(
             named = _refitted(search, [*named, claimed])
             continue
         if not parts:
-            told = tuple(_with_either_sign(model, tied_family(c, policy), effects, policy) for c in named)
+            told = tuple(_with_every_mode(model, tied_family(c, policy), effects, policy) for c in named)
             plain = Verdict(model, threshold, top, before, told, tuple(abstained), after, (), models=search.models())
             return _verdict(plain, left, refused, policy)
         # the weakest goes first: without it, what is left may be within the other laws' tolerances
@@ -160,25 +163,39 @@ def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> V
     return vetoed(search.model, candidate, tuple(c.effect for c in named), without.effects, search.policy)
 
 
-def _with_either_sign(
+def _with_every_mode(
     model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
 ) -> Candidate:
-    """The candidate with standard deviations about the value told that hold both signs of parameters that act by their
-    square, where the recordings don't tell the sign: sqrt(s^2 + (2 v)^2 / 2)."""
+    """The candidate with standard deviations about the values told, v, that hold the posterior's other modes v_m, where the recordings
+    don't tell them apart: sqrt(s^2 + mean over modes of (v_m - v)^2), the mode told among them.
+
+    Parameters that act by their square have such modes: both signs, and, where an effect has several, any of them in the place of all
+    (a bowed and a tilted image are as far out of focus at one place). Those are looked for by a refit from each alone.
+    """
     effect = candidate.effect
-    both = {
+    signed = {
         name: float(getattr(effect, name))
         for name, q in type(effect).quantities().items()
         if q.linear_power == 2 and (q.lower is None or q.lower < 0.0)
     }
-    if not both:
+    if not signed:
         return candidate
-    mirrored = effect.having(**{n: -v for n, v in both.items()})
     others = tuple(e for e in effects if e is not effect)
-    if log_likelihood(model, (*others, mirrored)) < log_likelihood(model, effects) - policy.equal_sign_log_odds:
-        return candidate
+    least = log_likelihood(model, effects) - policy.equal_mode_log_odds
+    modes = [effect]
+    if len(signed) > 1:
+        total = float(np.sqrt(np.sum(np.square(list(signed.values())))))
+        alone = [effect.having(**{n: total if n == name else 0.0 for n in signed}) for name in signed]
+        for fit in (refit(model, (*others, start), policy) for start in alone):
+            place = np.array([[getattr(one, n) for n in signed] for one in (fit.effects[-1], *modes)], float)
+            another = bool(np.all(np.linalg.norm(place[1:] - place[0], axis=1) > SAME_MODE * total))
+            if another and fit.log_likelihood >= least:
+                modes.append(fit.effects[-1])
+    mirrored = [one.having(**{n: -float(getattr(one, n)) for n in signed}) for one in modes]
+    modes += [one for one in mirrored if log_likelihood(model, (*others, one)) >= least]
+    away = {n: np.array([float(getattr(one, n)) for one in modes]) - value for n, value in signed.items()}
     std = {
-        n: s if s is None or n not in both else float(np.hypot(s, np.sqrt(2.0) * both[n]))
+        n: s if s is None or n not in away else float(np.hypot(s, np.sqrt(np.mean(np.square(away[n])))))
         for n, s in candidate.std.items()
     }
     return replace(candidate, std=std)

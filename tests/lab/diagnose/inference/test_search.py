@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 import pytest
 
-from lab.diagnose.inference.decide import _with_either_sign, decide
+from lab.diagnose.inference.decide import _with_every_mode, decide
 from lab.diagnose.inference.gaussian import BlockCovariance
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit
@@ -226,8 +226,33 @@ def test_an_uncertainty_holds_both_signs_where_only_the_square_acts() -> None:
         truth = kind(size_dn=0.5)
         model = _model((truth,), np.random.default_rng(6))
         candidate = Candidate(truth, {"size_dn": 0.01}, 1.0, (), 50.0)
-        std = _with_either_sign(model, candidate, (truth,), DecisionPolicy()).std["size_dn"]
+        std = _with_every_mode(model, candidate, (truth,), DecisionPolicy()).std["size_dn"]
         assert std == pytest.approx(np.hypot(0.01, np.sqrt(2.0) * 0.5) if widened else 0.01)
+
+
+class _Either(_Curve):
+    """As a bowed and a tilted image in two opposite places: the parameters may be exchanged, and turn their signs together."""
+
+    name: ClassVar[str] = "either"
+    size_dn: Annotated[
+        float, Quantity("DN", "size", lower=-5.0, upper=5.0, prior=(0.0, 1.0), absent=0.0, linear_power=2)
+    ] = 0.0
+    other_dn: Annotated[
+        float, Quantity("DN", "size", lower=-5.0, upper=5.0, prior=(0.0, 1.0), absent=0.0, linear_power=2)
+    ] = 0.0
+
+    def added_dn(self, elapsed_s: float) -> float:
+        return ((self.size_dn + self.other_dn) ** 2 + (self.size_dn - self.other_dn) ** 2 * elapsed_s) * elapsed_s
+
+
+def test_an_uncertainty_holds_other_modes_where_one_parameter_acts_as_another() -> None:
+    """Modes (v, 0), (0, v), (-v, 0) and (0, -v), as likely: mean squares of the distances from the first of 1.5 and 0.5 v^2."""
+    truth = _Either(size_dn=0.5)
+    model = _model((truth,), np.random.default_rng(6))
+    candidate = Candidate(truth, {"size_dn": 0.01, "other_dn": 0.01}, 1.0, (), 50.0)
+    std = _with_every_mode(model, candidate, (truth,), DecisionPolicy()).std
+    assert std["size_dn"] == pytest.approx(0.5 * np.sqrt(1.5), rel=0.1)
+    assert std["other_dn"] == pytest.approx(0.5 * np.sqrt(0.5), rel=0.1)
 
 
 def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> None:
