@@ -62,11 +62,20 @@ class Unsteadiness:
 
 
 @dataclass(frozen=True)
+class RowLight:
+    """Light that changes while a frame is taken. `factors`: (number of rows, exposure_s, elapsed_s) -> factor (rows,) on the source's
+    light, periodic in elapsed_s with `period_s`."""
+
+    period_s: float
+    factors: Callable[[int, float, float], FloatArray]
+
+
+@dataclass(frozen=True)
 class Light(State):
     """What reaches the lens, given what the radiometer and the screen were told.
 
-    `spectrum`: (wavelength_nm, radiance, kind of capture) -> radiance. `level`: elapsed_s -> factor on the source. `rows`: (number of
-    rows, exposure_s, elapsed_s) -> factor (rows,) on the source's light in one frame. `shading`: (x_um, y_um) -> factor by place on the sensor. `ambient_e_per_s`: channel -> electrons a second of
+    `spectrum`: (wavelength_nm, radiance, kind of capture) -> radiance. `level`: elapsed_s -> factor on the source. `rows`: factors on
+    the source's light by row of one frame. `shading`: (x_um, y_um) -> factor by place on the sensor. `ambient_e_per_s`: channel -> electrons a second of
     light beside the source. `screen`: (share asked for, x_um, y_um) -> share of the lit state that is shown. `pair_gain`: factors
     on the right camera's signal over the left one's in one scene. `pair_delay_s`: by how much the right camera captures later.
     `unsteadiness`: random factors on the source, one a frame.
@@ -74,7 +83,7 @@ class Light(State):
 
     spectrum: tuple[Callable[[FloatArray, FloatArray, str], FloatArray], ...] = ()
     level: tuple[Callable[[float], float], ...] = ()
-    rows: tuple[Callable[[int, float, float], FloatArray], ...] = ()
+    rows: tuple[RowLight, ...] = ()
     shading: tuple[Callable[[FloatArray, FloatArray], FloatArray], ...] = ()
     ambient_e_per_s: tuple[Callable[[str], float], ...] = ()
     screen: tuple[Callable[[FloatArray, FloatArray, FloatArray], FloatArray], ...] = ()
@@ -98,7 +107,7 @@ class Light(State):
         """Factor (rows,) on the source's light in each row of one frame; None where no law says one."""
         if not self.rows:
             return None
-        return reduce(lambda value, law: value * law(rows, exposure_s, elapsed_s), self.rows, np.ones(rows))
+        return reduce(lambda value, law: value * law.factors(rows, exposure_s, elapsed_s), self.rows, np.ones(rows))
 
     def ambient(self, channel: str) -> float:
         """Electrons a second that reach a pixel of a channel beside the source while the shutter is open."""

@@ -165,6 +165,12 @@ class Uniform:
         factors = self._light.row_factors(rows, exposure_s, elapsed_s)
         return np.ones(rows) if factors is None else factors
 
+    def row_factors_by_phase(self, rows: int, exposure_s: float, phases: int) -> FloatArray:
+        """The same (phases, rows) of frames that begin at `phases` equally spaced times of one period, the longest of several."""
+        period_s = max((law.period_s for law in self._light.rows), default=0.0)
+        begins_s = period_s * np.arange(phases) / phases
+        return np.array([self.row_factors(rows, exposure_s, float(t)) for t in begins_s])
+
     # --- charge ------------------------------------------------------------------------------------------------------
 
     def electrons(

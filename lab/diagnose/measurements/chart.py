@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from lab.diagnose.measurements.dark_level import added_dark_dn
 from lab.diagnose.measurements.halo_light import Surroundings, halo_light, harmonics
 from lab.diagnose.measurements.held_out import held_out_of
 from lab.diagnose.measurements.reads import DARK_CURRENT
+from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.diagnose.measurements.saturation import CLIPPED_SHARE
 from lab.diagnose.measurements.study import Study, mean_frame
 from lab.errors import NotDetermined
@@ -100,6 +102,7 @@ def chart_block(study: Study) -> Block:
         jacobian["chart:scale"] = CHART_SCALE_STD * lit
         jacobian["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
         jacobian["chart:y"] = CHART_GRADIENT_STD * lit * (row / camera.rows - 0.5) * 2
+        jacobian |= _row_light(points, model, camera.rows, lit)
         return Prediction(noise.black + out * noise.gain + shift, jacobian)
 
     return Block(
@@ -112,6 +115,7 @@ def chart_block(study: Study) -> Block:
             Label(float(names[p.name]), p.channel, p.name, tuple(c.id for c in p.captures), p.held_out) for p in points
         ),
         reads=(LEVEL - {"light.level"}) | SPECTRAL | DARK_CURRENT | {"image.veils"},
+        scattered_by=ROW_LIGHT,
         predict=predict,
         scale=signal,
     )
@@ -191,6 +195,22 @@ def _spread(study: Study, plane: FloatArray, channel: str, light: str) -> FloatA
     otf = np.real(optical_transfer(study.camera, channel, study.spectrum(light), fx, fy))
     blurred = np.fft.irfft2(np.fft.rfft2(picture) * otf, picture.shape)
     return np.asarray(blurred[: plane.shape[0], : plane.shape[1]] - plane)
+
+
+def _row_light(points: list[Patch], model: Uniform, rows: int, lit: FloatArray) -> dict[str, FloatArray]:
+    """Jacobian of the patches' levels by a light that varies while a frame is taken, of each capture's frames at once."""
+    by_capture: dict[tuple[ChartCapture, ...], list[int]] = {}
+    for i, p in enumerate(points):
+        by_capture.setdefault(p.captures, []).append(i)
+    vectors = []
+    for captures, members in by_capture.items():
+        at = np.clip(np.round([points[i].row for i in members]).astype(int), 0, rows - 1)
+        exposure_s = captures[0].exposure_s
+        for one in row_light_scatter(model, rows, exposure_s, len(captures), partial(np.take, indices=at, axis=1)):
+            whole = np.zeros(len(points))
+            whole[members] = one * lit[members]
+            vectors.append(whole)
+    return nuisances("chart", vectors)
 
 
 def _mixing(study: Study, points: list[Patch], electrons: FloatArray, model: Uniform) -> FloatArray:

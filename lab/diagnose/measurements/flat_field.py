@@ -10,6 +10,7 @@ import numpy as np
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.camera import CameraModel
@@ -74,7 +75,8 @@ def shading_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         base = _shaded(planes, place, effects, study)
-        return Prediction(base, {name: _shaded(planes, off, effects, study) - base for name, off in moved.items()})
+        axis = {name: _shaded(planes, off, effects, study) - base for name, off in moved.items()}
+        return Prediction(base, axis | _row_light(planes, base, Uniform(camera, effects), camera.rows))
 
     radius = np.hypot(x_mm, y_mm)
     return Block(
@@ -82,7 +84,7 @@ def shading_block(study: Study) -> Block:
         value=np.concatenate([p.cells for p in planes]), covariance=_covariance(planes),
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures), p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | {"signal.response", "image.veils"}, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
+        reads=SHADING | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
 
@@ -189,7 +191,7 @@ def _covariance(planes: Sequence[_ChannelCells]) -> FloatArray:
             if i == j:
                 part += np.eye(cells) * a.noise
             if a.held_out == b.held_out:
-                part += np.kron(a.row_covariance, np.ones((COLS, COLS)))
+                part += np.kron(a.row_covariance, np.ones((COLS, COLS))) * np.outer(a.cells, b.cells)
     return covariance
 
 
@@ -222,6 +224,24 @@ def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effect
         electrons = model.response(light / light.mean() * plane.level_e)
         found.append(electrons / electrons.mean())
     return np.concatenate(found)
+
+
+def _row_light(planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform, rows: int) -> dict[str, FloatArray]:
+    """Jacobian of the cells `base` by a light that varies while a frame is taken, of the seen and of the held-out frames."""
+    edges = np.linspace(0, rows, ROWS + 1).astype(int)
+
+    def of(light: FloatArray) -> FloatArray:
+        cells = np.add.reduceat(light, edges[:-1], axis=1) / np.diff(edges)
+        return np.asarray(cells / cells.mean(1, keepdims=True))
+
+    vectors = []
+    for held_out in (False, True):
+        own = np.array([float(plane.held_out == held_out) for plane in planes])
+        captures = next((plane.captures for plane in planes if plane.held_out == held_out), ())
+        for capture in captures:  # each in a phase of its own
+            for one in row_light_scatter(model, rows, capture.exposure_s, len(captures) ** 2, of):
+                vectors.append(base * np.kron(own, np.repeat(one, COLS)))
+    return nuisances("flat_field", vectors)
 
 
 def _cells(plane: FloatArray) -> FloatArray:

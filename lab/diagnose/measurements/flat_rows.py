@@ -8,19 +8,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import resample
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.reads import acting
+from lab.diagnose.measurements.row_light import ROW_LIGHT
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from sim.effects.base import Effect
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
 MOST_FRAMES, MOST_LEVELS = 6, 8  # frames of a level; levels of a session
-WIDEN = 1.6  # ratio of the lower ends of successive frequency bands
+WIDEN = 1.25  # ratio of the lower ends of successive frequency bands
 HIGHEST = 0.45  # cy/row
 #: Relative prior standard deviation of a band's power, common to all levels: row noise that isn't white. Five times as much above
 #: 0.15 cy/row.
@@ -29,9 +30,10 @@ COLOUR_STD = 0.1
 PATTERN_STD = 3e-5
 #: Standard deviation of the rows' offsets over the read noise, where there are no repeated dark frames.
 ROW_SHARE = 0.15
-#: Start times of exposures, s, at which flicker is evaluated: multiples of the golden ratio cover all phases of any period evenly.
-INSTANTS = 0.6180339887 * np.arange(24) % 1.0
 LEAST_ROWS = 24  # of a plane of the mosaic
+#: Times within a period at which a frame may begin, evaluated and interpolated; and how often they are found anew, beside the mean of
+#: all frames that follows from them.
+PHASES, FINE_PHASES, REFINEMENTS = 24, 240, 3
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class _Level:
     variance: float  # relative variance of a row's mean by the noise of pixels
     power: FloatArray  # (bands,): of the rows of single frames, over that of the noise
     freedom: FloatArray  # (bands,): degrees of freedom
+    rows: FloatArray  # (frames, rows): of single frames, over the mean of all
+    weight: FloatArray  # (frames,): in that mean
 
 
 def flicker_block(study: Study) -> Block:
@@ -51,7 +55,8 @@ def flicker_block(study: Study) -> Block:
     q(r) = row means of a frame / row means of all frames - 1. Power at k cycles a frame: |sum over r of q(r) exp(-2 pi i k r / rows)|^2
     / (rows x variance of a row's mean). The cube root of its mean over a band is nearly normal (Wilson and Hilferty 1931): mean
     1 - 2 / (9 v), variance 2 / (9 v) for v degrees of freedom. Row noise of the dark frames is expected in light as well. Nuisance
-    parameters: its size, the noise's spectrum, the fixed pattern of rows, and the phases of the light. Raises NotDetermined without
+    parameters: its size, the noise's spectrum, and the fixed pattern of rows. A frame begins at that time within a period of the light
+    for which the predicted rows are most like its own. Raises NotDetermined without
     unclipped, repeated flats, and for too few rows.
     """
     groups = [g for g in study.flat_levels() if all(m is not None for c in g for m in study.levels(c).mean.values())]
@@ -81,14 +86,10 @@ def flicker_block(study: Study) -> Block:
     band = np.tile(np.arange(len(bands)), len(levels))
 
     def predict(effects: Effects) -> Prediction:
-        moving = acting(effects, FLICKER)
-        power, spread = 1.0 + offsets, np.zeros(len(value))
+        moving = acting(effects, ROW_LIGHT)
+        power = 1.0 + offsets
         if moving:
-            found = [_modulation(study, level, effects, bands, step) for level in levels]
-            power = power + np.concatenate([mean for mean, _ in found])
-            spread = np.concatenate(
-                [std / np.sqrt(len(level.captures)) for (_, std), level in zip(found, levels, strict=True)]
-            )
+            power = power + _added_power(Uniform(study.camera, effects), study.camera.rows, levels, bands, step)
         mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
         slope = mean / (3.0 * power)
         jacobian = {}
@@ -98,9 +99,6 @@ def flicker_block(study: Study) -> Block:
                 band == k, slope * COLOUR_STD * (1.0 + 4.0 * (frequency[k] > 0.15)), 0.0
             )
             jacobian[f"rows:pattern:{k}"] = np.where(band == k, slope * pattern, 0.0)
-        # the few frames of a level have phases of their own: standard deviation of their mean power about that over all phases
-        for i in np.flatnonzero(spread):
-            jacobian[f"rows:phase:{i}"] = np.where(np.arange(len(value)) == i, slope[i] * spread[i], 0.0)
         return Prediction(mean, jacobian)
 
     return Block(
@@ -108,11 +106,10 @@ def flicker_block(study: Study) -> Block:
         value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.captures[0].id in out)
                      for level in levels for f in frequency),
-        reads=FLICKER, predict=predict, scale=np.ones(len(value)),
+        reads=ROW_LIGHT, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
-FLICKER = frozenset({"light.rows"})
 LOG_REACH = 1.0  # correlation length in ln(frequency)
 
 
@@ -136,7 +133,6 @@ def _profile(frame: NDArray[np.floating], step: int) -> FloatArray:
 def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[range]) -> list[_Level]:
     """The levels of groups of repeated flats."""
     noise, step = study.noise, mosaic.step(study.camera.cfa)
-    rows = study.camera.rows // step
     profiles, variances, signals = [], [], []
     for group in groups:
         frames = [np.asarray(study.recordings.frame(c), np.float32) for c in group]
@@ -162,14 +158,15 @@ def _measured(study: Study, groups: Sequence[Sequence[Any]], bands: Sequence[ran
         first += len(group)
         # variance of q: the frame's own noise, less its covariance with the reference, and the reference's
         own = level * (1.0 - 2.0 * weight[at].mean()) + float(weight**2 @ variance)
-        lines = np.abs(np.fft.rfft(every[at] / reference - 1.0, axis=1)) ** 2 / rows / own
         found.append(
             _Level(
                 tuple(group),
                 signal,
                 own,
-                np.array([lines[:, list(band)].mean() for band in bands]),
+                _power(every[at] / reference, bands) / own,
                 np.array([2.0 * len(group) * len(band) for band in bands]),
+                every[at] / reference,
+                weight[at],
             )
         )
     return found
@@ -208,22 +205,41 @@ def _dark_power(study: Study, bands: Sequence[range]) -> tuple[FloatArray, Float
     return np.where(excess > 2.0 * uncertain, excess, 0.0), uncertain
 
 
-def _modulation(
-    study: Study, level: _Level, effects: Sequence[Effect], bands: Sequence[range], step: int
-) -> tuple[FloatArray, FloatArray]:
-    """Power (bands,) that a varying light adds to a level: mean over `INSTANTS`, and standard deviation of a single frame."""
-    rows = study.camera.rows // step
-    model = Uniform(study.camera, effects)
-    exposure = level.captures[0].exposure_s
-    profiles = []
-    for instant in INSTANTS:
-        own = _profile(model.row_factors(study.camera.rows, exposure, float(instant))[:, None], step)
-        profiles.append(own / own.mean())
-    relative = np.array(profiles)
-    relative = relative / relative.mean(0) - 1.0
-    lines = np.abs(np.fft.rfft(relative, axis=1)) ** 2 / rows / level.variance
-    power = np.array([lines[:, list(band)].mean(1) for band in bands])
-    return power.mean(1), power.std(1)
+def _power(rows: FloatArray, bands: Sequence[range]) -> FloatArray:
+    """Power (bands,) of rows (frames, rows) about 1, mean over the frames."""
+    lines = np.abs(np.fft.rfft(rows - 1.0, axis=1)) ** 2 / rows.shape[1]
+    return np.array([lines[:, list(band)].mean() for band in bands])
+
+
+def _added_power(
+    model: Uniform, camera_rows: int, levels: Sequence[_Level], bands: Sequence[range], step: int
+) -> FloatArray:
+    """Power (levels x bands,) over that of the noise, of the rows in a light that varies while a frame is taken."""
+    factors = []
+    for level in levels:
+        by_phase = model.row_factors_by_phase(camera_rows, level.captures[0].exposure_s, PHASES)
+        profiles = by_phase[:, : camera_rows // step * step].reshape(PHASES, -1, step).mean(2)
+        factors.append(resample(profiles / profiles.mean(1, keepdims=True), FINE_PHASES))
+    mean, light = np.ones(factors[0].shape[1]), list[FloatArray]()
+    for _ in range(REFINEMENTS):
+        light = [_nearest(level.rows * mean, own) for level, own in zip(levels, factors, strict=True)]
+        mean = sum((level.weight @ own for level, own in zip(levels, light, strict=True)), np.zeros(len(mean)))
+    return np.concatenate(
+        [_power(own / mean, bands) / level.variance for level, own in zip(levels, light, strict=True)]
+    )
+
+
+def _nearest(rows: FloatArray, by_phase: FloatArray) -> FloatArray:
+    """The light (frames, rows) of least squares from rows (frames, rows), of `by_phase` (phases, rows), interpolated linearly between
+    phases: it is continuous in the law's parameters."""
+    phases = len(by_phase)
+    mismatch = np.square(by_phase).sum(1) - 2.0 * rows @ by_phase.T
+    frame, at = np.arange(len(rows)), np.argmin(mismatch, axis=1)
+    below, above = mismatch[frame, at - 1], mismatch[frame, (at + 1) % phases]
+    curvature = np.maximum(below + above - 2.0 * mismatch[frame, at], 1e-300)
+    off = np.clip(0.5 * (below - above) / curvature, -0.5, 0.5)[:, None]
+    beside = by_phase[(at + np.where(off[:, 0] < 0.0, -1, 1)) % phases]
+    return np.asarray(by_phase[at] * (1.0 - np.abs(off)) + beside * np.abs(off))
 
 
 FLAT_ROWS = Measurement(

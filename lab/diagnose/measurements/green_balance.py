@@ -86,7 +86,7 @@ def green_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         differing = acting(effects, GREENS)
-        found = [_predicted_ratio(r, effects, study) if differing else 0.0 for r in ratios]
+        found = [_predicted_ratio(r, differing, study) if differing else 0.0 for r in ratios]
         return Prediction(np.concatenate([found, np.zeros(cells)]), {})
 
     return Block(
@@ -178,8 +178,9 @@ def _by_wavelength(study: Study, rows_dn2: float) -> list[_Ratio]:
     return found
 
 
-#: Quantities of the stages by which neighbouring pixels differ in uniform light.
-GREENS = frozenset({"light.rows", "charge.collected", "charge.kernels"})
+#: Quantities of the stages by which neighbouring pixels differ in uniform light. A light that changes from row to row isn't among them: a
+#: green is held against the mean of the rows above and below.
+GREENS = frozenset({"charge.collected", "charge.kernels"})
 
 
 def _predicted_ratio(ratio: _Ratio, effects: Effects, study: Study) -> float:

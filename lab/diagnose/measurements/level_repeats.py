@@ -9,9 +9,9 @@ from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, 
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.repeatability import RepeatedMeans, repeated_levels, steady
+from lab.diagnose.measurements.row_light import PHASES, ROW_LIGHT
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
-from sim.spectrum import FloatArray
 from sim.uniform import Uniform
 
 #: Relative standard deviation of a steady lamp's light from frame to frame: data sheets of regulated halogen sources and integrating
@@ -19,8 +19,6 @@ from sim.uniform import Uniform
 STEADY_LAMP = 5.0e-4
 #: Least degrees of freedom of a number, and most numbers, each of settings of neighbouring exposures.
 LEAST_FREEDOM, MOST_NUMBERS = 4, 4
-#: Start times of frames at which a light that varies within a frame is evaluated.
-PHASES = 32
 
 
 def level_repeats_block(study: Study) -> Block:
@@ -61,7 +59,7 @@ def level_repeats_block(study: Study) -> Block:
     )
     return Block(
         measurement=LEVEL_REPEATS, reach=1.0, value=value, covariance=covariance, labels=labels,
-        reads=frozenset({"light.unsteadiness", "light.rows"}) | LAG, predict=predict, scale=np.ones(len(value)),
+        reads=frozenset({"light.unsteadiness"}) | ROW_LIGHT | LAG, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -106,11 +104,7 @@ def _of_rows(model: Uniform, study: Study, exposure_s: float) -> float:
     """Relative variance of whole frames' levels in a light that varies within a frame, over the time at which frames begin."""
     if not model.varies_by_row:
         return 0.0
-    # multiples of the golden ratio of a second cover the phases of any frequency evenly
-    begin_s = np.arange(PHASES) * 0.6180339887498949
-    mean = [float(np.mean(model.row_factors(study.camera.rows, exposure_s, float(t)))) for t in begin_s]
-    level: FloatArray = np.array(mean)
-    return float(np.var(level))
+    return float(np.var(model.row_factors_by_phase(study.camera.rows, exposure_s, PHASES).mean(1)))
 
 
 def _of_lag(study: Study, effects: Effects, group: list[RepeatedMeans]) -> float:

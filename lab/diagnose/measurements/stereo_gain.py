@@ -19,6 +19,7 @@ from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import views_of
 from lab.diagnose.measurements.dark_squares import screen_block
+from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView
@@ -30,6 +31,7 @@ from sim.optics.illumination import relative_illumination
 from sim.point import even_share
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
+from sim.uniform import Uniform
 
 # Relative standard deviations of the ratio of the two sides.
 SCENE_STD = 0.01  # common to a scene's channels: gloss, viewing angles, borders of the compared region
@@ -88,7 +90,7 @@ def scene_gain_block(study: Study) -> Block:
     lamps = [(left, right) for left in uniform[0] for right in uniform[1] if left.like(right)]
     if not lamps:
         raise NotDetermined("stereo_gain", "the two sides' flats are of different lamps")
-    values, labels, lifts = [], [], []
+    values, labels, lifts, exposures = [], [], [], []
     for scene_name, regions in _scenes(study).items():
         rates = [
             _rates(study, side, darks[side], captures, mask)
@@ -104,6 +106,7 @@ def scene_gain_block(study: Study) -> Block:
             of_lamp = np.mean([[side.lift[channel] for side in pair] for pair in alike], axis=0)
             lifts.append(np.array([side[channel].lift for side in rates]) - of_lamp)
             labels.append(Label(float(len(values) - 1), channel, scene_name, captures, False))
+            exposures.append(tuple(c.exposure_s for part, _ in regions for c in part))
     if not values:
         raise NotDetermined(
             "stereo_gain",
@@ -122,13 +125,34 @@ def scene_gain_block(study: Study) -> Block:
     def predict(effects: Effects) -> Prediction:
         gain = np.log(max(right_over_left(study.camera, effects), 1e-6))
         scattered = even_share(study.camera, effects) * right_lift
-        of_left = {"stereo_gain:glare of the left camera": -glare_std * left_lift}
-        return Prediction(gain + scattered - glare * left_lift, of_left)
+        jacobian = {"stereo_gain:glare of the left camera": -glare_std * left_lift}
+        jacobian |= _row_light(Uniform(study.camera, effects), study.camera.rows, scenes, exposures)
+        return Prediction(gain + scattered - glare * left_lift, jacobian)
 
     return Block(
         measurement=STEREO_GAIN, reach=1e9, value=np.array(values), covariance=covariance,
-        labels=tuple(labels), reads=frozenset({"light.pair_gain", "image.veils"}), predict=predict, scale=np.ones(len(values)),
+        labels=tuple(labels), reads=frozenset({"light.pair_gain", "image.veils"}), scattered_by=ROW_LIGHT, predict=predict, scale=np.ones(len(values)),
     )  # fmt: skip
+
+
+def _row_light(
+    model: Uniform, rows: int, scenes: np.ndarray, exposures: Sequence[tuple[float, ...]]
+) -> dict[str, FloatArray]:
+    """Jacobian of a scene's ratios by a light that varies while a frame is taken. Regions are taken as the frame's middle half; the few
+    frames of each side begin at times of their own."""
+    vectors = []
+    for scene in dict.fromkeys(scenes):
+        own = scenes == scene
+        of_scene = exposures[int(np.argmax(own))]
+        for exposure_s in of_scene:
+            frames = (len(of_scene) / 2) ** 2  # a frame's part of its side's mean
+            vectors += [
+                one[0] * own
+                for one in row_light_scatter(
+                    model, rows, exposure_s, frames, lambda light: light[:, rows // 4 : -(rows // 4)].mean(1)[:, None]
+                )
+            ]
+    return nuisances("stereo_gain", vectors)
 
 
 @dataclass(frozen=True)
