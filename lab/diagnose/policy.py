@@ -159,16 +159,6 @@ class DecisionPolicy(Frozen):
             "what refits of the same set from different starts differ by",
         ),
     ] = 0.5
-    misstated_log_odds: Annotated[
-        float,
-        Rule(
-            "cost of a model",
-            "log odds",
-            "prior odds that the model lacks an effect, against a misstated f-number or pitch",
-            TUNED,
-            off=0.0,
-        ),
-    ] = 10.0
     misstated_ratio: Annotated[
         float,
         Rule(
@@ -189,25 +179,14 @@ class DecisionPolicy(Frozen):
     ] = 30.0
 
     # --- name ------------------------------------------------------------------------------------------------------------
-    most_unknown_probability: Annotated[
-        float, Rule("name", "1", "probability of an unknown cause above which no name is given", TUNED, off=1.0)
-    ] = 0.4
-    least_probability: Annotated[
-        float, Rule("name", "1", "least probability of a name that explains at least `exact_share`", TUNED, off=0.0)
-    ] = 0.35
-    least_probability_inexact: Annotated[
-        float,
-        Rule(
-            "name", "1", "least probability of a name that explains less than `exact_share`", "odds of 4 to 1, chosen"
-        ),
-    ] = 0.8
+    least_probability: Annotated[float, Rule("name", "1", "least probability of a name", "likelier than not")] = 0.5
     family_probability: Annotated[
         float,
         Rule(
             "name",
             "1",
             "least probability that a family's members hold together, if the cause is a listed effect; and below which its likeliest member isn't named beside others of the family that fit",
-            "as `least_probability_inexact`: odds of 4 to 1",
+            "odds of 4 to 1, chosen",
         ),
     ] = 0.8
     family_least_share: Annotated[
@@ -219,9 +198,6 @@ class DecisionPolicy(Frozen):
             "a straight line explains three quarters of a step, so that a difference between taps would be uneven light by less",
         ),
     ] = 0.76
-    exact_share: Annotated[
-        float, Rule("name", "1", "share of the excess chi2 from which on a name explains it nearly all", TUNED, off=0.0)
-    ] = 0.95
     least_explained_share: Annotated[
         float,
         Rule(
@@ -233,7 +209,15 @@ class DecisionPolicy(Frozen):
         ),
     ] = 0.8
     least_explained_share_open: Annotated[
-        float, Rule("name", "1", "the same where what is left exceeds noise and form tolerances", TUNED, off=0.8)
+        float,
+        Rule(
+            "name",
+            "1",
+            "the same where what is left exceeds noise and form tolerances",
+            "a filter beside a ripple without a law is no vibration of 96 % (`tests/lab/diagnose/inference/test_decide.py`); "
+            + TUNED,
+            off=0.8,
+        ),
     ] = 0.98
     noise_sigma: Annotated[
         float,
@@ -244,26 +228,6 @@ class DecisionPolicy(Frozen):
             "one-sided 99.9 % of a normal distribution",
         ),
     ] = 3.0
-    tolerance_sigma: Annotated[
-        float,
-        Rule(
-            "name",
-            "standard deviations",
-            "the same where form tolerances are in the covariance",
-            "wider than `noise_sigma`, as the correlation kernel of a law's error is assumed; " + TUNED,
-            off=3.0,
-        ),
-    ] = 5.0
-    companion_share: Annotated[
-        float,
-        Rule(
-            "name",
-            "1",
-            "share of a stronger effect's size below which an effect beside it counts as that one's law's error, unless nothing departs with it and something without it",
-            TUNED,
-            off=0.0,
-        ),
-    ] = 0.03
     remainder_log_odds: Annotated[
         float, Rule("name", "log odds", "gain of a discrepancy that never speaks against a name", "odds of 20 to 1")
     ] = 3.0
@@ -272,18 +236,8 @@ class DecisionPolicy(Frozen):
         Rule(
             "name",
             "1",
-            "gain of a discrepancy in the same frames, over the name's gain, above which both count as one unknown cause",
-            TUNED,
-            off=1.0,
-        ),
-    ] = 0.1
-    own_remainder_share: Annotated[
-        float,
-        Rule(
-            "name",
-            "1",
-            "the same in the measurement that shows the name most",
-            "as `least_explained_share_open`: 2 % may be left",
+            "gain of a discrepancy in the measurement that shows a name most, over the name's gain, above which both count as one unknown cause",
+            "chosen: 2 % may be left",
         ),
     ] = 0.02
     equal_mode_log_odds: Annotated[
@@ -356,16 +310,6 @@ class DecisionPolicy(Frozen):
             "`false_alarm_rate` for wrong names",
         ),
     ] = 0.99
-    refit_again_log_odds: Annotated[
-        float,
-        Rule(
-            "budget of the search",
-            "log odds",
-            "gain of a member below which the others are fitted once more without it, from where they stand",
-            TUNED,
-            off=0.0,
-        ),
-    ] = 100.0
     hopeless_log_odds: Annotated[
         float,
         Rule(
@@ -375,17 +319,6 @@ class DecisionPolicy(Frozen):
             "a probability of exp(-30) changes no decision",
         ),
     ] = 30.0
-    rough_fit_steps: Annotated[
-        float,
-        Rule(
-            "budget of the search",
-            "1",
-            "gain that a rough fit may still make, in gains that its next Newton step promises",
-            TUNED,
-            off=1.0,
-        ),
-    ] = 10.0
-
     # --- model discrepancy -----------------------------------------------------------------------------------------------
     left_out_parts: Annotated[
         int,

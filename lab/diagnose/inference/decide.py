@@ -208,22 +208,8 @@ def _is_part_of_unknown(
     discrepancies: Iterable[Discrepancy],
     policy: DecisionPolicy,
 ) -> bool:
-    """Whether the frames in which an effect shows most hold a discrepancy that is strong beside it: both may have one
-    unknown cause."""
+    """Whether the measurement that an effect changes most holds a discrepancy that is strong beside it: both may have one unknown
+    cause."""
     strongest = model.strongest_block(candidate.effect, effects)
-    frames = _frames(model, strongest)
-
-    def is_strong(one: Discrepancy) -> bool:
-        share = policy.own_remainder_share if one.index == strongest else policy.remainder_share
-        return one.log_odds > max(share * candidate.log_odds, policy.remainder_log_odds)
-
-    def shares_frames(index: int) -> bool:
-        other = _frames(model, index)
-        return 2 * len(frames & other) > min(len(frames), len(other))
-
-    return any(shares_frames(d.index) for d in discrepancies if is_strong(d))
-
-
-def _frames(model: MeasurementModel, index: int) -> set[str]:
-    """Ids of a block's captures."""
-    return {name for label in model.blocks[index].labels for name in label.captures}
+    least = max(policy.remainder_share * candidate.log_odds, policy.remainder_log_odds)
+    return any(d.index == strongest and d.log_odds > least for d in discrepancies)

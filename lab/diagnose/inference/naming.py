@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
-from lab.diagnose.inference.locate import mismatches
 from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate, explained, weigh
@@ -29,16 +26,14 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
     certain: dict[str, Candidate] = {}
     while current.effects:
         weighed.add(frozenset(current.names))
-        weakest = _too_weak(search, current)
-        if weakest is not None:
-            index, is_companion = weakest
-            if not is_companion:  # the error of a named law is no unknown cause
-                report(f"weighing {current.effects[index].name} against its rivals")
-                candidate, better = weigh(search, current, index)
-                if better is not None and frozenset(better.names) not in weighed:
-                    current = search.fitted(better.effects, converged=True)
-                    continue
-                given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
+        index = _too_weak(search, current)
+        if index is not None:
+            report(f"weighing {current.effects[index].name} against its rivals")
+            candidate, better = weigh(search, current, index)
+            if better is not None and frozenset(better.names) not in weighed:
+                current = search.fitted(better.effects, converged=True)
+                continue
+            given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
             current = search.without(current, index)
             continue
         members, likelier = [], None
@@ -74,43 +69,22 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
 
 def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
     """Whether a name is likely enough and explains enough."""
-    is_exact = candidate.explained_share >= policy.exact_share
-    least_probability = policy.least_probability if is_exact else policy.least_probability_inexact
     least_share = policy.least_explained_share if candidate.is_closed else policy.least_explained_share_open
-    return (
-        candidate.unknown_probability <= policy.most_unknown_probability
-        and candidate.probability >= least_probability
-        and candidate.explained_share >= least_share
-    )
+    return candidate.probability >= policy.least_probability and candidate.explained_share >= least_share
 
 
-def _too_weak(search: Search, fit: Fit) -> tuple[int, bool] | None:
-    """The weakest member that can't be named whatever its rivals, and whether it may be no more than the error of
-    another member's law. Tested before anything is weighed, as that fits every rival of every member."""
-    policy = search.policy
+def _too_weak(search: Search, fit: Fit) -> int | None:
+    """The weakest member that can't be named whatever its rivals. Tested before anything is weighed, as that fits every rival of every
+    member."""
     log_odds = [fit.log_posterior - search.without(fit, i).log_posterior for i in range(len(fit.effects))]
     members = [Candidate(e, s, 0.0, (), odds) for e, s, odds in zip(fit.effects, fit.std, log_odds, strict=True)]
-    companions = [c for c in members if _is_companion(c, members, search)]
-    companions = [c for c in companions if not _settles(search, fit, members.index(c))]
 
     def needed(candidate: Candidate) -> float:
-        factor = policy.added_threshold_factor if _is_beside_stronger(candidate, members, search) else 1.0
+        factor = search.policy.added_threshold_factor if _is_beside_stronger(candidate, members, search) else 1.0
         return search.threshold * factor
 
-    weak = companions or [c for c in members if 2.0 * c.log_odds < needed(c)]
-    if not weak:
-        return None
-    return members.index(min(weak, key=lambda c: c.log_odds)), bool(companions)
-
-
-def _settles(search: Search, fit: Fit, index: int) -> bool:
-    """Whether nothing departs from the set, within its laws' tolerances, and something does without one member: that is no error of the
-    others' laws."""
-    model, policy = search.model, search.policy
-    without = search.without(fit, index)
-    return not mismatches(model, model.gaussian(fit.effects), policy) and bool(
-        mismatches(model, model.gaussian(without.effects), policy)
-    )
+    weak = [c for c in members if 2.0 * c.log_odds < needed(c)]
+    return members.index(min(weak, key=lambda c: c.log_odds)) if weak else None
 
 
 def _is_beside_stronger(candidate: Candidate, members: Sequence[Candidate], search: Search) -> bool:
@@ -121,29 +95,6 @@ def _is_beside_stronger(candidate: Candidate, members: Sequence[Candidate], sear
     model = search.model
     block = model.blocks[model.strongest_block(candidate.effect, [c.effect for c in members])]
     return any(block.touched_by(type(c.effect)) for c in stronger)
-
-
-def _is_companion(candidate: Candidate, members: Sequence[Candidate], search: Search) -> bool:
-    """Whether a member may be no more than the error of a stronger one's law.
-
-    It may where its log odds are below `companion_share` of a rival's; and where, in the block that it changes most,
-    its change is below `companion_share` of another member's.
-    """
-    model, policy = search.model, search.policy
-    others = [c for c in members if c is not candidate]
-    rivals = search.rivals[candidate.effect.name]
-    if any(c.effect.name in rivals and candidate.log_odds < policy.companion_share * c.log_odds for c in others):
-        return True
-    acts = model.acts(type(candidate.effect))
-    around = tuple(c.effect for c in others)
-    changes = [model.change_chi2(candidate.effect, around, i) if acting else 0.0 for i, acting in enumerate(acts)]
-    most = int(np.argmax(changes))
-    for c in others:
-        if model.blocks[most].touched_by(type(c.effect)):
-            without = (candidate.effect, *(o.effect for o in others if o is not c))
-            if changes[most] < policy.companion_share * model.change_chi2(c.effect, without, most):
-                return True
-    return False
 
 
 def _replaced_by_a_discrepancy(search: Search, fit: Fit) -> list[int]:

@@ -62,7 +62,7 @@ class Search:
     """The sets that were fitted so far, by their effects' names, and the search over further ones.
 
     `threshold` is that of the scores: twice the log odds that every effect has to earn. `changes`: of the candidates' prototypes, beside
-    no effect. `refitted_again` holds the names of sets that were fitted from a second start. `clock` gives the CPU time (s) that the
+    no effect. `clock` gives the CPU time (s) that the
     budget is counted in, from the search's beginning. `not_weighed`: what the budget left.
     """
 
@@ -72,7 +72,6 @@ class Search:
     threshold: float
     policy: DecisionPolicy = field(default_factory=DecisionPolicy)
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
-    refitted_again: set[frozenset[str]] = field(default_factory=set)
     clock: Callable[[], float] = time.process_time
     not_weighed: dict[frozenset[str], tuple[str, ...]] = field(default_factory=dict)
     _signatures: dict[tuple[Effect, ...], Signatures] = field(default_factory=dict)
@@ -173,8 +172,7 @@ class Search:
         if fit.converged:
             return self.log_odds(fit)
         dispensable = sum(q.dispensable for e in fit.effects for q in type(e).quantities().values())
-        further = self.policy.rough_fit_steps * fit.promised_gain + self.policy.parameter_log_odds * dispensable
-        return self.log_odds(fit) + further
+        return self.log_odds(fit) + fit.promised_gain + self.policy.parameter_log_odds * dispensable
 
     def is_known(self, effects: Effects) -> bool:
         """Whether these effects were fitted together."""
@@ -271,33 +269,26 @@ class Search:
 
     # --- fits --------------------------------------------------------------------------------------------------------
 
-    def fitted(self, start: Effects, *, converged: bool = False, again: bool = False, beside: Fit | None = None) -> Fit:
+    def fitted(self, start: Effects, *, converged: bool = False, beside: Fit | None = None) -> Fit:
         """The fit of a set of effects, made once: rough, which is enough to rank sets, or to convergence.
 
-        There are several optima. `again`: fit once more from `start`, once, and keep the better. `beside`: the set that
-        `start` grew from, whose Jacobian a rough fit reuses.
+        `beside`: the set that `start` grew from, whose Jacobian a rough fit reuses.
         """
         key, begin = frozenset(e.name for e in start), tuple(start)
         known = self.fits.get(key)
         if known is not None and known.converged >= converged:
-            if not again or key in self.refitted_again:
-                return known
-            self.refitted_again.add(key)
-        elif known is not None:
+            return known
+        if known is not None:
             begin = known.effects
         made = refit(self.model, begin, self.policy, rough=not converged, beside=None if converged else beside)
-        if known is None or known.converged < converged or made.log_posterior > known.log_posterior:
-            self.fits[key] = made
+        self.fits[key] = made
         self.not_weighed.pop(key, None)
-        return self.fits[key]
+        return made
 
     def without(self, fit: Fit, index: int) -> Fit:
-        """The set fitted without one of its members; from a second start, too, where that member gains little."""
+        """The set fitted without one of its members."""
         rest = (*fit.effects[:index], *fit.effects[index + 1 :])
-        without = self.fitted(rest, converged=True)
-        if rest and fit.log_posterior - without.log_posterior < self.policy.refit_again_log_odds:
-            without = self.fitted(rest, converged=True, again=True)
-        return without
+        return self.fitted(rest, converged=True)
 
     # --- what it says ------------------------------------------------------------------------------------------------
 

@@ -182,7 +182,7 @@ def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, st
         return -np.inf, ""
     stated, pitch = model.camera.lens.f_number, model.camera.pixel_pitch_um
     return (
-        tried.log_posterior - policy.misstated_log_odds,
+        tried.log_posterior,
         (
             f"as if the lens worked at f/{stated * ratio:.3g} in place of f/{stated:.3g}, "
             f"or the pixels' pitch were {pitch / ratio:.3g} um in place of {pitch:.3g}"
@@ -198,7 +198,7 @@ def explained(
 
     share = (chi2 without - chi2 with) / (chi2 without - n), by the baseline's covariance, so that an effect's own form
     tolerance explains nothing; 1 where chi2 with it is within `noise_sigma` of n. Closed: chi2 by the covariance with
-    form tolerances is within `tolerance_sigma` of n; the standard deviation of chi2 is sqrt(2 n).
+    form tolerances is within `noise_sigma` of n; the standard deviation of chi2 is sqrt(2 n).
     """
     if not affected:
         return 1.0, True
@@ -206,7 +206,7 @@ def explained(
     n = int(where.sum())
     sigma = np.sqrt(2.0 * n)
     left = model.gaussian(fit.effects, where).chi2(model.value[where]) / (1.0 + policy.covariance_slack) ** 2
-    is_closed = left - n < policy.tolerance_sigma * sigma
+    is_closed = left - n < policy.noise_sigma * sigma
     gaussian = model.gaussian((), where)
     after, before = (
         float(np.sum(np.square(gaussian.whiten((model.value - model.mean(f.effects))[where])))) for f in (fit, without)
