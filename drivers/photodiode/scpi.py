@@ -93,12 +93,15 @@ class ScpiPhotodiode(Photodiode):
             self._dark_a, self._var_dark = float(np.mean(found)), _variance_of_mean(found)
             return self._dark_a
 
-    def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
+    def check_nm(self, wavelength_nm: float) -> None:
         low, high = self._responsivity.wavelength_nm[0], self._responsivity.wavelength_nm[-1]
         if not low <= wavelength_nm <= high:
             raise InstrumentError(
                 f"photodiode: {wavelength_nm} nm is outside its calibration's {low:g}..{high:g} nm; ask for a wavelength in it"
             )
+
+    def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
+        self.check_nm(wavelength_nm)
         with self._conversation():
             found = self._currents()
             current_a = float(np.mean(found)) - self._dark_a

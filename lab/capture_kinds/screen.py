@@ -56,6 +56,10 @@ class ScreenTarget(Target):
     right: ScreenLayout | None = None
 
     @property
+    def screen_px(self) -> tuple[int, int]:
+        return self.rows, self.cols
+
+    @property
     def instruction(self) -> str:
         return "put the screen before the cameras, and move nothing until all patterns are taken"
 
