@@ -177,7 +177,8 @@ class Cornerstone260(WireInstrument, Monochromator):
         self._echoes = first.strip().upper() == "INFO?"
         reply = self._line("INFO?") if self._echoes else first
         more = line.drain(quiet_s=0.1).decode("latin-1").split()
-        if reply in _FAILED or len(more) > 1 or any(len(word) > 2 for word in more):
+        complains = "INFO?" in reply.upper() or reply.upper().startswith(("ER:", "ERROR"))  # another instrument does
+        if complains or reply in _FAILED or len(more) > 1 or any(len(word) > 2 for word in more):
             raise self._strange("INFO?", " ".join([first, reply, *more]))
         if self._found_handshake is None:
             self._found_handshake = bool(more)
