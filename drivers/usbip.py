@@ -541,7 +541,7 @@ def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
     except usb.core.NoBackendError as error:
         raise Disconnected("no libusb on this computer: install libusb-1.0, or use a camera over usbip://") from error
     except usb.core.USBError as error:
-        raise Disconnected(f"USB: {_words(error)}; start a USB/IP server there, or correct the address") from error
+        raise Disconnected(f"USB: {in_words(error)}; start a USB/IP server there, or correct the address") from error
     for device in candidates:
         place = getattr(device._ctx.dev, "place", b"")
         if isinstance(place, bytes) and place.decode("ascii", "replace") == serial_number:
@@ -577,7 +577,7 @@ def open_device(address: str) -> usb.core.Device:
     raise InstrumentError(f"{address!r} is no USB address; write usbip://HOST:PORT/SERIAL or usb://SERIAL")
 
 
-def _words(error: usb.core.USBError) -> str:
+def in_words(error: usb.core.USBError) -> str:
     """What an error says, without its number before and its name behind."""
     return re.sub(r"^\[Errno -?\d+\] |: E[A-Z]+$", "", str(error))
 

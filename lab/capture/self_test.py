@@ -125,10 +125,12 @@ def station_text(found: Iterable[Found]) -> str:
     cameras = 0
     exposures: list[tuple[float, float]] = []
     taken: set[str] = set()
-    for one in found:
+    there = list(found)
+    pair = sum(one.family == "camera" for one in there) > 1
+    for one in there:
         if one.family == "camera" and (side := next(sides, None)) is not None:
             sensor = _sensor(side, one)
-            lines += ["", *_camera_table(side, one, sensor)]
+            lines += ["", *_camera_table(side, one, sensor, pair)]
             cameras += 1
             if sensor.exposure_s is not None:
                 exposures.append(sensor.exposure_s)
@@ -161,8 +163,12 @@ def _sensor(side: str, one: Found) -> SensorInfo:
         raise DeviceError(f"camera {side}: {error}") from error
 
 
-def _camera_table(side: str, one: Found, sensor: SensorInfo) -> list[str]:
+def _camera_table(side: str, one: Found, sensor: SensorInfo, pair: bool) -> list[str]:
     lines = [f"# {one.what}", f"[cameras.{side}]", f'driver = "{one.name}"', f'address = "{one.address}"']
+    if pair and side == "left":
+        lines += ['# output_line = "Line1"  # it leads: the line on which it gives the pulse that triggers the other']
+    elif pair:
+        lines += ['trigger_line = "Software"  # or the line that is wired to the one that leads, as "Line0"']
     lines += [f"[cameras.{side}.datasheet]", f"rows = {sensor.rows}", f"cols = {sensor.cols}"]
     lines += [f'cfa = "{sensor.cfa or "MONO"}"' + ("" if sensor.cfa else "  # it doesn't say: correct this")]
     bits = sensor.bit_depth

@@ -166,7 +166,8 @@ def _with_curves(tables: Any, folder: Path) -> Any:
 def _complaints(error: ValidationError) -> Iterator[str]:
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"])
-        yield f"{key or 'it'}: {item['msg']}"
+        said = item["msg"].removeprefix("Value error, ")
+        yield f"{key}: {said}" if key else said
 
 
 def read_station(path: str | Path) -> Station:
