@@ -39,7 +39,7 @@ def test_usb_instruments_are_told_by_what_they_are(server: UsbIpServer) -> None:
         "CB-260B-01": "monochromator.cornerstone260b",
         "USB2+F00001": "spectroradiometer.ocean_optics",
     }
-    with pytest.raises(Disconnected, match="no USB/IP server at 127.0.0.1:1 .Connection refused.; start"):
+    with pytest.raises(Disconnected, match=r"no USB/IP server at 127\.0\.0\.1:1 \(Connection refused\); start"):
         list(usbip_devices("127.0.0.1:1"))
 
 
