@@ -79,6 +79,8 @@ INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
 
 #: Exported over USB/IP (`mocks.usb`).
 USB_INSTRUMENTS = ("cornerstone260b", "usb2000plus", "u3v", "u3v-stereo")
+#: Come with a calibration file (`--calibration`).
+CALIBRATED = ("usb2000plus", "scpi-meter")
 EVERY_INSTRUMENT = (*INSTRUMENTS, *USB_INSTRUMENTS, "display")
 
 
@@ -101,14 +103,15 @@ def mock(
         ),
     ] = "",
     real_time: Annotated[
-        float, typer.Option(help="Real seconds for each second of the instrument (0: no waiting).")
+        float, typer.Option(min=0.0, help="Real seconds for each second of the instrument (0: no waiting).")
     ] = 0.0,
     dialect: Annotated[
         str,
         typer.Option(help="Which of an instrument's public dialects it speaks (pr655, pr670: two-lines, one-line)."),
     ] = "",
     calibration: Annotated[
-        Path | None, typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus).")
+        Path | None,
+        typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus, scpi-meter)."),
     ] = None,
     frames: Annotated[
         Path | None,
@@ -129,14 +132,16 @@ def mock(
             raise _Unusable(f"mock {name}: it has no line that a path could name; leave --link out")
         if dialect and (name not in ("pr655", "pr670") or dialect not in DIALECTS):
             raise _Unusable(f"mock {name}: no dialect {dialect!r}; pr655 and pr670 have {', '.join(DIALECTS)}")
-        if calibration is not None and name != "usb2000plus":
+        if calibration is not None and name not in CALIBRATED:
             raise _Unusable(f"mock {name}: no calibration file comes with it; leave --calibration out")
         if frames is not None and not name.startswith("u3v"):
             raise _Unusable(f"mock {name}: it takes no frames; leave --frames out")
         if link is not None and tcp:
             raise _Unusable("mock: --link and --tcp exclude one another; give one of them")
         faults = parse_faults(fault, frames=name.startswith("u3v"))
-        lamp = Lamp(clock=LampClock(max(0.0, real_time)))
+        if calibration is not None:
+            _write(calibration, _calibration_of(name))
+        lamp = Lamp(clock=LampClock(real_time))
         stop = threading.Event()
         with _ended_by_signals(stop):
             if name == "display":
@@ -144,14 +149,23 @@ def mock(
                 _say(f"ready {host}:{port}")
                 browse(Page(lamp), f"{host}:{port}", stop, faults)
             elif name in USB_INSTRUMENTS:
-                light = lamp if not name.startswith("u3v") else _before_cameras(name, frames, max(0.0, real_time))
-                _serve_usb(name, light, _host_and_port(tcp or "127.0.0.1:0"), stop, faults, calibration)
+                light = lamp if not name.startswith("u3v") else _before_cameras(name, frames, real_time)
+                _serve_usb(name, light, _host_and_port(tcp or "127.0.0.1:0"), stop, faults)
             else:
                 endpoint = Tcp(*_host_and_port(tcp)) if tcp else Pty(link)
                 grammar = INSTRUMENTS[name](lamp)
                 if isinstance(grammar, PhotoResearch) and dialect:
                     grammar.dialect = dialect
                 serve(grammar, endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
+
+
+def _calibration_of(name: str) -> str:
+    """The calibration file of one of `CALIBRATED`, as far off as real ones are."""
+    from mocks import scpi_meter, usb2000plus
+
+    if name == "scpi-meter":
+        return scpi_meter.calibration_csv()
+    return usb2000plus.calibration_csv(CALIBRATION_DEPARTURE_PERCENT)
 
 
 def _before_cameras(name: str, frames: Path | None, real_time: float) -> Bench | ReadyFrames:
@@ -176,16 +190,12 @@ def _serve_usb(
     at: tuple[str, int],
     stop: threading.Event,
     faults: tuple[Fault, ...],
-    calibration: Path | None,
 ) -> None:
     from mocks.usb import devices, serve_usbip
-    from mocks.usb2000plus import calibration_csv
 
     exported = devices(name, light)
     for device in exported:
         device.fail(faults)
-    if calibration is not None:
-        _write(calibration, calibration_csv(CALIBRATION_DEPARTURE_PERCENT))
     try:
         server = serve_usbip(exported, *at)
     except OSError as error:
@@ -202,7 +212,9 @@ def _serve_usb(
 def bench(
     station: Annotated[Path | None, typer.Option(help="Write the station file of this bench here.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the hidden truth and of the noise.")] = 1,
-    real_time: Annotated[float, typer.Option(help="Real seconds for each second of the bench (0: no waiting).")] = 0.0,
+    real_time: Annotated[
+        float, typer.Option(min=0.0, help="Real seconds for each second of the bench (0: no waiting).")
+    ] = 0.0,
     fault: Annotated[
         list[str] | None, typer.Option(help="INSTRUMENT:SPEC, as in spectroradiometer:half@3; may be repeated.")
     ] = None,
@@ -290,7 +302,7 @@ def _bench(seed: int, real_time: float, concealed: Concealed | None, warm_up_c: 
 
     if not abs(warm_up_c) <= WARMEST_C:
         raise _Unusable(f"--warm-up {warm_up_c:g}: beyond {WARMEST_C:g} degrees; give how much warmer the sensors get")
-    place = Bench(seed, max(0.0, real_time), concealed, warm_up_c=warm_up_c, session_clock=time.time)
+    place = Bench(seed, real_time, concealed, warm_up_c=warm_up_c, session_clock=time.time)
     place.compile_loops()
     return place
 
