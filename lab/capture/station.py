@@ -101,10 +101,12 @@ class Station(Frozen):
         for table, entry in tables.items():
             if entry is None or not entry.address:
                 continue
-            other = taken.setdefault(entry.address, table)
+            # A port has several names: /dev/ttyUSB0, and a link in /dev/serial/by-id.
+            port = str(Path(entry.address).resolve()) if entry.address.startswith("/") else entry.address
+            other = taken.setdefault(port, table)
             if other != table:
                 raise ValueError(
-                    f"[{other}] and [{table}] both have the address {entry.address}; one port serves one instrument: correct one of them"
+                    f"[{other}] and [{table}] both have the address {port}; one port serves one instrument: correct one of them"
                 )
         return self
 
