@@ -71,9 +71,13 @@ class Camera(Instrument):
     def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
         """Set exposure (s) and gain (dB) of the frames to come. Raises `InstrumentError` outside the camera's limits."""
 
-    def check(self, exposure_s: float, gain_db: float = 0.0, trigger: Trigger = "software") -> None:
-        """Raise `InstrumentError` for settings that `configure` or a trigger that `arm` would refuse; nothing is exposed."""
+    def check(self, exposure_s: float, gain_db: float = 0.0) -> None:
+        """Raise `InstrumentError` for an exposure (s) or a gain (dB) that `configure` would refuse; nothing is exposed."""
         self.configure(exposure_s, gain_db)
+
+    def check_trigger(self, trigger: Trigger) -> None:
+        """Raise `InstrumentError` for a trigger that `arm` would refuse, as far as the driver knows; nothing is exposed."""
+        return
 
     @abstractmethod
     def arm(self, trigger: Trigger = "software") -> None:

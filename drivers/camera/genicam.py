@@ -209,8 +209,7 @@ class GenicamCamera(StreamingCamera):
                 exposure_s=self._exposure_limits_s(features),
             )
 
-    def check(self, exposure_s: float, gain_db: float = 0.0, trigger: Trigger = "software") -> None:
-        self.configure(exposure_s, gain_db)
+    def check_trigger(self, trigger: Trigger) -> None:
         with self._used() as features:
             self._trigger_source(features, trigger)
 

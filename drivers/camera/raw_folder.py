@@ -110,7 +110,7 @@ class RawFolderCamera(Camera):
             rows, cols = sample.raw.shape
             return SensorInfo(rows, cols, "raw file", sample.cfa, sample.bit_depth, black_level=sample.black_level)
 
-    def check(self, exposure_s: float, gain_db: float = 0.0, trigger: Trigger = "software") -> None:
+    def check(self, exposure_s: float, gain_db: float = 0.0) -> None:
         if not (math.isfinite(exposure_s) and 0 < exposure_s <= 3600 and math.isfinite(gain_db)):
             raise InstrumentError(
                 f"{self._who}: exposure {exposure_s} s at {gain_db} dB is outside 0..3600 s; give a time in it"

@@ -145,6 +145,7 @@ class CameraContract(FamilyContract):
     def settings(self, driver: Camera) -> None:
         for exposure_s in (0.002, 0.02):
             driver.check(exposure_s)
+            driver.check_trigger("software")
             driver.configure(exposure_s)
             frame = driver.capture()
             require(

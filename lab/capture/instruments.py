@@ -120,14 +120,15 @@ class Instruments:
             try:
                 asks()
             except InstrumentError as error:
-                raise DeviceError(f"{error}; {whence}") from error
+                raise DeviceError("; ".join(filter(None, (str(error), whence)))) from error
         for name in sorted({step.setting.target for step in steps if step.setting.target and step.setting.pattern}):
             self._check_screen(name)
 
     def _demands(self, steps: Sequence[Step]) -> Iterator[tuple[Callable[[], None], str]]:
         """What is asked of the instruments without moving them, and, in words, where the plan's value comes from."""
         limits = self.limits
-        for wavelength_nm, sequence in sorted({(step.setting.wavelength_nm or 0.0, step.sequence) for step in steps}):
+        lights = {(nm, step.sequence) for step in steps if (nm := step.setting.wavelength_nm) is not None}
+        for wavelength_nm, sequence in sorted(lights):
             whence = f"the sequence {sequence} needs it: give it other wavelengths, or leave it out"
             if self.light is not None:
                 yield partial(self.light.monochromator.check_nm, wavelength_nm), whence
@@ -152,8 +153,9 @@ class Instruments:
                     whence = f"exposure_{key}_s and gain_db under [limits] of the station file allow it: correct them"
                     exposures[whence, exposure_s] = None
         for number, camera in enumerate(self.drivers.cameras.values()):
+            yield partial(camera.check_trigger, "line" if number else "software"), ""
             for whence, exposure_s in exposures:
-                yield partial(camera.check, exposure_s, limits.gain_db, "line" if number else "software"), whence
+                yield partial(camera.check, exposure_s, limits.gain_db), whence
 
     def _check_screen(self, target: str) -> None:
         """Raise DeviceError where the display's screen isn't as large as the station file has it: something scales its pixels."""

@@ -243,24 +243,24 @@ def _refusing(of: type, method: str, message: str, when: Callable[..., bool]) ->
     ("refuses", "message"),
     [
         (
-            _refusing(fake_bench.FakeCamera, "check", "camera left: 10 s is too long", lambda s, gain, line: s > 1.0),
+            _refusing(fake_bench.FakeCamera, "check", "camera left: 10 s is too long", lambda s, gain: s > 1.0),
             r"camera left: 10 s is too long; exposure_max_s and gain_db under \[limits\]",
         ),
         (
-            _refusing(fake_bench.FakeCamera, "check", "camera left: too short", lambda s, gain, line: s < 1e-4),
+            _refusing(fake_bench.FakeCamera, "check", "camera left: too short", lambda s, gain: s < 1e-4),
             r"too short; exposure_min_s and gain_db under \[limits\]",
         ),
         (
-            _refusing(fake_bench.FakeCamera, "check", "camera left: not 1 ms", lambda s, gain, line: s == 0.001),
+            _refusing(fake_bench.FakeCamera, "check", "camera left: not 1 ms", lambda s, gain: s == 0.001),
             r"not 1 ms; the sequence dark needs it, with gain_db under \[limits\]",
         ),
         (
-            _refusing(fake_bench.FakeCamera, "check", "camera: no trigger line", lambda s, gain, line: line == "line"),
-            "no trigger line; ",
+            _refusing(fake_bench.FakeCamera, "check_trigger", "camera: no trigger line", lambda line: line == "line"),
+            "no trigger line$",
         ),
         (
             _refusing(fake_bench.FakeMonochromator, "check_nm", "monochromator: no white light", lambda nm: nm == 0.0),
-            "no white light; the sequence (dark|flat) needs it: give it other wavelengths",
+            "no white light; the sequence flat needs it: give it other wavelengths",
         ),
         (
             _refusing(fake_bench.FakeMonochromator, "check_slit_um", "monochromator: 5 mm", lambda um: um == 5000.0),
