@@ -1,8 +1,8 @@
 """Clients that know nothing of calibench, on each mock after the project's driver has used the instrument and let it go.
 
-They are packages of the index (the extra `dev`); the PR-655 and PR-670 are told the maker's commands on a plain serial port. For the
-specbos, the CR-250 and USB3 Vision cameras the index has none that this environment takes; seabreeze is what the driver of the Ocean
-Optics spectrometers stands on.
+They are packages of the index (the extra `dev`); those spectroradiometers for which the index has none that this environment takes are
+told their makers' commands on a plain serial port. For USB3 Vision cameras it has none, either; seabreeze is what the driver of the
+Ocean Optics spectrometers stands on.
 """
 
 from __future__ import annotations
@@ -20,15 +20,19 @@ import usb.core
 from drivers.monochromator.cornerstone260 import Cornerstone260
 from drivers.monochromator.cornerstone260b import Cornerstone260B
 from drivers.photodiode.scpi import ScpiPhotodiode
+from drivers.spectroradiometer.cr300 import Cr300
 from drivers.spectroradiometer.ocean_optics import OceanOptics
 from drivers.spectroradiometer.pr655 import Pr655
+from drivers.spectroradiometer.specbos1211 import Specbos1211
 from mocks.bench import Bench
 from mocks.cornerstone260 import MockCornerstone260
 from mocks.cornerstone260b import MockCornerstone260B
+from mocks.cr300 import ColorimetryResearch
 from mocks.lamp import Lamp, tristimulus
 from mocks.pr655 import PhotoResearch
 from mocks.scpi_meter import AREA_M2, DARK_A, NOISE_A, MockScpiMeter
 from mocks.scpi_meter import calibration_csv as diode_calibration
+from mocks.specbos1211 import MockSpecbos1211
 from mocks.usb import InProcessBackend
 from mocks.usb2000plus import PIXELS, MockUsb2000Plus, calibration_csv
 from mocks.wire import Pty, Tcp
@@ -131,6 +135,56 @@ def test_pr655_by_the_makers_commands(
     assert told == pytest.approx(np.interp(told_nm, own_nm, own), abs=0.01 * own.mean())
     with Pr655(address) as ours:
         assert (ours.identity().model, ours.identity().serial_number) == (model, serial_number)
+
+
+def test_cr300_by_the_makers_commands(served: Callable[..., str], tmp_path: Path) -> None:
+    """As its SDK puts them on the line; `colour-specio`, which does the same, wants an older numpy."""
+    address = served(ColorimetryResearch(Lamp(20.0)), Pty(tmp_path / "cr"))
+    with Cr300(address) as ours:
+        expected = ours.measure().radiance_w_sr_m2_nm
+    with serial.Serial(address, 115200, timeout=10.0) as port:
+
+        def ask(command: str) -> str:
+            port.write(command.encode("ascii") + b"\n")
+            return port.readline().decode("ascii").strip()
+
+        assert ask("RC Model") == "OK:0:RC Model:CR-300"
+        assert ask("SM Speed 1") == "OK:0:SM Speed:No errors"
+        assert ask("M") == "OK:0:M:No errors"
+        head, _, told_range = ask("RM Spectrum").rpartition(":")
+        assert head == "OK:0:RM Spectrum"
+        first_nm, last_nm, step_nm, count = map(float, told_range.split(","))
+        told = np.array([float(port.readline()) for _ in range(int(count))])
+    told_nm = np.linspace(first_nm, last_nm, int(count))
+    assert np.diff(told_nm) == pytest.approx(step_nm)
+    own_nm, own = expected.arrays
+    # two measurements of one lamp: 1 % of the spectrum's mean
+    assert told == pytest.approx(np.interp(told_nm, own_nm, own), abs=0.01 * own.mean())
+    with Cr300(address) as ours:
+        assert ours.identity().model == "CR-300"
+
+
+def test_specbos_by_the_makers_commands(served: Callable[..., str], tmp_path: Path) -> None:
+    """The maker's sequence (specbos 1211, interface commands) on a plain serial port."""
+    address = served(MockSpecbos1211(Lamp(20.0)), Pty(tmp_path / "specbos"))
+    with Specbos1211(address) as ours:
+        expected = ours.measure().radiance_w_sr_m2_nm
+    with serial.Serial(address, 921600, timeout=10.0) as port:
+
+        def told(command: str, end: bytes) -> bytes:
+            port.write(command.encode("ascii") + b"\r")
+            return port.read_until(end)
+
+        assert told("*idn?", b"\r") == b"JETI_SB1211\r"
+        for command in ("*conf:default", "*conf:func 6", "*conf:form 4", "*conf:wran 380 780 1"):
+            assert told(command, b"\x06") == b"\x06"
+        assert told("*init", b"\x07") == b"\x06\x07"
+        assert told("*fetch:XYZ", b"\r").startswith(b"X: ")
+        luminance, _ = (float(port.read_until(b"\r").split()[1]) for _ in range(2))
+        # photopic luminance of two measurements of one lamp
+        assert luminance == pytest.approx(tristimulus(expected)[1], rel=0.01)
+    with Specbos1211(address) as ours:
+        assert ours.identity().model == "specbos 1211"
 
 
 def test_scpi_meter_by_pyvisa(served: Callable[..., str], tmp_path: Path) -> None:
