@@ -18,7 +18,8 @@ from serial.tools import list_ports
 from drivers.errors import Disconnected, InstrumentError, InUse
 from drivers.instrument import Identity
 from drivers.registry import driver, drivers
-from drivers.usbip import DEFAULT_PORT, UsbIpBackend
+from drivers.transport import Transport
+from drivers.usbip import DEFAULT_PORT, UsbIpBackend, in_words
 
 #: Longest time (s) for one answer of a serial driver that may be the wrong one.
 _PROBE_TIMEOUT_S = 0.5
@@ -70,7 +71,9 @@ def usbip_devices(server: str) -> Iterator[Found]:
             if (found := _usb_device(device, where)) is not None:
                 yield found
     except (usb.core.USBError, ValueError) as error:
-        raise Disconnected(f"{where}: no USB/IP server answers ({error}); start it, or correct the address") from error
+        raise Disconnected(
+            f"{where}: {in_words(error)}; start a USB/IP server there, or correct the address"
+        ) from error
 
 
 def _usb_device(device: usb.core.Device, where: str) -> Found | None:
@@ -117,8 +120,12 @@ def _enumerated(family: str, name: str) -> Iterator[Found]:
 def probe(address: str) -> Iterator[tuple[str, Identity | InstrumentError]]:
     """Ask each driver of a serial instrument whether its instrument is at this address; the first that connects is the last yielded.
 
-    Each writes its own greeting there: not for a port on which something moves that understands none of them.
+    Each writes its own greeting there: not for a port on which something moves that understands none of them. Raises `Disconnected` for a
+    port that can't be opened, `InUse` for one that another program holds.
     """
+    port = Transport(address, "port")
+    port.open()
+    port.close()
     for family, name in drivers():
         made = driver(family, name)
         if not _is_serial(made):

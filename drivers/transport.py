@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import threading
 import time
@@ -70,8 +71,9 @@ class Transport:
                 self.address, baudrate=self.baudrate, timeout=0, write_timeout=self.timeout_s, **options
             )
         except (OSError, ValueError) as error:  # pyserial's SerialException is an OSError
-            reason = getattr(error, "strerror", None) or str(error).replace("\n", " ")
-            if _number_of(error) in _IN_USE:
+            number = _number_of(error)
+            reason = os.strerror(number) if number is not None else str(error).replace("\n", " ")
+            if number in _IN_USE:
                 raise InUse(
                     f"{self.name}: this port is in use, by another program or another instrument of the station; "
                     "one port serves one instrument: close the other, or correct the address in the station file"
@@ -166,7 +168,7 @@ class Transport:
             if left <= 0:
                 question = f" to {asked!r}" if asked else ""
                 got = f"only {shown(bytes(self._received))}" if self._received else "no answer"
-                remedy = "the power, the cable and that nothing else talks to it"
+                remedy = "the power, the cable, the address, and that nothing else talks to it"
                 if self._received:
                     remedy = "that it is this instrument that is connected there, and that nothing else talks to it"
                 since = f"then nothing for {BETWEEN_S:g} s" if begun else f"within {wait_s:g} s"

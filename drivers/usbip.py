@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import itertools
+import re
 import socket
 import struct
 import threading
@@ -187,6 +188,9 @@ def failed(status: int, what: str) -> usb.core.USBError:
 class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
     """pyusb's backend on pipes: standard requests and descriptors, once for all transports."""
 
+    #: Devices that the last enumeration couldn't ask who they are, as somebody uses them.
+    in_use = 0
+
     @abstractmethod
     def devices(self) -> Sequence[RemoteDevice]:
         """Devices that are connected now."""
@@ -196,11 +200,13 @@ class PipeBackend(IBackend):  # type: ignore[misc]  # pyusb is untyped
         """Open a device for transfers."""
 
     def enumerate_devices(self) -> Iterator[RemoteDevice]:
+        self.in_use = 0
         for device in self.devices():
             try:
                 self._read_descriptors(device)
-            except usb.core.USBError:
-                continue  # busy, or just unplugged: others may still be usable
+            except usb.core.USBError as error:
+                self.in_use += error.errno == errno.EBUSY
+                continue  # in use, or just unplugged: others may still be usable
             yield device
 
     def _read_descriptors(self, device: RemoteDevice) -> None:
@@ -471,7 +477,7 @@ class UsbIpBackend(PipeBackend):
             connection = socket.create_connection((self.host, self.port), self.timeout_s)
         except OSError as error:
             raise failed(
-                errno.ENODEV, f"no USB/IP server at {self.host}:{self.port} ({error}): start it, or correct the address"
+                errno.ENODEV, f"no USB/IP server at {self.host}:{self.port} ({error.strerror or error})"
             ) from error
         try:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -535,7 +541,7 @@ def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
     except usb.core.NoBackendError as error:
         raise Disconnected("no libusb on this computer: install libusb-1.0, or use a camera over usbip://") from error
     except usb.core.USBError as error:
-        raise Disconnected(f"USB: {error}") from error
+        raise Disconnected(f"USB: {in_words(error)}; start a USB/IP server there, or correct the address") from error
     for device in candidates:
         place = getattr(device._ctx.dev, "place", b"")
         if isinstance(place, bytes) and place.decode("ascii", "replace") == serial_number:
@@ -549,9 +555,12 @@ def find(backend: IBackend | None, serial_number: str) -> usb.core.Device:
         seen.append(found)
         usb.util.dispose_resources(device)
     there = ", ".join(name for name in seen if name) or "none"
-    raise Disconnected(
-        f"no USB device with serial number {serial_number}; there are: {there}; is it plugged in, and free?"
-    )
+    absent = f"no USB device with serial number {serial_number}; there are: {there}"
+    if in_use := getattr(backend, "in_use", 0):
+        raise InUse(
+            f"{absent}, and {in_use} in use by another program or another instrument of the station: close that one, or correct the address"
+        )
+    raise Disconnected(f"{absent}; plug it in and switch it on, or correct the address")
 
 
 def open_device(address: str) -> usb.core.Device:
@@ -566,6 +575,11 @@ def open_device(address: str) -> usb.core.Device:
     if parts.scheme == "usb" and parts.netloc:
         return find(None, parts.netloc)
     raise InstrumentError(f"{address!r} is no USB address; write usbip://HOST:PORT/SERIAL or usb://SERIAL")
+
+
+def in_words(error: usb.core.USBError) -> str:
+    """What an error says, without its number before and its name behind."""
+    return re.sub(r"^\[Errno -?\d+\] |: E[A-Z]+$", "", str(error))
 
 
 def translate(error: usb.core.USBError, who: str, doing: str) -> InstrumentError:

@@ -79,7 +79,9 @@ INSTRUMENTS: dict[str, Callable[[Place], Grammar]] = {
 
 #: Exported over USB/IP (`mocks.usb`).
 USB_INSTRUMENTS = ("cornerstone260b", "usb2000plus", "u3v", "u3v-stereo")
-EVERY_INSTRUMENT = (*INSTRUMENTS, *USB_INSTRUMENTS, "display")
+#: Come with a calibration file (`--calibration`).
+CALIBRATED = ("usb2000plus", "scpi-meter")
+EVERY_INSTRUMENT = (*INSTRUMENTS, *USB_INSTRUMENTS, "tethered", "display")
 
 
 class _Unusable(Exception):
@@ -101,14 +103,15 @@ def mock(
         ),
     ] = "",
     real_time: Annotated[
-        float, typer.Option(help="Real seconds for each second of the instrument (0: no waiting).")
+        float, typer.Option(min=0.0, help="Real seconds for each second of the instrument (0: no waiting).")
     ] = 0.0,
     dialect: Annotated[
         str,
         typer.Option(help="Which of an instrument's public dialects it speaks (pr655, pr670: two-lines, one-line)."),
     ] = "",
     calibration: Annotated[
-        Path | None, typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus).")
+        Path | None,
+        typer.Option(help="Write the calibration file that came with the instrument here (usb2000plus, scpi-meter)."),
     ] = None,
     frames: Annotated[
         Path | None,
@@ -116,42 +119,80 @@ def mock(
             help="Replay the frames *-left.npy and *-right.npy of this folder, in real time (u3v, u3v-stereo)."
         ),
     ] = None,
+    folder: Annotated[
+        Path | None, typer.Option(help="The folder that the camera's software writes raw files into (tethered).")
+    ] = None,
 ) -> None:
     """Serve one mock instrument on a pseudo-terminal, a TCP port or USB/IP; prints `ready ADDRESS` when it listens."""
     from mocks.display import Page, browse
     from mocks.lamp import Lamp, LampClock
-    from mocks.pr655 import DIALECTS, PhotoResearch
+    from mocks.pr655 import PhotoResearch
 
     with _one_line_errors():
-        if name not in EVERY_INSTRUMENT:
-            raise _Unusable(f"mock {name}: no such instrument; choose from {', '.join(EVERY_INSTRUMENT)}")
-        if link is not None and name in (*USB_INSTRUMENTS, "display"):
-            raise _Unusable(f"mock {name}: it has no line that a path could name; leave --link out")
-        if dialect and (name not in ("pr655", "pr670") or dialect not in DIALECTS):
-            raise _Unusable(f"mock {name}: no dialect {dialect!r}; pr655 and pr670 have {', '.join(DIALECTS)}")
-        if calibration is not None and name != "usb2000plus":
-            raise _Unusable(f"mock {name}: no calibration file comes with it; leave --calibration out")
-        if frames is not None and not name.startswith("u3v"):
-            raise _Unusable(f"mock {name}: it takes no frames; leave --frames out")
-        if link is not None and tcp:
-            raise _Unusable("mock: --link and --tcp exclude one another; give one of them")
+        _check_options(name, link=link, tcp=tcp, dialect=dialect, calibration=calibration, frames=frames, folder=folder)
         faults = parse_faults(fault, frames=name.startswith("u3v"))
-        lamp = Lamp(clock=LampClock(max(0.0, real_time)))
+        if calibration is not None:
+            _write(calibration, _calibration_of(name))
+        lamp = Lamp(clock=LampClock(real_time))
         stop = threading.Event()
         with _ended_by_signals(stop):
             if name == "display":
                 host, port = _host_and_port(tcp or "127.0.0.1:8765")
                 _say(f"ready {host}:{port}")
                 browse(Page(lamp), f"{host}:{port}", stop, faults)
+            elif folder is not None:
+                _serve_tethered(folder, real_time, stop, faults)
             elif name in USB_INSTRUMENTS:
-                light = lamp if not name.startswith("u3v") else _before_cameras(name, frames, max(0.0, real_time))
-                _serve_usb(name, light, _host_and_port(tcp or "127.0.0.1:0"), stop, faults, calibration)
+                light = lamp if not name.startswith("u3v") else _before_cameras(name, frames, real_time)
+                _serve_usb(name, light, _host_and_port(tcp or "127.0.0.1:0"), stop, faults)
             else:
                 endpoint = Tcp(*_host_and_port(tcp)) if tcp else Pty(link)
                 grammar = INSTRUMENTS[name](lamp)
                 if isinstance(grammar, PhotoResearch) and dialect:
                     grammar.dialect = dialect
                 serve(grammar, endpoint, stop, faults=faults, announce=lambda at: _say(f"ready {at}"))
+
+
+def _check_options(
+    name: str,
+    *,
+    link: Path | None,
+    tcp: str,
+    dialect: str,
+    calibration: Path | None,
+    frames: Path | None,
+    folder: Path | None,
+) -> None:
+    """Raise `_Unusable` for an instrument that isn't there, and for an option that this one doesn't take."""
+    from mocks.pr655 import DIALECTS
+
+    if name not in EVERY_INSTRUMENT:
+        raise _Unusable(f"mock {name}: no such instrument; choose from {', '.join(EVERY_INSTRUMENT)}")
+    by_line = name in INSTRUMENTS
+    refused = {
+        "it has no line that a path could name; leave --link out": link is not None and not by_line,
+        "--link and --tcp exclude one another; give one of them": link is not None and bool(tcp),
+        "its address is a folder; leave --tcp out": bool(tcp) and name == "tethered",
+        "name the folder that its software writes into: --folder": folder is None and name == "tethered",
+        "it writes into no folder; leave --folder out": folder is not None and name != "tethered",
+        f"no dialect {dialect!r}; pr655 and pr670 have {', '.join(DIALECTS)}": bool(dialect)
+        and (name not in ("pr655", "pr670") or dialect not in DIALECTS),
+        "no calibration file comes with it; leave --calibration out": calibration is not None
+        and name not in CALIBRATED,
+        "it takes no frames; leave --frames out": frames is not None and not name.startswith("u3v"),
+    }
+    for why, wrong in refused.items():
+        if wrong:
+            raise _Unusable(f"mock {name}: {why}")
+
+
+def _calibration_of(name: str) -> str:
+    """The calibration file of one of `CALIBRATED`, as far off as real ones are."""
+    from mocks import scpi_meter, usb2000plus
+
+    if name == "scpi-meter":
+        return scpi_meter.calibration_csv()
+    return usb2000plus.calibration_csv(CALIBRATION_DEPARTURE_PERCENT)
 
 
 def _before_cameras(name: str, frames: Path | None, real_time: float) -> Bench | ReadyFrames:
@@ -164,10 +205,38 @@ def _before_cameras(name: str, frames: Path | None, real_time: float) -> Bench |
             return ReadyFrames.of_folder(frames, ("left", "right") if name == "u3v-stereo" else ("left",))
         except ValueError as error:
             raise _Unusable(f"--frames {error}") from error
-    light = Bench(real_time_factor=real_time)
-    light.place("sphere")
-    light.set_shutter(True)
-    return light
+    return _lit(Bench(real_time_factor=real_time))
+
+
+def _lit(bench: Bench) -> Bench:
+    """The bench with white light before the cameras."""
+    bench.place("sphere")
+    bench.set_shutter(True)
+    return bench
+
+
+def _serve_tethered(folder: Path, real_time: float, stop: threading.Event, faults: tuple[Fault, ...]) -> None:
+    """Write pictures into a folder until `stop`; says the driver's settings as lines of a station file, then `ready`."""
+    from mocks.bench import Bench
+    from mocks.tethered import TetheredCamera
+
+    if any(fault.kind == "error" for fault in faults):
+        raise _Unusable("mock tethered: a folder has no error code; choose another fault")
+    light = _lit(Bench(real_time_factor=real_time))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        camera = TetheredCamera(folder.absolute(), light)
+        camera.start()
+    except OSError as error:
+        raise _Unusable(
+            f"--folder {folder}: can't be written ({error.strerror}); name a folder that is yours"
+        ) from error
+    camera.fail(faults)
+    for key, command in camera.settings.items():
+        _say(f"{key} = {json.dumps(command)}")
+    _say(f"ready {folder.absolute()}")
+    stop.wait()
+    camera.close()
 
 
 def _serve_usb(
@@ -176,16 +245,12 @@ def _serve_usb(
     at: tuple[str, int],
     stop: threading.Event,
     faults: tuple[Fault, ...],
-    calibration: Path | None,
 ) -> None:
     from mocks.usb import devices, serve_usbip
-    from mocks.usb2000plus import calibration_csv
 
     exported = devices(name, light)
     for device in exported:
         device.fail(faults)
-    if calibration is not None:
-        _write(calibration, calibration_csv(CALIBRATION_DEPARTURE_PERCENT))
     try:
         server = serve_usbip(exported, *at)
     except OSError as error:
@@ -202,7 +267,9 @@ def _serve_usb(
 def bench(
     station: Annotated[Path | None, typer.Option(help="Write the station file of this bench here.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the hidden truth and of the noise.")] = 1,
-    real_time: Annotated[float, typer.Option(help="Real seconds for each second of the bench (0: no waiting).")] = 0.0,
+    real_time: Annotated[
+        float, typer.Option(min=0.0, help="Real seconds for each second of the bench (0: no waiting).")
+    ] = 0.0,
     fault: Annotated[
         list[str] | None, typer.Option(help="INSTRUMENT:SPEC, as in spectroradiometer:half@3; may be repeated.")
     ] = None,
@@ -290,7 +357,7 @@ def _bench(seed: int, real_time: float, concealed: Concealed | None, warm_up_c: 
 
     if not abs(warm_up_c) <= WARMEST_C:
         raise _Unusable(f"--warm-up {warm_up_c:g}: beyond {WARMEST_C:g} degrees; give how much warmer the sensors get")
-    place = Bench(seed, max(0.0, real_time), concealed, warm_up_c=warm_up_c, session_clock=time.time)
+    place = Bench(seed, real_time, concealed, warm_up_c=warm_up_c, session_clock=time.time)
     place.compile_loops()
     return place
 

@@ -43,6 +43,7 @@ class _Cs260bRefusal(Exception):
     """An entry of the error queue."""
 
 
+_DEVICE_ERROR = '-300, "Device-specific error"'
 _UNKNOWN, _BAD_DATA, _OUT_OF_RANGE = '-113, "Undefined header"', '-104, "Data type error"', '-222, "Data out of range"'
 
 
@@ -196,7 +197,12 @@ class MockCornerstone260B(UsbDevice):
                 self._events |= 0x20 if str(refusal).startswith("-11") else 0x10
             return
         if answer is not None:
-            data = self.broken(answer.encode() + b"\r\n")
+            try:
+                data = self.broken(answer.encode() + b"\r\n")
+            except Stalled:  # a fault of the kind `error`: no answer, and an error to be asked for
+                data = b""
+                with self.changed:
+                    self._errors.append(_DEVICE_ERROR)
             with self.changed:
                 self._answers += data
                 self.changed.notify_all()

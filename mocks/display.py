@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from mocks.wire import Fault
+from mocks.wire import Fault, FaultPlan
 
 #: How long a page waits before it tries the driver again.
 RETRY_S = 0.1
@@ -90,7 +90,7 @@ class Page:
 
 def browse(page: Page, address: str, stop: threading.Event, faults: Iterable[Fault] = ()) -> None:
     """Keep `page` connected to the driver at `address` (host:port) until `stop`; faults count its answers."""
-    broken = tuple(faults)
+    broken = FaultPlan(faults)
     answers = 0
     while not stop.is_set():
         try:
@@ -106,7 +106,7 @@ def browse(page: Page, address: str, stop: threading.Event, faults: Iterable[Fau
                         continue
                     for said in page.receive(message):
                         answers += 1
-                        if not _answer(socket, said, [f for f in broken if f.hits(answers)], stop):
+                        if not _answer(socket, said, broken.of(answers), stop):
                             break
         except (OSError, WebSocketException):
             stop.wait(RETRY_S)

@@ -87,14 +87,15 @@ class MockScpiMeter(Grammar):
             return b""
         if command == "*IDN?":
             return f"KEITHLEY INSTRUMENTS INC.,MODEL 6485,{self._serial_number},B03\n".encode()
-        if command == "*RST":
+        if command == "*CLS":
+            self._errors.clear()
+        elif command == "*RST":
             self._zero_check = True
         elif command.startswith("SYST:ZCH "):
             self._zero_check = command.endswith(("ON", "1"))
         elif command in ("READ?", "MEAS?", "MEAS:CURR?", "MEAS:CURR:DC?"):
             self._done_at = self.clock.now() + 0.1  # five cycles of the mains
         elif command not in (
-            "*CLS",
             "RANG:AUTO ON",
             "CURR:RANG:AUTO ON",
             "CONF:CURR",

@@ -63,7 +63,7 @@ class TetheredCamera:
         self._thread.start()
 
     def fail(self, faults: tuple[Fault, ...]) -> None:
-        """Break the pictures to come, counted from the next one: `late`, `never`, `half`, `wrong`."""
+        """Break the pictures to come, counted from the next one: `late`, `never`, `half`, `wrong`, or the folder gone (`unplug`)."""
         self._faults = deque(faults)
         self._pictures = 0
 
@@ -75,6 +75,12 @@ class TetheredCamera:
         self._pictures += 1
         kinds = {fault.kind: fault for fault in self._faults if fault.hits(self._pictures)}
         if "never" in kinds or "drop" in kinds:
+            return
+        if "unplug" in kinds:
+            gone = self.folder.with_name(f"{self.folder.name}.gone")
+            self.folder.rename(gone)
+            self._stop.wait(1.0 if kinds["unplug"].value is None else kinds["unplug"].value)
+            gone.rename(self.folder)
             return
         if "late" in kinds:
             time.sleep(kinds["late"].value or 1.0)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from mocks.wire import Fault
+from mocks.wire import Fault, FaultPlan
 
 #: Asked from time to time by a device that waits: has whoever asked lost patience?
 Cancelled = Callable[[], bool]
@@ -111,7 +111,7 @@ class UsbDevice:
         self._association = association
         self._state = _UsbDeviceState()
         self._strings = ["", identity.maker, identity.product, identity.serial_number]
-        self._line_faults: tuple[Fault, ...] = ()
+        self._line_faults = FaultPlan()
         self.answers = 0
         self._silent = False
 
@@ -229,7 +229,7 @@ class UsbDevice:
 
     def fail(self, faults: Iterable[Fault]) -> None:
         """Break answers, which count from 1, as serial instruments' answers break; a camera's answers are its frames."""
-        self._line_faults = tuple(faults)
+        self._line_faults = FaultPlan(faults)
         self.answers = 0
 
     def mute(self, silent: bool) -> None:
@@ -241,7 +241,7 @@ class UsbDevice:
     def _faults_of_answer(self) -> list[Fault]:
         """The faults of the answer that is about to go out."""
         self.answers += 1
-        return [fault for fault in self._line_faults if fault.hits(self.answers)]
+        return self._line_faults.of(self.answers)
 
     def _unplug_for(self, seconds: float) -> None:
         self.unplug()

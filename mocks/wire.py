@@ -127,6 +127,26 @@ class Fault:
         return number == self.at or (self.onwards and number > self.at)
 
 
+class FaultPlan:
+    """Faults by the answers that they break: a bench that runs for a day has thousands."""
+
+    def __init__(self, faults: Iterable[Fault] = ()) -> None:
+        self._at: dict[int, list[Fault]] = {}
+        self._onwards: list[Fault] = []
+        for fault in faults:
+            if fault.onwards:
+                self._onwards.append(fault)
+            else:
+                self._at.setdefault(fault.at, []).append(fault)
+
+    def __bool__(self) -> bool:
+        return bool(self._at or self._onwards)
+
+    def of(self, number: int) -> list[Fault]:
+        """Those that break the answer of this number."""
+        return [*self._at.get(number, ()), *(fault for fault in self._onwards if fault.hits(number))]
+
+
 def parse_faults(spec: str, frames: bool = False) -> tuple[Fault, ...]:
     """Faults from `KIND[=VALUE][@N[+]]`, several with commas: `half@3`, `late=5@2`, `error=120@1+`. `frames`: those of a camera, too.
 
@@ -167,7 +187,7 @@ class FaultyLine:
 
     def __init__(self, grammar: Grammar, faults: Iterable[Fault] = ()) -> None:
         self.grammar = grammar
-        self.faults = tuple(faults)
+        self.faults = FaultPlan(faults)
         self.answers = 0
         self._arm()
 
@@ -184,8 +204,8 @@ class FaultyLine:
         return self._pass(self.grammar.elapse())
 
     def _arm(self) -> None:
-        for fault in self.faults:
-            if fault.kind == "error" and fault.hits(self.answers + 1):
+        for fault in self.faults.of(self.answers + 1):
+            if fault.kind == "error":
                 self.grammar.fail_next(None if fault.value is None else int(fault.value))
 
     def _pass(self, pieces: Sequence[bytes]) -> list[Output]:
@@ -201,9 +221,7 @@ class FaultyLine:
 
     def _broken(self, reply: Reply) -> Output:
         data, delay_s = bytes(reply), 0.0
-        for fault in self.faults:
-            if not fault.hits(self.answers):
-                continue
+        for fault in self.faults.of(self.answers):
             if fault.kind == "late":
                 delay_s = 3.0 if fault.value is None else fault.value
             elif fault.kind == "never":

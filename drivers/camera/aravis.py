@@ -23,8 +23,8 @@ from drivers.instrument import Identity
 _T = TypeVar("_T")
 _DISTRIBUTION = "/usr/lib/python3/dist-packages"
 _BUFFERS = 4
+_CLEARED = 1
 _STATUS = {
-    1: "cleared",
     2: "it came after the time-out",
     3: "packets are missing",
     4: "its packets have wrong numbers",
@@ -196,6 +196,9 @@ class AravisCamera(GenicamCamera):
         if buffer is None:
             return None
         status = int(buffer.get_status())
+        if status == _CLEARED:  # nothing was written into it; seen with the fake camera on a busy computer
+            self._stream.push_buffer(buffer)
+            return None
         damage = "" if status == 0 else _STATUS.get(status, f"status {status}")
         grabbed = Grabbed(
             payload=b"" if damage else buffer.get_data(),

@@ -22,7 +22,10 @@ TEMPERATURE_NS = 250_000_000
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """What the camera reports of its sensor; None where it doesn't. `black_level` is in the camera's own unit, mostly codes."""
+    """What the camera reports of its sensor; None where it doesn't. `black_level` is in the camera's own unit, mostly codes.
+
+    `exposure_s`: its shortest and longest exposure.
+    """
 
     rows: int
     cols: int
@@ -31,6 +34,7 @@ class SensorInfo:
     bit_depth: int | None
     pixel_pitch_um: float | None = None
     black_level: float | None = None
+    exposure_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +70,14 @@ class Camera(Instrument):
     @abstractmethod
     def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
         """Set exposure (s) and gain (dB) of the frames to come. Raises `InstrumentError` outside the camera's limits."""
+
+    def check(self, exposure_s: float, gain_db: float = 0.0) -> None:
+        """Raise `InstrumentError` for an exposure (s) or a gain (dB) that `configure` would refuse; nothing is exposed."""
+        self.configure(exposure_s, gain_db)
+
+    def check_trigger(self, trigger: Trigger) -> None:
+        """Raise `InstrumentError` for a trigger that `arm` would refuse, as far as the driver knows; nothing is exposed."""
+        return
 
     @abstractmethod
     def arm(self, trigger: Trigger = "software") -> None:

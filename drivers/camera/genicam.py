@@ -206,15 +206,18 @@ class GenicamCamera(StreamingCamera):
                 bit_depth=self._format.bits,
                 pixel_pitch_um=pitch,
                 black_level=black_level(features),
+                exposure_s=self._exposure_limits_s(features),
             )
+
+    def check_trigger(self, trigger: Trigger) -> None:
+        with self._used() as features:
+            self._trigger_source(features, trigger)
 
     def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
         if not (math.isfinite(exposure_s) and exposure_s > 0 and math.isfinite(gain_db)):
             raise InstrumentError(f"{self._who}: exposure {exposure_s} s at {gain_db} dB; give a positive time")
         with self._used() as features:
-            name = next((name for name in _EXPOSURES if features.has(name)), None)
-            if name is None:
-                raise InstrumentError(f"{self._who}: it has no exposure time that can be set; use a camera that has")
+            name = self._exposure_name(features)
             self._set_within(features, name, exposure_s * 1e6, "us")
             if features.has("Gain"):
                 self._set_within(features, "Gain", gain_db, "dB")
@@ -223,13 +226,27 @@ class GenicamCamera(StreamingCamera):
             self._exposure_s = float(features.get(name)) * 1e-6
             self._gain_db = float(features.get("Gain")) if features.has("Gain") else 0.0
 
+    def _exposure_name(self, features: CameraFeatures) -> str:
+        name = next((name for name in _EXPOSURES if features.has(name)), None)
+        if name is None:
+            raise InstrumentError(f"{self._who}: it has no exposure time that can be set; use a camera that has")
+        return name
+
+    def _exposure_limits_s(self, features: CameraFeatures) -> tuple[float, float] | None:
+        for name in _EXPOSURES:
+            if features.has(name):
+                low, high = features.limits(name)
+                return low * 1e-6, high * 1e-6
+        return None
+
     def _set_within(self, features: CameraFeatures, name: str, value: float, unit: str) -> None:
         low, high = features.limits(name)
-        if not low <= value <= high:  # a library may clamp it without a word
+        within = min(max(value, low), high)
+        if not math.isclose(within, value, rel_tol=1e-9):  # a library may clamp it without a word
             raise InstrumentError(
                 f"{self._who}: {name} {value:g} {unit} is outside {low:g}..{high:g} {unit}; ask for a value in it"
             )
-        features.set(name, value)
+        features.set(name, within)
 
     def arm(self, trigger: Trigger = "software") -> None:
         with self._used() as features:
@@ -238,14 +255,19 @@ class GenicamCamera(StreamingCamera):
             self.follows_by_software = trigger == "line" and self._wanted_line == "Software"
             if self._armed != trigger:
                 self._stop_acquisition()
-                line = "Software"
-                if trigger == "line" and not self.follows_by_software:
-                    line = trigger_line(features, self._who, self._wanted_line)
-                features.set("TriggerSource", line)
+                features.set("TriggerSource", self._trigger_source(features, trigger))
                 self._before, self._owed = None, 0
                 self._start()
                 self._armed = trigger
             self._fired = datetime.now(UTC)
+
+    def _trigger_source(self, features: CameraFeatures, trigger: Trigger) -> str:
+        """What triggers it: a line of its own, or the computer. Raises `InstrumentError` where it hasn't got that."""
+        if trigger == "line" and self._wanted_line != "Software":
+            return trigger_line(features, self._who, self._wanted_line)
+        if "Software" not in features.entries("TriggerSource"):
+            raise InstrumentError(f"{self._who}: it has no software trigger; use a camera that has")
+        return "Software"
 
     def fire(self) -> None:
         with self._used() as features:

@@ -38,12 +38,20 @@ PROCESSING: tuple[tuple[str, Setting], ...] = (
     ("BalanceWhiteAuto", "Off"),
     ("BlackLevelAuto", "Off"),
     ("GammaEnable", False),
+    ("GammaEnabled", False),
+    ("Gamma", 1.0),
+    ("BslBrightness", 0.0),
+    ("BslContrast", 0.0),
+    ("DigitalShift", 0),
     ("LUTEnable", False),
     ("SharpeningEnable", False),
     ("DefectCorrectStaticEnable", False),
     ("DefectCorrectDynamicEnable", False),
     ("BslDefectPixelCorrectionMode", "Off"),
 )
+
+#: Features that do nothing while a switch of theirs, one of `PROCESSING`, is off: those switches' names.
+SWITCHES = {"Gamma": ("GammaEnable", "GammaEnabled")}
 
 
 def set_if_there(features: Features, name: str, value: Setting) -> None:
@@ -67,7 +75,7 @@ def switch_processing_off(features: Features, who: str) -> None:
     for name, off in PROCESSING:
         if not features.has(name) or (isinstance(off, str) and off not in features.entries(name)):
             continue
-        if features.get(name) == off:
+        if features.get(name) == off or any(features.has(switch) for switch in SWITCHES.get(name, ())):
             continue
         refused: InstrumentError | None = None
         try:

@@ -110,11 +110,14 @@ class RawFolderCamera(Camera):
             rows, cols = sample.raw.shape
             return SensorInfo(rows, cols, "raw file", sample.cfa, sample.bit_depth, black_level=sample.black_level)
 
-    def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
+    def check(self, exposure_s: float, gain_db: float = 0.0) -> None:
         if not (math.isfinite(exposure_s) and 0 < exposure_s <= 3600 and math.isfinite(gain_db)):
             raise InstrumentError(
                 f"{self._who}: exposure {exposure_s} s at {gain_db} dB is outside 0..3600 s; give a time in it"
             )
+
+    def configure(self, exposure_s: float, gain_db: float = 0.0) -> None:
+        self.check(exposure_s, gain_db)
         with self._lock:
             self._ready()
             changed = (exposure_s, gain_db) != (self._exposure_s, self._gain_db)

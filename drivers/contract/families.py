@@ -74,7 +74,7 @@ class MonochromatorContract(FamilyContract):
 
     def settings(self, driver: Monochromator) -> None:
         for wavelength_nm in (450.0, 632.8, 0.0):
-            driver.check_nm(wavelength_nm)
+            driver.check_nm(wavelength_nm)  # refuses nothing that it can do
             driver.move_nm(wavelength_nm)
             found = driver.wavelength_nm()
             require(abs(found - wavelength_nm) <= 0.5, f"told to go to {wavelength_nm} nm it stands at {found} nm")
@@ -82,6 +82,7 @@ class MonochromatorContract(FamilyContract):
             (driver.open_shutter if opened else driver.close_shutter)()
             require(driver.shutter_is_open() is opened, f"the shutter told to be open = {opened} isn't")
         before = driver.slit_um()
+        driver.check_slit_um(500.0)
         driver.set_slit_um(500.0)
         require(abs(driver.slit_um() - 500.0) <= 5.0, f"told a slit of 500 um it has {driver.slit_um()} um")
         require(driver.bandwidth_nm() > 0.0, "its bandwidth isn't above 0")
@@ -143,6 +144,8 @@ class CameraContract(FamilyContract):
 
     def settings(self, driver: Camera) -> None:
         for exposure_s in (0.002, 0.02):
+            driver.check(exposure_s)
+            driver.check_trigger("software")
             driver.configure(exposure_s)
             frame = driver.capture()
             require(
@@ -160,6 +163,7 @@ class CameraContract(FamilyContract):
             require(highest < 2**sensor.bit_depth, f"a code of {highest} with {sensor.bit_depth} bits")
         for wrong_s in (0.0, -1.0, math.nan, math.inf, 1e9):
             require_refused(lambda wrong_s=wrong_s: driver.configure(wrong_s), f"an exposure of {wrong_s} s")  # type: ignore[misc]
+            require_refused(lambda wrong_s=wrong_s: driver.check(wrong_s), f"an exposure of {wrong_s} s to be checked")  # type: ignore[misc]
         driver.configure(0.005)
         require_refused(driver.collect, "a frame that nobody triggered")
 
@@ -196,7 +200,7 @@ class DisplayContract(FamilyContract):
 
     def everyday(self, driver: Display) -> None:
         shown = driver.show(np.ones((2, 2), np.uint8), 4)
-        require(shown.cell_px == 4 and shown.device_pixel_ratio == 1.0, f"it shows {shown}")
+        require(shown.cell_px == 4 and shown.canvas_px == shown.screen_px, f"it shows {shown}")
 
     def takes_long(self, driver: Display) -> None:
         driver.show(np.ones((2, 2), np.uint8), 8)

@@ -7,12 +7,19 @@ let announced = null;
 let pattern = null;
 let socket = null;
 
+// The browser tells the screen in whole CSS pixels: where the system scales by 1.5, that is off by up to half of one, and the
+// canvas, which is measured in screen pixels, tells which screen it fills.
+function pixels(css, ratio, canvas_px) {
+  const off = Number.isInteger(ratio) ? 0 : ratio / 2;
+  return Math.abs(css * ratio - canvas_px) <= off ? canvas_px : Math.round(css * ratio);
+}
+
 function geometry() {
   const ratio = window.devicePixelRatio;
   return {
     device_pixel_ratio: ratio,
     canvas_px: [canvas.height, canvas.width],
-    screen_px: [Math.round(screen.height * ratio), Math.round(screen.width * ratio)],
+    screen_px: [pixels(screen.height, ratio, canvas.height), pixels(screen.width, ratio, canvas.width)],
   };
 }
 

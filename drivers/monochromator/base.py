@@ -89,6 +89,10 @@ class Monochromator(Instrument):
         """Raise `InstrumentError` for a wavelength (nm) that `move_nm` would refuse, as far as the driver knows; nothing moves."""
         return
 
+    def check_slit_um(self, width_um: float) -> None:
+        """Raise `InstrumentError` for a slit width (um) that `set_slit_um` would refuse, as far as the driver knows; nothing moves."""
+        return
+
     @abstractmethod
     def wavelength_nm(self) -> float:
         """Wavelength (nm) that the instrument reports."""
@@ -124,6 +128,20 @@ class Monochromator(Instrument):
     @abstractmethod
     def bandwidth_nm(self) -> float:
         """Full width at half maximum (nm) of the light: slit width x reciprocal linear dispersion."""
+
+
+#: Narrowest and widest slit (um) of the motorised slits of Cornerstone 260 and CS260B.
+SLIT_LIMITS_UM = (4.0, 3000.0)
+
+
+def checked_slit_um(width_um: float) -> float:
+    """The slit width (um) if the slits can be set to it; raises `InstrumentError` if not (a NaN included)."""
+    low, high = SLIT_LIMITS_UM
+    if not low <= width_um <= high:
+        raise InstrumentError(
+            f"monochromator: a slit of {width_um:g} um is outside {low:g}..{high:g} um; ask for a width in this range"
+        )
+    return width_um
 
 
 def checked_wavelength_nm(wavelength_nm: float, upper_nm: float) -> float:

@@ -16,6 +16,7 @@ from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refu
 from drivers.instrument import Identity, Recorder
 from drivers.monochromator.base import (
     Monochromator,
+    checked_slit_um,
     checked_wavelength_nm,
     filter_place,
     order_sorting_filters,
@@ -90,6 +91,9 @@ class Cornerstone260(WireInstrument, Monochromator):
     def check_nm(self, wavelength_nm: float) -> None:
         filter_place(self.filters, checked_wavelength_nm(wavelength_nm, self.upper_nm))
 
+    def check_slit_um(self, width_um: float) -> None:
+        checked_slit_um(width_um)
+
     def move_nm(self, wavelength_nm: float) -> None:
         wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
         with self._conversation():
@@ -136,9 +140,10 @@ class Cornerstone260(WireInstrument, Monochromator):
             return self._number("SLIT1MICRONS?")
 
     def set_slit_um(self, width_um: float) -> None:
+        wanted = checked_slit_um(width_um)
         with self._conversation():
             for slit in (1, 2):
-                self._do(f"SLIT{slit}MICRONS {round(width_um)}")
+                self._do(f"SLIT{slit}MICRONS {round(wanted)}")
 
     def bandwidth_nm(self) -> float:
         return self.slit_um() * 1e-3 * self.dispersion_nm_per_mm
@@ -172,7 +177,8 @@ class Cornerstone260(WireInstrument, Monochromator):
         self._echoes = first.strip().upper() == "INFO?"
         reply = self._line("INFO?") if self._echoes else first
         more = line.drain(quiet_s=0.1).decode("latin-1").split()
-        if reply in _FAILED or len(more) > 1 or any(len(word) > 2 for word in more):
+        complains = "INFO?" in reply.upper() or reply.upper().startswith(("ER:", "ERROR"))  # another instrument does
+        if complains or reply in _FAILED or len(more) > 1 or any(len(word) > 2 for word in more):
             raise self._strange("INFO?", " ".join([first, reply, *more]))
         if self._found_handshake is None:
             self._found_handshake = bool(more)

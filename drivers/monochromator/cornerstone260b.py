@@ -15,14 +15,19 @@ import usb.core
 
 from drivers.errors import Garbled, InstrumentError, Interrupted, NoAnswer, Refused
 from drivers.instrument import Identity, Recorder
-from drivers.monochromator.base import Monochromator, checked_wavelength_nm, filter_place, order_sorting_filters
+from drivers.monochromator.base import (
+    Monochromator,
+    checked_slit_um,
+    checked_wavelength_nm,
+    filter_place,
+    order_sorting_filters,
+)
 from drivers.transport import shown
 from drivers.usbip import open_device
 from drivers.usbtmc import UsbTmc
 
 VENDOR, MODELS = 0x1FDE, {0x0014: "CS260B", 0x0006: "CS130B"}
 _LOOK_S = 0.05
-_SLIT_UM = (4.0, 3000.0)
 
 
 class Cornerstone260B(Monochromator):
@@ -73,6 +78,9 @@ class Cornerstone260B(Monochromator):
     def check_nm(self, wavelength_nm: float) -> None:
         filter_place(self.filters, checked_wavelength_nm(wavelength_nm, self.upper_nm))
 
+    def check_slit_um(self, width_um: float) -> None:
+        checked_slit_um(width_um)
+
     def move_nm(self, wavelength_nm: float) -> None:
         wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
         with self._conversation() as wire:
@@ -116,14 +124,10 @@ class Cornerstone260B(Monochromator):
             return self._number(wire, "slit1microns?")
 
     def set_slit_um(self, width_um: float) -> None:
-        low, high = _SLIT_UM
-        if not low <= width_um <= high:
-            raise InstrumentError(
-                f"{self._who}: a slit of {width_um} um is outside {low:g}..{high:g} um; ask for a width in it"
-            )
+        wanted = checked_slit_um(width_um)
         with self._conversation():
             for slit in (1, 2):
-                self._do(f"slit{slit}microns {round(width_um)}")
+                self._do(f"slit{slit}microns {round(wanted)}")
 
     def bandwidth_nm(self) -> float:
         return self.slit_um() * 1e-3 * self.dispersion_nm_per_mm

@@ -31,6 +31,10 @@ class Photodiode(Instrument):
     def measure_dark(self) -> float:
         """Current (A) without light, mean of the readings; later measurements are above it."""
 
+    def check_nm(self, wavelength_nm: float) -> None:
+        """Raise `InstrumentError` for a wavelength (nm) that `measure` would refuse, as far as the driver knows; nothing is asked."""
+        return
+
     @abstractmethod
     def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
         """Irradiance of light of this wavelength. Raises `InstrumentError` outside the calibration, `Refused` for an overload."""

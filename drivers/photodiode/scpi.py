@@ -93,12 +93,15 @@ class ScpiPhotodiode(Photodiode):
             self._dark_a, self._var_dark = float(np.mean(found)), _variance_of_mean(found)
             return self._dark_a
 
-    def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
+    def check_nm(self, wavelength_nm: float) -> None:
         low, high = self._responsivity.wavelength_nm[0], self._responsivity.wavelength_nm[-1]
         if not low <= wavelength_nm <= high:
             raise InstrumentError(
                 f"photodiode: {wavelength_nm} nm is outside its calibration's {low:g}..{high:g} nm; ask for a wavelength in it"
             )
+
+    def measure(self, wavelength_nm: float) -> IrradianceMeasurement:
+        self.check_nm(wavelength_nm)
         with self._conversation():
             found = self._currents()
             current_a = float(np.mean(found)) - self._dark_a
@@ -151,7 +154,7 @@ class ScpiPhotodiode(Photodiode):
                 f"{self._who}: can't be opened ({reason}); check the cable, the power and the address"
             ) from error
         try:
-            told = self._ask("*IDN?")
+            told = self._first_answer()
             maker, model, serial_number, firmware = (*(part.strip() for part in told.split(",")), "", "", "", "")[:4]
             self._identity = Identity(maker, model, serial_number, firmware)
             commands = self.setup
@@ -169,6 +172,16 @@ class ScpiPhotodiode(Photodiode):
         except InstrumentError:
             self._drop()
             raise
+
+    def _first_answer(self) -> str:
+        """Its identity. PyVISA opens a TCP address without looking whether anyone is there."""
+        try:
+            return self._ask("*IDN?")
+        except Disconnected as error:
+            reason = str(error.__cause__).partition(":")[0] if error.__cause__ is not None else str(error)
+            raise Disconnected(
+                f"{self._who}: can't be reached ({reason}); check the cable, the power and the address"
+            ) from error
 
     def _currents(self) -> list[float]:
         return [self._current() for _ in range(self.readings)]

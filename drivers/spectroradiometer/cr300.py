@@ -68,6 +68,7 @@ class Cr300(WireInstrument, Spectroradiometer):
         self._identity = Identity(
             "Colorimetry Research", self._ask("RC Model"), serial_number, self._ask("RC Firmware")
         )
+        self._transport.device = self._identity.model
 
     def _make_safe(self) -> None:
         """It emits nothing and moves nothing."""

@@ -147,8 +147,8 @@ class OceanOptics(Spectroradiometer):
             try:
                 integration_s = self._choose_time(pixels)
                 scans = [self._scan(pixels) for _ in range(self.averages)]
-            except usb.core.USBError as error:
-                self._drop()
+            except (usb.core.USBError, Garbled) as error:
+                self._drop()  # what it sends next may belong to this
                 raise self._error(error, "measuring") from error
             signal = np.mean([self._signal(scan) for scan in scans], axis=0)
             rate = Spectrum.of(self._wavelength_nm, signal / integration_s)
@@ -194,10 +194,21 @@ class OceanOptics(Spectroradiometer):
         """Counts of all pixels, dark ones included, (2048,)."""
         if self._stopped.is_set():
             raise Interrupted(f"spectrometer {self.address}: the measurement was stopped")
-        counts = np.asarray(pixels.get_intensities(), float) / self._stretch
+        try:
+            counts = np.asarray(pixels.get_intensities(), float) / self._stretch
+        except ValueError as error:  # the library's, where bytes are missing
+            raise Garbled(
+                f"spectrometer {self.address}: sent a spectrum that isn't whole ({' '.join(str(error).split())}); measure again"
+            ) from error
         if counts.shape != self._wavelength_nm.shape:
             raise Garbled(
                 f"spectrometer {self.address}: sent {counts.size} pixels of {self._wavelength_nm.size}; measure again"
+            )
+        covered = counts[self._dark_pixels]
+        if covered.size > 1 and np.ptp(covered) == 0 and covered[0] < SATURATED * self._full_scale:
+            raise Garbled(
+                f"spectrometer {self.address}: sent {covered[0]:.0f} counts for each of its {covered.size} covered pixels, without any noise; "
+                "measure again"
             )
         return counts
 

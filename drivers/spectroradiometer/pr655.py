@@ -69,6 +69,7 @@ class Pr655(WireInstrument, Spectroradiometer):
         if not model.startswith(("PR-655", "PR-670")):
             raise self._strange("D111", model.encode("latin-1"))
         self._identity = Identity("Photo Research", model, self._ask("D110"), self._ask("D114"))
+        self._transport.device = self._identity.model
 
     def _make_safe(self) -> None:
         """It emits nothing and moves nothing."""

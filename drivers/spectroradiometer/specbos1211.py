@@ -121,6 +121,7 @@ class Specbos1211(WireInstrument, Spectroradiometer):
         with suppress(Refused):
             firmware = self._ask("*vers?")
         self._identity = Identity("JETI", model, serial_number, firmware)
+        self._transport.device = self._identity.model
         self._spectraval = model.startswith("spectraval")
         if self._spectraval:
             settings = ["*para:aver 1", f"*para:maxtint {round(self.max_integration_s * 1000)}"]

@@ -54,7 +54,11 @@ class OperatorStage(WireInstrument, Stage):
             self._transport.resume()
 
     def _establish(self) -> None:
-        self._ask("PLACED?")
+        answer = self._ask("PLACED?")
+        if "PLACED?" in answer:  # an echo, or a complaint about it
+            raise Garbled(
+                f"{self._transport.name}: answered 'PLACED?' with {shown(answer.encode())}; check that a stage is at this address"
+            )
 
     def _make_safe(self) -> None:
         """It emits nothing and moves nothing by itself."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from lab.capture.devices import (
 )
 from lab.capture.station import Drivers, Station
 from lab.capture_kinds.base import CaptureLimits, FixedExposure, Step
+from lab.capture_kinds.irradiance import irradiance_nm
 from lab.errors import DeviceError
 from sim.camera import Side
 from sim.parameters import Frozen
@@ -110,18 +112,65 @@ class Instruments:
         return found
 
     def check(self, steps: Sequence[Step]) -> None:
-        """Raise DeviceError for a wavelength, an exposure or a gain of these steps that an instrument can't be set to; nothing moves."""
-        wavelengths = {nm for step in steps if (nm := step.setting.wavelength_nm) is not None}
-        exposures = {step.exposure.exposure_s for step in steps if isinstance(step.exposure, FixedExposure)}
-        try:
+        """Raise DeviceError for what these steps need and an instrument can't do; nothing moves, and nothing is exposed.
+
+        That is a wavelength, a slit width, an exposure, a gain, the line that triggers a camera, and a screen of another size.
+        """
+        for asks, whence in self._demands(steps):
+            try:
+                asks()
+            except InstrumentError as error:
+                raise DeviceError("; ".join(filter(None, (str(error), whence)))) from error
+        for name in sorted({step.setting.target for step in steps if step.setting.target and step.setting.pattern}):
+            self._check_screen(name)
+
+    def _demands(self, steps: Sequence[Step]) -> Iterator[tuple[Callable[[], None], str]]:
+        """What is asked of the instruments without moving them, and, in words, where the plan's value comes from."""
+        limits = self.limits
+        lights = {(nm, step.sequence) for step in steps if (nm := step.setting.wavelength_nm) is not None}
+        for wavelength_nm, sequence in sorted(lights):
+            whence = f"the sequence {sequence} needs it: give it other wavelengths, or leave it out"
             if self.light is not None:
-                for wavelength_nm in sorted(wavelengths):
-                    self.light.monochromator.check_nm(wavelength_nm)
-            for camera in self.drivers.cameras.values():
-                for exposure_s in sorted({min(exposures), max(exposures)} if exposures else ()):
-                    camera.configure(exposure_s, self.limits.gain_db)
+                yield partial(self.light.monochromator.check_nm, wavelength_nm), whence
+        if self.photodiode is not None:
+            lit = {(nm, step.sequence) for step in steps if (nm := irradiance_nm(step)) is not None}
+            for wavelength_nm, sequence in sorted(lit):
+                whence = f"the sequence {sequence} needs it: give it other wavelengths, or leave the photodiode out"
+                yield partial(self.photodiode.photodiode.check_nm, wavelength_nm), whence
+        if self.light is not None:
+            for slit_um in sorted({step.setting.slit_um for step in steps if step.setting.slit_um is not None}):
+                yield (
+                    partial(self.light.monochromator.check_slit_um, slit_um),
+                    "it stands as slit_um under [limits] of the station file",
+                )
+        exposures: dict[tuple[str, float], None] = {}
+        for step in steps:
+            if isinstance(step.exposure, FixedExposure):
+                whence = f"the sequence {step.sequence} needs it, with gain_db under [limits] of the station file"
+                exposures[whence, step.exposure.exposure_s] = None
+            elif step.exposure is not None:
+                for key, exposure_s in (("min", limits.exposure_min_s), ("max", limits.exposure_max_s)):
+                    whence = f"exposure_{key}_s and gain_db under [limits] of the station file allow it: correct them"
+                    exposures[whence, exposure_s] = None
+        for number, camera in enumerate(self.drivers.cameras.values()):
+            yield partial(camera.check_trigger, "line" if number else "software"), ""
+            for whence, exposure_s in exposures:
+                yield partial(camera.check, exposure_s, limits.gain_db), whence
+
+    def _check_screen(self, target: str) -> None:
+        """Raise DeviceError where the display's screen isn't as large as the station file has it: something scales its pixels."""
+        wanted = self.station.targets[target].screen_px if target in self.station.targets else None
+        if self.screen is None or wanted is None:
+            return
+        try:
+            found = self.screen.display.screen_px()
         except InstrumentError as error:
-            raise DeviceError(f"{error}; the plan needs it: see [limits] in the station file") from error
+            raise DeviceError(named_complaint("display", error)) from error
+        if found != wanted:
+            raise DeviceError(
+                f"display: its screen has {found[0]} x {found[1]} px, [targets.{target}] in the station file says {wanted[0]} x {wanted[1]}: "
+                "the system scales its pixels, or it is another screen; set its scaling to 100 %, or correct rows and cols there"
+            )
 
     def make_safe(self) -> list[str]:
         """Close the shutter, darken the screen, stop all motion: every instrument at once, within `STOP_S`.

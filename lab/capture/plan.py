@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from lab.capture_kinds.base import SEQUENCES, Cells, Equipment, Sequence, Step
+from lab.capture_kinds.base import SEQUENCES, Cells, Equipment, Sequence, Step, name_of
 from lab.errors import InputError
 from sim.parameters import declared
 
@@ -31,9 +31,12 @@ class CapturePlan:
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         """All steps. Raises InputError if the station lacks what one of them needs, and where a step is there twice."""
         made = tuple(step for sequence in self.sequences for step in sequence.steps(station))
-        for step_id, times in Counter(step.id for step in made).items():
-            if times > 1:
-                raise InputError(f"sequences: the step {step_id} is there {times} times; give every value once")
+        times = Counter(name_of(step.id) for step in made)
+        for step in made:
+            if (there := times[name_of(step.id)]) > 1:
+                raise InputError(
+                    f"sequences: the step {step.id} is there {there} times; take each sequence once, and give every value once"
+                )
         return made
 
     def patterns(self, station: Equipment) -> dict[str, Cells]:
@@ -41,8 +44,11 @@ class CapturePlan:
         return {path: cells for sequence in self.sequences for path, cells in sequence.patterns(station).items()}
 
     def document(self) -> dict[str, Any]:
-        """The sequences' parameters by name, as JSON."""
-        return {sequence.name: sequence.model_dump(mode="json", exclude_none=True) for sequence in self.sequences}
+        """The sequences' parameters by name, as JSON; a list of them where a sequence is taken in several lights."""
+        found: dict[str, list[Any]] = {}
+        for sequence in self.sequences:
+            found.setdefault(sequence.name, []).append(sequence.model_dump(mode="json", exclude_none=True))
+        return {name: taken[0] if len(taken) == 1 else taken for name, taken in found.items()}
 
 
 def full_plan(

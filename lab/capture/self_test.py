@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.camera.base import Camera
+from drivers.camera.base import Camera, SensorInfo
 from drivers.contract.families import CONTRACTS, NotMet
 from drivers.discovery import Found
 from drivers.errors import InstrumentError
@@ -20,6 +20,8 @@ from lab.errors import DeviceError, InputError
 
 #: Longest time (s) for the self-test of one instrument: a measurement of a dark source takes minutes.
 TEST_S = 300.0
+#: Longest exposure (s) that a drafted station file allows, however long its cameras can.
+MOST_EXPOSURE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -121,11 +123,17 @@ def station_text(found: Iterable[Found]) -> str:
     ]
     sides = iter(("left", "right"))
     cameras = 0
+    exposures: list[tuple[float, float]] = []
     taken: set[str] = set()
-    for one in found:
+    there = list(found)
+    pair = sum(one.family == "camera" for one in there) > 1
+    for one in there:
         if one.family == "camera" and (side := next(sides, None)) is not None:
-            lines += ["", *_camera_table(side, one)]
+            sensor = _sensor(side, one)
+            lines += ["", *_camera_table(side, one, sensor, pair)]
             cameras += 1
+            if sensor.exposure_s is not None:
+                exposures.append(sensor.exposure_s)
         elif one.family and one.family != "camera" and one.family not in taken:
             taken.add(one.family)
             lines += ["", f"# {one.what}", f"[{one.family}]", f'driver = "{one.name}"', f'address = "{one.address}"']
@@ -137,19 +145,30 @@ def station_text(found: Iterable[Found]) -> str:
             "no camera is connected that a driver here reaches: plug it in, give --usbip HOST:PORT, or install its library "
             "(calibench[basler], Aravis); `calibench devices` shows what is"
         )
+    if exposures:
+        lines += ["", "[limits]", "# What every camera can; give less where that is enough."]
+        lines += [f"exposure_min_s = {max(shortest for shortest, _ in exposures):.9g}"]
+        lines += [f"exposure_max_s = {min(MOST_EXPOSURE_S, *(longest for _, longest in exposures)):.9g}"]
     lines += ["", "[targets.cap]", 'kind = "cap"']
     return "\n".join(lines) + "\n"
 
 
-def _camera_table(side: str, one: Found) -> list[str]:
+def _sensor(side: str, one: Found) -> SensorInfo:
     camera: Any = driver(one.family, one.name)(one.address)
     assert isinstance(camera, Camera)
-    lines = [f"# {one.what}", f"[cameras.{side}]", f'driver = "{one.name}"', f'address = "{one.address}"']
     try:
         with camera:
-            sensor = camera.sensor()
+            return camera.sensor()
     except InstrumentError as error:
         raise DeviceError(f"camera {side}: {error}") from error
+
+
+def _camera_table(side: str, one: Found, sensor: SensorInfo, pair: bool) -> list[str]:
+    lines = [f"# {one.what}", f"[cameras.{side}]", f'driver = "{one.name}"', f'address = "{one.address}"']
+    if pair and side == "left":
+        lines += ['# output_line = "Line1"  # it leads: the line on which it gives the pulse that triggers the other']
+    elif pair:
+        lines += ['trigger_line = "Software"  # or the line that is wired to the one that leads, as "Line0"']
     lines += [f"[cameras.{side}.datasheet]", f"rows = {sensor.rows}", f"cols = {sensor.cols}"]
     lines += [f'cfa = "{sensor.cfa or "MONO"}"' + ("" if sensor.cfa else "  # it doesn't say: correct this")]
     bits = sensor.bit_depth

@@ -16,7 +16,7 @@ import signal
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -353,7 +353,7 @@ class CaptureSession:
 
         def steps() -> Generator[Msg, Any, None]:
             yield Msg("open_run", None)
-            results.update({entry.step.id: entry.result for entry in entries if entry.finished is not None})
+            results.update({entry.step.id: entry.result for entry in entries if _has_exposure(entry.result)})
             to_do = Counter(entry.step.sequence for entry in entries if entry.finished is None)
             repeats = repeats_ahead([None if entry.finished else entry.step for entry in entries])
             for entry, following in zip(entries, repeats, strict=True):
@@ -367,7 +367,8 @@ class CaptureSession:
                 started, began_s = now(), time.monotonic()
                 taken: Taken = yield from take(step, instruments, results, following)
                 yield Msg("in_a_thread", None, call=lambda s=step, t=taken, b=started: self._keep(s, t, b))
-                results[step.id] = taken.result
+                if _has_exposure(taken.result):
+                    results[step.id] = taken.result
                 to_do[step.sequence] -= 1
                 self._done += 1
                 self._pace.add(step, time.monotonic() - began_s)
@@ -447,6 +448,11 @@ class _Wakeful(DuringTask):  # type: ignore[misc]  # the library has no types
     def block(self, blocking_event: threading.Event) -> None:
         while not blocking_event.wait(WAKE_S):
             pass
+
+
+def _has_exposure(result: Mapping[str, Any]) -> bool:
+    """Whether later steps ask for a step's result: for the exposure that it found. Others aren't kept: a session may take a day."""
+    return "exposure_s" in result
 
 
 async def _awaited(call: Callable[[], Any]) -> Any:

@@ -101,10 +101,12 @@ class Station(Frozen):
         for table, entry in tables.items():
             if entry is None or not entry.address:
                 continue
-            other = taken.setdefault(entry.address, table)
+            # A port has several names: /dev/ttyUSB0, and a link in /dev/serial/by-id.
+            port = str(Path(entry.address).resolve()) if entry.address.startswith("/") else entry.address
+            other = taken.setdefault(port, table)
             if other != table:
                 raise ValueError(
-                    f"[{other}] and [{table}] both have the address {entry.address}; one port serves one instrument: correct one of them"
+                    f"[{other}] and [{table}] both have the address {port}; one port serves one instrument: correct one of them"
                 )
         return self
 
@@ -166,7 +168,8 @@ def _with_curves(tables: Any, folder: Path) -> Any:
 def _complaints(error: ValidationError) -> Iterator[str]:
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"])
-        yield f"{key or 'it'}: {item['msg']}"
+        said = item["msg"].removeprefix("Value error, ")
+        yield f"{key}: {said}" if key else said
 
 
 def read_station(path: str | Path) -> Station:

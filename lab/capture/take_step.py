@@ -16,7 +16,7 @@ from lab.capture.devices import LightSetting, PhotodiodeDevice, Shot, ShownPatte
 from lab.capture.instruments import Instruments
 from lab.capture.records import StoredFile
 from lab.capture_kinds.base import Capture, FindExposure, FixedExposure, Reading, RelativeExposure, Step
-from lab.capture_kinds.irradiance import IrradianceCapture
+from lab.capture_kinds.irradiance import irradiance_nm
 from lab.errors import DeviceError, InputError
 from sim.camera import Side
 
@@ -214,13 +214,12 @@ def take(
 
 
 def _irradiance_meter(step: Step, instruments: Instruments) -> PhotodiodeDevice | None:
-    """The photodiode, for a step with captures in light of one wavelength: it has one responsivity."""
+    """The photodiode, for a step beside whose captures it measures."""
     photodiode = instruments.photodiode
     if photodiode is None:
         return None
     photodiode.measured = None  # that of an earlier step
-    lit = (step.setting.wavelength_nm or 0.0) > 0.0
-    return photodiode if lit and any(isinstance(one, IrradianceCapture) for one in step.captures) else None
+    return None if irradiance_nm(step) is None else photodiode
 
 
 def _measure_irradiance(photodiode: PhotodiodeDevice, wavelength_nm: float | None) -> Plan[None]:

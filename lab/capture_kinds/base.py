@@ -156,6 +156,11 @@ class Target(Frozen):
         """What an operator has to do to put it there."""
         raise NotImplementedError
 
+    @property
+    def screen_px(self) -> tuple[int, int] | None:
+        """Size (rows, cols) of the screen that the display has to have; None where the target is no screen."""
+        return None
+
 
 TargetT = TypeVar("TargetT", bound=Target)
 TARGETS: ByKind[Target] = ByKind("target")
@@ -165,13 +170,24 @@ AnyTarget = Annotated[Target, TARGETS]
 
 
 class CaptureLimits(Frozen):
-    """Limits of all sequences: the exposure (s), the gain (dB), the slit width (um) and the light of flats."""
+    """Limits of all sequences: the exposure (s), the gain (dB), the slit width (um) and the light of flats.
+
+    Exposures that a search finds stay within them, and so do those that a sequence has without an operator's values.
+    """
 
     exposure_min_s: float = Field(default=20e-6, gt=0)
     exposure_max_s: float = Field(default=10.0, gt=0)
     gain_db: float = 0.0
     slit_um: float | None = Field(default=None, gt=0)  # None: as the instrument stands
     flat_wavelength_nm: float | None = Field(default=None, gt=0)  # None: white light
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.exposure_min_s > self.exposure_max_s:
+            raise ValueError(
+                f"exposure_min_s: {self.exposure_min_s:g} s is above exposure_max_s, {self.exposure_max_s:g} s; exchange them"
+            )
+        return self
 
 
 class Equipment(Protocol):

@@ -58,7 +58,12 @@ class DarkSequence(Sequence):
 
     @classmethod
     def planned(cls, station: Equipment, quick: bool) -> Self | None:
-        return cls(exposures_s=QUICK_DARK_S if quick else DARK_S, frames=4)
+        limits = station.limits
+        within = {
+            min(max(exposure_s, limits.exposure_min_s), limits.exposure_max_s)
+            for exposure_s in (QUICK_DARK_S if quick else DARK_S)
+        }
+        return cls(exposures_s=tuple(sorted(within)), frames=4)
 
     def steps(self, station: Equipment) -> tuple[Step, ...]:
         cap = station.one(CapTarget)

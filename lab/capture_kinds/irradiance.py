@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 from scipy import constants
 
-from lab.capture_kinds.base import Capture, Reading
+from lab.capture_kinds.base import Capture, Reading, Step
 
 
 class IrradianceCapture(Capture):
@@ -44,3 +44,10 @@ class IrradianceCapture(Capture):
     def irradiance_calibration_sd(self) -> float:
         """Relative standard uncertainty of the photodiode's calibration; 0 where it isn't stated apart."""
         return (self.irradiance_calibration_sd_percent or 0.0) / 100.0
+
+
+def irradiance_nm(step: Step) -> float | None:
+    """Wavelength (nm) at which a photodiode measures the irradiance beside a step's captures; None: it has one responsivity, and
+    measures in light of one wavelength alone."""
+    lit = step.setting.wavelength_nm or 0.0
+    return lit if lit > 0.0 and any(isinstance(one, IrradianceCapture) for one in step.captures) else None

@@ -56,6 +56,10 @@ class ScreenTarget(Target):
     right: ScreenLayout | None = None
 
     @property
+    def screen_px(self) -> tuple[int, int]:
+        return self.rows, self.cols
+
+    @property
     def instruction(self) -> str:
         return "put the screen before the cameras, and move nothing until all patterns are taken"
 
@@ -115,7 +119,7 @@ class ScreenSequence(Sequence):
         rows, cols = (int(2 * half / cell_px) // SQUARE_CELLS * SQUARE_CELLS for half in (half_rows, half_cols))
         if min(rows, cols) < 2 * SQUARE_CELLS:
             raise InputError(
-                f"station: only {rows} x {cols} cells of {cell_px} screen px fit what both cameras see of {name!r}; "
+                f"station: only {max(0, rows)} x {max(0, cols)} cells of {cell_px} screen px fit what both cameras see of {name!r}; "
                 "give a larger visible rectangle or smaller cells"
             )
         return CellGrid(rows=rows, cols=cols, cell_px=cell_px)

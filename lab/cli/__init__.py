@@ -13,6 +13,10 @@ import os
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+from lab.memory import share_arenas
+
+share_arenas()
+
 from lab.cli.entry import main
 
 __all__ = ["main"]

@@ -42,12 +42,13 @@ def listed(
     if context.invoked_subcommand is not None:
         return
     table = _table("address", "what", "driver")
-    count = 0
+    count, answered = 0, False
     try:
         if probe:
             for name, answer in discovery.probe(probe):
                 said = "no"
                 if not isinstance(answer, InstrumentError):
+                    answered = True
                     said = " ".join(filter(None, (answer.maker, answer.model, answer.serial_number)))
                 table.add_row(escape(probe), escape(said), name)
                 count += 1
@@ -59,6 +60,11 @@ def listed(
         raise DeviceError(str(error)) from error
     if count:
         out.print(table)
+        if probe and not answered:
+            raise DeviceError(
+                f"{probe}: none of these drivers' instruments answers there; check the power and the cable, and that "
+                "the instrument is set to the speed that its driver uses"
+            )
     else:
         out.print(
             "nothing is connected that is known here; serial ports of USB adapters, USB instruments and cameras are looked for"

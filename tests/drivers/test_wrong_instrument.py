@@ -9,18 +9,20 @@ import pytest
 import usb.core
 
 from drivers.camera.u3v import U3vCamera
-from drivers.errors import InstrumentError
+from drivers.errors import InstrumentError, InUse
 from drivers.monochromator.cornerstone260 import Cornerstone260
 from drivers.monochromator.cornerstone260b import Cornerstone260B
 from drivers.spectroradiometer.cr300 import Cr300
 from drivers.spectroradiometer.specbos1211 import Specbos1211
+from drivers.stage.operator import OperatorStage
 from mocks.bench import Bench
 from mocks.cornerstone260 import MockCornerstone260
 from mocks.cornerstone260b import MockCornerstone260B
+from mocks.cr300 import ColorimetryResearch
 from mocks.lamp import Lamp
 from mocks.specbos1211 import MockSpecbos1211
 from mocks.u3v import U3vDevice
-from mocks.usb import InProcessBackend
+from mocks.usb import InProcessBackend, serve_usbip
 from mocks.wire import Pty
 
 NOT_THIS = "check that it is this instrument that is connected there"
@@ -48,7 +50,31 @@ def test_at_a_monochromator(
         assert not rightly.shutter_is_open()
 
 
-def refused_at(address: str, driver: type[Cornerstone260 | Specbos1211 | Cr300], message: str) -> None:
+@pytest.mark.parametrize(
+    ("driver", "message"),
+    [
+        (Cornerstone260, r"answered 'INFO\?' with 'ER:-500:.*; check that a Cornerstone 260 is at this address"),
+        (OperatorStage, r"answered 'PLACED\?' with 'ER:-500:.*; check that a stage is at this address"),
+    ],
+)
+def test_at_a_cr300(
+    served: Callable[..., str], tmp_path: Path, driver: type[Cornerstone260 | OperatorStage], message: str
+) -> None:
+    refused_at(served(ColorimetryResearch(Lamp(20.0)), Pty(tmp_path / "line")), driver, message)
+
+
+def test_one_that_is_in_use_is_said_to_be() -> None:
+    bench = Bench()
+    with serve_usbip([MockCornerstone260B(bench)]) as server:
+        address = server.url("CB-260B-01")
+        with (
+            Cornerstone260B(address),
+            pytest.raises(InUse, match="there are: none, and 1 in use by another program or another instrument"),
+        ):
+            Cornerstone260B(address).connect()
+
+
+def refused_at(address: str, driver: type[Cornerstone260 | Specbos1211 | Cr300 | OperatorStage], message: str) -> None:
     with pytest.raises(InstrumentError, match=message) as caught:
         driver(address, timeout_s=0.3).connect()
     assert "\n" not in str(caught.value)

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.errors import Disconnected
 from drivers.registry import driver
 from lab.capture.station import drivers_of, read_station
 from mocks.command import station_toml
@@ -93,6 +95,22 @@ def test_a_usb_mock_alone_is_exported_over_usbip(start: Start, tmp_path: Path) -
     assert process.wait(30) == 0
 
 
+def test_a_tethered_camera_says_what_its_table_needs(start: Start, tmp_path: Path) -> None:
+    process = start("mock", "tethered", "--folder", str(tmp_path / "raws"), "--fault", "unplug=0.5@1")
+    *table, ready = lines_until_ready(process)
+    make = driver("camera", "raw_folder")
+    with make(ready.removeprefix("ready "), settle_s=0.1, **tomllib.loads("\n".join(table))) as camera:
+        camera.configure(0.005)
+        with pytest.raises(Disconnected, match=r"can't be read \(No such file or directory\)"):
+            camera.capture()
+        end = time.monotonic() + 30
+        while not (tmp_path / "raws").is_dir() and time.monotonic() < end:
+            time.sleep(0.02)
+        assert camera.capture().exposure_s == pytest.approx(0.005)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -103,6 +121,8 @@ def test_a_usb_mock_alone_is_exported_over_usbip(start: Start, tmp_path: Path) -
         (("mock", "pr655", "--link", "/no/such/folder/x"), "can't become a link"),
         (("mock", "u3v", "--link", "/tmp/x"), "no line that a path could name"),
         (("mock", "cr300", "--calibration", "x.csv"), "no calibration file comes with it"),
+        (("mock", "tethered"), "name the folder that its software writes into: --folder"),
+        (("mock", "tethered", "--folder", "x", "--fault", "error"), "a folder has no error code"),
         (("bench", "--fault", "half@3"), "write INSTRUMENT:SPEC"),
     ],
 )

@@ -116,3 +116,25 @@ def test_frames_of_a_gige_camera_come_one_a_trigger(fake: AravisFakeCamera) -> N
 def test_nobody_at_the_address(fake: AravisFakeCamera) -> None:
     with pytest.raises(Disconnected, match=r"Aravis finds no such camera \(Can't connect"):
         AravisCamera("127.0.0.9").connect()
+
+
+def test_an_empty_buffer_is_no_frame() -> None:
+    class Stream:
+        """A stream whose buffers come back as they were queued."""
+
+        def __init__(self) -> None:
+            self.queued = [self]
+
+        def get_status(self) -> int:
+            return 1
+
+        def timeout_pop_buffer(self, timeout_us: int) -> Stream:
+            return self.queued.pop()
+
+        def push_buffer(self, buffer: Stream) -> None:
+            self.queued.append(buffer)
+
+    camera = AravisCamera("nowhere")
+    camera._stream = Stream()
+    assert camera._grab(0.1) is None
+    assert camera._stream.queued == [camera._stream]

@@ -17,7 +17,7 @@ const element = { textContent: "", classList: { toggle() {} }, addEventListener(
 globalThis.document = { getElementById: (id) => (id === "screen" ? canvas : element), body: element, documentElement: element };
 globalThis.window = { devicePixelRatio: Number(ratio), ResizeObserverEntry: class { get devicePixelContentBoxSize() { return []; } } };
 globalThis.ResizeObserverEntry = window.ResizeObserverEntry;
-globalThis.screen = { height: Number(rows) / Number(ratio), width: Number(cols) / Number(ratio) };
+globalThis.screen = { height: Math.round(Number(rows) / Number(ratio)), width: Math.round(Number(cols) / Number(ratio)) }; // whole, as browsers tell it
 globalThis.location = { host: address };
 globalThis.requestAnimationFrame = (then) => setTimeout(then, 16);
 globalThis.ResizeObserver = class {

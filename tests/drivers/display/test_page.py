@@ -63,10 +63,19 @@ def test_the_script_paints_centred_cells_and_says_so(
     assert painted(process)[1] == "0"
 
 
-def test_the_script_refuses_what_is_not_pixel_on_pixel(
+def test_a_screen_that_the_system_scales_by_a_fraction_is_one_to_one(
     display: BrowserDisplay, page: Callable[..., subprocess.Popen[str]]
 ) -> None:
-    page(60, 100, 1.0, (50, 100))
+    page(1440, 2560, 1.5, (1440, 2560))  # 960 x 1707 CSS pixels, and 1707 x 1.5 = 2560.5
+    shown = display.show(np.ones((2, 2), np.uint8))
+    assert (shown.canvas_px, shown.screen_px) == ((1440, 2560), (1440, 2560))
+
+
+@pytest.mark.parametrize(("ratio", "canvas"), [(1.0, (50, 100)), (1.1, (54, 91)), (1.5, (58, 100))])
+def test_the_script_refuses_what_is_not_pixel_on_pixel(
+    display: BrowserDisplay, page: Callable[..., subprocess.Popen[str]], ratio: float, canvas: tuple[int, int]
+) -> None:
+    page(60, 100, ratio, canvas)
     with pytest.raises(Refused, match="one canvas pixel isn't one screen pixel"):
         display.show(np.ones((2, 2), np.uint8))
 

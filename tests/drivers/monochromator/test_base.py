@@ -76,3 +76,13 @@ def test_a_wavelength_is_checked_without_the_instrument(made: type[Cornerstone26
     ):
         with pytest.raises(InstrumentError, match=message):
             driver.check_nm(wrong_nm)
+
+
+@pytest.mark.parametrize("made", [Cornerstone260, Cornerstone260B])
+def test_a_slit_is_checked_without_the_instrument(made: type[Cornerstone260 | Cornerstone260B]) -> None:
+    driver = made("nowhere")
+    driver.check_slit_um(3000.0)
+    for wrong_um in (3.9, 3001.0, math.nan):
+        for refuses in (driver.check_slit_um, driver.set_slit_um):
+            with pytest.raises(InstrumentError, match=r"a slit of .* um is outside 4\.\.3000 um"):
+                refuses(wrong_um)

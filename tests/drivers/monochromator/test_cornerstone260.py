@@ -112,7 +112,7 @@ def test_refusals_carry_the_instruments_code_and_keep_the_line(served: Callable[
         mono.move_nm(1500)
     assert caught.value.code == 3
     with pytest.raises(Refused, match="error 2, bad parameter"):
-        mono.set_slit_um(1)
+        mono.select_filter(9)
     mono.move_nm(600)
     assert mono.wavelength_nm() == 600
     mono.close()

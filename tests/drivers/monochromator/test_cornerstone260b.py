@@ -129,7 +129,13 @@ def test_units_are_left_as_they_were_found(device: Mock) -> None:
 # Answers count from the moment the faults are set: the first is that to idle?, after the command.
 @pytest.mark.parametrize(
     ("fault", "error"),
-    [("never@1", NoAnswer), ("half@1", InstrumentError), ("wrong@2", Garbled), ("unplug=0.2@1", Disconnected)],
+    [
+        ("never@1", NoAnswer),
+        ("half@1", InstrumentError),
+        ("wrong@2", Garbled),
+        ("error@1", NoAnswer),
+        ("unplug=0.2@1", Disconnected),
+    ],
 )
 def test_a_fault_is_one_error_and_then_it_works_again(
     mono: Cornerstone260B, device: Mock, fault: str, error: type[Exception]

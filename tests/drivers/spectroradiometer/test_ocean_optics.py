@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import usb.core
 
-from drivers.errors import Disconnected, InstrumentError, Interrupted
+from drivers.errors import Disconnected, Garbled, InstrumentError, Interrupted
 from drivers.registry import driver
 from drivers.spectroradiometer.ocean_optics import OceanOptics
 from mocks import usb as mock_usb
 from mocks.bench import Bench
 from mocks.usb2000plus import NOISE_COUNTS, calibration_csv, response
+from mocks.wire import parse_faults
 
 
 @pytest.fixture
@@ -103,6 +104,22 @@ def test_unplugged_and_plugged_again(bench: Bench, calibration: str) -> None:
     assert meter.measure().radiance_w_sr_m2_nm.integral() > 0
     meter.close()
     meter.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"), [("half@1", "a spectrum that isn't whole"), ("wrong@1", "covered pixels, without any noise")]
+)
+def test_a_broken_spectrum_is_told_and_the_next_is_good(
+    bench: Bench, calibration: str, fault: str, message: str
+) -> None:
+    backend = mock_usb.backend("usb2000plus", bench)
+    with OceanOptics("usb://x", calibration=calibration, device=usb.core.find(backend=backend), averages=1) as meter:
+        meter.connect()
+        backend.plugged_in[0].fail(parse_faults(fault))
+        with pytest.raises(Garbled, match=message) as caught:
+            meter.measure()
+        assert "\n" not in str(caught.value)
+        assert meter.measure().radiance_w_sr_m2_nm.integral() > 0
 
 
 def test_stop_ends_a_measurement(bench: Bench, calibration: str) -> None:

@@ -55,7 +55,10 @@ def test_parameters_replace_those_of_a_full_session() -> None:
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ({"dark": {"exposures_s": [0.1, 0.1]}}, "the step dark/0.1s/1 is there 2 times; give every value once"),
+        (
+            {"dark": {"exposures_s": [0.1, 0.1]}},
+            "the step dark/0.1s/1 is there 2 times; take each sequence once, and give every value once",
+        ),
         ({"dark": {"exposures_s": [0.1, 1e9]}}, r"dark\.exposures_s: .* is above the upper limit 3600"),
         ({"dark": {"exposures_s": []}}, r"dark\.exposures_s: .* at least 1 item"),
         ({"dark": {"frames": 2.5}}, r"dark\.frames: .* valid integer"),

@@ -4,8 +4,9 @@ from collections import Counter, defaultdict
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from lab.capture.plan import full_plan
+from lab.capture.plan import CapturePlan, full_plan
 from lab.capture_kinds.base import FindExposure, RelativeExposure, Setting, Step
 from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
@@ -144,3 +145,18 @@ def test_only_the_sequences_that_are_named_are_planned_in_their_order() -> None:
     without_screen = STATION.model_copy(update={"display": None})
     with pytest.raises(InputError, match="lacks instruments or targets for screen; leave it out"):
         full_plan(without_screen, only=["dark", "screen"])
+
+
+def test_darks_stay_within_the_stations_exposures() -> None:
+    station = fake_bench.station(limits={"exposure_min_s": 0.001, "exposure_max_s": 1.0})
+    assert DarkSequence.planned(station, quick=False) == DarkSequence(exposures_s=(0.001, 0.05, 0.5, 1.0), frames=4)
+    with pytest.raises(ValidationError, match="exposure_min_s: 2 s is above exposure_max_s, 1 s; exchange them"):
+        fake_bench.station(limits={"exposure_min_s": 2.0, "exposure_max_s": 1.0})
+
+
+def test_a_plan_is_kept_with_every_sequence_and_none_is_taken_twice() -> None:
+    white, green = (FlatSequence(levels=(0.5,), frames=1, wavelength_nm=nm) for nm in (0.0, 530.0))
+    assert [one["wavelength_nm"] for one in CapturePlan((white, green)).document()["flat"]] == [0.0, 530.0]
+    assert CapturePlan((white,)).document()["flat"]["wavelength_nm"] == 0.0
+    with pytest.raises(InputError, match="the step flat/exposure is there 2 times; take each sequence once"):
+        CapturePlan((white, green, white)).steps(STATION)

@@ -25,6 +25,7 @@ from lab.capture.take_step import DUMMY_FRAMES
 from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandSequence
+from lab.capture_kinds.screen import ScreenSequence
 from lab.errors import DeviceError, InputError
 from lab.formats.recording_set import inspect
 from tests.lab import fake_bench
@@ -222,25 +223,70 @@ def test_an_instrument_that_is_not_there_fails_before_anything_is_taken(store: S
     assert store.session(session.id).steps_done == 0
 
 
+def _refusing(of: type, method: str, message: str, when: Callable[..., bool]) -> Callable[[pytest.MonkeyPatch], None]:
+    """A fake instrument one of whose methods refuses what `when` says."""
+
+    def patch(monkeypatch: pytest.MonkeyPatch) -> None:
+        own = getattr(of, method)
+
+        def asked(instrument: Any, *values: Any) -> Any:
+            if when(*values):
+                raise InstrumentError(message)
+            return own(instrument, *values)
+
+        monkeypatch.setattr(of, method, asked)
+
+    return patch
+
+
 @pytest.mark.parametrize(
-    ("method", "of", "message"),
+    ("refuses", "message"),
     [
-        ("configure", fake_bench.FakeCamera, "camera left: Gain 90 dB is outside 0..24 dB"),
-        ("check_nm", fake_bench.FakeMonochromator, "monochromator: 5000 nm is outside 0..1400 nm"),
+        (
+            _refusing(fake_bench.FakeCamera, "check", "camera left: 10 s is too long", lambda s, gain: s > 1.0),
+            r"camera left: 10 s is too long; exposure_max_s and gain_db under \[limits\]",
+        ),
+        (
+            _refusing(fake_bench.FakeCamera, "check", "camera left: too short", lambda s, gain: s < 1e-4),
+            r"too short; exposure_min_s and gain_db under \[limits\]",
+        ),
+        (
+            _refusing(fake_bench.FakeCamera, "check", "camera left: not 1 ms", lambda s, gain: s == 0.001),
+            r"not 1 ms; the sequence dark needs it, with gain_db under \[limits\]",
+        ),
+        (
+            _refusing(fake_bench.FakeCamera, "check_trigger", "camera: no trigger line", lambda line: line == "line"),
+            "no trigger line$",
+        ),
+        (
+            _refusing(fake_bench.FakeMonochromator, "check_nm", "monochromator: no white light", lambda nm: nm == 0.0),
+            "no white light; the sequence flat needs it: give it other wavelengths",
+        ),
+        (
+            _refusing(fake_bench.FakeMonochromator, "check_slit_um", "monochromator: 5 mm", lambda um: um == 5000.0),
+            r"5 mm; it stands as slit_um under \[limits\]",
+        ),
+        (
+            lambda patch: patch.setattr(fake_bench.FakeDisplay, "screen_px", lambda display: (540, 960)),
+            r"display: its screen has 540 x 960 px, \[targets.screen\] in the station file says 1080 x 1920: the system scales",
+        ),
     ],
 )
 def test_what_the_plan_needs_and_an_instrument_refuses_is_told_before_anything_moves(
-    store: Store, monkeypatch: pytest.MonkeyPatch, method: str, of: type, message: str
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    refuses: Callable[[pytest.MonkeyPatch], None],
+    message: str,
 ) -> None:
-    def refuse(instrument: Any, *asked: float) -> None:
-        raise InstrumentError(message)
-
     bench = Bench()
-    monkeypatch.setattr(of, method, refuse)
+    refuses(monkeypatch)
     monkeypatch.setattr(fake_bench.FakeStage, "place", lambda stage, target: bench.log.append("moved"))
-    session = begin(store, bench, LIT)
-    with pytest.raises(DeviceError, match=f"{message}; the plan needs it: see \\[limits\\]"):
+    station = fake_bench.station(limits={"slit_um": 5000.0})
+    plan = CapturePlan((*LIT.sequences, NarrowbandSequence(to_nm=410), ScreenSequence(frames=1)))
+    session = CaptureSession.start(store, station, plan, connect=bench.drivers)
+    with pytest.raises(DeviceError, match=message) as caught:
         session.run()
+    assert "\n" not in str(caught.value)
     assert bench.shots == 0
     assert "moved" not in bench.log
     assert store.session(session.id).steps_done == 0

@@ -101,6 +101,13 @@ def test_what_cannot_be_used_is_named_in_one_line(tmp_path: Path, old: str, new:
     assert "\n" not in str(caught.value)
 
 
+def test_a_port_by_two_names_is_one_port(tmp_path: Path) -> None:
+    (tmp_path / "by-id").symlink_to("/dev/null")
+    file = written(tmp_path, TEXT.replace("socket://127.0.0.1:1", str(tmp_path / "by-id")))
+    with pytest.raises(InputError, match=r"toml: \[monochromator\] and \[stage\] both have the address /dev/null"):
+        read_station(file)
+
+
 def test_a_missing_file_says_how_to_get_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="calibench bench --station"):
         read_station(tmp_path / "none.toml")

@@ -39,10 +39,15 @@ def test_what_is_connected_and_a_station_of_it(tmp_path: Path, capsys: pytest.Ca
     assert main(["devices", "--usbip", "127.0.0.1:1"]) == 3
 
 
-def test_a_port_is_probed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_is_probed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with specbos1211() as peer:
         assert main(["devices", "--probe", peer.address]) == 0
-    assert "JETI specbos 1211 1211427" in capsys.readouterr().out
+        assert "JETI specbos 1211 1211427" in capsys.readouterr().out
+        peer.mute(True)
+        assert main(["devices", "--probe", peer.address]) == 3
+        assert "none of these drivers' instruments answers there" in capsys.readouterr().err
+    assert main(["devices", "--probe", str(tmp_path / "none")]) == 3
+    assert "can't be opened (No such file or directory)" in capsys.readouterr().err
 
 
 def test_a_contract_that_is_kept_and_one_that_is_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,1 +1,0 @@
-"""Tests, as a package: one that a dependency installs under the same name must not take its place."""
