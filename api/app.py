@@ -53,6 +53,8 @@ from lab.quick_look.process import QuickLook
 
 log = logging.getLogger(__name__)
 PREFIX = "/api/v1"
+#: What takes archives, which may be larger than the memory.
+ARCHIVES = frozenset((f"{PREFIX}/recordings", f"{PREFIX}/camera-models"))
 PAGES = Path(__file__).parent / "pages"
 ASSETS = {
     "operator.css": "text/css",
@@ -223,8 +225,8 @@ def create_app(
             Middleware(CountedRequests, metrics=counted),
             Middleware(DefectMiddleware),
             Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
-            Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_path=f"{PREFIX}/recordings"),
-            Middleware(Idempotency, store=store, prefix=PREFIX, unread_path=f"{PREFIX}/recordings"),
+            Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_paths=ARCHIVES),
+            Middleware(Idempotency, store=store, prefix=PREFIX, unread_paths=ARCHIVES),
         ],
     )
     gate = Gate(lambda: stored_keys(store))

@@ -241,14 +241,14 @@ class SafeHeaders:
 
 
 class SmallBodies:
-    """Refuses bodies above `limit_bytes`, by their stated or their streamed size. `except_path` has a limit of its own."""
+    """Refuses bodies above `limit_bytes`, by their stated or their streamed size. `except_paths` have a limit of their own."""
 
-    def __init__(self, app: ASGIApp, limit_bytes: int, except_path: str) -> None:
-        self.app, self.limit_bytes, self.except_path = app, limit_bytes, except_path
+    def __init__(self, app: ASGIApp, limit_bytes: int, except_paths: frozenset[str]) -> None:
+        self.app, self.limit_bytes, self.except_paths = app, limit_bytes, except_paths
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on while its body is below the limit, else answer 413."""
-        if scope["type"] != "http" or (scope["method"] == "POST" and scope["path"] == self.except_path):
+        if scope["type"] != "http" or (scope["method"] == "POST" and scope["path"] in self.except_paths):
             await self.app(scope, receive, send)
             return
         stated = Headers(scope=scope).get("content-length", "0")

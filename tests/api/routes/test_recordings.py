@@ -10,6 +10,7 @@ import os
 import shutil
 import socket
 import stat
+import tarfile
 import threading
 import zipfile
 from collections.abc import Callable
@@ -395,14 +396,32 @@ def test_what_was_sent_in_is_fetched_again_and_deleted(
     assert not list(tmp_path.glob("*none.zip*"))
 
 
-def test_a_damaged_frame_breaks_the_archive_off(running: Running, folder: Path, tmp_path: Path) -> None:
+def test_a_set_is_fetched_as_a_tar_and_sent_in_again(running: Running, folder: Path, tmp_path: Path) -> None:
+    with ServiceClient(running.url, running.keys["calibrate"]) as client:
+        (tmp_path / "set.zip").write_bytes(packed(folder))
+        first = client.send_recordings(tmp_path / "set.zip")
+        fetched = client.fetch_recordings(first.id, tmp_path / "set.tar")
+        with tarfile.open(fetched, "r:") as tar:
+            # The manifest comes last: what breaks off before has none.
+            assert tar.getnames()[-1] == "manifest.json" and len(tar.getnames()) == 3
+        again = client.send_recordings(fetched)
+        assert again.model_dump(exclude={"id"}) == first.model_dump(exclude={"id"})
+        a, b = (recording.read(running.store.root / "recordings" / one.id) for one in (first, again))
+        for one, other in zip(a.captures(), b.captures(), strict=True):
+            np.testing.assert_array_equal(a.frame(one), b.frame(other))
+        with pytest.raises(ServiceProblem, match="422"):
+            client.fetch_recordings(first.id, tmp_path / "set.rar")
+
+
+@pytest.mark.parametrize("form", ["zip", "tar"])
+def test_a_damaged_frame_breaks_the_archive_off(running: Running, folder: Path, tmp_path: Path, form: str) -> None:
     with running.client("calibrate") as client:
         sent = send(client, packed(folder)).json()["id"]
         (running.store.root / "recordings" / sent / "frames" / "1.npy").write_bytes(b"damaged")
         with pytest.raises(httpx.RemoteProtocolError):
-            client.get(f"/api/v1/recordings/{sent}/archive.zip")
+            client.get(f"/api/v1/recordings/{sent}/archive.{form}")
         (running.store.root / "recordings" / sent / "frames" / "0.npy").unlink()
-        refused = client.get(f"/api/v1/recordings/{sent}/archive.zip")
+        refused = client.get(f"/api/v1/recordings/{sent}/archive.{form}")
         assert refused.status_code == 422 and "frames/0.npy" in refused.json()["detail"]
 
 
