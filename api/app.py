@@ -27,7 +27,7 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
-from api.routes import calibrations, camera_models, challenges, jobs, knowledge, queue, recordings, sessions
+from api.routes import calibrations, camera_models, challenges, findings, jobs, knowledge, queue, recordings, sessions
 from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -69,6 +69,8 @@ ASSETS = {
             "watch.js",
             "recordings.js",
             "calibrations.js",
+            "challenges.js",
+            "findings.js",
             "docs.js",
         ),
         "text/javascript",
@@ -257,7 +259,7 @@ def create_app(
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
     app.include_router(stations_router, prefix=PREFIX)
-    for part in (knowledge, sessions, queue, recordings, jobs, calibrations, camera_models, challenges):
+    for part in (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

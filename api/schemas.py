@@ -276,6 +276,9 @@ class SessionDetail(StoredSession):
     progress: Progress | None = Field(description="null unless this service runs it now")
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
     captures: tuple[CaptureCount, ...] = Field(description="how many there are of each kind and side")
+    results: dict[str, str] = Field(
+        description="kind -> id of the newest `fit` (also the id of its calibration and camera model), `validate`, `diagnose`, `report`"
+    )
 
 
 class StoredCapture(Schema):

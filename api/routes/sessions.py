@@ -139,6 +139,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
+        results=service.store.newest_results(session_id),
     )
 
 

@@ -517,6 +517,12 @@ class Store:
                 raise InputError(f"result {result_id!r} isn't in {self.root}; list the results of a session")
             return ResultInfo.model_validate(row)
 
+    def newest_results(self, source: str) -> dict[str, str]:
+        """Kind -> id of the newest result of that kind, of one session (or recording set's folder)."""
+        asked = sa.select(ResultRow.kind, ResultRow.id).where(ResultRow.source == source).order_by(ResultRow.created)
+        with self.reading() as db:
+            return {row.kind: row.id for row in db.execute(asked)}
+
     def results(self, source: str | None = None, kind: str | None = None) -> list[ResultInfo]:
         """Results, the newest first; of one session (or recording set's folder) and one kind, or all."""
         asked = sa.select(ResultRow).order_by(ResultRow.created.desc())

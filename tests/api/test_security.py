@@ -58,6 +58,8 @@ ROUTES = [
     ("POST", "/calibrations/{calibration_id}/certify", "calibrate"),
     ("GET", "/figures", "read"),
     ("GET", "/history", "read"),
+    ("GET", "/sessions/{session_id}/findings", "read"),
+    ("GET", "/recordings/{recordings_id}/findings", "read"),
     ("GET", "/recordings", "read"),
     ("POST", "/recordings", "calibrate"),
     ("GET", "/recordings/{recordings_id}", "read"),
