@@ -41,6 +41,7 @@ from api.security import (
     set_cookie,
 )
 from api.service import READ, Here, Limits, Service
+from api.shared_answers import Shared, SharedAnswers
 from api.upload import Inbox
 from api.waiting import QueueRunner
 from lab.capture.recovery import Recovery
@@ -210,6 +211,9 @@ def create_app(
         app.state.service.live.close()
         app.state.service.quick_look.close()
 
+    shared = Shared()
+    live = LiveSessions(store, connect, shared.forget)
+    gate = Gate(lambda anew: stored_keys(store, anew), store.knows_keys)
     jobs_of = jobs_runner or JobRunner(store)
     counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})
     app = FastAPI(
@@ -227,15 +231,14 @@ def create_app(
             Middleware(CountedRequests, metrics=counted),
             Middleware(DefectMiddleware),
             Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
+            Middleware(SharedAnswers, shared=shared, prefix=PREFIX, busy=lambda: live.any_runs, gate=gate),
             Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_paths=ARCHIVES),
             Middleware(Idempotency, store=store, prefix=PREFIX, unread_paths=ARCHIVES),
         ],
     )
-    gate = Gate(lambda: stored_keys(store))
     app.state.gate = gate
     app.state.metrics = counted
     app.state.public = PublicText(store.root)
-    live = LiveSessions(store, connect)
     app.state.service = Service(
         store=store,
         stations=folder,
@@ -250,6 +253,7 @@ def create_app(
         public=app.state.public,
         limits=caps,
         checks=DeviceChecks(live, connect, store.root / "transcripts"),
+        changed=shared.forget,
     )
     errors.install(app)
 

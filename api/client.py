@@ -123,10 +123,10 @@ class ServiceClient:
         return response
 
     def _fetched(self, path: str, file: Path) -> Path:
-        """Write the archive of a path to `file`, a .zip or .tar, as it arrives: completely, or not at all."""
+        """Write the archive of a path to `file`, a .tar where its name ends so, else a .zip, as it arrives: completely, or not at all."""
         partial = file.with_name(f".{file.name}.partial")
         try:
-            with self.http.stream("GET", f"{path}{file.suffix}") as response, partial.open("wb") as to:
+            with self.http.stream("GET", f"{path}{file.suffix or '.zip'}") as response, partial.open("wb") as to:
                 if response.is_error:
                     response.read()
                     raise _problem(response)

@@ -70,7 +70,10 @@ class TooManyFailures(Exception):
 class Gate:
     """Identifies the key of a request; one per application."""
 
-    keys: Callable[[], Iterable[StoredKey]]
+    #: The keys as they are (True), or as they were known just now.
+    keys: Callable[[bool], Iterable[StoredKey]]
+    #: Whether those that were known just now are at hand.
+    is_quick: Callable[[], bool] = lambda: False
     logins: Logins = field(default_factory=Logins)
     failures: FailedKeys = field(default_factory=FailedKeys)
     #: SHA-256 of keys that were valid once: these are compared whatever their address did.
@@ -81,7 +84,7 @@ class Gate:
         mine = digest(key)
         if mine not in self._proven and (wait_s := self.failures.wait_s(address)):
             raise TooManyFailures(wait_s)
-        found = holder(key, self.keys())
+        found = holder(key, self.keys(False)) or holder(key, self.keys(True))
         if found is None:
             self._proven.discard(mine)
             self.failures.failed(address)
@@ -106,7 +109,7 @@ class Gate:
         token = request.cookies.get(COOKIE)
         login = self.logins.holder(token) if token else None
         # A key that was taken away takes its logins with it.
-        return login if login is not None and login in self.keys() else None
+        return login if login is not None and login in self.keys(False) else None
 
 
 def address_of(request: Request) -> str:

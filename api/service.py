@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -66,6 +66,8 @@ class Service:
     limits: Limits
     public: PublicText
     checks: DeviceChecks
+    #: To be called where a state was seen to change that no request changed.
+    changed: Callable[[], None]
 
     def station_files(self) -> dict[str, Path]:
         """The station files by name."""

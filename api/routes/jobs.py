@@ -164,7 +164,7 @@ def job_events(service: Here, job_id: HexId) -> EventSourceResponse:
     def look() -> Job:
         return _job(service, service.jobs.job(job_id))
 
-    return stream(lambda stopping: watched(look, lambda job: job.state in over, "progress", stopping))
+    return stream(lambda stopping: watched(look, lambda job: job.state in over, "progress", stopping, service.changed))
 
 
 def _done(service: Service, job_id: str) -> JobInfo:

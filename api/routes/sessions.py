@@ -218,7 +218,7 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
     seen = None
     live = service.live.find(session_id)
     if live is None:  # another process runs it, or nobody does
-        async for told in watched(look, lambda session: session.state in OVER, "state", stopping):
+        async for told in watched(look, lambda session: session.state in OVER, "state", stopping, service.changed):
             yield told
         return
     yield event("state", await asyncio.to_thread(look))
