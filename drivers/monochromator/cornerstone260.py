@@ -90,6 +90,12 @@ class Cornerstone260(WireInstrument, Monochromator):
     def check_nm(self, wavelength_nm: float) -> None:
         filter_place(self.filters, checked_wavelength_nm(wavelength_nm, self.upper_nm))
 
+    def shut_at_once(self) -> bool:
+        with self._lock:
+            self._transport.open()
+            self._transport.write(b"\r\nABORT\r\nSHUTTER C\r\n")
+        return True
+
     def move_nm(self, wavelength_nm: float) -> None:
         wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
         with self._conversation():
