@@ -38,7 +38,7 @@ _MODEL_FILES = 64
 def check_size(size_bytes: int, limit_bytes: int) -> None:
     """Raises TooMuch for an archive, stated or received, beyond the limit."""
     if size_bytes > limit_bytes:
-        raise TooMuch(f"the archive is larger than {limit_bytes} bytes; send fewer captures, or use the command line")
+        raise TooMuch(f"the archive is larger than {limit_bytes} bytes; send less at a time")
 
 
 async def receive(body: AsyncIterator[bytes], file: BinaryIO, limit_bytes: int) -> int:

@@ -12,6 +12,7 @@ import socket
 import stat
 import tarfile
 import threading
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -264,6 +265,28 @@ def test_a_stated_size_beyond_the_cap_is_refused_before_it_is_sent(tmp_path: Pat
             )
             assert line.recv(1000).startswith(b"HTTP/1.1 413")  # after two bytes of 30,000
         assert kept(running) == []
+
+
+@pytest.mark.parametrize("path", ["recordings", "camera-models"])
+def test_an_upload_that_breaks_off_leaves_nothing_and_is_no_defect(
+    running: Running, path: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "api.errors")
+    address = urlsplit(running.url)
+    with socket.create_connection((address.hostname, address.port), timeout=10) as line:
+        line.sendall(
+            f"POST /api/v1/{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/zip\r\nContent-Length: 30000\r\n"
+            f"Idempotency-Key: once\r\nAuthorization: Bearer {running.keys['calibrate']}\r\n\r\nPK".encode()
+        )
+    until = time.monotonic() + 30.0
+    while not caplog.messages:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    assert caplog.messages == [f"POST /api/v1/{path}: the client broke off"]
+    assert kept(running) == [] and not (running.store.root / "cameras").exists()
+    with running.client("calibrate") as client:  # and the key is free again
+        headers = ZIP | {"Idempotency-Key": "once"}
+        assert client.post(f"/api/v1/{path}", content=b"no archive", headers=headers).status_code == 422
 
 
 def test_a_full_disk_is_said_and_captures_keep_their_room(
