@@ -163,7 +163,7 @@ class LiveSessions:
     @property
     def any_runs(self) -> bool:
         """Whether this process runs a session now."""
-        return any(not session.ended for session in self._live.values())
+        return any(not session.ended for session in list(self._live.values()))
 
     def find(self, session_id: str) -> LiveSession | None:
         """The session if this process runs it now, else None."""
