@@ -64,7 +64,7 @@ from lab.diagnose.effect_list import EffectDescription, ParameterDescription
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves
 from lab.quick_look.frame_figures import FrameFigures
-from lab.report.findings import Findings
+from lab.report.findings import DiagnosisFindings
 
 M = TypeVar("M", bound=BaseModel)
 W = TypeVar("W", SessionDetail, Job)
@@ -450,13 +450,13 @@ class ServiceClient:
         """Diagnose a finished session."""
         return self._made(DiagnosisResult, "diagnose", session_id, patience_s)
 
-    def findings(self, session_id: str) -> Findings:
+    def findings(self, session_id: str) -> DiagnosisFindings:
         """What a session's newest diagnosis found, in words."""
-        return self._get(Findings, f"/sessions/{session_id}/findings")
+        return self._get(DiagnosisFindings, f"/sessions/{session_id}/findings")
 
-    def recordings_findings(self, recordings_id: str) -> Findings:
+    def recordings_findings(self, recordings_id: str) -> DiagnosisFindings:
         """What the newest diagnosis of recordings found, in words."""
-        return self._get(Findings, f"/recordings/{recordings_id}/findings")
+        return self._get(DiagnosisFindings, f"/recordings/{recordings_id}/findings")
 
     def pipeline_results(self, job_id: str) -> PipelineResults:
         """What a pipeline found."""

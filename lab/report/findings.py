@@ -10,7 +10,7 @@ from lab.report.answers import proof_curves, proof_words
 from sim.parameters import Frozen
 
 
-class Proof(Frozen):
+class ProofCurve(Frozen):
     """A measurement as recorded and as predicted, before and after the named effects, with its title and caption."""
 
     title: str
@@ -18,7 +18,7 @@ class Proof(Frozen):
     curve: ResidualCurve
 
 
-class Findings(Frozen):
+class DiagnosisFindings(Frozen):
     """`verdict` in two words, `headline` in a sentence, and the questions of the report's first screen with their `answers`. `proofs`: the two
     measurements that the baseline predicts worst. `pictures`: of each camera, the frame whose residuals the effects lessen most, where they do by a
     tenth at least."""
@@ -26,7 +26,7 @@ class Findings(Frozen):
     verdict: str
     headline: str
     answers: dict[str, tuple[str, ...]]
-    proofs: tuple[Proof, ...]
+    proofs: tuple[ProofCurve, ...]
     pictures: tuple[ResidualPicture, ...]
 
 
@@ -40,17 +40,17 @@ def _taken_away(picture: ResidualPicture) -> float:
     return 1.0 - after / max(before, 1e-12)
 
 
-def _proof(curve: ResidualCurve) -> Proof:
+def _proof(curve: ResidualCurve) -> ProofCurve:
     title, caption = proof_words(curve)
-    return Proof(title=title, caption=caption, curve=curve)
+    return ProofCurve(title=title, caption=caption, curve=curve)
 
 
-def findings(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult) -> Findings:
+def findings(fit: FitResult, validation: ValidationResult | None, diagnosis: DiagnosisResult) -> DiagnosisFindings:
     """What is told of a diagnosis, and of the fit and the validation that go with it."""
     verdict, _, headline = words.headline(diagnosis)
     told = [picture for picture in diagnosis.pictures if _taken_away(picture) >= WORTH_A_PICTURE]
     best = {picture.side: picture for picture in sorted(told, key=_taken_away)}
-    return Findings(
+    return DiagnosisFindings(
         verdict=verdict,
         headline=headline,
         answers={question: tuple(lines) for question, lines in answers.answers(fit, validation, diagnosis) if lines},
