@@ -27,7 +27,7 @@ from api.live import LiveSessions
 from api.metrics import CountedRequests, Metrics
 from api.pictures import Pictures
 from api.public_text import PublicText
-from api.routes import calibrations, camera_models, challenges, jobs, knowledge, queue, recordings, sessions
+from api.routes import calibrations, camera_models, challenges, findings, jobs, knowledge, queue, recordings, sessions
 from api.routes.stations import router as stations_router
 from api.schemas import Health, Login, Me
 from api.security import (
@@ -41,6 +41,7 @@ from api.security import (
     set_cookie,
 )
 from api.service import READ, Here, Limits, Service
+from api.shared_answers import Shared, SharedAnswers
 from api.upload import Inbox
 from api.waiting import QueueRunner
 from lab.capture.recovery import Recovery
@@ -53,6 +54,8 @@ from lab.quick_look.process import QuickLook
 
 log = logging.getLogger(__name__)
 PREFIX = "/api/v1"
+#: What takes archives, which may be larger than the memory.
+ARCHIVES = frozenset((f"{PREFIX}/recordings", f"{PREFIX}/camera-models"))
 PAGES = Path(__file__).parent / "pages"
 ASSETS = {
     "operator.css": "text/css",
@@ -67,6 +70,8 @@ ASSETS = {
             "watch.js",
             "recordings.js",
             "calibrations.js",
+            "challenges.js",
+            "findings.js",
             "docs.js",
         ),
         "text/javascript",
@@ -206,6 +211,9 @@ def create_app(
         app.state.service.live.close()
         app.state.service.quick_look.close()
 
+    shared = Shared()
+    live = LiveSessions(store, connect, shared.forget)
+    gate = Gate(lambda anew: stored_keys(store, anew), store.knows_keys)
     jobs_of = jobs_runner or JobRunner(store)
     counted = Metrics({"sessions": store.count_states, "jobs": jobs_of.count_states})
     app = FastAPI(
@@ -223,15 +231,14 @@ def create_app(
             Middleware(CountedRequests, metrics=counted),
             Middleware(DefectMiddleware),
             Middleware(SameHost, hosts=LOOPBACK | frozenset(hosts)),
-            Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_path=f"{PREFIX}/recordings"),
-            Middleware(Idempotency, store=store, prefix=PREFIX, unread_path=f"{PREFIX}/recordings"),
+            Middleware(SharedAnswers, shared=shared, prefix=PREFIX, busy=lambda: live.any_runs, gate=gate),
+            Middleware(SmallBodies, limit_bytes=caps.body_bytes, except_paths=ARCHIVES),
+            Middleware(Idempotency, store=store, prefix=PREFIX, unread_paths=ARCHIVES),
         ],
     )
-    gate = Gate(lambda: stored_keys(store))
     app.state.gate = gate
     app.state.metrics = counted
     app.state.public = PublicText(store.root)
-    live = LiveSessions(store, connect)
     app.state.service = Service(
         store=store,
         stations=folder,
@@ -246,6 +253,7 @@ def create_app(
         public=app.state.public,
         limits=caps,
         checks=DeviceChecks(live, connect, store.root / "transcripts"),
+        changed=shared.forget,
     )
     errors.install(app)
 
@@ -255,7 +263,7 @@ def create_app(
     app.add_exception_handler(TooManyFailures, too_many)
     app.include_router(open_to_all)
     app.include_router(stations_router, prefix=PREFIX)
-    for part in (knowledge, sessions, queue, recordings, jobs, calibrations, camera_models, challenges):
+    for part in (knowledge, sessions, queue, recordings, jobs, findings, calibrations, camera_models, challenges):
         app.include_router(part.router, prefix=PREFIX)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -32,6 +32,7 @@ from api.schemas import (
     ConnectedDevice,
     DeviceCheck,
     DeviceState,
+    FigureName,
     Halt,
     Halted,
     Health,
@@ -56,15 +57,21 @@ from lab.calibration.limits import CalibrationLimits
 from lab.capture.catalogue import PlanEstimate, SequenceDescription
 from lab.capture.plan import Parameters
 from lab.capture.queue import QueuedSession
+from lab.capture.session import Progress
 from lab.challenge.score import ChallengeScore
 from lab.challenge.truth import Truths
+from lab.diagnose.effect_list import EffectDescription, ParameterDescription
 from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
 from lab.quick_look.curves import Curves
+from lab.quick_look.frame_figures import FrameFigures
+from lab.report.findings import DiagnosisFindings
 
 M = TypeVar("M", bound=BaseModel)
 W = TypeVar("W", SessionDetail, Job)
 #: How often (s) a client that waits looks, and how long it waits unless it is told.
 LOOK_S, PATIENCE_S = 0.2, 600.0
+#: How long (s) a stream of events may be silent: it says something every 15 s.
+EVENTS_S = 60.0
 
 
 class ServiceProblem(Exception):
@@ -116,10 +123,10 @@ class ServiceClient:
         return response
 
     def _fetched(self, path: str, file: Path) -> Path:
-        """Write what a path answers to `file`, as it arrives: completely, or not at all."""
+        """Write the archive of a path to `file`, a .tar where its name ends so, else a .zip, as it arrives: completely, or not at all."""
         partial = file.with_name(f".{file.name}.partial")
         try:
-            with self.http.stream("GET", path) as response, partial.open("wb") as to:
+            with self.http.stream("GET", f"{path}{file.suffix or '.zip'}") as response, partial.open("wb") as to:
                 if response.is_error:
                     response.read()
                     raise _problem(response)
@@ -136,6 +143,30 @@ class ServiceClient:
     def _post(self, model: type[M], path: str, body: BaseModel | None = None) -> M:
         content = {} if body is None else {"json": body.model_dump(mode="json")}
         return model.model_validate_json(self.request("POST", path, **content).content)
+
+    def _send(self, model: type[M], path: str, archive: Path, **params: Any) -> M:
+        """Send a .zip, .tar or .tar.gz piece by piece: it may be larger than the memory."""
+        sent = {".zip": "application/zip", ".tar": "application/x-tar"}.get(archive.suffix, "application/gzip")
+        headers = {"Content-Type": sent, "Content-Length": str(archive.stat().st_size)}
+        with archive.open("rb") as file:
+            response = self.request("POST", path, content=file, headers=headers, params=params)
+        return model.model_validate_json(response.content)
+
+    def _events(self, path: str) -> Iterator[tuple[str, str]]:
+        """(name, data) of each event of a stream, as it arrives."""
+        name = ""
+        with self.http.stream("GET", path, timeout=EVENTS_S) as response:
+            if response.is_error:
+                response.read()
+                raise _problem(response)
+            for line in response.iter_lines():
+                key, _, value = line.partition(": ")
+                if key == "event":
+                    name = value
+                elif key == "data":
+                    yield name, value
+                    if name == "end":
+                        return
 
     def _pages(self, model: type[M], path: str, **params: Any) -> Iterator[M]:
         """All items of a list, page by page."""
@@ -162,6 +193,17 @@ class ServiceClient:
     def health(self) -> Health:
         """Whether the service is up, and its version."""
         return Health.model_validate_json(self.http.get(f"{self.url}/health").raise_for_status().content)
+
+    def ready(self) -> Health:
+        """Whether the service can work: its registry answers, its data folder takes files."""
+        response = self.http.get(f"{self.url}/healthz")
+        if response.is_error:
+            raise _problem(response)
+        return Health.model_validate_json(response.content)
+
+    def metrics(self) -> str:
+        """Requests, sessions and jobs, as Prometheus reads them."""
+        return self.request("GET", f"{self.url}/metrics").text
 
     def me(self) -> Me:
         """Name and scope of the key."""
@@ -215,6 +257,10 @@ class ServiceClient:
     def sequences(self) -> list[SequenceDescription]:
         """The catalogue of sequences."""
         return list(self._pages(SequenceDescription, "/sequences"))
+
+    def sequence(self, name: str) -> SequenceDescription:
+        """One sequence of the catalogue."""
+        return self._get(SequenceDescription, f"/sequences/{name}")
 
     def estimate(self, station: str, asked: PlanAsked | None = None) -> PlanEstimate:
         """What a session would take on a station: captures and time."""
@@ -296,13 +342,31 @@ class ServiceClient:
         """The captures of a session; `only`: of a `kind`, a `side`."""
         return self._pages(StoredCapture, f"/sessions/{session_id}/captures", **only)
 
+    def follow_session(self, session_id: str) -> Iterator[StoredSession | Progress]:
+        """A session's state and progress as they change, until its run is over."""
+        for name, data in self._events(f"/sessions/{session_id}/events"):
+            yield (Progress if name == "progress" else StoredSession).model_validate_json(data)
+
+    def stored_capture(self, session_id: str, capture_id: int) -> StoredCapture:
+        """One capture."""
+        return self._get(StoredCapture, f"/sessions/{session_id}/captures/{capture_id}")
+
+    def preview(self, session_id: str, capture_id: int, *, width_px: int = 480, stretch: bool = False) -> bytes:
+        """A capture's small picture, PNG. `stretch`: white is the frame's own brightest."""
+        asked = {"width": width_px, "stretch": stretch}
+        return self.request("GET", f"/sessions/{session_id}/captures/{capture_id}/preview.png", params=asked).content
+
+    def capture_figures(self, session_id: str, capture_id: int) -> FrameFigures:
+        """Histogram, mean and saturated share of each channel of a frame."""
+        return self._get(FrameFigures, f"/sessions/{session_id}/captures/{capture_id}/figures")
+
     def curves(self, session_id: str) -> Curves:
         """Photon transfer, sensitivity and MTF as a session's captures so far show them."""
         return self._get(Curves, f"/sessions/{session_id}/curves")
 
     def frame(self, capture: StoredCapture) -> NDArray[np.uint16]:
         """The raw frame of a capture: uint16 (rows, cols)."""
-        content = self.request("GET", f"{self.url}{capture.frame}").content
+        content = self.request("GET", f"/sessions/{capture.session_id}/captures/{capture.id}/frame.npy").content
         frame: NDArray[np.uint16] = np.load(io.BytesIO(content), allow_pickle=False)
         return frame
 
@@ -310,36 +374,45 @@ class ServiceClient:
 
     def send_recordings(self, archive: Path, asked: SentAs | None = None) -> Recordings:
         """Send in a recording set, a .zip, .tar or .tar.gz; with `asked`, recordings of another format, which become one."""
-        sent = {".zip": "application/zip", ".tar": "application/x-tar"}.get(archive.suffix, "application/gzip")
-        headers = {"Content-Type": sent, "Content-Length": str(archive.stat().st_size)}
         stated = {} if asked is None else asked.model_dump(mode="json", exclude_unset=True)
-        with archive.open("rb") as file:  # sent piece by piece: a set may be larger than the memory
-            response = self.request("POST", "/recordings", content=file, headers=headers, params=stated)
-        return Recordings.model_validate_json(response.content)
+        return self._send(Recordings, "/recordings", archive, **stated)
 
     def recordings(self) -> Iterator[Recordings]:
         """All recording sets that were sent in, the newest first."""
         return self._pages(Recordings, "/recordings")
 
+    def recording_set(self, recordings_id: str) -> Recordings:
+        """One recording set that was sent in."""
+        return self._get(Recordings, f"/recordings/{recordings_id}")
+
     def fetch_recordings(self, recordings_id: str, file: Path) -> Path:
-        """Write a recording set that was sent in to `file`, a .zip."""
-        return self._fetched(f"/recordings/{recordings_id}/archive.zip", file)
+        """Write a recording set that was sent in to `file`, a .zip or .tar."""
+        return self._fetched(f"/recordings/{recordings_id}/archive", file)
 
     def delete_recordings(self, recordings_id: str) -> None:
         """Delete a recording set for ever."""
         self.request("DELETE", f"/recordings/{recordings_id}")
 
     def fetch_session(self, session_id: str, file: Path) -> Path:
-        """Write a session to `file`, a .zip of a recording set."""
-        return self._fetched(f"/sessions/{session_id}/archive.zip", file)
+        """Write a session to `file`, a .zip or .tar of a recording set."""
+        return self._fetched(f"/sessions/{session_id}/archive", file)
 
     def delete_session(self, session_id: str) -> None:
         """Delete a session for ever; its results and calibrations stay."""
         self.request("DELETE", f"/sessions/{session_id}")
 
-    def start_job(self, kind: JobKind, session_id: str) -> Job:
-        """Start work on a finished session."""
-        return self._post(Job, f"/sessions/{session_id}/jobs", JobStart(kind=kind))
+    def start_job(self, kind: JobKind, session_id: str, camera_model: str | None = None) -> Job:
+        """Start work on a finished session; validate and diagnose may begin with a `camera_model`."""
+        return self._post(Job, f"/sessions/{session_id}/jobs", JobStart(kind=kind, camera_model=camera_model))
+
+    def start_recordings_job(self, kind: JobKind, recordings_id: str, camera_model: str | None = None) -> Job:
+        """Start work on recordings that were sent in, as `start_job`."""
+        return self._post(Job, f"/recordings/{recordings_id}/jobs", JobStart(kind=kind, camera_model=camera_model))
+
+    def follow_job(self, job_id: str) -> Iterator[Job]:
+        """A job as it changes, until it is over."""
+        for _, data in self._events(f"/jobs/{job_id}/events"):
+            yield Job.model_validate_json(data)
 
     def start_pipeline(self, start: PipelineStart) -> Job:
         """Start a session and the whole pipeline on it."""
@@ -377,6 +450,14 @@ class ServiceClient:
         """Diagnose a finished session."""
         return self._made(DiagnosisResult, "diagnose", session_id, patience_s)
 
+    def findings(self, session_id: str) -> DiagnosisFindings:
+        """What a session's newest diagnosis found, in words."""
+        return self._get(DiagnosisFindings, f"/sessions/{session_id}/findings")
+
+    def recordings_findings(self, recordings_id: str) -> DiagnosisFindings:
+        """What the newest diagnosis of recordings found, in words."""
+        return self._get(DiagnosisFindings, f"/recordings/{recordings_id}/findings")
+
     def pipeline_results(self, job_id: str) -> PipelineResults:
         """What a pipeline found."""
         return self._get(PipelineResults, f"/jobs/{job_id}/result")
@@ -404,8 +485,8 @@ class ServiceClient:
         return self._get(Challenge, f"/challenges/{challenge_id}")
 
     def fetch_case(self, challenge_id: str, case: str, file: Path) -> Path:
-        """Write the recordings of a case to `file`, a .zip of a recording set."""
-        return self._fetched(f"/challenges/{challenge_id}/cases/{case}/archive.zip", file)
+        """Write the recordings of a case to `file`, a .zip or .tar of a recording set."""
+        return self._fetched(f"/challenges/{challenge_id}/cases/{case}/archive", file)
 
     def challenge_score(self, challenge_id: str) -> ChallengeScore:
         """The score of a challenge that is scored."""
@@ -425,6 +506,10 @@ class ServiceClient:
         """All calibrations, the newest first."""
         return self._pages(CalibrationRecord, "/calibrations")
 
+    def calibration(self, calibration_id: str) -> CalibrationRecord:
+        """One calibration, with its judgements."""
+        return self._get(CalibrationRecord, f"/calibrations/{calibration_id}")
+
     def certify(
         self, calibration_id: str, limits: CalibrationLimits | None = None, *, accept_warnings: bool = False
     ) -> CalibrationRecord:
@@ -440,14 +525,44 @@ class ServiceClient:
         """One camera model, with the parameters of each camera."""
         return self._get(CameraModels, f"/camera-models/{model_id}")
 
+    def send_camera_model(self, archive: Path) -> CameraModels:
+        """Send in camera files, left.toml or right.toml or both, as a .zip, .tar or .tar.gz."""
+        return self._send(CameraModels, "/camera-models", archive)
+
+    def delete_camera_model(self, model_id: str) -> None:
+        """Delete a camera model that was sent in, for ever."""
+        self.request("DELETE", f"/camera-models/{model_id}")
+
     def fetch_camera_model(self, model_id: str, file: Path) -> Path:
-        """Write the camera files of a model to `file`, a .zip."""
-        return self._fetched(f"/camera-models/{model_id}/archive.zip", file)
+        """Write the camera files of a model to `file`, a .zip or .tar."""
+        return self._fetched(f"/camera-models/{model_id}/archive", file)
 
     def compare(self, a: str, b: str, fail_on: Sequence[str] = ()) -> Comparison:
         """Two calibrations, by id, compared as `calibench compare` does."""
         return self._get(Comparison, "/comparisons", a=a, b=b, fail_on=list(fail_on))
 
+    def comparison_page(self, a: str, b: str) -> str:
+        """The comparison with its pictures, one page."""
+        return self.request("GET", "/comparisons/page", params={"a": a, "b": b}).text
+
+    def figures(self) -> list[FigureName]:
+        """What there is a history of."""
+        return list(self._pages(FigureName, "/figures"))
+
     def history(self, camera: str, figure: str, place: str = "") -> History:
         """A figure of a camera over its calibrations."""
         return self._get(History, "/history", camera=camera, figure=figure, place=place)
+
+    # --- what the models know --------------------------------------------------------------------------------------------
+
+    def parameters(self) -> list[ParameterDescription]:
+        """The parameters of the camera model, with unit, bounds and prior."""
+        return list(self._pages(ParameterDescription, "/parameters"))
+
+    def effects(self) -> list[EffectDescription]:
+        """The library that a diagnosis chooses from."""
+        return list(self._pages(EffectDescription, "/effects"))
+
+    def effect(self, name: str) -> EffectDescription:
+        """One effect."""
+        return self._get(EffectDescription, f"/effects/{name}")

@@ -28,8 +28,6 @@ Folder = Annotated[
 FIRST_KEY = "first"
 #: Longest wait (s), before the service is loaded, for the stations of sessions whose process died to be made safe.
 RESCUE_FIRST_S = 4.0
-#: How long (s) their shutters are waited for before that.
-SHUTTERS_S = 3.0
 #: Switch interval (s) of Python's threads: short, as a session's steps and the service's answers alternate often.
 SWITCH_S = 0.001
 _ANY = ("0.0.0.0", "::", "")  # addresses that listen everywhere and name no computer
@@ -40,17 +38,6 @@ def _store(folder: Path | None) -> Store:
     from lab.capture.store import Store
 
     return Store.open(Settings() if folder is None else Settings(data=folder))
-
-
-def _close_shutters(folder: Path | None) -> None:
-    """Before anything that takes time is loaded, the settings among it: a shutter may be open."""
-    if "CALIBENCH_DATABASE_URL" in os.environ:
-        return
-    from lab.capture.close_shutters import close_shutters
-
-    data = folder or Path(os.environ.get("CALIBENCH_DATA", "calibench-data"))
-    for session_id in close_shutters(data, SHUTTERS_S):
-        typer.echo(f"session {session_id}: its process ended without a word; its shutter was closed", err=True)
 
 
 def _first_key(store: Store) -> None:
@@ -108,7 +95,7 @@ def serve(
     for file in (tls_certificate, tls_key):
         if file is not None and not os.access(file, os.R_OK):
             raise InputError(f"{file}: can't be read; give a PEM file")
-    _close_shutters(data)
+    from lab.capture.close_shutters import closed_at_start
     from lab.capture.recovery import Recovery
 
     store = _store(data)
@@ -117,6 +104,7 @@ def serve(
     if not makes_key:
         check_bind(host, stored_keys(store))
     with _listening(host, port) as line, contextlib.closing(Recovery(store)) as recovery:
+        closed_at_start()
         recovery.start(
             RESCUE_FIRST_S
         )  # before the service itself is loaded, which takes seconds: a shutter may be open

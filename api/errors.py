@@ -11,6 +11,7 @@ from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException as RouterException
+from starlette.requests import ClientDisconnect
 from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -95,10 +96,16 @@ def _answer(status: int) -> Callable[[Request, Exception], Response]:
 
 def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    lines = []
+    lines: list[str] = []
     for one in error.errors():
-        where = ".".join(str(part) for part in one["loc"] if part != "body") or "body"
-        lines.append(f"{where}: {one['msg']}")
+        where = ".".join(str(part) for part in one["loc"] if part != "body")
+        said = str(one["msg"]).removeprefix("Value error, ")
+        given = one.get("input")
+        # A key that was sent is never repeated. What our own checks say names the value already.
+        if isinstance(given, int | float) and one["type"] != "value_error":
+            said = f"{given!r}: {said}"
+        if not any(line.startswith(f"{where}.") for line in lines):  # it follows from what is said of a part of it
+            lines.append(f"{where}: {said}" if where else said)
     return problem(422, request.app.state.public("; ".join(lines)))
 
 
@@ -116,7 +123,10 @@ def _refused(request: Request, error: Exception) -> Response:
         ]
         headers["allow"] = ", ".join(dict.fromkeys(methods)) or headers.get("allow", "GET")
         return problem(405, f"{request.method} isn't for this path; use {headers['allow']}", headers)
-    return problem(error.status_code, request.app.state.public(str(error.detail)), headers)
+    said = str(error.detail)
+    if said == HTTPStatus.NOT_FOUND.phrase:  # the router's own
+        said = "there is no such path; /docs lists those that there are"
+    return problem(error.status_code, request.app.state.public(said), headers)
 
 
 class DefectMiddleware:
@@ -136,6 +146,8 @@ class DefectMiddleware:
 
         try:
             await self.app(scope, receive, watched)
+        except ClientDisconnect:  # there is nobody to answer
+            log.info("%s %s: the client broke off", scope.get("method"), scope.get("path"))
         except Exception as error:
             log.exception("%s %s: a defect", scope.get("method"), scope.get("path"))
             if begun:

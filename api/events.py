@@ -33,15 +33,18 @@ async def watched(
     over: Callable[[Any], bool],
     name: str,
     stopping: anyio.Event,
+    changed: Callable[[], None],
     every_s: float = 0.5,
 ) -> AsyncIterator[ServerSentEvent]:
     """The state now and after each change; the last event is called `end`. `look` reads the registry every `every_s` seconds,
-    because other processes write to it, too."""
-    seen = None
+    because other processes write to it, too; `changed` is called before a change of its `state` is told."""
+    seen: Any = None
     while True:
-        found = await asyncio.to_thread(look)
+        found: Any = await asyncio.to_thread(look)
         ended = over(found)
         if found != seen:
+            if seen is None or found.state != seen.state:
+                changed()
             yield event(name, found)
             seen = found
         if ended:

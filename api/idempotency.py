@@ -42,11 +42,11 @@ def _digest(*parts: bytes) -> str:
 
 
 class Idempotency:
-    """Answers a repeated POST below `prefix` from what was kept; only a success is kept. Of the bodies sent to `unread_path`, which may
-    be larger than the memory, only the stated length is compared."""
+    """Answers a repeated POST below `prefix` from what was kept; only a success is kept. Of the bodies sent to `unread_paths`, which
+    may be larger than the memory, only the stated length is compared."""
 
-    def __init__(self, app: ASGIApp, store: Store, prefix: str, unread_path: str) -> None:
-        self.app, self.store, self.prefix, self.unread_path = app, store, prefix, unread_path
+    def __init__(self, app: ASGIApp, store: Store, prefix: str, unread_paths: frozenset[str]) -> None:
+        self.app, self.store, self.prefix, self.unread_paths = app, store, prefix, unread_paths
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or answer it from what was kept."""
@@ -67,7 +67,7 @@ class Idempotency:
         if holder is None:  # the route refuses it
             await self.app(scope, receive, send)
             return
-        unread = scope["path"] == self.unread_path
+        unread = scope["path"] in self.unread_paths
         try:
             body = request.headers.get("content-length", "").encode() if unread else await request.body()
         except HTTPException as refused:  # larger than allowed

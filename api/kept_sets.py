@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from fastapi import Response
 
-from api.archives import zipped_set
+from api.archives import sent
 from api.errors import Conflict, known
 from api.service import OVER, Service
 from lab.calibration.life import check_nothing_rests_on
 from lab.errors import InputError
-from lab.formats.recording_set import RecordingSet
+from lab.formats.recording_set import ArchiveForm, RecordingSet, archive
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,14 @@ class KeptSet:
     read: Callable[[], RecordingSet]
     remove: Callable[[], None]
 
-    def archive(self) -> Response:
-        """The set as a .zip. Raises Conflict where it can't be handed out now."""
+    def archive(self, form: ArchiveForm) -> Response:
+        """The set as an archive. Raises Conflict where it can't be handed out now."""
         try:
             recordings = self.read()
         except InputError as error:
             raise Conflict(str(error)) from None
-        return zipped_set(recordings, self.what.replace(" ", "-"))
+        recordings.cache_bytes = 0  # each frame is read once
+        return sent(archive(recordings, form), self.what.replace(" ", "-"), form)
 
     def delete(self, service: Service) -> None:
         """Delete it for ever. Raises Conflict while a job works on it, or where it can't be deleted now."""

@@ -61,9 +61,9 @@ class StoredKey:
     sha256: str
 
 
-def stored_keys(store: Store) -> list[StoredKey]:
-    """The keys that a store holds."""
-    return [StoredKey(name, Permission(scope), sha256) for name, scope, sha256 in store.keys()]  # noqa: SIM118
+def stored_keys(store: Store, anew: bool = True) -> list[StoredKey]:
+    """The keys that a store holds; unless `anew`, as it knows them."""
+    return [StoredKey(name, Permission(scope), sha256) for name, scope, sha256 in store.keys(anew)]
 
 
 def create_key(store: Store, name: str, scope: Permission) -> str:

@@ -35,8 +35,9 @@ def _wake(followers: list[asyncio.Event]) -> None:
 class LiveSession:
     """One session in a thread of its own. A follower gets the latest progress first, then later ones; a slow follower misses some."""
 
-    def __init__(self, station: Station) -> None:
+    def __init__(self, station: Station, changed: Callable[[], None]) -> None:
         self.station = station
+        self._on_change = changed
         self.pausing = False
         self.capture: CaptureSession | None = None
         self._latest: Progress | None = None
@@ -87,10 +88,13 @@ class LiveSession:
 
     def _changed(self, progress: Progress | None = None, ended: bool = False) -> None:
         with self._lock:
+            was = self._latest.state if self._latest is not None else None
             self._latest = progress or self._latest
             self._number += 1
             self._ended = self._ended or ended
             followers = list(self._followers)
+        if progress is None or progress.state != was:  # before the followers hear of it and ask
+            self._on_change()
         for loop in {loop for loop, _ in followers}:  # one call into a loop, however many follow there
             mine = [wake for of, wake in followers if of is loop]
             with contextlib.suppress(RuntimeError):  # that loop is closed
@@ -133,10 +137,16 @@ class LiveSession:
 
 
 class LiveSessions:
-    """Starts, controls and ends sessions. Only one session at a time runs on an instrument, also across processes."""
+    """Starts, controls and ends sessions. Only one session at a time runs on an instrument, also across processes. `changed` is called at every
+    change of a session's state, by any thread."""
 
-    def __init__(self, store: Store, connect: Callable[[Station], Drivers] = drivers_of) -> None:
-        self._store, self._connect = store, connect
+    def __init__(
+        self,
+        store: Store,
+        connect: Callable[[Station], Drivers] = drivers_of,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._store, self._connect, self._changed = store, connect, changed
         self._live: dict[str, LiveSession] = {}
         self._lock = threading.Lock()
         self._closed = False
@@ -150,6 +160,11 @@ class LiveSessions:
             self._held.append(station.addresses)
         return lambda: self._held.remove(station.addresses)
 
+    @property
+    def any_runs(self) -> bool:
+        """Whether this process runs a session now."""
+        return any(not session.ended for session in list(self._live.values()))
+
     def find(self, session_id: str) -> LiveSession | None:
         """The session if this process runs it now, else None."""
         live = self._live.get(session_id)
@@ -160,7 +175,7 @@ class LiveSessions:
         the station lacks what the plan needs."""
         with self._lock:
             self._check_free(station)
-            live = LiveSession(station)
+            live = LiveSession(station, self._changed)
             capture = CaptureSession.start(
                 self._store,
                 station,
@@ -198,7 +213,7 @@ class LiveSessions:
                 now = self._store.session(session_id)
                 if now.state != "queued" or now.error is not None:
                     raise Conflict(f"session {session_id} is {now.state} now: {now.error}")
-            live = LiveSession(station)
+            live = LiveSession(station, self._changed)
             capture = CaptureSession(
                 self._store, session_id, station=station, on_progress=live.tell, connect=self._connect
             )

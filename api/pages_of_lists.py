@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Query, Request, Response
+from fastapi import HTTPException, Query, Request, Response
 
 #: Items of a page where the request doesn't say how many.
 PAGE = 100
@@ -36,3 +36,11 @@ def page_headers(request: Request, response: Response, total: int, limit: int, i
     if len(ids) == limit:
         there = request.url.include_query_params(after=ids[-1])
         response.headers["Link"] = f'<{there.path}?{there.query}>; rel="next"'
+
+
+def page_of(ids: list[str], after: str | None, limit: int, what: str) -> list[str]:
+    """Of a list that is all there: the ids of the page after a cursor. Raises 422 for a cursor that isn't in it."""
+    if after is not None and after not in ids:
+        raise HTTPException(422, f"after: no {what} {after!r}; begin without it")
+    begin = ids.index(after) + 1 if after is not None else 0
+    return ids[begin : begin + limit]

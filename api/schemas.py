@@ -192,7 +192,7 @@ class Certify(Schema):
 
 
 class CameraModels(Schema):
-    """The camera models of a result: `fitted` by a fit, or `improved` with what a diagnosis named."""
+    """Camera models: `fitted` by a fit, `improved` with what a diagnosis named, or `sent` in."""
 
     id: str
     kind: CameraModelKind
@@ -276,6 +276,9 @@ class SessionDetail(StoredSession):
     progress: Progress | None = Field(description="null unless this service runs it now")
     runs: tuple[RunRecord, ...] = Field(description="provenance: each run's instruments, serial numbers and versions")
     captures: tuple[CaptureCount, ...] = Field(description="how many there are of each kind and side")
+    results: dict[str, str] = Field(
+        description="kind -> id of the newest `fit` (also the id of its calibration and camera model), `validate`, `diagnose`, `report`"
+    )
 
 
 class StoredCapture(Schema):
@@ -301,6 +304,12 @@ class JobStart(Schema):
     resolve: bool = Field(
         default=False,
         description="pipeline of a session: while rivals are left, take the capture that tells them apart and diagnose again",
+    )
+    camera_model: str | None = Field(
+        default=None,
+        pattern=r"^[0-9a-f]{16}$",
+        description="validate, diagnose: id of a camera model that stands in for the fitted cameras, with its effects, as "
+        "`--model` of the command line does; later reports don't rest on the result",
     )
     station: str | None = Field(
         default=None,

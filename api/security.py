@@ -70,7 +70,10 @@ class TooManyFailures(Exception):
 class Gate:
     """Identifies the key of a request; one per application."""
 
-    keys: Callable[[], Iterable[StoredKey]]
+    #: The keys as they are (True), or as they were known just now.
+    keys: Callable[[bool], Iterable[StoredKey]]
+    #: Whether those that were known just now are at hand.
+    is_quick: Callable[[], bool] = lambda: False
     logins: Logins = field(default_factory=Logins)
     failures: FailedKeys = field(default_factory=FailedKeys)
     #: SHA-256 of keys that were valid once: these are compared whatever their address did.
@@ -81,7 +84,7 @@ class Gate:
         mine = digest(key)
         if mine not in self._proven and (wait_s := self.failures.wait_s(address)):
             raise TooManyFailures(wait_s)
-        found = holder(key, self.keys())
+        found = holder(key, self.keys(False)) or holder(key, self.keys(True))
         if found is None:
             self._proven.discard(mine)
             self.failures.failed(address)
@@ -106,7 +109,7 @@ class Gate:
         token = request.cookies.get(COOKIE)
         login = self.logins.holder(token) if token else None
         # A key that was taken away takes its logins with it.
-        return login if login is not None and login in self.keys() else None
+        return login if login is not None and login in self.keys(False) else None
 
 
 def address_of(request: Request) -> str:
@@ -241,14 +244,14 @@ class SafeHeaders:
 
 
 class SmallBodies:
-    """Refuses bodies above `limit_bytes`, by their stated or their streamed size. `except_path` has a limit of its own."""
+    """Refuses bodies above `limit_bytes`, by their stated or their streamed size. `except_paths` have a limit of their own."""
 
-    def __init__(self, app: ASGIApp, limit_bytes: int, except_path: str) -> None:
-        self.app, self.limit_bytes, self.except_path = app, limit_bytes, except_path
+    def __init__(self, app: ASGIApp, limit_bytes: int, except_paths: frozenset[str]) -> None:
+        self.app, self.limit_bytes, self.except_paths = app, limit_bytes, except_paths
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on while its body is below the limit, else answer 413."""
-        if scope["type"] != "http" or (scope["method"] == "POST" and scope["path"] == self.except_path):
+        if scope["type"] != "http" or (scope["method"] == "POST" and scope["path"] in self.except_paths):
             await self.app(scope, receive, send)
             return
         stated = Headers(scope=scope).get("content-length", "0")

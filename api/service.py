@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,6 +21,8 @@ from api.public_text import PublicText
 from api.security import Demand, Gate
 from api.upload import Inbox
 from api.waiting import QueueRunner
+from lab.calibration import camera_models
+from lab.calibration.camera_models import CameraModelRecord
 from lab.capture.records import RunRecord, SessionInfo
 from lab.capture.session import Progress
 from lab.capture.station import Station, read_station
@@ -43,6 +45,8 @@ class Limits:
     upload_bytes: int = 4 << 30
     unpacked_bytes: int = 16 << 30
     unpacked_files: int = 20_000
+    #: Of a camera model, packed and unpacked: its files are read into memory.
+    model_bytes: int = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class Service:
     limits: Limits
     public: PublicText
     checks: DeviceChecks
+    #: To be called where a state was seen to change that no request changed.
+    changed: Callable[[], None]
 
     def station_files(self) -> dict[str, Path]:
         """The station files by name."""
@@ -148,6 +154,12 @@ class Service:
 def missing_session(session_id: str) -> str:
     """What is said of a session that isn't there."""
     return f"no session {session_id[:60]!r}; GET /api/v1/sessions lists them"
+
+
+def camera_model(service: Service, model_id: str) -> CameraModelRecord:
+    """A camera model; 404 where there is none."""
+    missing = f"no camera model {model_id!r}; GET /api/v1/camera-models lists them"
+    return known(missing, lambda: camera_models.record(service.store, model_id))
 
 
 @functools.lru_cache(maxsize=64)

@@ -60,7 +60,9 @@ def inside(name: str) -> PurePosixPath:
         or any(":" in part or any(ord(letter) < 32 for letter in part) or len(part.encode()) > 200 for part in parts)
         or len(parts) > 10
     ):
-        raise InputError(f"archive: {name[:80]!r} isn't a path inside it; pack the recording set's folder itself")
+        raise InputError(
+            f"archive: {name[:80]!r} isn't a path inside it; pack the files, or their folder, by themselves"
+        )
     return path
 
 
@@ -143,7 +145,7 @@ class _Bounded(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         if whence == io.SEEK_SET and offset > self._limit_bytes:
-            raise TooMuch(f"archive: more than {self._limit_bytes} bytes unpacked; pack fewer captures")
+            raise TooMuch(f"archive: more than {self._limit_bytes} bytes unpacked; pack less")
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
@@ -156,7 +158,7 @@ class _Bounded(io.RawIOBase):
             size = self.seek(0, io.SEEK_END) - at
             self.seek(at)
         if size > self._at_once:
-            raise TooMuch("archive: its list of files is too long; pack fewer captures")
+            raise TooMuch("archive: its list of files is too long; pack less")
         return self._file.read(size) or b""
 
 
@@ -214,11 +216,11 @@ def _checked(opened: _Archive, room: Path, limit_bytes: int, limit_files: int) -
     checked: list[tuple[_Member, PurePosixPath]] = []
     for member in opened.members():
         if len(checked) == limit_files:
-            raise TooMuch(f"archive: more files than it may hold, {limit_files} at most; pack fewer captures")
+            raise TooMuch(f"archive: more files than it may hold, {limit_files} at most; pack less")
         checked.append((member, inside(member.name)))
     stated = sum(member.size_bytes for member, _ in checked)
     if stated > limit_bytes:
-        raise TooMuch(f"archive: {stated} bytes unpacked, {limit_bytes} at most; pack fewer captures")
+        raise TooMuch(f"archive: {stated} bytes unpacked, {limit_bytes} at most; pack less")
     check_room(room, stated)
     return checked
 
@@ -236,5 +238,5 @@ def _write(opened: _Archive, members: list[tuple[_Member, PurePosixPath]], folde
             while chunk := source.read(CHUNK):
                 left -= len(chunk)
                 if left < 0:
-                    raise TooMuch(f"archive: more than {limit_bytes} bytes unpacked; pack fewer captures")
+                    raise TooMuch(f"archive: more than {limit_bytes} bytes unpacked; pack less")
                 made.write(chunk)

@@ -12,27 +12,33 @@ import re
 import secrets
 import shutil
 import time
+import zipfile
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from api.unpacking import TooMuch, inside, unpack
+from lab.calibration.camera_models import SIDES
 from lab.errors import InputError
 from lab.formats import recording_set as recording
+from lab.formats.camera_file import CameraFile, read_camera
 from lab.formats.importers.import_options import ImportOptions
 from lab.formats.recording_set import FolderFiles, RecordingSet
+from sim.camera import Side
 
 _ID = re.compile(r"[0-9a-f]{16}")
 _MANIFEST = "manifest.json"
 #: A folder of an upload that a crash left behind is removed when it is older than this (s).
 _STALE_S = 86400.0
+#: Files of a camera model, at most: two cameras, their curves and arrays.
+_MODEL_FILES = 64
 
 
 def check_size(size_bytes: int, limit_bytes: int) -> None:
     """Raises TooMuch for an archive, stated or received, beyond the limit."""
     if size_bytes > limit_bytes:
-        raise TooMuch(f"the archive is larger than {limit_bytes} bytes; send fewer captures, or use the command line")
+        raise TooMuch(f"the archive is larger than {limit_bytes} bytes; send less at a time")
 
 
 async def receive(body: AsyncIterator[bytes], file: BinaryIO, limit_bytes: int) -> int:
@@ -157,6 +163,29 @@ class Inbox:
         folder = self.folder(id)
         manifest, _ = recording.parse_manifest((folder / _MANIFEST).read_text(encoding="utf-8-sig"), _MANIFEST)
         return RecordingSet(manifest, source=id, files=FolderFiles(folder))
+
+
+def take_cameras(place: Path, archive: Path, limit_bytes: int) -> dict[Side, CameraFile]:
+    """The camera files of an archive: SIDE.toml, with the curves and arrays that they name beside them. Raises InputError."""
+    sent = place / "sent"
+    unpack(archive, sent, limit_bytes, _MODEL_FILES)
+    folder = _top(sent, None)
+    named: dict[Side, Path] = {side: file for side in SIDES if (file := folder / f"{side}.toml").is_file()}
+    if not named:
+        raise InputError(
+            f"the archive has none of {', '.join(f'{side}.toml' for side in SIDES)}; pack the camera files themselves"
+        )
+    try:
+        for arrays in folder.glob("*.npz"):
+            with zipfile.ZipFile(arrays) as packed:  # it may be compressed: what it states is what is read
+                check_size(sum(one.file_size for one in packed.infolist()), limit_bytes)
+        return {side: read_camera(file, sent=True) for side, file in named.items()}
+    except TooMuch:
+        raise
+    except InputError as error:
+        raise InputError(as_in_archive(str(error), place)) from None
+    except (zipfile.BadZipFile, MemoryError) as error:
+        raise InputError(f"the archive's arrays can't be read ({type(error).__name__}); save them with numpy") from None
 
 
 def _top(folder: Path, holds: str | None = _MANIFEST) -> Path:

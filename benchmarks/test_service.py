@@ -25,6 +25,7 @@ import psutil
 import pytest
 import sqlalchemy as sa
 
+from api.app import ASSETS
 from api.client import ServiceClient
 from api.keys import Permission, create_key
 from api.pytest_plugin import service_process
@@ -136,7 +137,7 @@ def test_the_first_page(tmp_path: Path) -> None:
         for _ in range(20):
             began_s = time.perf_counter()
             page = browser.get("/").text
-            for name in ("operator.css", "operator.js", "page.js", "charts.js", "stations.js", "queue.js", "watch.js"):
+            for name in ASSETS:
                 assert browser.get(f"/static/{name}").status_code == 200
             times.append(1e3 * (time.perf_counter() - began_s))
             assert "operator.js" in page
@@ -238,6 +239,7 @@ def test_lists_of_a_store_of_a_thousand_sessions(tmp_path: Path) -> None:
             "captures, 100": f"/sessions/{session_id}/captures",
             "captures, the newest": f"/sessions/{session_id}/captures?order=newest&limit=1",
             "calibrations, 50": "/calibrations?limit=50",
+            "camera models, 50": "/camera-models?limit=50",
             "figures": "/figures",
             "history of a figure": f"/history?camera={camera}&figure=noise read_noise_e",
             "jobs": "/jobs?limit=50",

@@ -12,10 +12,11 @@ import contextlib
 import secrets
 import threading
 import time
+from dataclasses import replace
 from datetime import datetime
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import urlsplit
 
 import sqlalchemy as sa
@@ -39,6 +40,10 @@ from lab.pipeline import (
 )
 from lab.workers import dask_client
 from sim.parameters import Frozen
+
+if TYPE_CHECKING:
+    from lab.formats.camera_file import CameraFile
+    from sim.camera import Side
 
 JobKind = Goal | ChallengeWork
 KINDS = (*STEPS, *WORK)
@@ -100,7 +105,12 @@ class _Reporter:
 
 
 def run_job(
-    root: str, database_url: str | None, job_id: str, resolve: bool = False, capturer: Capturer | None = None
+    root: str,
+    database_url: str | None,
+    job_id: str,
+    resolve: bool = False,
+    capturer: Capturer | None = None,
+    camera_model: str | None = None,
 ) -> None:
     """Carry out a job, in this process or on a worker; its result goes to the registry. Never raises."""
     store = Store(root, database_url)
@@ -120,6 +130,8 @@ def run_job(
                 carry_out(kind, Path(source), tell)
             else:
                 request = _request(store, cast(Goal, kind), source, job_id, resolve)
+                if camera_model is not None:
+                    request = replace(request, models=_models(store, request, camera_model))
                 run_pipeline(request, tell.pipeline, store=store, capturer=capturer)
         except Cancelled:
             _over(store, job_id, "cancelled", None)
@@ -147,6 +159,17 @@ def _request(store: Store, kind: Goal, source: str, job_id: str, resolve: bool) 
         reuse=kind != "pipeline",
         report_file=page,
     )
+
+
+def _models(store: Store, request: PipelineRequest, camera_model: str) -> dict[Side, CameraFile]:
+    """The cameras that stand in for the fitted ones. Raises InputError where the model lacks one."""
+    from lab.calibration import camera_models
+
+    assert request.recordings is not None
+    found = camera_models.camera_files(store, camera_models.record(store, camera_model))
+    if missing := [side for side in request.recordings.sides if side not in found]:
+        raise InputError(f"camera model {camera_model}: has no {' and no '.join(missing)} camera; name one that has")
+    return {side: found[side] for side in request.recordings.sides}
 
 
 def _over(store: Store, job_id: str, state: JobState, error: str | None) -> None:
@@ -246,17 +269,30 @@ class JobRunner:
                     )
             return self._client
 
-    def submit(self, kind: JobKind, source: str, *, resolve: bool = False, capturer: Capturer | None = None) -> str:
+    def submit(
+        self,
+        kind: JobKind,
+        source: str,
+        *,
+        resolve: bool = False,
+        capturer: Capturer | None = None,
+        camera_model: str | None = None,
+    ) -> str:
         """Queue a job on a session's id, a recording set's folder, or a challenge's; returns the job's id.
 
         `capturer`: how the job reaches the instruments; with one, the job runs in a thread of this process. `resolve`: of a
-        pipeline, take the captures that tell the remaining rivals apart. Raises InputError for an unknown kind, and for
-        `resolve` where the job can't capture.
+        pipeline, take the captures that tell the remaining rivals apart. `camera_model`: id of one that stands in for the fitted
+        cameras of a validation or a diagnosis. Raises InputError for an unknown kind, and for `resolve` or `camera_model` where the job
+        can't take it.
         """
         if kind not in KINDS:
             raise InputError(f"job {kind!r}: no such work; choose from {', '.join(KINDS)}")
         if resolve and (kind != "pipeline" or capturer is None):
             raise InputError(f"job {kind}: only a pipeline on a session's station can resolve; leave resolve out")
+        if camera_model is not None and kind not in ("validate", "diagnose"):
+            raise InputError(
+                f"camera_model: a job of the kind {kind} takes none; leave it out, or validate or diagnose with it"
+            )
         client = self._dask() if capturer is None else None
         job_id = secrets.token_hex(8)
         with self.store.transaction() as db:
@@ -278,7 +314,7 @@ class JobRunner:
             self._started[job_id] = thread
             thread.start()
         else:
-            future = client.submit(run_job, *work, key=f"job-{job_id}", pure=False)
+            future = client.submit(run_job, *work, camera_model=camera_model, key=f"job-{job_id}", pure=False)
             self._started[job_id] = future
             future.add_done_callback(lambda _: self._left(job_id))
         return job_id

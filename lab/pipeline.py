@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -356,9 +356,10 @@ class _Pipeline:
             return None
         if self.store.session(self._session).state != "finished":
             return None
-        for found in self.store.results(self._session, kind)[:1]:
-            self._results[kind] = found.id
-            return model.model_validate(found.document)
+        for found in self.store.results(self._session, kind):
+            if found.document.get("baseline") is None:  # of the fitted cameras, not of others that stood in for them
+                self._results[kind] = found.id
+                return model.model_validate(found.document)
         return None
 
     # --- the steps -------------------------------------------------------------------------------------------------------
@@ -422,7 +423,7 @@ class _Pipeline:
                 self.fitted,
                 models=self.request.models,
                 progress=lambda what, share: self._say("validate", what, share),
-            )
+            ).model_copy(update={"baseline": self._baseline})
             self._keep("validate", self._validation)
 
     def _diagnose_step(self) -> None:
@@ -439,7 +440,7 @@ class _Pipeline:
         from lab.diagnose import examine
 
         begun = 0.1 if step == "resolve" else 0.0
-        return examine(
+        found = examine(
             recordings,
             self.fitted,
             lambda what, share: self._say(step, what, begun + (1.0 - begun) * share),
@@ -448,12 +449,16 @@ class _Pipeline:
             bootstrap=self.request.bootstrap,
             workers=self.request.workers,
         )
+        return replace(found, result=found.result.model_copy(update={"baseline": self._baseline}))
+
+    @property
+    def _baseline(self) -> str | None:
+        """Names of the camera files that stand in for the fitted cameras."""
+        return ", ".join(dict.fromkeys(one.name for one in self.request.models.values())) or None
 
     def _resolve_step(self) -> None:
         """Take the best capture that a station can take by itself, and diagnose with it again, until no rivals are left or no
         capture is worth taking."""
-        from dataclasses import replace
-
         from lab.diagnose.policy import DecisionPolicy
         from lab.formats.results import Resolution
 

@@ -78,7 +78,7 @@ export function chart({ title, series, x, y }) {
   for (const one of series) {
     const drawn = svg("g", { class: `series c${one.colour}` });
     const points = one.points.filter(([a, b]) => across.takes(a) && up.takes(b)).map(([a, b]) => [across.place(a), up.place(b)]);
-    if (one.line && points.length) drawn.append(svg("path", { class: "line", d: `M${points.map((p) => p.map((v) => v.toFixed(1)).join(" ")).join("L")}` }));
+    if (one.line && points.length) drawn.append(svg("path", { class: one.dashed ? "line dashed" : "line", d: `M${points.map((p) => p.map((v) => v.toFixed(1)).join(" ")).join("L")}` }));
     else drawn.append(...points.map(([a, b]) => SHAPES[one.colour % SHAPES.length](a, b)));
     picture.append(drawn);
   }
@@ -87,12 +87,12 @@ export function chart({ title, series, x, y }) {
 
 // The key of a chart: a name beside a mark of its colour and shape.
 export const key = (names) =>
-  names.map(({ name, colour }) => {
+  names.map(({ name, colour, line, dashed }) => {
     const entry = document.createElement("span");
     entry.className = "key";
     const mark = svg("svg", { viewBox: "0 0 10 10", "aria-hidden": "true" });
     const inside = svg("g", { class: `series c${colour}` });
-    inside.append(SHAPES[colour % SHAPES.length](5, 5));
+    inside.append(line ? svg("path", { class: dashed ? "line dashed" : "line", d: "M0 5L10 5" }) : SHAPES[colour % SHAPES.length](5, 5));
     mark.append(inside);
     entry.append(mark, name);
     return entry;

@@ -1,6 +1,8 @@
 // The operator's page: what runs now, the sessions, the jobs and their reports. No framework: a few functions over fetch.
 
 import { showCalibrations } from "./calibrations.js";
+import { challengesAre, showChallenges } from "./challenges.js";
+import { showFindings } from "./findings.js";
 import { $, Problem, api, ask, element, post, put, show, time, told } from "./page.js";
 import { asked as planned, showPlan } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";
@@ -46,6 +48,7 @@ async function enter() {
   $("halt").hidden = !["operate", "admin"].includes(me.scope);
   stationsAre(me.scope, () => refresh().catch(() => {}));
   queueIs(refresh);
+  challengesAre(me.scope, refresh);
   recordingsAre(me.scope, async () => (await showRecordings(), await refresh()));
   await refresh();
   await Promise.all([showCalibrations(), showRecordings()]);
@@ -158,7 +161,7 @@ function jobRow(job) {
     cancel.addEventListener("click", guarded("job-problem", () => post(`/jobs/${job.id}/cancel`)));
     actions.append(cancel);
   } else if (job.state === "done") {
-    const made = { report: ["report"], pipeline: ["report", "result"] }[job.kind] ?? ["result"];
+    const made = job.challenge_id ? [] : ({ report: ["report"], pipeline: ["report", "result"] }[job.kind] ?? ["result"]);
     for (const what of made) {
       const label = what === "report" ? "Report" : "JSON";
       const link = { href: `${api}/jobs/${job.id}/${what}`, textContent: label, target: "_blank", rel: "noopener" };
@@ -173,7 +176,7 @@ function jobRow(job) {
   return element(
     "tr",
     {},
-    element("td", { textContent: job.kind }),
+    element("td", { textContent: job.kind.replace("-", " ") }),
     element("td", { textContent: job.of }),
     element("td", { className: "when", textContent: time(job.created) }),
     state,
@@ -324,13 +327,16 @@ async function refresh() {
   await showQueue();
   show("sessions", sessions, sessionRow);
   $("no-sessions").hidden = sessions.length > 0;
-  show("jobs", jobs.map((job) => ({ ...job, of: names.get(job.session_id) ?? job.session_id ?? `recordings ${job.recordings_id}` })), jobRow);
+  const challenges = await showChallenges(jobs);
+  const of = (job) => (job.challenge_id ? (challenges.get(job.challenge_id) ?? "a challenge") : (names.get(job.session_id) ?? job.session_id ?? `recordings ${job.recordings_id}`));
+  show("jobs", jobs.map((job) => ({ ...job, of: of(job) })), jobRow);
   $("no-jobs").hidden = jobs.length > 0;
   const done = jobs.filter((job) => job.state === "done").length;
   if (done !== jobsDone) await showCalibrations(); // a fit is a new candidate
   jobsDone = done;
   if (!watches() && live.length) watch(live[0]);
   await showWatched();
+  if (selected) await showFindings(selected, jobs.filter((job) => job.session_id === selected && job.state === "done").length);
   if (ended || running.includes(selected)) await showCaptures();
 }
 

@@ -1,19 +1,22 @@
-"""The camera models that fits and diagnoses found, and two calibrations compared."""
+"""The camera models that fits and diagnoses found or that were sent in, and two calibrations compared."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
-from api.archives import Zip, zipped
-from api.errors import Conflict, answers, known
+from api.archives import ARCHIVE, Form, Packed, sent
+from api.errors import Conflict, answers
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import CameraModels, Comparison
 from api.security import REPORT_POLICY
-from api.service import READ, Here, HexId, Service
+from api.sending import BODY, arrived
+from api.service import CALIBRATE, READ, Here, HexId, Service, camera_model
+from api.upload import take_cameras
 from lab.calibration import camera_models
 from lab.calibration.camera_models import CameraModelRecord
 from lab.errors import InputError
@@ -31,53 +34,82 @@ router = APIRouter(tags=["calibrations"])
 
 def _fields(service: Service, record: CameraModelRecord) -> CameraModels:
     recordings_id = service.inbox.id_of(record.source)
+    of_session = recordings_id is None and record.kind != "sent"
     return CameraModels(
         id=record.id,
         kind=record.kind,
-        session_id=record.source if recordings_id is None else None,
+        session_id=record.source if of_session else None,
         recordings_id=recordings_id,
         created=record.created,
         sides=record.sides,
     )
 
 
-def _record(service: Service, model_id: str) -> CameraModelRecord:
-    missing = f"no camera model {model_id!r}; GET /api/v1/camera-models lists them"
-    return known(missing, lambda: camera_models.record(service.store, model_id))
+def _whole(service: Service, model_id: str) -> CameraModels:
+    record = camera_model(service, model_id)
+    return _fields(service, record).model_copy(update={"cameras": camera_models.cameras(service.store, record)})
 
 
 @router.get("/camera-models", dependencies=[READ], responses=answers(401, 422) | {200: {"headers": HEADERS}})
 def list_camera_models(
     service: Here, request: Request, response: Response, after: IdCursor = None, limit: Limit = PAGE
 ) -> list[CameraModels]:
-    """The camera models of fits (`fitted`) and diagnoses (`improved`: with the effects that were named), the newest first, in pages. `sides` is
-    empty for results from before models were kept."""
+    """The camera models of fits (`fitted`), of diagnoses (`improved`: with the effects that were named), and those that were sent in (`sent`), the
+    newest first, in pages. `sides` is empty for results from before models were kept."""
     found = camera_models.records(service.store, after, limit)
     page_headers(request, response, camera_models.count(service.store), limit, [one.id for one in found])
     return [_fields(service, one) for one in found]
 
 
+@router.post(
+    "/camera-models",
+    status_code=201,
+    dependencies=[CALIBRATE],
+    responses=answers(401, 403, 413, 422, 503),
+    openapi_extra=BODY,
+)
+async def send_camera_model(service: Here, request: Request, response: Response) -> CameraModels:
+    """Send in camera files, left.toml or right.toml or both, with the arrays that they name beside them, as a .zip, .tar or .tar.gz. Each is read
+    completely before it is kept. A traced lens is sent as its table, for no lens is traced here."""
+    async with arrived(service, request, service.limits.model_bytes) as came:
+        found = await asyncio.to_thread(take_cameras, came.place, came.archive, service.limits.model_bytes)
+        id = await asyncio.to_thread(camera_models.bring_in, service.store, found)
+    response.headers["Location"] = f"/api/v1/camera-models/{id}"
+    return await asyncio.to_thread(_whole, service, id)
+
+
 @router.get("/camera-models/{model_id}", dependencies=[READ], responses=answers(401, 404, 422))
 def get_camera_model(service: Here, model_id: HexId) -> CameraModels:
     """One camera model: the parameters of each camera with unit and meaning, what is known of their uncertainty, and the effects that act."""
-    record = _record(service, model_id)
-    return _fields(service, record).model_copy(update={"cameras": camera_models.cameras(service.store, record)})
+    return _whole(service, model_id)
+
+
+@router.delete(
+    "/camera-models/{model_id}", status_code=204, dependencies=[CALIBRATE], responses=answers(401, 403, 404, 409, 422)
+)
+def delete_camera_model(service: Here, model_id: HexId) -> None:
+    """Delete a camera model that was sent in, for ever. 409 for one that a fit or a diagnosis found: it is part of that result."""
+    camera_model(service, model_id)
+    try:
+        camera_models.remove(service.store, model_id)
+    except InputError as error:
+        raise Conflict(str(error)) from None
 
 
 @router.get(
-    "/camera-models/{model_id}/archive.zip",
+    "/camera-models/{model_id}/archive.{form}",
     dependencies=[READ],
-    response_class=Zip,
-    responses=answers(401, 404, 409, 422),
+    response_class=Packed,
+    responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
-def camera_model_archive(service: Here, model_id: HexId) -> Response:
+def camera_model_archive(service: Here, model_id: HexId, form: Form) -> Response:
     """Its camera files, SIDE.toml with the arrays beside them, as `calibench simulate --camera` and `--model` take them. 409 where none were
     kept."""
-    record = _record(service, model_id)
+    record = camera_model(service, model_id)
     if not record.sides:
         raise Conflict(f"camera model {model_id}: no camera file was kept; fit again")
     files = list(camera_models.files(service.store, model_id))
-    return zipped(packed((file.name, file.read_bytes()) for file in files), f"camera-{model_id}")
+    return sent(packed(((file.name, file.read_bytes()) for file in files), form), f"camera-{model_id}", form)
 
 
 # --- comparisons -------------------------------------------------------------------------------------------------------

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
 
-from api.archives import Zip
+from api.archives import ARCHIVE, Form, Packed
 from api.errors import Conflict, answers, known
 from api.kept_sets import challenge_folder
-from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, page_of
 from api.routes.jobs import accepted
 from api.schemas import Challenge, ChallengeJobStart, ChallengeStart, Job
 from api.service import CALIBRATE, READ, Here, HexId, Service
@@ -47,12 +47,9 @@ def list_challenges(
 ) -> list[Challenge]:
     """Challenges, the newest first, in pages."""
     every = service.challenges.all()
-    ids = [one.order.id for one in every]
-    if after is not None and after not in ids:
-        raise HTTPException(422, f"after: no challenge {after!r}; begin without it")
-    begin = ids.index(after) + 1 if after is not None else 0
-    page_headers(request, response, len(ids), limit, ids[begin : begin + limit])
-    return [_challenge(one) for one in every[begin : begin + limit]]
+    page = page_of([one.order.id for one in every], after, limit, "challenge")
+    page_headers(request, response, len(every), limit, page)
+    return [_challenge(one) for one in every if one.order.id in page]
 
 
 @router.get("/challenges/{challenge_id}", dependencies=[READ], responses=answers(401, 404, 422))
@@ -89,14 +86,14 @@ def start_challenge_job(service: Here, challenge_id: HexId, start: ChallengeJobS
 
 
 @router.get(
-    "/challenges/{challenge_id}/cases/{case}/archive.zip",
+    "/challenges/{challenge_id}/cases/{case}/archive.{form}",
     dependencies=[READ],
-    response_class=Zip,
-    responses=answers(401, 404, 409, 422),
+    response_class=Packed,
+    responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
-def challenge_case(service: Here, challenge_id: HexId, case: CaseName) -> Response:
-    """The recordings of a case, a recording set as a .zip: for other programs, or for a diagnosis of one's own."""
-    return challenge_folder(service, challenge_id, case).archive()
+def challenge_case(service: Here, challenge_id: HexId, case: CaseName, form: Form) -> Response:
+    """The recordings of a case, a recording set as a .zip or .tar: for other programs, or for a diagnosis of one's own."""
+    return challenge_folder(service, challenge_id, case).archive(form)
 
 
 def _opened(service: Service, challenge_id: str, what: Literal["score", "truths"]) -> Response:

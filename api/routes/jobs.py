@@ -14,7 +14,7 @@ from api.keys import Permission
 from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
 from api.schemas import Job, JobStart, PipelineResults, PipelineStart
 from api.security import REPORT_POLICY, Demand
-from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId
+from api.service import ADMIN, CALIBRATE, READ, Here, HexId, Service, SessionId, camera_model
 from lab.challenge.kept import WORK
 from lab.formats.results import DiagnosisResult, FitResult, ReportFile, ValidationResult
 from lab.jobs import JobInfo
@@ -41,6 +41,13 @@ def accepted(service: Service, job_id: str, response: Response) -> Job:
     return _job(service, service.jobs.job(job_id))
 
 
+def _submit(service: Service, start: JobStart, source: str) -> str:
+    """Queue a job that needs no instrument; its id. 404 for a camera model that isn't there, 409 for one without files."""
+    if start.camera_model is not None and not camera_model(service, start.camera_model).sides:
+        raise Conflict(f"camera model {start.camera_model}: no camera file was kept; fit again")
+    return service.jobs.submit(start.kind, source, resolve=start.resolve, camera_model=start.camera_model)
+
+
 @router.post(
     "/sessions/{session_id}/jobs",
     status_code=202,
@@ -63,7 +70,9 @@ def start_session_job(
                 f"session {session_id} is {service.state(info)}, not finished; wait for its end "
                 "or resume it, then start the job; a pipeline does both"
             )
-        return accepted(service, service.jobs.submit(start.kind, session_id, resolve=start.resolve), response)
+        return accepted(service, _submit(service, start, session_id), response)
+    if start.camera_model is not None:
+        raise HTTPException(422, "camera_model: a pipeline fits its own; leave it out, or validate or diagnose with it")
     if start.resolve or info.state != "finished":
         Demand(Permission.ADMIN)(request, None, None)
     station = service.station(start.station) if start.station is not None else service.store.station(session_id)
@@ -94,14 +103,14 @@ def start_pipeline(service: Here, start: PipelineStart, response: Response) -> J
     status_code=202,
     tags=["jobs"],
     dependencies=[CALIBRATE],
-    responses=answers(401, 403, 404, 422),
+    responses=answers(401, 403, 404, 409, 422),
 )
 def start_recordings_job(service: Here, recordings_id: HexId, start: JobStart, response: Response) -> Job:
     """Start work on recordings that were sent in. They have no station, so nothing can be resolved."""
     folder = str(service.recordings(recordings_id))
     if start.station is not None:
         raise HTTPException(422, "station: recordings that were sent in have none; leave it out")
-    return accepted(service, service.jobs.submit(start.kind, folder, resolve=start.resolve), response)
+    return accepted(service, _submit(service, start, folder), response)
 
 
 @router.get(
@@ -155,7 +164,7 @@ def job_events(service: Here, job_id: HexId) -> EventSourceResponse:
     def look() -> Job:
         return _job(service, service.jobs.job(job_id))
 
-    return stream(lambda stopping: watched(look, lambda job: job.state in over, "progress", stopping))
+    return stream(lambda stopping: watched(look, lambda job: job.state in over, "progress", stopping, service.changed))
 
 
 def _done(service: Service, job_id: str) -> JobInfo:

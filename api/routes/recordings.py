@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import re
 from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 
-from api.archives import Zip
+from api.archives import ARCHIVE, Form, Packed
 from api.errors import answers
 from api.kept_sets import sent_set
-from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers
+from api.pages_of_lists import HEADERS, PAGE, IdCursor, Limit, page_headers, page_of
 from api.schemas import Recordings, SentAs
+from api.sending import BODY, arrived
 from api.service import CALIBRATE, READ, Here, HexId
-from api.unpacking import NoRoom, TooMuch, check_room
-from api.upload import Foreign, as_in_archive, check_size, receive
+from api.unpacking import TooMuch
+from api.upload import Foreign
 from lab.errors import InputError
 from lab.formats.importers.import_options import ImportOptions, chart_corners, grid
 
 router = APIRouter()
-#: What an archive may be; its own first bytes say which it is.
-ARCHIVES = ("application/zip", "application/x-tar", "application/gzip")
-TYPES = (*ARCHIVES, "application/x-zip-compressed", "application/x-gzip", "application/octet-stream")
 
 
 def _recordings(id: str, manifest: dict[str, Any], warnings: tuple[str, ...] = ()) -> Recordings:
@@ -75,12 +72,7 @@ def _foreign(asked: SentAs) -> Foreign | None:
     tags=["recordings"],
     dependencies=[CALIBRATE],
     responses=answers(401, 403, 413, 422, 503),
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {archive: {"schema": {"type": "string", "format": "binary"}} for archive in ARCHIVES},
-        }
-    },
+    openapi_extra=BODY,
 )
 async def send_recordings(
     service: Here, request: Request, response: Response, asked: Annotated[SentAs, Query()]
@@ -89,34 +81,18 @@ async def send_recordings(
     archive holds recordings as `calibench import` takes them, which become a recording set; the other parameters state what that format
     doesn't."""
     foreign = _foreign(asked)
-    sent = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if sent not in TYPES:
-        raise HTTPException(422, f"Content-Type {sent[:60]!r}: send the archive itself, as {', '.join(ARCHIVES)}")
     limits = service.limits
-    stated = request.headers.get("content-length", "0")
-    with service.inbox.receiving() as place:
-        archive = place / "archive"
+    async with arrived(service, request, limits.upload_bytes) as sent:
         try:
-            stated_bytes = int(stated) if stated.isdecimal() else 0
-            check_size(stated_bytes, limits.upload_bytes)
-            check_room(place, stated_bytes)
-            with archive.open("wb") as file:
-                await receive(request.stream(), file, limits.upload_bytes)
             id, found = await asyncio.to_thread(
-                service.inbox.take_in, place, archive, limits.unpacked_bytes, limits.unpacked_files, foreign
+                service.inbox.take_in, sent.place, sent.archive, limits.unpacked_bytes, limits.unpacked_files, foreign
             )
+        except TooMuch:
+            raise
         except InputError as error:
-            if isinstance(error, TooMuch):
-                raise HTTPException(413, str(error), headers={"Connection": "close"}) from None
             raise InputError(_as_parameters(str(error)) if foreign is not None else str(error)) from None
-        except NoRoom as error:
-            raise HTTPException(503, str(error), headers={"Connection": "close"}) from None
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            raise HTTPException(503, "the data folder is full; make room", headers={"Connection": "close"}) from None
+        lines = tuple(sent.told(line) for line in found.warnings)
     response.headers["Location"] = f"/api/v1/recordings/{id}"
-    lines = tuple(service.public(as_in_archive(line, place)) for line in found.warnings)
     return _recordings(id, found.manifest.model_dump(include={"name", "notes", "cameras", "captures"}), lines)
 
 
@@ -128,10 +104,7 @@ def list_recordings(
 ) -> list[Recordings]:
     """Recordings that were sent in, the newest first, in pages."""
     ids = service.inbox.ids()
-    if after is not None and after not in ids:
-        raise HTTPException(422, f"after: no recordings {after!r}; begin without it")
-    begin = ids.index(after) + 1 if after is not None else 0
-    page = ids[begin : begin + limit]
+    page = page_of(ids, after, limit, "recordings")
     page_headers(request, response, len(ids), limit, page)
     return [_recordings(id, service.inbox.manifest(id)) for id in page]
 
@@ -144,15 +117,15 @@ def get_recordings(service: Here, recordings_id: HexId) -> Recordings:
 
 
 @router.get(
-    "/recordings/{recordings_id}/archive.zip",
+    "/recordings/{recordings_id}/archive.{form}",
     tags=["recordings"],
     dependencies=[READ],
-    response_class=Zip,
-    responses=answers(401, 404, 409, 422),
+    response_class=Packed,
+    responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
-def recordings_archive(service: Here, recordings_id: HexId) -> Response:
-    """The recording set as a .zip, as `POST /recordings` takes it: sent while it is packed, without a stated length."""
-    return sent_set(service, recordings_id).archive()
+def recordings_archive(service: Here, recordings_id: HexId, form: Form) -> Response:
+    """The recording set as a .zip or .tar, as `POST /recordings` takes it: sent while it is packed, without a stated length."""
+    return sent_set(service, recordings_id).archive(form)
 
 
 @router.delete(

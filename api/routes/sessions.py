@@ -11,7 +11,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from sse_starlette.event import ServerSentEvent
 from sse_starlette.sse import EventSourceResponse
 
-from api.archives import Zip
+from api.archives import ARCHIVE, Form, Packed
 from api.errors import answers, known
 from api.events import described, event, stream, watched
 from api.kept_sets import session_set
@@ -139,6 +139,7 @@ def get_session(service: Here, session_id: SessionId) -> SessionDetail:
             CaptureCount(kind=kind, side=side, captures=n)  # type: ignore[arg-type]
             for (kind, side), n in sorted(service.store.count_captures(session_id).items())
         ),
+        results=service.store.newest_results(session_id),
     )
 
 
@@ -156,16 +157,16 @@ def delete_session(service: Here, session_id: SessionId) -> None:
 
 
 @router.get(
-    "/sessions/{session_id}/archive.zip",
+    "/sessions/{session_id}/archive.{form}",
     tags=["sessions"],
     dependencies=[READ],
-    response_class=Zip,
-    responses=answers(401, 404, 409, 422),
+    response_class=Packed,
+    responses=answers(401, 404, 409, 422) | ARCHIVE,
 )
-def session_archive(service: Here, session_id: SessionId) -> Response:
-    """The session as a recording set, a .zip as `POST /recordings` takes it: sent while it is packed, without a stated length. 409 while it
+def session_archive(service: Here, session_id: SessionId, form: Form) -> Response:
+    """The session as a recording set, a .zip or .tar as `POST /recordings` takes it: sent while it is packed, without a stated length. 409 while it
     runs, because what it has is still changing, and where it has captured nothing."""
-    return session_set(service, session_id).archive()
+    return session_set(service, session_id).archive(form)
 
 
 @router.post(
@@ -217,7 +218,7 @@ async def _follow(service: Service, session_id: str, stopping: anyio.Event) -> A
     seen = None
     live = service.live.find(session_id)
     if live is None:  # another process runs it, or nobody does
-        async for told in watched(look, lambda session: session.state in OVER, "state", stopping):
+        async for told in watched(look, lambda session: session.state in OVER, "state", stopping, service.changed):
             yield told
         return
     yield event("state", await asyncio.to_thread(look))

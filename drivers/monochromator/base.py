@@ -81,6 +81,11 @@ def filter_place(filters: Sequence[OrderSortingFilter], wavelength_nm: float) ->
 class Monochromator(Instrument):
     """A monochromator behind a light source. `stop` and `close` leave the shutter closed."""
 
+    def shut_at_once(self) -> bool:
+        """Ask for a closed shutter before anything else is said, without an answer: the first thing after a crash. `connect` and `stop` follow,
+        which make sure. False where the instrument needs to be spoken to first, and nothing was asked. Raises `InstrumentError`."""
+        return False
+
     @abstractmethod
     def move_nm(self, wavelength_nm: float) -> None:
         """Go to a wavelength (nm; 0 is zero order, white light) with its order-sorting filter; returns on arrival."""

@@ -94,6 +94,12 @@ class Cornerstone260(WireInstrument, Monochromator):
     def check_slit_um(self, width_um: float) -> None:
         checked_slit_um(width_um)
 
+    def shut_at_once(self) -> bool:
+        with self._lock:
+            self._transport.open()
+            self._transport.write(b"\r\nABORT\r\nSHUTTER C\r\n")
+        return True
+
     def move_nm(self, wavelength_nm: float) -> None:
         wanted = checked_wavelength_nm(wavelength_nm, self.upper_nm)
         with self._conversation():

@@ -1,13 +1,14 @@
-"""The camera models that fits and diagnoses of the registry found, kept as camera files: `DATA/cameras/RESULT/SIDE.toml`.
+"""The camera models of the registry, kept as camera files: `DATA/cameras/RESULT/SIDE.toml`.
 
 A fit's model is the baseline with what was fitted; a diagnosis' has the effects that it named, too. They stay when the session is
-deleted. What was kept before there were such files has none: fit again.
+deleted. What was kept before there were such files has none: fit again. A model that was sent in belongs to no session.
 """
 
 from __future__ import annotations
 
 import logging
 import re
+import secrets
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -18,6 +19,7 @@ from typing import Any, Literal, get_args
 import sqlalchemy as sa
 from pydantic import BaseModel
 
+from lab.capture.records import now
 from lab.capture.store import Store
 from lab.capture.tables import ResultRow
 from lab.errors import InputError
@@ -28,9 +30,11 @@ from sim.camera import Side
 from sim.parameters import Frozen, declared
 
 log = logging.getLogger(__name__)
-Kind = Literal["fitted", "improved"]
+Kind = Literal["fitted", "improved", "sent"]
+#: The kind of result that a model which was sent in is registered as; nothing else has it.
+_SENT = "camera-model"
 #: A result's kind, and what its cameras are.
-KINDS: dict[str, Kind] = {"fit": "fitted", "diagnose": "improved"}
+KINDS: dict[str, Kind] = {"fit": "fitted", "diagnose": "improved", _SENT: "sent"}
 SIDES: tuple[Side, ...] = get_args(Side)
 _ID = re.compile(r"[0-9a-f]{16}")
 
@@ -65,7 +69,7 @@ class ModelOfCamera(Frozen):
 
 
 class CameraModelRecord(Frozen):
-    """The cameras of one result, by side."""
+    """The cameras of one result, by side. `source`: the session, or the folder of recordings; empty for what was sent in."""
 
     id: str
     kind: Kind
@@ -95,6 +99,27 @@ def keep(store: Store, result_id: str, cameras: Mapping[Side, CameraFile]) -> No
         partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def bring_in(store: Store, cameras: Mapping[Side, CameraFile]) -> str:
+    """Keep cameras that were sent in; the id of their model."""
+    id = secrets.token_hex(8)
+    keep(store, id, cameras)
+    with store.transaction() as db:
+        db.add(ResultRow(id=id, job_id=None, source="", kind=_SENT, created=now(), document={}))
+    return id
+
+
+def remove(store: Store, model_id: str) -> None:
+    """Delete a model that was sent in, for ever. Raises InputError where there is none, and for one that a fit or a diagnosis found."""
+    found = record(store, model_id)
+    if found.kind != "sent":
+        raise InputError(
+            f"camera model {model_id}: is {found.kind}, part of a result; only those that were sent in can be deleted"
+        )
+    with store.transaction() as db:
+        db.execute(sa.delete(ResultRow).where(ResultRow.id == model_id))
+    shutil.rmtree(_folder(store, model_id))
 
 
 def keep_fitted(store: Store, result_id: str, recordings: RecordingSet, fit: FitResult) -> None:
@@ -151,10 +176,15 @@ def files(store: Store, result_id: str) -> Iterator[Path]:
     yield from sorted(_folder(store, result_id).iterdir())
 
 
+def camera_files(store: Store, found: CameraModelRecord) -> dict[Side, CameraFile]:
+    """The cameras themselves."""
+    folder = _folder(store, found.id)
+    return {side: read_camera(folder / f"{side}.toml") for side in found.sides}
+
+
 def cameras(store: Store, found: CameraModelRecord) -> dict[Side, ModelOfCamera]:
     """What each camera file says."""
-    folder = _folder(store, found.id)
-    return {side: _camera(read_camera(folder / f"{side}.toml")) for side in found.sides}
+    return {side: _camera(content) for side, content in camera_files(store, found).items()}
 
 
 def _camera(content: CameraFile) -> ModelOfCamera:

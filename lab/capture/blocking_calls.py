@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import heapq
+import itertools
+import os
+import queue
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, TypeVar
@@ -16,21 +21,99 @@ T = TypeVar("T")
 STOP_S = 15.0
 
 
+#: How long (s) a thread without work is kept: starting one takes milliseconds where the cores are busy, and a step takes five.
+IDLE_S = 1.0
+_Work = tuple[Callable[[], Any], "Future[Any]"]
+
+
+class _Threads:
+    """Daemon threads that carry out one call after the other. One whose call never returns is replaced, and doesn't keep the process alive."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._idle: list[queue.SimpleQueue[_Work]] = []
+
+    def give(self, work: _Work) -> None:
+        """Have a call carried out at once."""
+        with self._lock:
+            taker = self._idle.pop() if self._idle else None
+        if taker is None:
+            taker = queue.SimpleQueue()
+            threading.Thread(target=self._take, args=(taker,), daemon=True, name="instrument").start()
+        taker.put(work)
+
+    def _take(self, mine: queue.SimpleQueue[_Work]) -> None:
+        while (work := self._next(mine)) is not None:
+            call, future = work
+            try:
+                result = call()
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+            del work, call, future  # what they hold isn't kept while the thread waits
+            with self._lock:
+                self._idle.append(mine)
+
+    def _next(self, mine: queue.SimpleQueue[_Work]) -> _Work | None:
+        """The next call; None where the thread ends."""
+        try:
+            return mine.get(timeout=IDLE_S)
+        except queue.Empty:
+            with self._lock:
+                if mine in self._idle:
+                    self._idle.remove(mine)
+                    return None
+            return mine.get()  # it was given just now
+
+
+class _Deadlines:
+    """One thread that calls what is due."""
+
+    def __init__(self) -> None:
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._changed = threading.Condition()
+        self._numbers = itertools.count()
+        self._thread: threading.Thread | None = None
+
+    def add(self, after_s: float, call: Callable[[], None]) -> None:
+        """Call it in `after_s`; it returns soon, and does nothing where it is no longer wanted."""
+        with self._changed:
+            heapq.heappush(self._due, (time.monotonic() + after_s, next(self._numbers), call))
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._watch, daemon=True, name="deadlines")
+                self._thread.start()
+            elif self._due[0][2] is call:
+                self._changed.notify()
+
+    def _watch(self) -> None:
+        while True:
+            with self._changed:
+                while not self._due or self._due[0][0] > time.monotonic():
+                    self._changed.wait(self._due[0][0] - time.monotonic() if self._due else None)
+                call = heapq.heappop(self._due)[2]
+            call()
+
+
+_threads, _deadlines = _Threads(), _Deadlines()
+
+
+def _after_fork() -> None:
+    """A child process has none of its parent's threads."""
+    global _threads, _deadlines
+    _threads, _deadlines = _Threads(), _Deadlines()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows, which doesn't fork
+    os.register_at_fork(after_in_child=_after_fork)
+
+
 def in_thread(call: Callable[[], T]) -> Future[T]:
     """Run a blocking call in a daemon thread, so that a call which never returns doesn't keep the process alive."""
     future: Future[T] = Future()
     # The call can't be cancelled, so the future must not be, either: it has to accept a late result.
     future.set_running_or_notify_cancel()
-
-    def work() -> None:
-        try:
-            result = call()
-        except BaseException as error:
-            future.set_exception(error)
-        else:
-            future.set_result(result)
-
-    threading.Thread(target=work, daemon=True, name="instrument").start()
+    _threads.give((call, future))
     return future
 
 
@@ -42,9 +125,7 @@ class Status:
         self._callbacks: list[Callable[[Any], None]] = []
         self._done = threading.Event()
         self._error: BaseException | None = None
-        self._watch = threading.Timer(timeout_s, self._late, args=(who, timeout_s))
-        self._watch.daemon = True
-        self._watch.start()
+        _deadlines.add(timeout_s, lambda: self._late(who, timeout_s))
         in_thread(call).add_done_callback(lambda future: self._finish(future.exception()))
 
     def _late(self, who: str, timeout_s: float) -> None:
@@ -57,7 +138,6 @@ class Status:
             self._error = error
             self._done.set()
             callbacks, self._callbacks = self._callbacks, []
-        self._watch.cancel()
         for callback in callbacks:
             with contextlib.suppress(RuntimeError):  # the run was aborted meanwhile: its loop is closed, nobody waits
                 callback(self)

@@ -19,6 +19,7 @@ import hashlib
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -57,6 +58,9 @@ from lab.formats.spectrum_csv import format_spectrum
 from sim.camera import Side
 from sim.spectrum import Spectrum
 
+#: How long (s) the API's keys are taken as known, where another process may change them.
+KEYS_S = 0.5
+
 
 class Store:
     """The data folder and its registry. Threads may share one; each process opens its own.
@@ -76,6 +80,7 @@ class Store:
         self._engine = open_engine(self.settings.url)
         self._read = sessionmaker(self._engine, expire_on_commit=False)
         self._write = sessionmaker(self._engine.execution_options(writes=True), expire_on_commit=False)
+        self._keys: tuple[float, list[tuple[str, str, str]]] = (0.0, [])
         upgrade(self._engine, self.root)
 
     @classmethod
@@ -517,6 +522,12 @@ class Store:
                 raise InputError(f"result {result_id!r} isn't in {self.root}; list the results of a session")
             return ResultInfo.model_validate(row)
 
+    def newest_results(self, source: str) -> dict[str, str]:
+        """Kind -> id of the newest result of that kind, of one session (or recording set's folder)."""
+        asked = sa.select(ResultRow.kind, ResultRow.id).where(ResultRow.source == source).order_by(ResultRow.created)
+        with self.reading() as db:
+            return {row.kind: row.id for row in db.execute(asked)}
+
     def results(self, source: str | None = None, kind: str | None = None) -> list[ResultInfo]:
         """Results, the newest first; of one session (or recording set's folder) and one kind, or all."""
         asked = sa.select(ResultRow).order_by(ResultRow.created.desc())
@@ -529,10 +540,17 @@ class Store:
 
     # --- keys ------------------------------------------------------------------------------------------------------------
 
-    def keys(self) -> list[tuple[str, str, str]]:
-        """(name, scope, SHA-256) of every API key."""
-        with self.reading() as db:
-            return [(row.name, row.scope, row.sha256) for row in db.scalars(sa.select(KeyRow).order_by(KeyRow.name))]
+    def keys(self, anew: bool = True) -> list[tuple[str, str, str]]:
+        """(name, scope, SHA-256) of every API key; unless `anew`, as another process may have left them `KEYS_S` ago."""
+        if anew or not self.knows_keys():
+            with self.reading() as db:
+                rows = db.scalars(sa.select(KeyRow).order_by(KeyRow.name))
+                self._keys = (time.monotonic() + KEYS_S, [(row.name, row.scope, row.sha256) for row in rows])
+        return self._keys[1]
+
+    def knows_keys(self) -> bool:
+        """Whether `keys(anew=False)` asks nothing of the registry now."""
+        return time.monotonic() < self._keys[0]
 
     def add_key(self, name: str, scope: str, sha256: str) -> None:
         """Register an API key by its hash. Raises InputError if the name is taken."""
@@ -541,6 +559,7 @@ class Store:
                 db.add(KeyRow(name=name, scope=scope, sha256=sha256, created=now()))
         except sa.exc.IntegrityError as error:
             raise InputError(f"an API key called {name!r} exists; choose another name or remove it") from error
+        self._keys = (0.0, [])
 
     def remove_key(self, name: str) -> None:
         """Remove an API key."""
@@ -549,6 +568,7 @@ class Store:
             if row is None:
                 raise InputError(f"no API key is called {name!r}; list them for their names")
             db.delete(row)
+        self._keys = (0.0, [])
 
 
 def _captures_of(asked: Any, session_id: str, kind: str | None = None, side: str | None = None) -> Any:

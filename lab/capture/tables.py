@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from lab.capture.file_lock import Lock
 from lab.errors import InputError
 
 
@@ -217,37 +213,16 @@ def open_engine(url: str) -> sa.Engine:
     return engine
 
 
+#: The registry's migrations; a revision's name begins the name of its file.
+VERSIONS = Path(__file__).parent / "migrations" / "versions"
+
+
 def upgrade(engine: sa.Engine, folder: Path) -> None:
     """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry."""
-    config = Config()
-    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
-    scripts = ScriptDirectory.from_config(config)
-    newest, known = scripts.get_current_head(), {script.revision for script in scripts.walk_revisions()}
-    lock = Lock(folder / ".migration.lock")
-    if not lock.acquire(patience_s=60.0):
-        raise InputError(f"{folder}: its registry is being migrated by another process; try again when it is done")
-    try:
-        with engine.execution_options(writes=True).connect() as connection:
-            found = MigrationContext.configure(connection).get_current_revision()
-            if found == newest:
-                return
-            if found is not None and found not in known:
-                raise InputError(
-                    f"{folder}: its registry has the revision {found}, written by a newer calibench; install that version, or restore "
-                    "the backup of before the upgrade"
-                )
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
-            connection.commit()
-    except sa.exc.OperationalError as error:
-        raise InputError(
-            f"registry {engine.url!r}: can't be reached ({' '.join(str(error.orig).split())}); start it, or correct "
-            "CALIBENCH_DATABASE_URL"
-        ) from error
-    except sa.exc.DatabaseError as error:
-        raise InputError(
-            f"{engine.url}: isn't a registry ({str(error.orig or error).splitlines()[0]}); "
-            "set CALIBENCH_DATA to another folder"
-        ) from error
-    finally:
-        lock.release()
+    newest = max(file.name.partition("_")[0] for file in VERSIONS.glob("[0-9]*.py"))
+    with contextlib.suppress(sa.exc.SQLAlchemyError), engine.connect() as connection:
+        if connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalars().all() == [newest]:
+            return
+    from lab.capture.migrate import migrate  # here, as what it needs takes a tenth of a second to load
+
+    migrate(engine, folder)

@@ -13,10 +13,23 @@ import os
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+import sys
+
 from lab.memory import share_arenas
 
 share_arenas()
 
-from lab.cli.entry import main
-
 __all__ = ["main"]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["serve"] and "--help" not in given:
+        # Before anything that takes time is loaded, the command line's own library among it: a shutter may be open.
+        from lab.capture.close_shutters import close_at_start
+
+        close_at_start(given)
+    from lab.cli.entry import main as run
+
+    return run(arguments)

@@ -64,9 +64,14 @@ class CameraFile:
 
 
 def read_camera(
-    file: Path, cache: Path | None = None, progress: Callable[[str, float], None] | None = None
+    file: Path,
+    cache: Path | None = None,
+    progress: Callable[[str, float], None] | None = None,
+    *,
+    sent: bool = False,
 ) -> CameraFile:
-    """Read a camera file. `cache`: folder of traced lenses' tables (None: `lens_cache`).
+    """Read a camera file. `cache`: folder of traced lenses' tables (None: `lens_cache`). `sent`: it came from elsewhere, so that the files it
+    names are looked for in its folder alone, and no lens is traced.
 
     Raises InputError, in one line, that names file, key, value, limit and remedy.
     """
@@ -84,11 +89,11 @@ def read_camera(
     for curves in CURVES:
         if isinstance(values.get(curves), dict):
             values[curves] = {
-                channel: _curve(file, f"{curves}.{channel}", of) for channel, of in values[curves].items()
+                channel: _curve(file, f"{curves}.{channel}", of, sent) for channel, of in values[curves].items()
             }
     prescription = None
     if isinstance(values.get("lens"), dict) and isinstance(values["lens"].get("imaging"), dict):
-        imaging, prescription = _imaging(file, values["lens"]["imaging"], cache, progress)
+        imaging, prescription = _imaging(file, values["lens"]["imaging"], cache, progress, sent)
         values["lens"] = values["lens"] | {"imaging": imaging}
     camera = _validated(file, "", CameraModel, values)
     _check_levels(file, camera)
@@ -101,11 +106,19 @@ def read_camera(
     return CameraFile(name, camera, tuple(_effect(file, k, one) for k, one in enumerate(acting)), prescription)
 
 
-def _curve(file: Path, key: str, given: Any) -> Any:
+def _beside(file: Path, key: str, path: str, sent: bool) -> Path:
+    """A file that a camera file names. Raises InputError where it lies outside the folder of one that was sent."""
+    found = file.parent / path
+    if sent and ("\0" in path or not found.resolve().is_relative_to(file.parent.resolve())):
+        raise InputError(f"{file}: {key}: {path[:80]!r} leaves the folder; put the file beside the camera file")
+    return found
+
+
+def _curve(file: Path, key: str, given: Any, sent: bool) -> Any:
     """A spectrum's samples, from the CSV file where it is a path."""
     if not isinstance(given, str):
         return given
-    beside = file.parent / given
+    beside = _beside(file, key, given, sent)
     try:
         return parse_spectrum(beside.read_text(encoding="utf-8")).model_dump()
     except (OSError, UnicodeDecodeError) as error:
@@ -117,7 +130,11 @@ def _curve(file: Path, key: str, given: Any) -> Any:
 
 
 def _imaging(
-    file: Path, given: Mapping[str, Any], cache: Path | None, progress: Callable[[str, float], None] | None
+    file: Path,
+    given: Mapping[str, Any],
+    cache: Path | None,
+    progress: Callable[[str, float], None] | None,
+    sent: bool,
 ) -> tuple[Any, Path | None]:
     """The keys of `lens.imaging` with the files that they name read in, and the prescription among them."""
     values = dict(given)
@@ -129,7 +146,9 @@ def _imaging(
                 f'{file}: {key} of a traced lens has the keys {", ".join(values)}; give kind and either prescription = "FILE.zmx" or table = "FILE.npz"'
             )
         which, path = next(iter(named.items()))
-        beside = file.parent / path
+        if sent and which == "prescription":
+            raise InputError(f"{file}: {key}.prescription: a lens isn't traced here; trace it and send its table")
+        beside = _beside(file, f"{key}.{which}", path, sent)
         try:
             if which == "table":
                 return {"kind": "traced_lens", "table": LensTable.load(beside)}, None
@@ -138,7 +157,7 @@ def _imaging(
             raise InputError(f"{file}: {key}.{which}: {_first(error)}") from error
     if "samples" not in values:
         return values, None
-    beside = file.parent / str(values.pop("samples"))
+    beside = _beside(file, f"{key}.samples", str(values.pop("samples")), sent)
     try:
         stored = np.load(beside, allow_pickle=False)
         if isinstance(stored, np.ndarray):

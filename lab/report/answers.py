@@ -145,23 +145,31 @@ def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
     return float(np.sqrt(np.mean(np.square((np.asarray(curve.measured) - np.asarray(values)) / std))))
 
 
+def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
+    """The two measurements that the baseline fits worst; none where nothing was named."""
+    if not diagnosis.effects:
+        return []
+    return worst_of_each([curve for curve in diagnosis.curves if len(curve.x) > 3], PROOFS)
+
+
+def proof_words(curve: ResidualCurve) -> tuple[str, str]:
+    """Title and caption of such a measurement."""
+    before, after = _missed(curve.before, curve), _missed(curve.after, curve)
+    title = measurement_title(curve.measurement)
+    caption = (
+        f"{curve.label}{', held out' if curve.held_out else ''}: rms residual {_short(before)} σ without the effects, "
+        f"{_short(after)} σ with them."
+    )
+    return f"{title[0].upper()}{title[1:]}, {curve.side}, {curve.channel}", caption
+
+
 def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
     """Charts: the two measurements that the baseline fits worst, with both models; of a healthy or an undiagnosed camera, its photon
     transfer."""
     shown = []
-    if diagnosis is not None and diagnosis.effects:
-        curves = [curve for curve in diagnosis.curves if len(curve.x) > 3]
-        for curve in worst_of_each(curves, PROOFS):
-            before, after = _missed(curve.before, curve), _missed(curve.after, curve)
-            title = measurement_title(curve.measurement)
-            shown.append(
-                Proof(
-                    title=f"{title[0].upper()}{title[1:]}, {curve.side}, {curve.channel}",
-                    caption=f"{curve.label}{', held out' if curve.held_out else ''}: rms residual {_short(before)} σ without "
-                    f"the effects, {_short(after)} σ with them.",
-                    figure=charts.residual_curve(curve),
-                )
-            )
+    for curve in proof_curves(diagnosis) if diagnosis is not None else ():
+        title, caption = proof_words(curve)
+        shown.append(Proof(title=title, caption=caption, figure=charts.residual_curve(curve)))
     for side, camera in fit.cameras.items():
         figure = charts.photon_transfer(camera.noise) if camera.noise is not None else None
         if len(shown) < PROOFS and figure is not None:

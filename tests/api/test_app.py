@@ -169,3 +169,19 @@ def test_a_device_that_fails_is_503_and_a_defect_500(
         assert response.status_code == 500
         assert "secret" not in response.text and response.headers["x-content-type-options"] == "nosniff"
         assert "secret" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"station": "fakes", "sequences": ["magic"]}, "sequences.0: 'magic' is no sequence; choose from dark,"),
+        ({"station": "fakes", "not_before": "2030-01-01T00:00:00Z"}, "not_before: goes with queue = true; give both"),
+        ({"station": "fakes", "quick": 7}, "quick: 7: Input should be a valid boolean"),
+    ],
+)
+def test_a_refusal_names_the_field_and_its_value_once(shared: Running, body: dict[str, Any], said: str) -> None:
+    with shared.client() as client:
+        detail = client.post("/api/v1/sessions", json=body).json()["detail"]
+        assert detail.startswith(said) and "Value error" not in detail and "; sequences: " not in detail, detail
+        missing = client.get("/api/v1/nothing").json()
+        assert missing["status"] == 404 and "/docs" in missing["detail"]

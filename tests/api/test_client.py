@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -11,9 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import api.client
 import lab.fit
 from api.client import ServiceClient, ServiceProblem
 from api.pytest_plugin import FitReference
+from api.schemas import SessionStart, StoredSession
+from lab.capture.session import Progress
 from lab.formats.results import FitResult
 from tests.api.conftest import Running
 from tests.lab.calibration.test_life import fitted, limits
@@ -61,6 +67,64 @@ def test_what_is_refused_is_an_exception_with_the_services_line(shared: Running)
         pytest.raises(ServiceProblem, match="401: no valid key"),
     ):
         client.me()
+
+
+#: What a client of a program has no use for: the page's login.
+OF_THE_PAGE = {("POST", "/login"), ("POST", "/logout")}
+#: Methods of the client that ask, and how; an archive's path gets the ending of the file that it is written to.
+ASKS = {"_get": "GET", "_pages": "GET", "_events": "GET", "_fetched": "GET", "_post": "POST", "_send": "POST"}
+
+
+def asked_by_the_client() -> set[tuple[str, str]]:
+    """(method, path) of every request that the client's source has, parameters as `{}`."""
+    found = set()
+    for call in ast.walk(ast.parse(Path(api.client.__file__).read_text())):
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute):
+            continue
+        texts = [ast.unparse(one).strip("f'\"") for one in call.args if isinstance(one, ast.Constant | ast.JoinedStr)]
+        paths = [re.sub(r"{.*?}", "{}", one.replace("{self.url}", "")) for one in texts if "/" in one]
+        if call.func.attr == "get" and paths == ["{}/health"]:
+            continue
+        how = ASKS.get(call.func.attr) or next((one for one in texts if one in ("GET", "PUT", "POST", "DELETE")), "GET")
+        ending = ".{}" if call.func.attr == "_fetched" else ""
+        found |= {(how, f"{path}{ending}") for path in paths}
+    return found
+
+
+def test_the_client_has_a_method_for_every_operation() -> None:
+    described = json.loads((ROOT / "docs" / "reference" / "openapi.json").read_text())["paths"]
+    wanted = {
+        (method.upper(), re.sub(r"{.*?}", "{}", path.removeprefix("/api/v1")))
+        for path, methods in described.items()
+        for method in methods
+    }
+    assert wanted - asked_by_the_client() == OF_THE_PAGE
+
+
+def test_a_run_and_a_job_are_followed_to_their_end(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lab.fit, "fit_recording_set", lambda *_: fitted(2.0))
+    with ServiceClient(running.url, running.keys["admin"]) as client:
+        started = client.start_session(SessionStart(station="fakes", quick=True, sequences=("dark",)))
+        told = list(client.follow_session(started.id))
+        assert isinstance(told[-1], StoredSession) and told[-1].state == "finished"
+        assert any(isinstance(one, Progress) for one in told)
+        *_, last = client.follow_job(client.start_job("fit", started.id).id)
+        assert last.state == "done"
+        with pytest.raises(ServiceProblem, match="no job"):
+            next(client.follow_job("0123456789abcdef"))
+
+
+def test_a_capture_is_looked_at(shared: Running) -> None:
+    with ServiceClient(shared.url, shared.keys["read"]) as client:
+        session = next(client.sessions())
+        first = next(client.captures(session.id))
+        assert client.stored_capture(session.id, first.id) == first
+        assert client.preview(session.id, first.id, width_px=32).startswith(b"\x89PNG")
+        means = [one.mean_dn for one in client.capture_figures(session.id, first.id).channels]
+        frame = client.frame(first)
+        np.testing.assert_allclose(np.mean(means), frame.mean(), rtol=1e-6)  # four channels of as many pixels
+        assert client.ready().status == "ok" and "calibench" in client.metrics()
+        assert client.effect(client.effects()[0].name) == client.effects()[0] and client.parameters()
 
 
 # --- the plugin --------------------------------------------------------------------------------------------------------

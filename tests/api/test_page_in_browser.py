@@ -15,6 +15,7 @@ import pytest
 from api.client import ServiceClient
 from lab.capture.queue import put_into_queue
 from tests.api.conftest import STATION, Running, serving, until_state
+from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
 from tests.peers import missing
 
@@ -57,6 +58,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         until_state(client, started["id"], "finished")
         for value in READ_NOISE_E:
             running.store.add_result("fit", started["id"], fitted(value).model_dump(mode="json"))
+        running.store.add_result("diagnose", started["id"], diagnosis().model_dump(mode="json"))
         put_into_queue(running.store, waits["id"], held="halted by a test")
         with ServiceClient(running.url, running.keys["admin"]) as sender:
             archive = sender.fetch_session(started["id"], running.store.root / "nightly.zip")
@@ -88,6 +90,9 @@ class Watched:
         self.page.click("#sessions tr:has(.state.finished) button:has-text('Open')")
         self.page.wait_for_selector("#captures img")
         self.page.wait_for_selector("#transfer svg .c1")  # from the process that looks at the captures
+        self.page.wait_for_selector("#findings-proofs figure:nth-child(2) svg .c3")
+        assert "infrared cut filter" in self.page.inner_text("#findings-answers").lower()
+        assert len(self.page.query_selector_all("#findings-pictures canvas")) == 2  # before and after
 
     def serious(self) -> list[str]:
         """What axe finds that is serious or critical."""
@@ -309,4 +314,23 @@ def test_a_session_is_planned_on_the_page(browser: Any, lab: Running) -> None:
     page.fill("#start-form input[name=name]", "as planned")
     page.click("#start")
     page.wait_for_selector("#sessions tr:has-text('as planned') td:has-text('/10')")
+    watched.close()
+
+
+def test_a_challenge_is_made_and_deleted(browser: Any, lab: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The drawing itself is a stand-in that ends at once, with no case made."""
+    monkeypatch.setattr("lab.jobs.carry_out", lambda *_: None)
+    watched = Watched(browser, lab)
+    watched.log_in(lab, "calibrate")
+    page = watched.page
+    page.fill("#challenge-form input[name=name]", "since the upgrade")
+    page.fill("#challenge-form input[name=cases]", "2")
+    page.press("#challenge-form input[name=cases]", "Enter")
+    page.wait_for_selector("#challenges tr:has-text('since the upgrade'):has-text('0/2')")
+    page.wait_for_selector("#jobs tr:has-text('make challenge'):has-text('since the upgrade') .state.done")
+    page.wait_for_selector("#challenges .state:has-text('unfinished')")
+    assert watched.serious() == []
+    page.on("dialog", lambda asked: asked.accept())
+    page.click("#challenges button:has-text('Delete'):not([disabled])")
+    page.wait_for_selector("#challenges tr", state="detached")
     watched.close()

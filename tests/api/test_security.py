@@ -46,7 +46,7 @@ ROUTES = [
     ("GET", "/sessions/{session_id}/captures/{capture_id}/figures", "read"),
     ("GET", "/sessions/{session_id}/curves", "read"),
     ("DELETE", "/sessions/{session_id}", "admin"),
-    ("GET", "/sessions/{session_id}/archive.zip", "read"),
+    ("GET", "/sessions/{session_id}/archive.{form}", "read"),
     ("GET", "/queue", "read"),
     ("PUT", "/sessions/{session_id}/queue", "operate"),
     ("DELETE", "/sessions/{session_id}/queue", "operate"),
@@ -58,10 +58,12 @@ ROUTES = [
     ("POST", "/calibrations/{calibration_id}/certify", "calibrate"),
     ("GET", "/figures", "read"),
     ("GET", "/history", "read"),
+    ("GET", "/sessions/{session_id}/findings", "read"),
+    ("GET", "/recordings/{recordings_id}/findings", "read"),
     ("GET", "/recordings", "read"),
     ("POST", "/recordings", "calibrate"),
     ("GET", "/recordings/{recordings_id}", "read"),
-    ("GET", "/recordings/{recordings_id}/archive.zip", "read"),
+    ("GET", "/recordings/{recordings_id}/archive.{form}", "read"),
     ("DELETE", "/recordings/{recordings_id}", "calibrate"),
     ("POST", "/recordings/{recordings_id}/jobs", "calibrate"),
     ("GET", "/jobs", "read"),
@@ -72,7 +74,9 @@ ROUTES = [
     ("GET", "/jobs/{job_id}/report", "read"),
     ("GET", "/camera-models", "read"),
     ("GET", "/camera-models/{model_id}", "read"),
-    ("GET", "/camera-models/{model_id}/archive.zip", "read"),
+    ("POST", "/camera-models", "calibrate"),
+    ("DELETE", "/camera-models/{model_id}", "calibrate"),
+    ("GET", "/camera-models/{model_id}/archive.{form}", "read"),
     ("GET", "/comparisons", "read"),
     ("GET", "/comparisons/page", "read"),
     ("GET", "/challenges", "read"),
@@ -80,13 +84,14 @@ ROUTES = [
     ("GET", "/challenges/{challenge_id}", "read"),
     ("DELETE", "/challenges/{challenge_id}", "calibrate"),
     ("POST", "/challenges/{challenge_id}/jobs", "calibrate"),
-    ("GET", "/challenges/{challenge_id}/cases/{case}/archive.zip", "read"),
+    ("GET", "/challenges/{challenge_id}/cases/{case}/archive.{form}", "read"),
     ("GET", "/challenges/{challenge_id}/score", "read"),
     ("GET", "/challenges/{challenge_id}/truths", "read"),
 ]
 #: What can't be used as it is sent here: an empty upload, a query without its parameters, a challenge of no case.
 UNUSABLE = {
     ("POST", "/recordings"),
+    ("POST", "/camera-models"),
     ("GET", "/history"),
     ("GET", "/comparisons"),
     ("GET", "/comparisons/page"),
@@ -127,6 +132,7 @@ def test_each_route_needs_a_key_of_its_scope(shared: Running, method: str, path:
         "model_id": "0" * 16,
         "challenge_id": "0" * 16,
         "case": "case-0001",
+        "form": "tar",
     }
     asked = "/api/v1" + re.sub(r"\{(\w+)\}", lambda found: ids[found[1]], path)
     body = BODIES.get(path, BODIES["jobs"] if path.endswith("/jobs") and method == "POST" else None)

@@ -3,7 +3,7 @@
 `read` checks a whole folder and reports all problems at once, one line each. `write` writes a folder completely or not at all. The kinds of capture are in `lab.capture_kinds`.
 """
 
-from lab.formats.recording_set.archive import archive, packed
+from lab.formats.recording_set.archive import ArchiveForm, archive, packed
 from lab.formats.recording_set.checks import inspect
 from lab.formats.recording_set.clipping import clipped_share
 from lab.formats.recording_set.files import FolderFiles, RecordingFiles
@@ -15,6 +15,7 @@ from lab.formats.recording_set.writing import write
 
 __all__ = [
     "RAWS",
+    "ArchiveForm",
     "DataSheet",
     "FolderFiles",
     "Frame",

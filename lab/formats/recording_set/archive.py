@@ -1,13 +1,18 @@
-"""A recording set as a .zip, made piece by piece while it is sent: unpacked, it is what `read` takes."""
+"""Files as an archive, made piece by piece while it is sent: unpacked, a recording set's is what `read` takes."""
 
 from __future__ import annotations
 
 import io
+import tarfile
 import zipfile
 from collections.abc import Iterable, Iterator
+from typing import Literal
 
 from lab.formats.recording_set.recordings import RecordingSet
 from lab.formats.recording_set.writing import contents
+
+#: A .zip has its list of files at the end; a .tar can be unpacked while it arrives.
+ArchiveForm = Literal["zip", "tar"]
 
 
 class _Sent(io.RawIOBase):
@@ -30,19 +35,26 @@ class _Sent(io.RawIOBase):
         return held
 
 
-def packed(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
-    """The pieces of a .zip of files, (path, content) each: one of them in memory at a time, stored without compression. Where `files` raises,
-    the archive has no list of files, so nobody takes it for a whole one."""
+def packed(files: Iterable[tuple[str, bytes]], form: ArchiveForm = "zip") -> Iterator[bytes]:
+    """The pieces of an archive of files, (path, content) each: one of them in memory at a time, stored without compression. Where `files` raises,
+    the archive has no end (a .zip: no list of files), so nobody takes it for a whole one."""
     sent = _Sent()
-    with zipfile.ZipFile(
-        sent, "w", zipfile.ZIP_STORED
-    ) as made:  # closed after an error, too; what that writes isn't sent
-        for path, content in files:
-            made.writestr(zipfile.ZipInfo(path), content)
-            yield sent.taken()
+    if form == "tar":
+        with tarfile.open(fileobj=sent, mode="w|") as tar:
+            for path, content in files:
+                member = tarfile.TarInfo(path)
+                member.size = len(content)
+                tar.addfile(member, io.BytesIO(content))
+                yield sent.taken()
+    else:
+        # Closed after an error, too; what that writes isn't sent.
+        with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as made:
+            for path, content in files:
+                made.writestr(zipfile.ZipInfo(path), content)
+                yield sent.taken()
     yield sent.taken()
 
 
-def archive(recordings: RecordingSet) -> Iterator[bytes]:
-    """The pieces of a .zip of the set, as `packed` makes it. Raises InputError where a frame is missing or damaged."""
-    return packed(contents(recordings))
+def archive(recordings: RecordingSet, form: ArchiveForm = "zip") -> Iterator[bytes]:
+    """The pieces of an archive of the set, as `packed` makes it. Raises InputError where a frame is missing or damaged."""
+    return packed(contents(recordings), form)

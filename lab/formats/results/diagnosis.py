@@ -293,3 +293,4 @@ class DiagnosisResult(Frozen):
     skipped: tuple[Skipped, ...] = ()
     summary: tuple[str, ...] = ()  # the diagnosis in sentences
     policy: tuple[PolicyRule, ...] = ()  # the rules of decision
+    baseline: str | None = None  # names of the camera files that it began with, where not with the fitted cameras

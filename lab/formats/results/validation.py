@@ -66,3 +66,4 @@ class ValidationResult(Frozen):
     source: str
     checks: tuple[Check, ...]
     skipped: tuple[Skipped, ...] = ()
+    baseline: str | None = None  # names of the camera files that stood in for the fitted cameras

@@ -10,7 +10,9 @@ import os
 import shutil
 import socket
 import stat
+import tarfile
 import threading
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -265,6 +267,28 @@ def test_a_stated_size_beyond_the_cap_is_refused_before_it_is_sent(tmp_path: Pat
         assert kept(running) == []
 
 
+@pytest.mark.parametrize("path", ["recordings", "camera-models"])
+def test_an_upload_that_breaks_off_leaves_nothing_and_is_no_defect(
+    running: Running, path: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "api.errors")
+    address = urlsplit(running.url)
+    with socket.create_connection((address.hostname, address.port), timeout=10) as line:
+        line.sendall(
+            f"POST /api/v1/{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/zip\r\nContent-Length: 30000\r\n"
+            f"Idempotency-Key: once\r\nAuthorization: Bearer {running.keys['calibrate']}\r\n\r\nPK".encode()
+        )
+    until = time.monotonic() + 30.0
+    while not caplog.messages:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    assert caplog.messages == [f"POST /api/v1/{path}: the client broke off"]
+    assert kept(running) == [] and not (running.store.root / "cameras").exists()
+    with running.client("calibrate") as client:  # and the key is free again
+        headers = ZIP | {"Idempotency-Key": "once"}
+        assert client.post(f"/api/v1/{path}", content=b"no archive", headers=headers).status_code == 422
+
+
 def test_a_full_disk_is_said_and_captures_keep_their_room(
     running: Running, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -395,14 +419,32 @@ def test_what_was_sent_in_is_fetched_again_and_deleted(
     assert not list(tmp_path.glob("*none.zip*"))
 
 
-def test_a_damaged_frame_breaks_the_archive_off(running: Running, folder: Path, tmp_path: Path) -> None:
+def test_a_set_is_fetched_as_a_tar_and_sent_in_again(running: Running, folder: Path, tmp_path: Path) -> None:
+    with ServiceClient(running.url, running.keys["calibrate"]) as client:
+        (tmp_path / "set.zip").write_bytes(packed(folder))
+        first = client.send_recordings(tmp_path / "set.zip")
+        fetched = client.fetch_recordings(first.id, tmp_path / "set.tar")
+        with tarfile.open(fetched, "r:") as tar:
+            # The manifest comes last: what breaks off before has none.
+            assert tar.getnames()[-1] == "manifest.json" and len(tar.getnames()) == 3
+        again = client.send_recordings(fetched)
+        assert again.model_dump(exclude={"id"}) == first.model_dump(exclude={"id"})
+        a, b = (recording.read(running.store.root / "recordings" / one.id) for one in (first, again))
+        for one, other in zip(a.captures(), b.captures(), strict=True):
+            np.testing.assert_array_equal(a.frame(one), b.frame(other))
+        with pytest.raises(ServiceProblem, match="422"):
+            client.fetch_recordings(first.id, tmp_path / "set.rar")
+
+
+@pytest.mark.parametrize("form", ["zip", "tar"])
+def test_a_damaged_frame_breaks_the_archive_off(running: Running, folder: Path, tmp_path: Path, form: str) -> None:
     with running.client("calibrate") as client:
         sent = send(client, packed(folder)).json()["id"]
         (running.store.root / "recordings" / sent / "frames" / "1.npy").write_bytes(b"damaged")
         with pytest.raises(httpx.RemoteProtocolError):
-            client.get(f"/api/v1/recordings/{sent}/archive.zip")
+            client.get(f"/api/v1/recordings/{sent}/archive.{form}")
         (running.store.root / "recordings" / sent / "frames" / "0.npy").unlink()
-        refused = client.get(f"/api/v1/recordings/{sent}/archive.zip")
+        refused = client.get(f"/api/v1/recordings/{sent}/archive.{form}")
         assert refused.status_code == 422 and "frames/0.npy" in refused.json()["detail"]
 
 

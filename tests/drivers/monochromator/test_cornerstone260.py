@@ -53,6 +53,27 @@ def test_a_cs260b_answers_before_it_arrives(served: Callable[..., str], echo: bo
         assert (bench.light.wavelength_nm, bench.light.filter_place) == (pytest.approx(700, abs=0.0125), 3)
 
 
+@pytest.mark.parametrize("kind", [Pty(), Tcp("127.0.0.1", 0)], ids=["pty", "tcp"])
+@pytest.mark.parametrize(
+    "left", [b"", b"HANDSHAKE 1\nGOWAVE 700\n", b"GOWA"], ids=["idle", "moving", "half a statement"]
+)
+def test_a_shutter_that_was_left_open_is_closed_before_anything_is_asked(
+    served: Callable[..., str], kind: Pty | Tcp, left: bytes
+) -> None:
+    bench = Bench()
+    mock = Mock(bench)
+    mock.receive(b"SHUTTER O\n" + left)
+    mono = Cornerstone260(served(mock, kind))
+    mono.shut_at_once()
+    until = time.monotonic() + 30.0
+    while bench.light.shutter_open:
+        assert time.monotonic() < until
+        time.sleep(0.002)
+    mono.connect()  # what it answered to that isn't taken for something else
+    assert not mono.shutter_is_open()
+    mono.close()
+
+
 @pytest.mark.parametrize("found", [False, True], ids=["off", "on"])
 def test_the_next_program_finds_the_handshake_as_it_was(served: Callable[..., str], found: bool) -> None:
     mock = Mock(Lamp())

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import InstrumentError, NoAnswer
+from lab.capture import blocking_calls
 from lab.capture.blocking_calls import Status, in_thread
 from lab.capture.devices import level_of
 from lab.formats.recording_set import DataSheet
@@ -63,6 +64,46 @@ def test_a_call_that_nobody_waits_for_any_more_ends_quietly() -> None:
     assert not future.cancel()
     go.set()
     assert future.result(10.0)
+
+
+def test_a_thread_takes_the_next_call_and_one_that_hangs_is_replaced() -> None:
+    first = in_thread(threading.get_ident).result(10.0)
+    hangs, go = threading.Event(), threading.Event()
+
+    def hang() -> int:
+        hangs.set()
+        go.wait(30.0)
+        return threading.get_ident()
+
+    _until_idle()
+    hanging = in_thread(hang)  # in the thread that was idle
+    assert hangs.wait(10.0)
+    others = {in_thread(threading.get_ident).result(10.0) for _ in range(3)}
+    go.set()
+    assert hanging.result(10.0) not in others and first not in others
+
+
+def _until_idle() -> None:
+    """Wait until a thread that was given work is there for the next call."""
+    until = time.monotonic() + 10.0
+    while not blocking_calls._threads._idle:
+        assert time.monotonic() < until
+        time.sleep(0.001)
+
+
+def test_calls_at_the_same_time_have_threads_of_their_own() -> None:
+    together = threading.Barrier(4, timeout=30.0)
+    assert sorted(one.result(30.0) for one in [in_thread(together.wait) for _ in range(4)]) == [0, 1, 2, 3]
+
+
+def test_a_deadline_is_kept_while_a_later_one_is_waited_for() -> None:
+    free = threading.Event()
+    later = Status("later", lambda: free.wait(30.0), 600.0)
+    told = threading.Event()
+    Status("sooner", lambda: free.wait(30.0), 0.01).add_callback(lambda _: told.set())
+    assert told.wait(30.0) and not later.done
+    free.set()
+    assert later.exception(30.0) is None
 
 
 def test_the_level_is_the_percentile_of_the_codes() -> None:

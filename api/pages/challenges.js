@@ -1,0 +1,86 @@
+// Challenges: recording sets of cameras that conceal something, made and scored by jobs; their truths are sealed until then.
+
+import { $, api, ask, element, post, show, time, told } from "./page.js";
+
+let after = () => {};
+let mayChange = false;
+
+export function challengesAre(scope, changed) {
+  mayChange = ["calibrate", "admin"].includes(scope);
+  after = changed;
+  $("challenge-form").hidden = !mayChange;
+}
+
+export const nameOf = (one) => one.name || one.id;
+
+function row({ one, working, score }) {
+  const made = Object.keys(one.seals).length;
+  const actions = element("td");
+  const does = (label, action, disabled = false, className = "") => {
+    const button = element("button", { textContent: label, disabled, className });
+    button.setAttribute("aria-label", `${label} ${nameOf(one)}`);
+    button.addEventListener("click", told("challenge-problem", async () => (await action(), after())));
+    actions.append(button, " ");
+  };
+  const opens = (what, label) => {
+    const link = element("a", { href: `${api}/challenges/${one.id}/${what}`, textContent: label, target: "_blank", rel: "noopener" });
+    link.setAttribute("aria-label", `${label} of ${nameOf(one)}`);
+    actions.append(link, " ");
+  };
+  if (one.scored) {
+    opens("score", "Score");
+    opens("truths", "Truths");
+  } else if (mayChange && made < one.cases) does("Go on", () => post(`/challenges/${one.id}/jobs`, { kind: "make" }), working);
+  else if (mayChange) does("Score", () => post(`/challenges/${one.id}/jobs`, { kind: "score" }), working);
+  if (mayChange) {
+    does("Delete", async () => {
+      if (confirm(`Delete ${nameOf(one)}, its recordings and its truths for ever?`)) await ask(`/challenges/${one.id}`, { method: "DELETE" });
+    }, working, "danger");
+  }
+  const words = one.scored ? "scored" : working ? "a job works on it" : made < one.cases ? "unfinished" : "sealed";
+  const state = element("td", {}, element("span", { className: `state ${one.scored ? "finished" : ""}`, textContent: words }));
+  if (score) state.append(element("div", { className: "hint", textContent: score }));
+  return element(
+    "tr",
+    {},
+    element("td", { textContent: nameOf(one), title: one.id }),
+    element("td", { className: "when", textContent: time(one.created) }),
+    element("td", { className: "number", textContent: `${made}/${one.cases}` }),
+    state,
+    actions,
+  );
+}
+
+const scores = new Map(); // of those that are scored, in words; they don't change
+
+async function scoreOf(one) {
+  if (!one.scored) return "";
+  if (!scores.has(one.id)) {
+    const found = await ask(`/challenges/${one.id}/score`);
+    const right = found.case_scores.filter((each) => each.right).length;
+    const false_ = `${found.false_names.count} of ${found.false_names.of} with a false name`;
+    const broken = found.broken_seals.length ? `, ${found.broken_seals.length} seals broken` : "";
+    scores.set(one.id, `${right} of ${found.case_scores.length} cases right, ${false_}${broken}`);
+  }
+  return scores.get(one.id);
+}
+
+// `jobs`: those that the page knows.
+export async function showChallenges(jobs) {
+  const known = await ask("/challenges?limit=50");
+  const working = new Set(jobs.filter((job) => ["queued", "running"].includes(job.state)).map((job) => job.challenge_id));
+  const told = await Promise.all(known.map(scoreOf));
+  show("challenges", known.map((one, at) => ({ id: one.id, one, working: working.has(one.id), score: told[at] })), row);
+  $("no-challenges").hidden = known.length > 0;
+  return new Map(known.map((one) => [one.id, nameOf(one)]));
+}
+
+$("challenge-form").addEventListener(
+  "submit",
+  told("challenge-problem", async (event) => {
+    const fields = event.target.elements;
+    await post("/challenges", { name: fields.name.value, cases: Number(fields.cases.value), size: fields.size.value });
+    fields.name.value = "";
+    await after();
+  }),
+);

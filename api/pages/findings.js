@@ -1,0 +1,74 @@
+// What a session's diagnosis found: in words, with the measurements and the frames that prove it, before and after.
+
+import { chart, key, number } from "./charts.js";
+import { $, ask, element } from "./page.js";
+
+const CELL = 6; // px of a cell of a residual picture
+let asked = ""; // the session and the number of its jobs that are done
+let shown = ""; // the diagnosis that stands there
+
+// Blue: darker than predicted, red: brighter; white: as predicted.
+function residuals(cells, limit, title) {
+  const canvas = element("canvas", { width: cells[0].length * CELL, height: cells.length * CELL });
+  canvas.setAttribute("role", "img");
+  canvas.setAttribute("aria-label", title);
+  const brush = canvas.getContext("2d");
+  cells.forEach((row, y) =>
+    row.forEach((value, x) => {
+      const part = Math.max(-1, Math.min(1, value / limit)) || 0;
+      const [fades, stays] = [255 - 215 * Math.abs(part), 255 - 90 * Math.abs(part)];
+      brush.fillStyle = part > 0 ? `rgb(${stays} ${fades} ${fades})` : `rgb(${fades} ${fades} ${stays})`;
+      brush.fillRect(x * CELL, y * CELL, CELL, CELL);
+    }),
+  );
+  return canvas;
+}
+
+const rms = (cells) => Math.sqrt(cells.flat().reduce((sum, value) => sum + value * value, 0) / cells.flat().length);
+
+function drawPicture(picture) {
+  const limit = Math.max(3, ...[...picture.before, ...picture.after].flat().map((value) => Math.abs(value) || 0));
+  const pair = [
+    ["without the effects", picture.before],
+    ["with them", picture.after],
+  ].map(([when, cells]) => {
+    const title = `${picture.capture}, ${when}: rms ${number(rms(cells), 2)} σ`;
+    return element("figure", {}, residuals(cells, limit, `Residuals of ${title}`), element("figcaption", { textContent: title }));
+  });
+  const held = picture.held_out ? ", held out" : "";
+  const words = element("p", { className: "hint", textContent: `Residuals in the frame, ${picture.side} camera, ${picture.kind.replaceAll("_", " ")}${held}: red brighter, blue darker than predicted, full colour at ${number(limit, 2)} σ.` });
+  return element("div", { className: "residuals" }, words, ...pair);
+}
+
+function drawProof({ title, caption, curve }) {
+  const points = (values) => curve.x.map((x, at) => [x, values[at]]).sort((a, b) => a[0] - b[0]);
+  const series = [
+    { name: "measured", colour: 3, points: points(curve.measured) },
+    { name: "without the effects", colour: 0, points: points(curve.before), line: true, dashed: true },
+    { name: "with them", colour: 2, points: points(curve.after), line: true },
+  ];
+  const drawn = chart({ title: `${title}: ${caption}`, series, x: { label: curve.axis.replaceAll("_", " ") }, y: { label: curve.quantity || "measured" } });
+  return element("figure", {}, drawn, element("figcaption", {}, element("strong", { textContent: `${title}. ` }), caption, " ", ...key(series)));
+}
+
+// `jobs`: how many of the session are done; asked again where that changed.
+export async function showFindings(session, jobs) {
+  const wanted = `${session} ${jobs}`;
+  if (asked === wanted) return;
+  asked = wanted;
+  const newest = (await ask(`/sessions/${session}`)).results.diagnose ?? "";
+  if (asked !== wanted || newest === shown) return;
+  const found = newest ? await ask(`/sessions/${session}/findings`) : null;
+  if (asked !== wanted) return;
+  shown = newest;
+  $("findings").hidden = !found;
+  if (!found) return;
+  $("findings-headline").replaceChildren(element("strong", { textContent: found.verdict }), `: ${found.headline}`);
+  $("findings-answers").replaceChildren(
+    ...Object.entries(found.answers).map(([question, lines]) =>
+      element("div", {}, element("h4", { textContent: question }), element("ul", {}, ...lines.map((line) => element("li", { textContent: line })))),
+    ),
+  );
+  $("findings-proofs").replaceChildren(...found.proofs.map(drawProof));
+  $("findings-pictures").replaceChildren(...found.pictures.map(drawPicture));
+}

@@ -1,0 +1,51 @@
+"""A registry of an older revision, or an empty one, brought to the newest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+
+from lab.capture.file_lock import Lock
+from lab.capture.tables import VERSIONS
+from lab.errors import InputError
+
+
+def migrate(engine: sa.Engine, folder: Path) -> None:
+    """Bring the registry of the data folder to the newest revision. Raises InputError where it isn't a registry."""
+    config = Config()
+    config.set_main_option("script_location", str(VERSIONS.parent))
+    scripts = ScriptDirectory.from_config(config)
+    newest, known = scripts.get_current_head(), {script.revision for script in scripts.walk_revisions()}
+    lock = Lock(folder / ".migration.lock")
+    if not lock.acquire(patience_s=60.0):
+        raise InputError(f"{folder}: its registry is being migrated by another process; try again when it is done")
+    try:
+        with engine.execution_options(writes=True).connect() as connection:
+            found = MigrationContext.configure(connection).get_current_revision()
+            if found == newest:
+                return
+            if found is not None and found not in known:
+                raise InputError(
+                    f"{folder}: its registry has the revision {found}, written by a newer calibench; install that version, or restore "
+                    "the backup of before the upgrade"
+                )
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+            connection.commit()
+    except sa.exc.OperationalError as error:
+        raise InputError(
+            f"registry {engine.url!r}: can't be reached ({' '.join(str(error.orig).split())}); start it, or correct "
+            "CALIBENCH_DATABASE_URL"
+        ) from error
+    except sa.exc.DatabaseError as error:
+        raise InputError(
+            f"{engine.url}: isn't a registry ({str(error.orig or error).splitlines()[0]}); "
+            "set CALIBENCH_DATA to another folder"
+        ) from error
+    finally:
+        lock.release()
