@@ -10,6 +10,7 @@ import numpy as np
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.reads import ADDED
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.camera import CameraModel
@@ -82,7 +83,7 @@ def shading_block(study: Study) -> Block:
         value=np.concatenate([p.cells for p in planes]), covariance=_covariance(planes),
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures), p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | {"signal.response", "image.veils"}, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
+        reads=SHADING | ADDED | {"signal.response", "image.veils"}, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
 
@@ -217,9 +218,10 @@ def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effect
     # a veil of scattered light reduces the contrast of the fall-off
     even = even_share(study.camera, effects)
     light = (1.0 - even) * light + even * light.mean()
+    added = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
     found = []
     for plane in planes:
-        electrons = model.response(light / light.mean() * plane.level_e)
+        electrons = model.response(light / light.mean() * plane.level_e) + added
         found.append(electrons / electrons.mean())
     return np.concatenate(found)
 

@@ -1,4 +1,5 @@
-"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames."""
+"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames. A fixed pattern of rows
+that doesn't grow with the light shows there, too."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import acting
+from lab.diagnose.measurements.reads import ADDED, acting
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.effects.base import Effect
@@ -89,6 +90,8 @@ def flicker_block(study: Study) -> Block:
             spread = np.concatenate(
                 [std / np.sqrt(len(level.captures)) for (_, std), level in zip(found, levels, strict=True)]
             )
+        if Uniform(study.camera, effects).adds_signal:
+            power = power + _pattern_power(study, levels, effects, bands, step)
         mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
         slope = mean / (3.0 * power)
         jacobian = {}
@@ -108,7 +111,7 @@ def flicker_block(study: Study) -> Block:
         value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.captures[0].id in out)
                      for level in levels for f in frequency),
-        reads=FLICKER, predict=predict, scale=np.ones(len(value)),
+        reads=FLICKER | ADDED, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -224,6 +227,21 @@ def _modulation(
     lines = np.abs(np.fft.rfft(relative, axis=1)) ** 2 / rows / level.variance
     power = np.array([lines[:, list(band)].mean(1) for band in bands])
     return power.mean(1), power.std(1)
+
+
+def _pattern_power(
+    study: Study, levels: Sequence[_Level], effects: Effects, bands: Sequence[range], step: int
+) -> FloatArray:
+    """Power (levels x bands,) that a fixed pattern of rows adds: it is a larger share of a low level than of the mean of all."""
+    rows = study.camera.rows // step
+    model = Uniform(study.camera, effects)
+    added = study.noise.gain * _profile(model.added_e - model.added_e.mean(), step)
+    share = np.array([added / level.signal for level in levels])
+    weight = np.array([len(level.captures) * level.signal * level.captures[0].exposure_s for level in levels])
+    relative = (1.0 + share) / (1.0 + weight @ share / weight.sum()) - 1.0
+    lines = np.abs(np.fft.rfft(relative, axis=1)) ** 2 / rows
+    power = [lines[i, list(band)].mean() / level.variance for i, level in enumerate(levels) for band in bands]
+    return np.array(power)
 
 
 FLAT_ROWS = Measurement(
