@@ -276,6 +276,13 @@ def test_a_narrowband_light_that_lies_off_its_name_is_remarked_on(folder: Path) 
     assert [line for line in read(folder).warnings if "1 narrowband lights are centred elsewhere" in line]
 
 
+def test_one_remark_on_several_captures_is_one_warning(folder: Path) -> None:
+    flats = [capture.id for capture in read(folder).captures(FlatCapture)]
+    edit(folder, lambda m: [c.update(radiance=None) for c in m["captures"] if c["kind"] == "flat"])
+    (warning,) = (line for line in read(folder).warnings if "no sensitivity" in line)
+    assert f": {len(flats)} captures ({flats[0]}, " in warning
+
+
 def test_levels_that_contradict_each_other(folder: Path) -> None:
     edit(
         folder, lambda m: m["cameras"]["left"].update(black_level_dn=4095) or m["cameras"]["right"].update(bit_depth=11)
