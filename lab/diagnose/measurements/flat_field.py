@@ -42,6 +42,7 @@ class _ChannelCells:
     held_out: bool
     cells: FloatArray  # (ROWS * COLS,): means over their mean
     level_e: float  # mean signal
+    inverse_per_e: float  # mean of the frames' 1 / signal, which what read-out adds is multiplied by
     noise: float  # relative variance of a cell by shot and read noise
     pattern: float  # relative variance of a cell by the fixed pattern, which repeats share
     row_covariance: FloatArray  # (ROWS, ROWS): relative covariance of rows of cells by flicker of the light
@@ -108,6 +109,7 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
     """The mean of some captures above the dark level, by channel."""
     noise, step = study.noise, mosaic.step(study.camera.cfa)
     total: dict[str, FloatArray] = {}
+    inverse_per_dn: dict[str, float] = {}
     bands: dict[str, list[FloatArray]] = {c: [] for c in study.channels}
     for capture in captures:
         frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(
@@ -116,6 +118,7 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
         for channel in study.channels:
             phases = mosaic.phases(study.camera.cfa)[channel]
             plane = np.mean([frame[r::step, c::step] for r, c in phases], axis=0, dtype=float)
+            inverse_per_dn[channel] = inverse_per_dn.get(channel, 0.0) + 1.0 / float(plane.mean()) / len(captures)
             # each frame over its own mean, as levels may differ
             plane = plane / plane.mean()
             total[channel] = total.get(channel, 0.0) + plane / len(captures)
@@ -136,7 +139,8 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
         )
         planes.append(
             _ChannelCells(
-                tuple(captures), channel, held_out, (cells / cells.mean()).ravel(), float(levels.mean()) / noise.gain, shot / pixels,
+                tuple(captures), channel, held_out, (cells / cells.mean()).ravel(), float(levels.mean()) / noise.gain,
+                inverse_per_dn[channel] * noise.gain, shot / pixels,
                 _pattern_variance(plane, shot) / pixels,
                 rows_dn2,
             )
@@ -221,8 +225,8 @@ def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effect
     added = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
     found = []
     for plane in planes:
-        electrons = model.response(light / light.mean() * plane.level_e) + added
-        found.append(electrons / electrons.mean())
+        electrons = model.response(light / light.mean() * plane.level_e)
+        found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
     return np.concatenate(found)
 
 
