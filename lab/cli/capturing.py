@@ -29,7 +29,8 @@ StationFile = Annotated[
 ]
 Quick = Annotated[bool, typer.Option("--quick", help="fewer exposures and repeats")]
 DataFolder = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
+    Path | None,
+    typer.Option("--out", "--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)"),
 ]
 Name = Annotated[str, typer.Option(help="name of the session")]
 Resume = Annotated[str, typer.Option(metavar="SESSION", help="resume this session")]

@@ -208,7 +208,7 @@ def test_folder_or_manifest_missing_or_no_json(folder: Path) -> None:
     (folder / "manifest.json").write_text("[]")
     only(folder, "isn't a JSON object")
     (folder / "manifest.json").unlink()
-    only(folder, "manifest.json", "no such file")
+    only(folder, "manifest.json", "it has no manifest.json")
 
 
 def test_another_version(folder: Path) -> None:
