@@ -100,6 +100,9 @@ def _effect_lines(one: EffectDescription) -> Iterator[str]:
         absent = "" if p.absent is None else f"{p.absent:g}"
         yield f"| `{p.name}` | {p.unit} | {p.meaning} | {low} .. {high} | {prior} | {absent} |"
     yield ""
+    for choice in one.choices:
+        values = f" (`{'`, `'.join(choice.values)}`)" if choice.values else ""
+        yield f"- `{choice.name}`, not fitted: {choice.meaning}{values}; `{choice.default}` if not given."
     yield f"- Stage: {', '.join(one.stages)}. It doesn't depend on: {', '.join(one.invariances) or 'none of the axes'}."
     yield f"- Shown by the measurements: {', '.join(one.measurements) or 'none'}."
     yield f"- Rivals: {', '.join(f'[`{rival}`](#{rival})' for rival in one.rivals) or 'none'}."

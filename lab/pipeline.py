@@ -194,7 +194,9 @@ def source_recordings(source: str, open_store: Callable[[], Store | None]) -> Re
     store = open_store()
     if store is None or not store.has_session(source):
         where = "there is no data folder" if store is None else f"no session in {store.root}"
-        raise InputError(f"{source}: no such folder, and {where}; give a recording set's folder or a session's id")
+        raise InputError(
+            f"{source}: no such folder, and {where}; give a recording set's folder or a session's id, and its data folder as CALIBENCH_DATA"
+        )
     return session_recordings(store, source)
 
 

@@ -9,7 +9,9 @@ Effects on the light (lamp, monochromator, radiometer, screen, room, pair) act o
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, get_origin
+from difflib import get_close_matches
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
@@ -55,7 +57,9 @@ def _parsed(spec: str) -> tuple[tuple[Side, ...], Effect]:
             f"--conceal {spec}: {where!r} is no side; write SIDE:EFFECT:PARAMETER=VALUE with left, right or both"
         )
     if name not in library():
-        raise ConcealError(f"--conceal {spec}: no effect named {name!r}; there are {', '.join(library())}")
+        alike = get_close_matches(name.strip().lower(), library(), 3)
+        meant = f"did you mean {' or '.join(alike)}? " if alike else ""
+        raise ConcealError(f"--conceal {spec}: no effect named {name!r}; {meant}`calibench effects` lists them")
     if name in NOT_SHOWN:
         raise ConcealError(f"--conceal {spec}: the bench can't show {name}: {NOT_SHOWN[name]}")
     kind = library()[name]
@@ -66,16 +70,12 @@ def _parsed(spec: str) -> tuple[tuple[Side, ...], Effect]:
 
 def _made(spec: str, kind: type[Effect], text: str) -> Effect:
     quantities = kind.quantities()
-    others = [
-        field
-        for field, info in kind.model_fields.items()
-        if field not in quantities and (info.annotation in (int, float, bool) or get_origin(info.annotation) is Literal)
-    ]
-    known = ", ".join((*quantities, *others))
+    names = (*quantities, *(name for name, field in kind.choices().items() if _is_one_value(field.annotation)))
+    known = ", ".join(names)
     values: dict[str, Any] = {}
     for part in text.split(",") if text else ():
         field, equals, value = (piece.strip() for piece in part.partition("="))
-        if not equals or field not in (*quantities, *others):
+        if not equals or field not in names:
             raise ConcealError(
                 f"--conceal {spec}: {kind.name} has no parameter {field!r}; write PARAMETER=VALUE with {known}"
             )
@@ -88,10 +88,20 @@ def _made(spec: str, kind: type[Effect], text: str) -> Effect:
         first = error.errors()[0]
         field = str(first["loc"][0]) if first["loc"] else ""
         said = str(first["msg"]).removeprefix("Value error, ")
+        if field in quantities and not said.startswith(quantities[field].meaning):
+            unit = quantities[field].unit
+            said = f"{values[field]!r} is no number; give one{'' if unit == '1' else f', which is in {unit}'}, without a unit"
         raise ConcealError(f"--conceal {spec}: {kind.name} {field}: {said}") from None
     if effect == kind():
         raise ConcealError(f"--conceal {spec}: nothing of {kind.name} would be there; give a value of {known}")
     return effect
+
+
+def _is_one_value(annotation: Any) -> bool:
+    """Whether a field of that type can be given as VALUE."""
+    if isinstance(annotation, UnionType) or get_origin(annotation) is Union:
+        return all(_is_one_value(part) for part in get_args(annotation))
+    return annotation in (int, float, bool, type(None)) or get_origin(annotation) is Literal
 
 
 def check(concealed: Concealed) -> None:

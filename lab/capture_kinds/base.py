@@ -280,8 +280,8 @@ Level = Annotated[
 
 
 class Sequence(Frozen):
-    """The specification of a measurement. Its fields are the measurement's parameters, those with a `Quantity` an operator's to set; its
-    steps follow from them."""
+    """What is captured to determine something. Its fields are its parameters, those with a `Quantity` an operator's to set; its steps
+    follow from them."""
 
     name: ClassVar[str]
     purpose: ClassVar[str]  # what is determined with it, in words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,7 +29,8 @@ StationFile = Annotated[
 ]
 Quick = Annotated[bool, typer.Option("--quick", help="fewer exposures and repeats")]
 DataFolder = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)")
+    Path | None,
+    typer.Option("--out", "--data", metavar="DIR", help="the data folder (CALIBENCH_DATA, else calibench-data)"),
 ]
 Name = Annotated[str, typer.Option(help="name of the session")]
 Resume = Annotated[str, typer.Option(metavar="SESSION", help="resume this session")]
@@ -185,7 +187,14 @@ def _capturer(store: Store, station_file: Path | None, conceal: list[str] | None
                 return capture_here(store, read_station(file), request, told)
             except KeyboardInterrupt:
                 if session:
-                    err.print(f"calibench: go on with `calibench capture --resume {session}`")
+                    err.print(f"calibench: go on with `{_resuming(session, store, station_file, conceal or [])}`")
                 raise
 
     return captured
+
+
+def _resuming(session: str, store: Store, station_file: Path | None, conceal: list[str]) -> str:
+    """The command that resumes a session where it was captured."""
+    words = ["calibench", "capture", "--resume", session, "--out", str(store.root)]
+    words += [] if station_file is None else ["--station", str(station_file)]
+    return shlex.join([*words, *(f"--conceal={item}" for item in conceal)])

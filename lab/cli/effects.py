@@ -53,6 +53,11 @@ def _print_effect(effect: EffectDescription) -> None:
             absent = "-" if one.absent is None else f"{one.absent:g}"
             table.add_row(f"  {one.name}", one.unit, *numbers, usual, absent, escape(one.meaning))
         out.print(table)
+    for choice in effect.choices:
+        values = f" ({', '.join(choice.values)})" if choice.values else ""
+        out.print(
+            f"  {choice.name}, not fitted: {escape(choice.meaning)}{escape(values)}; {escape(choice.default)} if not given"
+        )
     for heading, items in (
         ("family", (effect.family,)),
         ("measurements that can show it", effect.measurements),

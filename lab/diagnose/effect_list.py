@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic.fields import FieldInfo
 
 from lab.diagnose.visibility import visibility
 from lab.errors import InputError
@@ -48,6 +50,36 @@ class ParameterDescription(Frozen):
         )
 
 
+class ChoiceDescription(Frozen):
+    """A field of an effect that no fit changes.
+
+    values : what it may be; empty where any value of its type will do
+    default : the value that it has where none is given
+    """
+
+    name: str
+    meaning: str
+    values: tuple[str, ...]
+    default: str
+
+    @classmethod
+    def of(cls, name: str, field: FieldInfo) -> ChoiceDescription:
+        """The declaration of the field `name`."""
+        return cls(
+            name=name,
+            meaning=field.description or "",
+            values=tuple(str(value) for value in _literals(field.annotation)),
+            default="none" if field.default is None else str(field.default),
+        )
+
+
+def _literals(annotation: Any) -> tuple[Any, ...]:
+    """The values of a `Literal`, at any depth of unions."""
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    return tuple(value for part in get_args(annotation) for value in _literals(part))
+
+
 class EffectDescription(Frozen):
     """An effect of the library.
 
@@ -55,6 +87,7 @@ class EffectDescription(Frozen):
     stages : the stages of the forward model in which it acts, in the order of the light
     sentence : the physics that a model without it lacks
     reference : source of its law
+    choices : its fields that no fit changes
     measurements, capture_kinds : the measurements that can show it, and the captures that these need; derived
     rivals : effects that change some part of a session alike; derived
     invariances : conditions that it doesn't depend on
@@ -67,6 +100,7 @@ class EffectDescription(Frozen):
     sentence: str
     reference: str
     parameters: tuple[ParameterDescription, ...]
+    choices: tuple[ChoiceDescription, ...]
     measurements: tuple[str, ...]
     capture_kinds: tuple[str, ...]
     rivals: tuple[str, ...]
@@ -134,6 +168,7 @@ def _described(kind: type[Effect]) -> EffectDescription:
         sentence=kind.sentence,
         reference=kind.reference,
         parameters=tuple(ParameterDescription.of(name, quantity) for name, quantity in kind.quantities().items()),
+        choices=tuple(ChoiceDescription.of(name, field) for name, field in kind.choices().items()),
         measurements=shown.measurements if shown else (),
         capture_kinds=shown.capture_kinds if shown else (),
         rivals=shown.rivals if shown else (),

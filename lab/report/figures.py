@@ -8,23 +8,34 @@ from dataclasses import dataclass
 
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
-from sim.camera import Side
+from sim.camera import CameraModel, Side
+from sim.parameters import declared
 
-#: Field of `NoiseFit` -> (name, unit), in the order of the table; the maker's value has the same field name.
-NOISE = {
-    "conversion_gain_dn_per_e": ("system gain K", "DN/e"),
-    "read_noise_e": ("temporal dark noise (read noise)", "e"),
-    "black_level_dn": ("black level", "DN"),
-    "dark_current_e_per_s": ("dark current", "e/s"),
-    "full_well_e": ("saturation capacity (full well)", "e"),
-    "dsnu_e": ("DSNU", "e"),
-    "prnu_percent": ("PRNU", "%"),
-    "linearity_error_percent": ("linearity error", "%"),
-    "response_bend_percent": ("response curvature at saturation", "%"),
-    "brighter_fatter_percent": ("variance loss at saturation", "%"),
-    "neighbour_covariance_percent": ("noise covariance with neighbours", "%"),
-    "quantum_efficiency": ("quantum efficiency", "1"),
+_NAMES = {
+    "conversion_gain_dn_per_e": "system gain K",
+    "read_noise_e": "temporal dark noise (read noise)",
+    "black_level_dn": "black level",
+    "dark_current_e_per_s": "dark current",
+    "full_well_e": "saturation capacity (full well)",
+    "dsnu_e": "DSNU",
+    "prnu_percent": "PRNU",
+    "linearity_error_percent": "linearity error",
+    "response_bend_percent": "response curvature at saturation",
+    "brighter_fatter_percent": "variance loss at saturation",
+    "neighbour_covariance_percent": "noise covariance with neighbours",
+    "quantum_efficiency": "quantum efficiency",
 }
+#: Units of those that the camera model doesn't declare as a quantity.
+_UNITS = {
+    "linearity_error_percent": "%",
+    "response_bend_percent": "%",
+    "brighter_fatter_percent": "%",
+    "neighbour_covariance_percent": "%",
+    "quantum_efficiency": "1",
+}
+_DECLARED = {field: quantity.unit for field, quantity in declared(CameraModel).items()}
+#: Field of `NoiseFit` -> (name, unit), in the order of the table; the maker's value has the same field name.
+NOISE = {field: (name, _UNITS[field] if field in _UNITS else _DECLARED[field]) for field, name in _NAMES.items()}
 
 
 #: Names of the distortion's coefficients, in OpenCV's order.

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Annotated, ClassVar, Literal, Self, get_args
 
 import numpy as np
+from pydantic import Field
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
@@ -38,7 +39,7 @@ class AmplifierGlow(Effect):
         float,
         Quantity("mm", "distance over which it falls to 1/e", lower=0.01, upper=5.0, prior=(1.0, 1.0), absent=1.0),
     ] = 1.0
-    corner: Corner = "top_left"
+    corner: Annotated[Corner, Field(description="where the output stage is")] = "top_left"
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:

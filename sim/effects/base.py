@@ -1,7 +1,7 @@
 """What a physical effect declares and where it acts. One effect, one file; `sim.effects.library` lists them.
 
 A first-order camera model leaves physics out. Each effect is one such piece: a change to a stage of the chain of light
-(`sim.stages`). An effect writes the methods below that it needs, of eight, and the parameters as fields.
+(`sim.stages`). An effect writes those of the seven methods below that it needs, and its parameters as fields.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import ClassVar, Self
 
 import numpy as np
+from pydantic.fields import FieldInfo
 
 from sim.camera import CameraModel
 from sim.effects.families import Family
@@ -21,7 +22,8 @@ STAGES = {"light": "on_light", "image": "on_image", "charge": "on_charge", "sign
 
 class Effect(Frozen):
     """Base of all effects. Parameters are fields annotated with `sim.parameters.Quantity` (unit, bounds, prior, `absent`,
-    `linear_power`), each with its `absent` value as default, so that `TheEffect()` is the baseline.
+    `linear_power`), each with its `absent` value as default, so that `TheEffect()` is the baseline. Other fields are choices, which
+    no fit changes; each has a pydantic `Field` with a description.
 
     The methods that an effect may write; each default changes nothing:
 
@@ -53,6 +55,12 @@ class Effect(Frozen):
     def quantities(cls) -> dict[str, Quantity]:
         """The declared parameters, by field name."""
         return declared(cls)
+
+    @classmethod
+    def choices(cls) -> dict[str, FieldInfo]:
+        """The fields that no fit changes, by name: a material, a corner, the seed of a drawn pattern."""
+        quantities = cls.quantities()
+        return {name: field for name, field in cls.model_fields.items() if name not in quantities}
 
     @classmethod
     def stages(cls) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ class CoverGlass(Effect):
         Quantity("mm", "thickness of the plate", lower=0.0, upper=20.0, prior=(0.0, 5.0), absent=0.0, linear_power=2),
     ] = 0.0
     refractive_index: Annotated[float, Field(ge=1.0, le=3.0, description="refractive index of the plate")] = 1.52
-    refocused: bool = True
+    refocused: Annotated[bool, Field(description="whether the lens is focused anew behind the plate")] = True
 
     def on_image(self, image: Image) -> Image:
         if self.thickness_mm == 0.0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from sim.camera import Geometry
 from sim.effects.base import Effect
@@ -39,7 +40,9 @@ class Distortion(Effect):
                  prior=(0.0, 0.5), absent=0.0),
     ] = 0.0  # fmt: skip
 
-    geometry: Geometry | None = None
+    geometry: Annotated[
+        Geometry | None, Field(description="camera matrix and distortion, in place of the camera's")
+    ] = None
 
     def on_image(self, image: Image) -> Image:
         camera = image.camera

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
+from pydantic import Field
+
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
@@ -61,7 +63,7 @@ class HotPixels(Effect):
             absent=1.0,
         ),
     ] = 1.0
-    pattern_seed: int = 0
+    pattern_seed: Annotated[int, Field(description="which of the patterns that the law can draw")] = 0
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from sim.effects.base import Effect
 from sim.effects.families import Family
@@ -60,7 +61,9 @@ class OpticalLowPassFilter(Effect):
         ),
     ] = 0.0
 
-    plate: Literal["quartz"] | None = None
+    plate: Annotated[
+        Literal["quartz"] | None, Field(description="material, by whose dispersion the distances grow")
+    ] = None
 
     def log_prior(self) -> float:
         """Filters are made of one plate, or of two nearly alike: not of a thick one and one of a third of its strength."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Self
 
+from pydantic import Field
+
 from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.effects.families import Family
@@ -55,7 +57,7 @@ class RowNoise(Effect):
             absent=0.0,
         ),
     ] = 0.0
-    pattern_seed: int = 0
+    pattern_seed: Annotated[int, Field(description="which of the patterns that the law can draw")] = 0
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:

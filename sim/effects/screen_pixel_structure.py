@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
+from pydantic import Field
 
 from sim.camera import CameraModel
 from sim.effects.base import Effect
@@ -38,7 +39,7 @@ class ScreenPixelStructure(Effect):
             absent=0.0,
         ),
     ] = 0.0
-    period_px: float = 3.5
+    period_px: Annotated[float, Field(description="period of the grid on the sensor, px")] = 3.5
 
     @classmethod
     def prototypes(cls, camera: CameraModel) -> tuple[tuple[Self, ...], ...]:

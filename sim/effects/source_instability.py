@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
+from pydantic import Field
+
 from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.parameters import Quantity
@@ -39,7 +41,7 @@ class SourceInstability(Effect):
             linear_power=2,
         ),
     ] = 0.0
-    draw_seed: int = 0
+    draw_seed: Annotated[int, Field(description="which of the sequences of levels that the law can draw")] = 0
 
     def on_light(self, light: Light) -> Light:
         if self.instability_percent == 0.0:

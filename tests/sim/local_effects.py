@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from sim.camera import Geometry
 from sim.effects.base import Effect
 from sim.effects.families import Family
+from sim.parameters import Quantity
 from sim.scene import (
     Darkness,
     EdgeRegion,
@@ -100,6 +102,31 @@ class EveryStage(Local):
             response=lambda electrons: electrons * 0.98,
             offset_dn=lambda elapsed_s, temperature_c: 0.5 * elapsed_s + (temperature_c or 0.0),
         )
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """e (r / (R - 1))^2 electrons in row r of R."""
+
+    last_row_e: float
+
+    def draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+        return self.mean_e(shape)
+
+    def mean_e(self, shape: tuple[int, ...]) -> FloatArray:
+        return self.last_row_e * np.linspace(0.0, 1.0, shape[0])[:, None] ** 2
+
+    def variance_e2(self, shape: tuple[int, ...]) -> float:
+        return 0.0
+
+
+class ReadOutRamp(Local):
+    name: ClassVar[str] = "test_read_out_ramp"
+
+    last_row_e: Annotated[float, Quantity("e", "of the last row", prior=(0.0, 10.0), absent=0.0)] = 0.0
+
+    def on_signal(self, signal: Signal) -> Signal:
+        return signal.adding(disturbances=Ramp(self.last_row_e))
 
 
 def scenes(lamp: Spectrum) -> list[Scene]:

@@ -25,7 +25,7 @@ from sim.sensor import mosaic
 from sim.spectrum import Spectrum, photons_from_energy
 from sim.stages import Light
 from sim.uniform import FieldPoints, Uniform, electron_rate
-from tests.sim.local_effects import AngleCut, Local
+from tests.sim.local_effects import AngleCut, Local, ReadOutRamp
 
 
 def test_a_laser_line_gives_the_closed_form(mono_camera: CameraModel) -> None:
@@ -114,7 +114,7 @@ def _means_dn(camera: CameraModel, lamp: Spectrum, exposure: Exposure, acting: t
 
 #: What the uniform entry leaves out: a reflection's share of even light, which is a factor on its level, and columns' fixed offsets.
 NOT_UNIFORM = {"ghost", "column_noise"}
-UNIFORM_EFFECTS = [kind for kind in library.effects().values() if kind.name not in NOT_UNIFORM]
+UNIFORM_EFFECTS = [kind for kind in (*library.effects().values(), ReadOutRamp) if kind.name not in NOT_UNIFORM]
 
 
 @pytest.mark.parametrize("kind", UNIFORM_EFFECTS, ids=lambda kind: kind.name)

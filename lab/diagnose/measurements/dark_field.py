@@ -1,4 +1,5 @@
-"""The dark signal by place in the frame: glow of the read-out and other dark current that isn't uniform."""
+"""The dark signal by place in the frame: glow of the read-out, other dark current that isn't uniform, and what
+read-out adds by itself."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import numpy as np
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.dark_frames import CELL_FLOOR_DN, CELLS, cell_means, dark_frames
 from lab.diagnose.measurements.dark_level import dark_current_map
+from lab.diagnose.measurements.reads import ADDED, DARK_CURRENT
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor.lines import Lines
@@ -56,12 +58,16 @@ def dark_field_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         mean = np.zeros(len(value))
-        if Uniform(study.camera, effects).changes_dark_current:
+        model = Uniform(study.camera, effects)
+        if model.adds_signal:
+            added = cell_means(model.added_e.astype(np.float32))
+            mean += np.tile((study.noise.gain * (added - added.mean())).ravel(), len(points))
+        if model.changes_dark_current:
             dark_at = dark_current_map(study, effects)
             for i, (f, *_) in enumerate(points):
                 cells = cell_means(dark_at(f.condition.temperature_c).astype(np.float32))
                 here = study.noise.gain * f.condition.exposure_s * (cells - cells.mean())
-                mean[i * count : (i + 1) * count] = here.ravel()
+                mean[i * count : (i + 1) * count] += here.ravel()
         jacobian = {}
         for i in range(len(points)):
             column = np.zeros(len(value))
@@ -73,7 +79,7 @@ def dark_field_block(study: Study) -> Block:
     return Block(
         measurement=DARK_FIELD, reach=0.5, value=value, covariance=np.asarray(covariance, float),
         labels=tuple(Label(float(radius[k]), "all", f.condition.name, part.captures, out) for f, out, part in points for k in range(count)),
-        reads=frozenset({"charge.dark_current"}), predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
+        reads=DARK_CURRENT | ADDED, predict=predict, scale=np.repeat(np.maximum(exposures / longest, 0.1), count),
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from lab.diagnose.measurements.dark_frames import (
     fine_conditions,
 )
 from lab.diagnose.measurements.line_spectra import LEVEL_BAND, Bands, log_mean_bias, log_mean_variance
-from lab.diagnose.measurements.reads import LINES
+from lab.diagnose.measurements.reads import ADDED, LINES
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor.lines import Lines
@@ -115,7 +115,13 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         still, moving, odd = np.zeros(len(frequency)), np.zeros(len(frequency)), 0.0
-        for one in Uniform(study.camera, effects).lines:
+        model = Uniform(study.camera, effects)
+        if model.adds_signal:
+            means = model.added_e.mean(axis=1 if lines == "rows" else 0)
+            # the periodogram's frequencies above 0 and below 0.5 cy/px
+            still += (np.abs(np.fft.rfft(means)) ** 2 / len(means))[1 : 1 + len(frequency)]
+            odd += float(means[1::2].mean() - means[::2].mean())
+        for one in model.lines:
             if one.lines == lines:
                 still += one.spectrum_e2(frequency, fixed=True)
                 moving += one.spectrum_e2(frequency, fixed=False)
@@ -127,7 +133,7 @@ def fixed_line_block(lines: Lines, study: Study) -> Block:
     return Block(
         measurement=ROW_PATTERN if lines == "rows" else COLUMN_PATTERN, reach=0.1,
         value=np.concatenate([*value, parity]), covariance=whole, labels=tuple(labels),
-        reads=LINES, predict=predict,
+        reads=LINES | ADDED, predict=predict,
         scale=np.concatenate([np.ones(n), 10.0 * std]),
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
+from lab.diagnose.measurements.reads import ADDED
 from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -42,6 +43,7 @@ class _ChannelCells:
     held_out: bool
     cells: FloatArray  # (ROWS * COLS,): means over their mean
     level_e: float  # mean signal
+    inverse_per_e: float  # mean of the frames' 1 / signal, which what read-out adds is multiplied by
     noise: float  # relative variance of a cell by shot and read noise
     pattern: float  # relative variance of a cell by the fixed pattern, which repeats share
     row_covariance: FloatArray  # (ROWS, ROWS): relative covariance of rows of cells by flicker of the light
@@ -84,7 +86,7 @@ def shading_block(study: Study) -> Block:
         value=np.concatenate([p.cells for p in planes]), covariance=_covariance(planes),
         labels=tuple(Label(float(radius[k]), p.channel, f"cell {k // COLS},{k % COLS}", tuple(c.id for c in p.captures), p.held_out)
                      for p in planes for k in range(ROWS * COLS)),
-        reads=SHADING | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
+        reads=SHADING | ADDED | {"signal.response", "image.veils"}, scattered_by=ROW_LIGHT, predict=predict, scale=np.ones(len(planes) * ROWS * COLS),
         along=np.tile(np.column_stack([x_mm, y_mm]), (len(planes), 1)),
     )  # fmt: skip
 
@@ -109,6 +111,7 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
     """The mean of some captures above the dark level, by channel."""
     noise, step = study.noise, mosaic.step(study.camera.cfa)
     total: dict[str, FloatArray] = {}
+    inverse_per_dn: dict[str, float] = {}
     bands: dict[str, list[FloatArray]] = {c: [] for c in study.channels}
     for capture in captures:
         frame = np.asarray(study.recordings.frame(capture), np.float32) - np.float32(
@@ -117,6 +120,7 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
         for channel in study.channels:
             phases = mosaic.phases(study.camera.cfa)[channel]
             plane = np.mean([frame[r::step, c::step] for r, c in phases], axis=0, dtype=float)
+            inverse_per_dn[channel] = inverse_per_dn.get(channel, 0.0) + 1.0 / float(plane.mean()) / len(captures)
             # each frame over its own mean, as levels may differ
             plane = plane / plane.mean()
             total[channel] = total.get(channel, 0.0) + plane / len(captures)
@@ -137,7 +141,8 @@ def _summed(study: Study, captures: Sequence[Any], held_out: bool) -> list[_Chan
         )
         planes.append(
             _ChannelCells(
-                tuple(captures), channel, held_out, (cells / cells.mean()).ravel(), float(levels.mean()) / noise.gain, shot / pixels,
+                tuple(captures), channel, held_out, (cells / cells.mean()).ravel(), float(levels.mean()) / noise.gain,
+                inverse_per_dn[channel] * noise.gain, shot / pixels,
                 _pattern_variance(plane, shot) / pixels,
                 rows_dn2,
             )
@@ -219,10 +224,11 @@ def _shaded(planes: Sequence[_ChannelCells], place: FieldPoints, effects: Effect
     # a veil of scattered light reduces the contrast of the fall-off
     even = even_share(study.camera, effects)
     light = (1.0 - even) * light + even * light.mean()
+    added = _cells(model.added_e - model.added_e.mean()).ravel() if model.adds_signal else 0.0
     found = []
     for plane in planes:
         electrons = model.response(light / light.mean() * plane.level_e)
-        found.append(electrons / electrons.mean())
+        found.append(electrons / electrons.mean() + added * plane.inverse_per_e)
     return np.concatenate(found)
 
 

@@ -1,4 +1,5 @@
-"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames."""
+"""Flicker: light that changes while a rolling shutter exposes row after row, seen in the rows of single flat frames. A fixed pattern of rows
+that doesn't grow with the light shows there, too."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from scipy.signal import resample
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
-from lab.diagnose.measurements.reads import acting
+from lab.diagnose.measurements.reads import ADDED
 from lab.diagnose.measurements.row_light import ROW_LIGHT
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
@@ -86,10 +87,12 @@ def flicker_block(study: Study) -> Block:
     band = np.tile(np.arange(len(bands)), len(levels))
 
     def predict(effects: Effects) -> Prediction:
-        moving = acting(effects, ROW_LIGHT)
+        model = Uniform(study.camera, effects)
         power = 1.0 + offsets
-        if moving:
-            power = power + _added_power(Uniform(study.camera, effects), study.camera.rows, levels, bands, step)
+        if model.varies_by_row:
+            power = power + _added_power(model, study.camera.rows, levels, bands, step)
+        if model.adds_signal:
+            power = power + _pattern_power(study, levels, model, bands, step)
         mean = np.cbrt(power) * (1.0 - 2.0 / (9.0 * freedom))
         slope = mean / (3.0 * power)
         jacobian = {}
@@ -106,7 +109,7 @@ def flicker_block(study: Study) -> Block:
         value=value, covariance=np.diag(2.0 / (9.0 * freedom)),
         labels=tuple(Label(float(f), "all", f"{level.captures[0].exposure_s:.4g} s", tuple(c.id for c in level.captures), level.captures[0].id in out)
                      for level in levels for f in frequency),
-        reads=ROW_LIGHT, predict=predict, scale=np.ones(len(value)),
+        reads=ROW_LIGHT | ADDED, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 
@@ -240,6 +243,19 @@ def _nearest(rows: FloatArray, by_phase: FloatArray) -> FloatArray:
     off = np.clip(0.5 * (below - above) / curvature, -0.5, 0.5)[:, None]
     beside = by_phase[(at + np.where(off[:, 0] < 0.0, -1, 1)) % phases]
     return np.asarray(by_phase[at] * (1.0 - np.abs(off)) + beside * np.abs(off))
+
+
+def _pattern_power(
+    study: Study, levels: Sequence[_Level], model: Uniform, bands: Sequence[range], step: int
+) -> FloatArray:
+    """Power (levels x bands,) that a fixed pattern of rows adds: it is a larger share of a low level than of the mean of all."""
+    added = study.noise.gain * _profile(model.added_e - model.added_e.mean(), step)
+    share = np.array([added / level.signal for level in levels])
+    weight = np.array([float(level.weight.sum()) for level in levels])
+    relative = (1.0 + share) / (1.0 + weight @ share)
+    return np.concatenate(
+        [_power(own[None], bands) / level.variance for level, own in zip(levels, relative, strict=True)]
+    )
 
 
 FLAT_ROWS = Measurement(

@@ -9,6 +9,8 @@ from sim.effects.library import changed_by
 #: Image lag.
 LAG = frozenset({"charge.lag"})
 DARK_CURRENT = frozenset({"charge.dark_current"})
+#: What read-out adds to the pixels, lit or dark.
+ADDED = frozenset({"signal.disturbances"})
 #: Row and column noise.
 LINES = frozenset({"signal.lines"})
 #: The light of a screen for the picture that it is given.

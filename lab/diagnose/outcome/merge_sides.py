@@ -227,8 +227,8 @@ def _summary(
     lines += [v.statement for v in vetoed]
     lines += set_sentences(models, effects, unexplained, policy)
     if held_out is not None and held_out.chi2_after != held_out.chi2_before:
+        before, after = f"{held_out.chi2_before:.0f}", f"{held_out.chi2_after:.0f}"
         way = "falls" if held_out.chi2_after < held_out.chi2_before else "rises"
-        lines.append(
-            f"On captures that neither choice nor fit has seen, chi2 {way} from {held_out.chi2_before:.0f} to {held_out.chi2_after:.0f} for {held_out.n} numbers."
-        )
+        change = f"stays at {after}" if before == after else f"{way} from {before} to {after}"
+        lines.append(f"On captures that neither choice nor fit has seen, chi2 {change} for {held_out.n} numbers.")
     return lines

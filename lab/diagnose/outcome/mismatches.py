@@ -223,7 +223,9 @@ def _shape(
     block = verdict.model.blocks[one.index]
     law = f"; {_nearest(one, verdict, near, chi2_without, policy)}" if near else ""
     if one.log_odds > 0:
-        return f"smooth over {one.length:.3g} {block.measurement.unit}, {one.grouping}, of relative size {one.amplitude:.2g}{law}"
+        unit = block.measurement.unit
+        kind = f"smooth over {one.length:.3g} {unit}, {one.grouping}" if one.length > 0 else one.grouping
+        return f"a model discrepancy, {kind}, of relative size {one.amplitude:.2g}{law}"
     return f"irregular: no smooth discrepancy predicts captures that it hasn't seen{law}"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -84,9 +84,8 @@ def _check_frames(recordings: RecordingSet, found: Findings, loaded: Loaded) -> 
         found.problems += saturated_flats(levels, recordings.manifest.cameras[side])
         found.warnings += wrong_lights(levels, recordings.manifest.cameras[side])
     for (side, kind), ids in clipped_of.items():
-        named = ", ".join(ids[:3]) + (f" .. {ids[-1]}" if len(ids) > 3 else "")
         found.warnings.append(
-            f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped ({named}); "
+            f"{recordings.source}: {len(ids)} {kind} captures of the {side} camera have a channel clipped ({_some(ids)}); "
             "what a clipped channel saw is not used; expose shorter"
         )
 
@@ -109,15 +108,25 @@ def _check_captures(recordings: RecordingSet, found: Findings) -> None:
         if count > 1:
             found.problems.append(f"{source}: capture id '{id}' is used {count} times; give every capture its own")
     framed: dict[str, Capture] = {}
+    remarked: dict[str, list[str]] = {}
     for capture in manifest.captures:
         where = f"{source}: capture {capture.id}"
         found.warnings += _unknown_keys(where, capture)
         camera = manifest.cameras[capture.side]
         found.problems += [f"{where}: {text}" for text in capture.problems(camera.rows, camera.cols)]
-        found.warnings += [f"{where}: {text}" for text in capture.remarks()]
+        for text in capture.remarks():
+            remarked.setdefault(text, []).append(capture.id)
         first = framed.setdefault(capture.frame, capture)
         if first is not capture and not capture.shares_frame:
             found.warnings.append(f"{where}: its frame is that of {first.id} too, so it is no repeat; check the path")
+    for text, ids in remarked.items():
+        what = f"capture {ids[0]}" if len(ids) == 1 else f"{len(ids)} captures ({_some(ids)})"
+        found.warnings.append(f"{source}: {what}: {text}")
+
+
+def _some(ids: Sequence[str]) -> str:
+    """The first three of some captures and the last."""
+    return ", ".join(ids[:3]) + (f" .. {ids[-1]}" if len(ids) > 3 else "")
 
 
 def _check_spectra_and_targets(recordings: RecordingSet, found: Findings) -> None:

@@ -25,6 +25,10 @@ def read(path: str | os.PathLike[str], *, progress: Callable[[str], None] | None
         root = root.parent
     if not root.is_dir():
         raise RecordingError([f"{root}: no such folder; give the folder of a recording set"])
+    if root.is_dir() and not (root / "manifest.json").exists():
+        raise RecordingError(
+            [f"{root}: no recording set: it has no manifest.json; `calibench import` and `calibench export` write one"]
+        )
     try:
         text = locate(root, "manifest.json").read_text(encoding="utf-8-sig")
     except (InputError, OSError, UnicodeDecodeError) as error:

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from lab.capture.plan import CapturePlan, full_plan
-from lab.capture_kinds.base import FindExposure, RelativeExposure, Setting, Step
+from lab.capture_kinds.base import SEQUENCES, FindExposure, RelativeExposure, Setting, Step
 from lab.capture_kinds.dark import DarkSequence
 from lab.capture_kinds.flat import FlatSequence
 from lab.capture_kinds.narrowband import NarrowbandCapture, NarrowbandSequence
@@ -140,7 +140,7 @@ def test_specs_refuse_unknown_axes() -> None:
 
 def test_only_the_sequences_that_are_named_are_planned_in_their_order() -> None:
     assert full_plan(STATION, only=["flat", "dark"]).names == ("dark", "flat")
-    with pytest.raises(InputError, match="there is no moon; name some of dark, flat, narrowband"):
+    with pytest.raises(InputError, match="there is no moon; name some of " + ", ".join(SEQUENCES)):
         full_plan(STATION, only=["dark", "moon"])
     without_screen = STATION.model_copy(update={"display": None})
     with pytest.raises(InputError, match="lacks instruments or targets for screen; leave it out"):

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ import lab.diagnose
 import lab.fit
 from lab import cli
 from lab.cli import bench_process, capturing, diagnosis, fitting
+from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
 from lab.diagnose.effect_list import EffectList, effect_list
 from lab.errors import DeviceError
@@ -504,3 +505,19 @@ def test_the_help_waits_for_no_numerics(arguments: list[str]) -> None:
     done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, timeout=60, check=True)
     assert "Usage:" in done.stdout
     assert sorted(set(SLOW_TO_LOAD) & set(done.stderr.split())) == []
+
+
+def test_an_interrupted_session_is_told_with_the_whole_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(store: object, station: object, request: object, tell: Callable[[object], None]) -> str:
+        tell(SimpleNamespace(session="session-1"))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(capturing, "capture_here", interrupted)
+    monkeypatch.setattr("lab.capture.station.read_station", lambda file: None)
+    store = open_store(tmp_path / "data folder")
+    with pytest.raises(KeyboardInterrupt):
+        capturing._capturer(store, Path("lab.toml"), None)(CaptureRequest(), lambda progress: None)
+    command = f"calibench capture --resume session-1 --out '{store.root}' --station lab.toml"
+    assert capsys.readouterr().err == f"calibench: go on with `{command}`\n"

@@ -62,9 +62,9 @@ def names(found: Verdict) -> list[str]:
     return [c.effect.name for c in found.named]
 
 
-def sigmas(found: MeasurementModel) -> float:
-    """How far chi2 of all numbers under the baseline lies from their count, in its standard deviations."""
-    gaussian = found.gaussian()
+def sigmas(found: MeasurementModel, effects: Sequence[Effect] = ()) -> float:
+    """How far chi2 of all numbers under the baseline with `effects` lies from their count, in its standard deviations."""
+    gaussian = found.gaussian(tuple(effects))
     n = len(found.value)
     return (chi2(found.value - gaussian.mean, gaussian.covariance) - n) / float(np.sqrt(2.0 * n))
 

@@ -26,6 +26,16 @@ def test_each_effect_is_told_with_its_declarations_and_what_is_derived() -> None
     assert told["blooming"].remark == UNSEEN
 
 
+def test_every_choice_is_told_with_its_meaning() -> None:
+    choices = {(effect.name, one.name): one for effect in effect_list().effects for one in effect.choices}
+    assert all(one.meaning for one in choices.values())
+    corner = choices["amplifier_glow", "corner"]
+    assert corner.values == ("top_left", "top_right", "bottom_left", "bottom_right")
+    assert corner.default == "top_left"
+    plate = choices["optical_low_pass_filter", "plate"]
+    assert (plate.values, plate.default) == (("quartz",), "none")
+
+
 def test_an_effect_that_was_just_added_says_what_to_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lab.diagnose.effect_list, "visibility", dict)
     assert effect_description("coma").remark == NOT_DERIVED

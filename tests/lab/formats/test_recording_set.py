@@ -208,7 +208,7 @@ def test_folder_or_manifest_missing_or_no_json(folder: Path) -> None:
     (folder / "manifest.json").write_text("[]")
     only(folder, "isn't a JSON object")
     (folder / "manifest.json").unlink()
-    only(folder, "manifest.json", "no such file")
+    only(folder, "manifest.json", "it has no manifest.json")
 
 
 def test_another_version(folder: Path) -> None:
@@ -274,6 +274,13 @@ def test_a_narrowband_light_that_lies_off_its_name_is_remarked_on(folder: Path) 
     assert not any("narrowband" in line for line in read(folder).warnings)
     call_it(556.0)
     assert [line for line in read(folder).warnings if "1 narrowband lights are centred elsewhere" in line]
+
+
+def test_one_remark_on_several_captures_is_one_warning(folder: Path) -> None:
+    flats = [capture.id for capture in read(folder).captures(FlatCapture)]
+    edit(folder, lambda m: [c.update(radiance=None) for c in m["captures"] if c["kind"] == "flat"])
+    (warning,) = (line for line in read(folder).warnings if "no sensitivity" in line)
+    assert f": {len(flats)} captures ({flats[0]}, " in warning
 
 
 def test_levels_that_contradict_each_other(folder: Path) -> None:

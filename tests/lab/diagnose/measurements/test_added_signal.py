@@ -1,0 +1,47 @@
+"""What read-out adds to the pixels of every frame: each measurement that it changes predicts it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from lab.diagnose.measurements.block import Block
+from lab.diagnose.measurements.dark_field import dark_field_block
+from lab.diagnose.measurements.dark_level import dark_level_block
+from lab.diagnose.measurements.dark_lines import fixed_line_block
+from lab.diagnose.measurements.flat_field import shading_block
+from lab.diagnose.measurements.flat_rows import flicker_block
+from lab.diagnose.measurements.study import Study
+from lab.formats.recording_set import RecordingSet
+from tests.lab.diagnose.on_blocks import measured_model, rendered, sigmas
+from tests.sim.local_effects import ReadOutRamp
+
+RAMP = ReadOutRamp(last_row_e=40.0)
+
+
+@cache
+def recorded() -> RecordingSet:
+    return rendered(5, (RAMP,))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [dark_field_block, partial(fixed_line_block, "rows"), shading_block, flicker_block],
+    ids=["dark_field", "dark_row_pattern", "flat_field", "flat_rows"],
+)
+def test_what_read_out_adds_is_predicted(make: Callable[[Study], Block]) -> None:
+    """Without the effect the numbers lie far off, with it chi-squared is within 4 of its standard deviations."""
+    model = measured_model(recorded(), make)
+    assert sigmas(model) > 20.0
+    assert abs(sigmas(model, (RAMP,))) < 4.0
+
+
+def test_the_mean_of_what_read_out_adds_is_an_offset_of_dark_frames() -> None:
+    """Alike at all exposures."""
+    model = measured_model(recorded(), dark_level_block)
+    change = model.mean((RAMP,)) - model.mean(())
+    mean_e = 40.0 * np.mean(np.linspace(0.0, 1.0, model.camera.rows) ** 2)
+    assert change == pytest.approx(model.camera.conversion_gain_dn_per_e * mean_e, rel=1e-9)
