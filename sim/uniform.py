@@ -31,7 +31,6 @@ LEVEL = SHADING | {
     "charge.exchange",
     "signal.response",
     "signal.offset_dn",
-    "signal.disturbances",
     "codes.codes",
 }
 
@@ -271,8 +270,8 @@ class Uniform:
         return self._signal.read(electrons)
 
     def offset_dn(self, elapsed_s: float, temperature_c: float | None) -> float:
-        """DN added to the black level, mean of the frame."""
-        return self._signal.shift_dn(elapsed_s, temperature_c) + self._mean_added_dn
+        """DN added to the black level, beside the mean of `added_e`."""
+        return self._signal.shift_dn(elapsed_s, temperature_c)
 
     @property
     def adds_signal(self) -> bool:
@@ -284,10 +283,6 @@ class Uniform:
         """Mean of what read-out adds to every pixel, lit or dark (rows, cols)."""
         shape = self.camera.rows, self.camera.cols
         return sum((np.asarray(one.mean_e(shape)) for one in self._signal.disturbances), np.zeros(shape))
-
-    @cached_property
-    def _mean_added_dn(self) -> float:
-        return self.camera.conversion_gain_dn_per_e * float(self.added_e.mean()) if self.adds_signal else 0.0
 
     @property
     def lines(self) -> tuple[LineNoise, ...]:

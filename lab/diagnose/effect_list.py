@@ -68,9 +68,14 @@ class ChoiceDescription(Frozen):
         return cls(
             name=name,
             meaning=field.description or "",
-            values=tuple(str(value) for value in _literals(field.annotation)),
+            values=choice_values(field),
             default="none" if field.default is None else str(field.default),
         )
+
+
+def choice_values(field: FieldInfo) -> tuple[str, ...]:
+    """The values among which a field chooses; empty where any value of its type will do."""
+    return tuple(str(value) for value in _literals(field.annotation))
 
 
 def _literals(annotation: Any) -> tuple[Any, ...]:

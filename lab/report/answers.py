@@ -41,12 +41,19 @@ def _short(value: float) -> str:
 
 def effect_line(effect: NamedEffect) -> str:
     """An effect, its cameras, and its parameters that differ from zero, in the library's words."""
-    described = library()[effect.nearest_law].quantities() if effect.nearest_law in library() else {}
+    law = library().get(effect.nearest_law)
+    described = law.quantities() if law else {}
+    fields = law.choices() if law else {}
     sizes = [
         f"{described[name].meaning if name in described else words.parameter_name(name, value)} "
         f"{measured(value.value, value.std, value.unit)}"
         for name, value in effect.parameters.items()
         if value.std is None or abs(value.value) >= TOLD_SIGMA * value.std
+    ]
+    sizes += [
+        f"{fields[name].description or name}: {value.replace('_', ' ')}"
+        for name, value in effect.choices.items()
+        if name in fields
     ]
     where = " and ".join(effect.sides)
     return f"{words.effect_name(effect.name).capitalize()}, {where}: {'; '.join(sizes)}."

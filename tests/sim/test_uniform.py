@@ -109,7 +109,10 @@ def _means_dn(camera: CameraModel, lamp: Spectrum, exposure: Exposure, acting: t
     electrons = model.electrons(
         rates, exposure.exposure_s, field=model.field(_every_pixel(camera)), elapsed_s=exposure.elapsed_s
     )
-    return {c: float(dn) + model.offset_dn(exposure.elapsed_s, None) for c, dn in model.mean_dn(electrons).items()}
+    offset_dn = model.offset_dn(exposure.elapsed_s, None) + camera.conversion_gain_dn_per_e * float(
+        model.added_e.mean()
+    )
+    return {c: float(dn) + offset_dn for c, dn in model.mean_dn(electrons).items()}
 
 
 #: What the uniform entry leaves out: a reflection's share of even light, which is a factor on its level, and columns' fixed offsets.

@@ -13,7 +13,7 @@ from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, 
 from lab.diagnose.measurements.dark_frames import DarkStatistics, conditions, dark_frames
 from lab.diagnose.measurements.line_means import LineMeans
 from lab.diagnose.measurements.noise_guess import BLACK_FLOOR_DN, STATED_BLACK_DN, STATED_BLACK_SHARE
-from lab.diagnose.measurements.reads import ADDED, DARK_CURRENT, LAG, LINES
+from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
@@ -56,8 +56,8 @@ def added_dark_dn(study: Study, effects: Effects) -> Callable[[Capture], float]:
 def dark_level_block(study: Study) -> Block:
     """Mean of every dark frame without defective pixels, DN.
 
-    Nuisance parameters: black level and dark current. Effects may add an offset, which may drift with time or temperature, dark
-    current, image lag, and the converter's error at these codes. Raises NotDetermined without dark captures.
+    Nuisance parameters: black level and dark current. Effects may add an offset that drifts with time or temperature, dark current,
+    image lag, and the converter's error at these codes. Raises NotDetermined without dark captures.
     """
     frames = study.once(dark_frames)
     captures = [(c, f.condition, c in f.condition.held_out) for f in frames for c in f.condition.captures]
@@ -88,7 +88,7 @@ def dark_level_block(study: Study) -> Block:
         measurement=DARK, reach=reach, value=value, along=exposures + 2.0 * reach * warmer / 10.0,
         covariance=np.diag(np.full(len(value), noise.jitter_dn**2 + BLACK_FLOOR_DN**2)) + same * np.outer(coarse, coarse),
         labels=tuple(Label(c.exposure_s, "all", k.name, (c.id,), out) for c, k, out in captures),
-        reads=LAG | DARK_CURRENT | ADDED | {"signal.offset_dn", "codes.codes"}, scattered_by=LINES, predict=predict, scale=np.ones(len(value)),
+        reads=LAG | DARK_CURRENT | {"signal.offset_dn", "codes.codes"}, scattered_by=LINES, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lab.diagnose.effect_list import choice_values
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.library import measurement_title
 from lab.diagnose.outcome.effect_sets import set_sentences
@@ -26,6 +27,7 @@ from lab.formats.results import (
     VetoedName,
 )
 from sim.camera import Side
+from sim.effects.base import Effect
 from sim.effects.families import Family
 from sim.effects.library import effects as library
 
@@ -105,9 +107,16 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 continue
             value, std = _mean([(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates])
             parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit)
+        chosen = [_choices(c.effect) for c in candidates]
+        choices = {
+            field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
+        }
         shown = sorted({measurement_title(measurement) for _, one in members for measurement in one.shown_in})
         values = ", ".join(
-            f"{f.removesuffix('_' + p.unit).replace('_', ' ')} {_number(p)}" for f, p in parameters.items()
+            (
+                *(f"{f.removesuffix('_' + p.unit).replace('_', ' ')} {_number(p)}" for f, p in parameters.items()),
+                *(f"{f} {value}".replace("_", " ") for f, value in choices.items()),
+            )
         )
         sides = tuple(side for side, _ in members)
         is_exact = all(one.candidate.is_closed for _, one in members)
@@ -126,6 +135,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 probability=min(one.candidate.probability for _, one in members),
                 sides=sides,
                 parameters=parameters,
+                choices=choices,
                 rivals=tuple(Rival(name=n, probability=p) for n, p in sorted(rivals.items(), key=lambda r: -r[1])),
                 statement=statement,
                 reference=kind.reference,
@@ -133,6 +143,12 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
             )
         )
     return named
+
+
+def _choices(effect: Effect) -> dict[str, str]:
+    """Which of its alternatives an effect is, by field."""
+    chosen = {name: getattr(effect, name) for name, field in effect.choices().items() if choice_values(field)}
+    return {name: str(value) for name, value in chosen.items() if value is not None}
 
 
 def _members(candidates: Sequence[Candidate]) -> tuple[Member, ...]:

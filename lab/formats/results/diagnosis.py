@@ -49,7 +49,8 @@ class NamedEffect(Frozen):
     """An effect that the diagnosis names, or the family of one, with its posterior probability.
 
     `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`: where the family is
-    named, its effects, likeliest first; `name` is then the family's identifier, and `parameters` are those of the first member.
+    named, its effects, likeliest first; `name` is then the family's identifier, and `parameters` are those of the first member. `choices`:
+    which of its alternatives the law is, by field: the corner of a glow.
     """
 
     name: str
@@ -59,6 +60,7 @@ class NamedEffect(Frozen):
     probability: float
     sides: tuple[Side, ...]
     parameters: dict[str, ParameterValue]
+    choices: dict[str, str] = {}
     rivals: tuple[Rival, ...] = ()
     statement: str
     #: Publication that the effect's law is taken from.
