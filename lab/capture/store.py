@@ -450,7 +450,7 @@ class Store:
                 name=row.name or session_id,
                 notes=row.notes,
                 cameras={side: DataSheet.model_validate(camera) for side, camera in row.cameras.items()},  # type: ignore[misc]
-                captures=tuple(CAPTURES.parse(one) for one in db.scalars(asked.order_by(CaptureRow.id))),
+                captures=tuple(_capture(session_id, one) for one in db.scalars(asked.order_by(CaptureRow.id))),
             )
             where = {path: StoredPlace(sha256, side, index) for path, sha256, side, index in db.execute(files)}
         return RecordingSet(manifest, source=session_id, files=SessionFiles(self.folder(session_id), where))
@@ -588,3 +588,13 @@ def _file_row(session_id: str, file: StoredFile) -> FileRow:
 def _aware(at: datetime) -> datetime:
     """The time with its zone, UTC, which SQLite doesn't keep."""
     return at if at.tzinfo is not None else at.replace(tzinfo=UTC)
+
+
+def _capture(session_id: str, document: dict[str, Any]) -> Capture:
+    """A capture of the registry. Raises InputError for a kind that this installation doesn't have."""
+    if document["kind"] not in CAPTURES.models:
+        raise InputError(
+            f"session {session_id}: it has captures of the kind {document['kind']!r}, which this version doesn't know; "
+            "read it with the version that took it"
+        )
+    return CAPTURES.parse(document)

@@ -112,6 +112,14 @@ def test_from_the_plan_to_the_report(
     assert page.count("<td>step wedge</td>") == 4
 
 
+def test_a_session_of_a_kind_that_is_gone_is_refused_by_name(tmp_path: Path) -> None:
+    store = Store(tmp_path / "data")
+    with registered(WedgeCapture):
+        session = taken(store, fake_bench.Bench())
+    with pytest.raises(InputError, match=f"session {session}: it has captures of the kind 'step_wedge', which this"):
+        store.recording_set(session)
+
+
 @pytest.mark.usefixtures("known")
 def test_the_kinds_own_checks_are_made(tmp_path: Path) -> None:
     keys: dict[str, Any] = {
