@@ -36,7 +36,7 @@ class Quantity:
     `prior` is (centre, one standard deviation) of a normal distribution in the parameter's own unit, or None for a
     flat prior between the bounds. `absent` is the value that means that the effect isn't there. `linear_power` says in
     which power of the parameter the prediction has a slope at `absent`: 2 for a displacement d, which acts as d^2.
-    `dispensable`: a refinement, that stays at `absent` where a fit without it is worth nearly as much. Of a tuple, each value is within the
+    `logarithmic`: positive, and fitted as its logarithm, as predictions depend on its product with another. `dispensable`: a refinement, that stays at `absent` where a fit without it is worth nearly as much. Of a tuple, each value is within the
     bounds.
     """
 
@@ -47,6 +47,7 @@ class Quantity:
     prior: tuple[float, float] | None = None
     absent: float | None = None
     linear_power: int = 1
+    logarithmic: bool = False
     dispensable: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:

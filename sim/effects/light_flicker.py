@@ -43,11 +43,14 @@ class LightFlicker(Effect):
             absent=0.0,
         ),
     ] = 0.0
-    frequency_hz: Annotated[float, Quantity("Hz", "frequency of the variation", lower=0.1, upper=1e6, absent=100.0)] = (
-        100.0
-    )
+    frequency_hz: Annotated[
+        float, Quantity("Hz", "frequency of the variation", lower=0.1, upper=1e6, absent=100.0, logarithmic=True)
+    ] = 100.0
     line_time_us: Annotated[
-        float, Quantity("us", "time from one row's exposure to the next one's", lower=0.0, upper=1e4, absent=15.0)
+        float,
+        Quantity(
+            "us", "time from one row's exposure to the next one's", lower=0.0, upper=1e4, absent=15.0, logarithmic=True
+        ),
     ] = 15.0
 
     @classmethod

@@ -26,6 +26,8 @@ PASSES, ROUGH_PASSES = 3, 2
 EVALUATIONS, ROUGH_EVALUATIONS, LATER_EVALUATIONS = 12, 8, 5
 #: The prior's width in a fit, in declared standard deviations: a camera at hand needn't be typical.
 PRIOR_WIDTH = 3.0
+#: A typical size of the logarithm of a parameter, and the least value of which there is one.
+TYPICAL_LOG, LEAST = 0.1, 1e-9
 #: Step of finite differences, in typical sizes of the coordinate.
 DIFFERENCE_STEP = 0.02
 
@@ -33,7 +35,7 @@ DIFFERENCE_STEP = 0.02
 @dataclass(frozen=True)
 class Coordinate:
     """One parameter of one effect as u = sign(p - absent) |p - absent|^linear_power, in which predictions have a slope
-    at `absent`."""
+    at `absent`; as u = ln p where it is declared logarithmic."""
 
     index: int  # of the effect in its set
     name: str
@@ -46,12 +48,17 @@ class Coordinate:
 
     def to_u(self, value: float) -> float:
         """u of a parameter's value."""
+        if self.quantity.logarithmic:
+            return float(np.log(max(value, LEAST)))
         away = value - self.absent
         return float(np.sign(away) * abs(away) ** self.quantity.linear_power)
 
     def to_value(self, u: float) -> float:
         """The parameter's value of u, within its bounds."""
-        value = self.absent + float(np.sign(u) * abs(u) ** (1.0 / self.quantity.linear_power))
+        if self.quantity.logarithmic:
+            value = float(np.exp(u))
+        else:
+            value = self.absent + float(np.sign(u) * abs(u) ** (1.0 / self.quantity.linear_power))
         low = self.quantity.lower if self.quantity.lower is not None else -np.inf
         high = self.quantity.upper if self.quantity.upper is not None else np.inf
         return min(max(value, low), high)
@@ -64,6 +71,8 @@ class Coordinate:
 
     def typical(self, value: float) -> float:
         """A typical size of u for a parameter at `value`."""
+        if self.quantity.logarithmic:
+            return TYPICAL_LOG
         width = self.quantity.prior[1] if self.quantity.prior is not None else 5.0
         if self.quantity.linear_power == 1:
             return width
@@ -219,8 +228,12 @@ def _prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
     centre = np.array(
         [c.to_u(c.quantity.prior[0]) if c.quantity.prior and c.quantity.linear_power == 1 else 0.0 for c in coords]
     )
-    width = np.array([PRIOR_WIDTH * c.quantity.prior[1] if c.quantity.prior else np.inf for c in coords])
-    return centre, np.array([w**c.quantity.linear_power for w, c in zip(width, coords, strict=True)])
+    width = [PRIOR_WIDTH * c.quantity.prior[1] if c.quantity.prior else np.inf for c in coords]
+    of_u = [
+        w / c.quantity.prior[0] if c.quantity.logarithmic and c.quantity.prior else w**c.quantity.linear_power
+        for w, c in zip(width, coords, strict=True)
+    ]
+    return centre, np.array(of_u)
 
 
 def _standard_deviations(
@@ -233,6 +246,9 @@ def _standard_deviations(
     std: list[dict[str, float | None]] = [{} for _ in range(effects)]
     for k, c in enumerate(coords):
         su = float(np.sqrt(max(covariance[k, k], 0.0)))
+        if c.quantity.logarithmic:
+            std[c.index][c.name] = su * c.to_value(float(u[k]))
+            continue
         power = c.quantity.linear_power
         away = abs(c.to_value(float(u[k])) - c.absent)
         std[c.index][c.name] = (

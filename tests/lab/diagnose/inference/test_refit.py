@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from lab.diagnose.inference.refit import refit
+from lab.diagnose.inference.refit import _standard_deviations, coordinates, refit
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.library import effect
+from sim.effects.light_flicker import LightFlicker
 from tests.lab.diagnose.inference.made_up import contrast_model
 
 
@@ -29,3 +31,16 @@ def test_refit_covers_the_truth() -> None:
         pulls.append((fit.effects[0].displacement_x_um - 1.5) / std)
     assert abs(np.mean(pulls)) < 3.0 / np.sqrt(40)
     assert 0.6 < np.std(pulls) < 1.35
+
+
+def test_a_logarithmic_parameter_is_fitted_as_its_logarithm() -> None:
+    """u = ln p, within ln of the bounds; the standard deviation of p is p times that of u."""
+    by_name = {c.name: c for c in coordinates((LightFlicker(),))}
+    frequency = by_name["frequency_hz"]
+    assert frequency.to_u(100.0) == pytest.approx(np.log(100.0))
+    assert frequency.to_value(frequency.to_u(120.0)) == pytest.approx(120.0)
+    assert frequency.bounds == pytest.approx((np.log(0.1), np.log(1e6)))
+    assert frequency.to_value(99.0) == 1e6
+    jacobian, prior_std = np.array([[10.0]]), np.array([np.inf])
+    std = _standard_deviations(jacobian, [frequency], np.array([np.log(100.0)]), prior_std, 1)
+    assert std == [{"frequency_hz": pytest.approx(10.0)}]
