@@ -62,6 +62,7 @@ class AdcStep(Effect):
         full = 2.0**codes.camera.bit_depth
 
         def converted(dn: FloatArray) -> FloatArray:
-            return np.asarray(dn * (1.0 - self.step_dn / full) + self.step_dn * (dn >= self.code_dn))
+            coded = np.asarray(dn * (1.0 - self.step_dn / full))
+            return np.add(coded, self.step_dn, out=coded, where=dn >= self.code_dn)
 
         return codes.adding(codes=converted)

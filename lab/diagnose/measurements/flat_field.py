@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -244,8 +245,8 @@ def _row_light(planes: Sequence[_ChannelCells], base: FloatArray, model: Uniform
     for held_out in (False, True):
         own = np.array([float(plane.held_out == held_out) for plane in planes])
         captures = next((plane.captures for plane in planes if plane.held_out == held_out), ())
-        for capture in captures:  # each in a phase of its own
-            for one in row_light_scatter(model, rows, capture.exposure_s, len(captures) ** 2, of):
+        for exposure_s, frames in Counter(c.exposure_s for c in captures).items():  # each frame in a phase of its own
+            for one in row_light_scatter(model, rows, exposure_s, len(captures) ** 2 / frames, of):
                 vectors.append(base * np.kron(own, np.repeat(one, COLS)))
     return nuisances("flat_field", vectors)
 
