@@ -98,6 +98,9 @@ def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     lines: list[str] = []
     for one in error.errors():
+        if one["type"] == "json_invalid":
+            lines.append(f"the body isn't JSON: {one['ctx']['error']}, at character {one['loc'][-1]}")
+            continue
         where = ".".join(str(part) for part in one["loc"] if part != "body")
         said = str(one["msg"]).removeprefix("Value error, ")
         given = one.get("input")

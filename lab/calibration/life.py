@@ -328,7 +328,11 @@ def _refusal(id: str, one: Judgement) -> str:
         return f"calibration {id}: {where}: the calibration doesn't have it; capture what determines it, or take the limit out"
     return (
         f"calibration {id}: {where} = {one.value:.6g} +- {one.std:.2g} is {one.mark}, good is {one.limit.good_text}; "
-        f"find out why, or accept warnings" + ("" if one.mark == "warn" else " (a bad one can't be accepted)")
+        + (
+            "find out why, or accept warnings"
+            if one.mark == "warn"
+            else "find out why and fit a new session; a bad one can't be accepted"
+        )
     )
 
 

@@ -32,11 +32,11 @@
   }, { rootMargin: "300px" });
   for (const box of boxes) seen.observe(box);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => drawn.forEach(draw));
-  // Print what is open, in the print's colours and width.
+  // Print what is open, in the print's colours and width: `printed` lays the page out so before a chart asks how wide it is.
   const shown = box => !box.closest("details:not([open])");
-  const print = () => window.Plotly && boxes.filter(shown).forEach(box => { draw(box); Plotly.Plots.resize(box); });
-  matchMedia("print").addEventListener("change", print);
-  addEventListener("beforeprint", print);
+  const redraw = () => window.Plotly && boxes.filter(shown).forEach(box => { Plotly.purge(box); draw(box); });
+  addEventListener("beforeprint", () => { document.documentElement.classList.add("printed"); redraw(); });
+  addEventListener("afterprint", () => { document.documentElement.classList.remove("printed"); redraw(); });
   // A link to a section opens it.
   const reveal = () => {
     const target = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));

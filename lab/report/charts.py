@@ -3,6 +3,7 @@ are replaced by the page's script. Uncertainty is drawn wherever the results sta
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -526,7 +527,9 @@ def residual_curve(curve: ResidualCurve) -> Figure:
         "layout": layout(
             330,
             xaxis=axis(curve.axis, anchor="y2", **_named_ticks(curve)),
-            yaxis=axis(curve.quantity or "measured", domain=[0.42, 1.0], range=_range(curve)),
+            yaxis=axis(
+                "<br>".join(textwrap.wrap(curve.quantity or "measured", 20)), domain=[0.42, 1.0], range=_range(curve)
+            ),
             yaxis2=axis("residual, σ", domain=[0.0, 0.32], zeroline=True),
             shapes=[
                 {

@@ -147,6 +147,8 @@ def test_errors_are_one_line(shared: Running) -> None:
         ]:
             assert response.status_code == status
             assert isinstance(response.json()["detail"], str) and "\n" not in response.json()["detail"]
+        broken = client.post("/api/v1/sessions", content=b'{"station":', headers={"Content-Type": "application/json"})
+        assert broken.json()["detail"] == "the body isn't JSON: Expecting value, at character 11"
         said = client.post("/api/v1/sessions", json={"station": "fakes", "colour": "red"}).json()["detail"]
         assert "colour" in said
 

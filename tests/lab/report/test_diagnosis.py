@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lab.formats.results import DiagnosisResult, ExaminedPlace, NamedEffect, ResidualCurve, ResidualPicture, Visibility
+from lab.report.charts import residual_curve
 from lab.report.diagnosis import context, mood, place_maps, worst_of_each
 
 PLACES = tuple(
@@ -21,6 +22,11 @@ def _curve(measurement: str, off: float, held_out: bool) -> ResidualCurve:
         side="left", measurement=measurement, label=measurement, channel="G", axis="x", x=(1.0,), measured=(off,),
         measured_std=(1.0,), before=(0.0,), after=(0.0,), held_out=held_out,
     )  # fmt: skip
+
+
+def test_a_long_quantity_is_broken_beside_its_axis() -> None:
+    curve = _curve("flat_rows", 5.0, True).model_copy(update={"quantity": "power over noise, cube root"})
+    assert residual_curve(curve)["layout"]["yaxis"]["title"]["text"] == "power over noise,<br>cube root"
 
 
 def test_the_map_has_every_measurement_and_its_worst_place() -> None:
