@@ -69,11 +69,13 @@ class Session:
             (folder / name).mkdir(parents=True, exist_ok=True)
 
     def run(self) -> None:
-        address = {"driver": "none", "address": "none"}
+        def entry(name: str) -> dict[str, str]:
+            return {"driver": "none", "address": name}
+
         sheets = self.bench.station_cameras()
         station = Station.model_validate(
-            dict.fromkeys(("monochromator", "spectroradiometer", "display", "stage"), address)
-            | {"cameras": {side: address | {"datasheet": sheet} for side, sheet in sheets.items()}}
+            {name: entry(name) for name in ("monochromator", "spectroradiometer", "display", "stage")}
+            | {"cameras": {side: entry(side) | {"datasheet": sheet} for side, sheet in sheets.items()}}
             | {"targets": self.bench.station_targets()}
         )
         calibration = full_plan(station)
