@@ -36,8 +36,8 @@ class Quantity:
     `prior` is (centre, one standard deviation) of a normal distribution in the parameter's own unit, or None for a
     flat prior between the bounds. `absent` is the value that means that the effect isn't there. `linear_power` says in
     which power of the parameter the prediction has a slope at `absent`: 2 for a displacement d, which acts as d^2.
-    `logarithmic`: positive, and fitted as its logarithm, as predictions depend on its product with another. `dispensable`: a refinement, that stays at `absent` where a fit without it is worth nearly as much. Of a tuple, each value is within the
-    bounds.
+    `logarithmic`: positive, and fitted as its logarithm, as predictions depend on its product with another. `dispensable`: a
+    refinement, that stays at `absent` where a fit without it is worth nearly as much. Of a tuple, each value is within the bounds.
     """
 
     unit: str

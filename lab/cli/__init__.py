@@ -8,12 +8,11 @@ An error is one line on stderr (one for each problem of a folder), never a trace
 from __future__ import annotations
 
 import os
+import sys
 
 # Both cameras are fitted at the same time; libraries that start threads of their own under these take four times as long.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
-
-import sys
 
 from lab.memory import share_arenas
 

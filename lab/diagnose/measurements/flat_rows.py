@@ -14,7 +14,7 @@ from scipy.signal import resample
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.reads import ADDED
-from lab.diagnose.measurements.row_light import ROW_LIGHT
+from lab.diagnose.measurements.row_light import PHASES, ROW_LIGHT
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.sensor import mosaic
@@ -32,9 +32,9 @@ PATTERN_STD = 3e-5
 #: Standard deviation of the rows' offsets over the read noise, where there are no repeated dark frames.
 ROW_SHARE = 0.15
 LEAST_ROWS = 24  # of a plane of the mosaic
-#: Times within a period at which a frame may begin, evaluated and interpolated; and how often they are found anew, beside the mean of
-#: all frames that follows from them.
-PHASES, FINE_PHASES, REFINEMENTS = 24, 240, 3
+#: Times within a period at which a frame may begin, interpolated between `PHASES`; and how often they are found anew, beside the mean
+#: of all frames that follows from them.
+FINE_PHASES, REFINEMENTS = 240, 3
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, 
 from lab.diagnose.measurements.held_out import held_out_flats
 from lab.diagnose.measurements.reads import LAG, acting
 from lab.diagnose.measurements.repeatability import RepeatedMeans, repeated_levels, steady
-from lab.diagnose.measurements.row_light import PHASES, ROW_LIGHT
+from lab.diagnose.measurements.row_light import ROW_LIGHT, row_light_variance
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.uniform import Uniform
@@ -48,7 +48,9 @@ def level_repeats_block(study: Study) -> Block:
 
     def predict(effects: Effects) -> Prediction:
         model = Uniform(study.camera, effects)
-        more = np.array([model.unsteadiness**2 + _of_rows(model, study, t) for t in exposure_s])
+        more = np.array(
+            [model.unsteadiness**2 + row_light_variance(model, study.camera.rows, float(t)) for t in exposure_s]
+        )
         if acting(effects, LAG):
             more = more + np.array([_of_lag(study, effects, group) for group in groups])
         return Prediction(np.log((noise + more + STEADY_LAMP**2) / (noise + STEADY_LAMP**2)) + bias, {})
@@ -98,13 +100,6 @@ def _by_exposure(repeats: list[RepeatedMeans]) -> list[list[RepeatedMeans]]:
 def _weighted(group: list[RepeatedMeans], value: list[float]) -> float:
     """Mean over settings, weighted by their degrees of freedom."""
     return float(np.average(value, weights=[len(r.away) - 1 for r in group]))
-
-
-def _of_rows(model: Uniform, study: Study, exposure_s: float) -> float:
-    """Relative variance of whole frames' levels in a light that varies within a frame, over the time at which frames begin."""
-    if not model.varies_by_row:
-        return 0.0
-    return float(np.var(model.row_factors_by_phase(study.camera.rows, exposure_s, PHASES).mean(1)))
 
 
 def _of_lag(study: Study, effects: Effects, group: list[RepeatedMeans]) -> float:

@@ -28,6 +28,13 @@ def row_light_scatter(
     return [s * d for s, d in zip(size, direction, strict=True) if s > 1e-9]
 
 
+def row_light_variance(model: Uniform, rows: int, exposure_s: float, part: slice = slice(None)) -> float:
+    """Relative variance of the mean level of the rows `part` in single frames that begin at random times."""
+    if not model.varies_by_row:
+        return 0.0
+    return float(np.var(model.row_factors_by_phase(rows, exposure_s, PHASES)[:, part].mean(1)))
+
+
 def nuisances(name: str, scattered: Iterable[FloatArray]) -> dict[str, FloatArray]:
     """Vectors as columns of a prediction's Jacobian, for nuisance parameters of standard deviation 1."""
     return {f"{name}:row light:{k}": v for k, v in enumerate(scattered)}

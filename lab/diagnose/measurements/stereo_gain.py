@@ -19,7 +19,7 @@ from lab.capture_kinds.white import WhiteCapture
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.boards import views_of
 from lab.diagnose.measurements.dark_squares import screen_block
-from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_scatter
+from lab.diagnose.measurements.row_light import ROW_LIGHT, nuisances, row_light_variance
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from lab.fit.geometry.board_detection import BoardView
@@ -138,20 +138,18 @@ def scene_gain_block(study: Study) -> Block:
 def _row_light(
     model: Uniform, rows: int, scenes: np.ndarray, exposures: Sequence[tuple[float, ...]]
 ) -> dict[str, FloatArray]:
-    """Jacobian of a scene's ratios by a light that varies while a frame is taken. Regions are taken as the frame's middle half; the few
-    frames of each side begin at times of their own."""
+    """Jacobian of the scenes' ratios by a light that varies while a frame is taken. Regions are taken as the frame's middle half; the
+    frames of both sides begin at times of their own. `exposures`: of a scene's frames, by number."""
+    if not model.varies_by_row:
+        return {}
+    middle = slice(rows // 4, rows - rows // 4)
+    variance = {t: row_light_variance(model, rows, t, middle) for t in set().union(*exposures)}
     vectors = []
     for scene in dict.fromkeys(scenes):
         own = scenes == scene
         of_scene = exposures[int(np.argmax(own))]
-        for exposure_s in of_scene:
-            frames = (len(of_scene) / 2) ** 2  # a frame's part of its side's mean
-            vectors += [
-                one[0] * own
-                for one in row_light_scatter(
-                    model, rows, exposure_s, frames, lambda light: light[:, rows // 4 : -(rows // 4)].mean(1)[:, None]
-                )
-            ]
+        # a frame is a part of its side's mean
+        vectors.append(np.sqrt(sum(variance[t] for t in of_scene)) / (len(of_scene) / 2.0) * own)
     return nuisances("stereo_gain", vectors)
 
 
