@@ -20,19 +20,6 @@ from sim.spectrum import FloatArray
 LEAST_NORM = 0.3
 
 
-def session_rivals(
-    model: MeasurementModel, candidates: Iterable[type[Effect]], cosine: float
-) -> dict[str, frozenset[str]]:
-    """By name, the effects that are rivals in one measurement of the model or in all together; effects without any have
-    an empty set."""
-    kinds = tuple(candidates)
-    changes = signature_changes(model, kinds)
-    pairs: set[tuple[str, str]] = set()
-    for mask in (*(model.mask(i) for i in range(len(model.blocks))), np.ones(len(model.value), bool)):
-        pairs |= parallel_pairs(whitened(model, changes, mask & model.seen), cosine)
-    return symmetric((k.name for k in kinds), pairs)
-
-
 def signature_changes(model: MeasurementModel, kinds: Iterable[type[Effect]]) -> dict[str, FloatArray]:
     """Changes of the baseline's prediction by every effect's prototypes, (n, prototypes), of those effects that change
     any."""

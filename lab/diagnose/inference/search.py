@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, zip_longest
@@ -13,7 +13,6 @@ from itertools import chain, zip_longest
 from lab.diagnose.inference.closed_form import LinearProblem, LinearSet, posterior, smallest_set
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit, log_likelihood, refit
-from lab.diagnose.inference.rivals import session_rivals
 from lab.diagnose.inference.score import Changes, Signatures, signatures_of
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
@@ -62,8 +61,8 @@ class Search:
     """The sets that were fitted so far, by their effects' names, and the search over further ones.
 
     `threshold` is that of the scores: twice the log odds that every effect has to earn. `changes`: of the candidates' prototypes, beside
-    no effect. `clock` gives the CPU time (s) that the
-    budget is counted in, from the search's beginning. `not_weighed`: what the budget left.
+    no effect. `clock` gives the CPU time (s) that the budget is counted in, from the search's beginning. `not_weighed`: what the budget
+    left.
     """
 
     model: MeasurementModel
@@ -79,11 +78,6 @@ class Search:
 
     def __post_init__(self) -> None:
         self._begin = self.clock()
-
-    @cached_property
-    def rivals(self) -> Mapping[str, frozenset[str]]:
-        """Effects whose signatures in these recordings are alike, by name; a symmetric relation."""
-        return session_rivals(self.model, self.candidates, self.policy.rival_cosine)
 
     @property
     def is_spent(self) -> bool:

@@ -67,11 +67,6 @@ class Candidate:
         """Whether what its law leaves is a part of what is named: of a family no law of which is exact."""
         return bool(self.members) and not self.is_closed
 
-    @property
-    def unknown_probability(self) -> float:
-        """That the cause isn't in the library."""
-        return dict(self.rivals).get(UNKNOWN, 0.0)
-
 
 def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
     """One member of a fitted set as a candidate; and the set with a rival in its place, where that is likelier.
