@@ -43,10 +43,10 @@ class KeptTransfers:
         self._kept: OrderedDict[Hashable, list[NDArray[np.complex64]]] = OrderedDict()
         self._most = most
 
-    def get(self, key: Hashable, make: Callable[[], list[ComplexArray]]) -> list[NDArray[np.complex64]]:
+    def get(self, key: Hashable, make: Callable[[], list[NDArray[np.complex64]]]) -> list[NDArray[np.complex64]]:
         """What is kept for `key`, else what `make` makes."""
         if key not in self._kept:
-            self._kept[key] = [part.astype(np.complex64) for part in make()]
+            self._kept[key] = make()
             while len(self._kept) > self._most:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
@@ -248,14 +248,14 @@ def _blurred_images(
     images: dict[str, FloatArray] = {}
     moved = _Moved(camera, grid, effects) if image_of(camera, effects).moves else None
     blur = Blur(camera, effects, collected=True)
-    transformed: list[ComplexArray] = []
+    transformed: list[NDArray[np.complex64]] = []
     for channel in camera.channels:
         wavelength_nm, weight = detected(camera, channel, lights, effects, scene.kind)
         weight = weight * collection_m2_sr(camera)
         nodes, _ = otf_wavelengths(camera, channel, wavelength_nm, np.sum(weight, axis=0), FRAME_WAVELENGTHS)
         shares = lagrange_shares(wavelength_nm, weight, nodes)
         field = _field_of_rates(camera, channel, lights, effects, scene.kind)
-        pictures = [layer.coverage for layer in drawing.layers]
+        pictures: list[NDArray[np.floating[Any]]] = [layer.coverage for layer in drawing.layers]
         # lights of one colour change alike over the field
         apart = field is not None and any(not np.allclose(f.c, field[0].c, rtol=0.0, atol=1e-12) for f in field)
         if field is not None and apart:
@@ -273,20 +273,20 @@ def _blurred_images(
         if few and (apart or not transformed) and (moved is None or moved.alike):
             transformed = [_transform(grid, [w], [p], [1.0]) for w, p in zip(windows, pictures, strict=True)]
 
-        spectrum = np.zeros((ny, nx // 2 + 1), complex)
+        spectrum = np.zeros((ny, nx // 2 + 1), np.complex64)
         if transformed and few:
             key = (channel, nodes.tobytes(), over.tobytes(), grid)
             make = partial(_layer_transfers, blur, nodes, over, grid)
-            acting: Sequence[NDArray[np.complexfloating[Any]]] = make() if kept is None else kept.get(key, make)
-            for transfer, picture in zip(acting, transformed, strict=True):
+            for transfer, picture in zip(make() if kept is None else kept.get(key, make), transformed, strict=True):
                 spectrum += transfer * picture
         else:
             for node, factors in zip(nodes, over.T.tolist(), strict=True):
                 total = _whole(grid, windows, pictures, factors)
                 if moved is not None:
                     total = moved.picture(total, float(node))
-                spectrum += blur.at(float(node), fx, fy) * (pixel_x * pixel_y) * fft.rfft2(total)
-        image = _at_pixels(spectrum, grid.oversample, nx)[m : m + grid.rows, m : m + grid.cols]
+                acting = blur.at(float(node), fx, fy) * pixel_x * pixel_y
+                spectrum += acting.astype(np.complex64) * np.asarray(fft.rfft2(total), np.complex64)
+        image = _at_pixels(spectrum, grid.oversample, nx)[m : m + grid.rows, m : m + grid.cols].astype(float)
         image = np.maximum(image + np.sum(weight[0]), 0.0)
         if field is not None:
             row, col = np.arange(camera.rows)[:, None], np.arange(camera.cols)[None, :]
@@ -295,7 +295,7 @@ def _blurred_images(
     return images
 
 
-def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid) -> list[ComplexArray]:
+def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid) -> list[NDArray[np.complex64]]:
     """What the transform of each layer's picture is multiplied with: sum_k over_lk OTF_k at the nodes (nm), with the pixel."""
     fy, fx, pixel_y, pixel_x = pixel_on_grid(blur.camera, grid)
     total = np.zeros((len(over), fy.size, fx.size), complex)
@@ -303,7 +303,8 @@ def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid
         transfer = blur.at(float(node), fx, fy)
         for index, factor in enumerate(factors):
             total[index] += factor * transfer
-    return [part * pixel_x * pixel_y for part in total]
+    pixel = pixel_x * pixel_y
+    return [(part * pixel).astype(np.complex64) for part in total]
 
 
 def _shown(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
@@ -349,7 +350,7 @@ def _cube_images(
             else:
                 transfer = blur.at(float(node), fx, fy)
                 drawn = cell_means(picture.astype(float), scene.warp(), grid, 0.0)
-                fine = (drawn if moved is None else moved.picture(drawn, float(node))).astype(np.float32)
+                fine = drawn.astype(np.float32) if moved is None else moved.picture(drawn, float(node))
             transformed = fft.rfft2(fine)
             transformed *= transfer.astype(np.complex64 if np.iscomplexobj(transfer) else np.float32)
             spectrum += transformed
@@ -487,12 +488,12 @@ class _Moved:
         #: Whether all wavelengths are moved alike.
         self.alike = bool(np.ptp(ends, axis=0).max() < ALIKE_PX)
 
-    def picture(self, drawn: FloatArray, wavelength_nm: float = MIDDLE_NM) -> FloatArray:
+    def picture(self, drawn: NDArray[np.floating[Any]], wavelength_nm: float = MIDDLE_NM) -> NDArray[np.float32]:
         """A picture on the grid, moved as light of a wavelength is."""
         from sim.scene.displace import displaced  # here: the compiler's library takes a while to load
 
         row, col = (part + self._grid.margin_px for part in self._from_px(wavelength_nm))
-        return displaced(drawn, row, col, self._grid.oversample)
+        return displaced(drawn, row, col, self._grid.oversample).astype(np.float32)
 
     def _from_px(self, wavelength_nm: float) -> tuple[FloatArray, FloatArray]:
         row, col = np.meshgrid(self._rows, self._cols, indexing="ij")
@@ -509,17 +510,23 @@ def _relative_to_ground(
 
 
 def _whole(
-    grid: Grid, windows: Sequence[tuple[slice, slice]], pictures: Sequence[FloatArray], factors: Sequence[float]
-) -> FloatArray:
+    grid: Grid,
+    windows: Sequence[tuple[slice, slice]],
+    pictures: Sequence[NDArray[np.floating[Any]]],
+    factors: Sequence[float],
+) -> NDArray[np.float32]:
     """The sum of factor x picture, each on its window of the grid."""
-    total = np.zeros(grid.shape)
+    total = np.zeros(grid.shape, np.float32)
     for window, picture, factor in zip(windows, pictures, factors, strict=True):
         total[window] += factor * picture
     return total
 
 
 def _transform(
-    grid: Grid, windows: Sequence[tuple[slice, slice]], pictures: Sequence[FloatArray], factors: Sequence[float]
-) -> ComplexArray:
+    grid: Grid,
+    windows: Sequence[tuple[slice, slice]],
+    pictures: Sequence[NDArray[np.floating[Any]]],
+    factors: Sequence[float],
+) -> NDArray[np.complex64]:
     """Fourier transform of the sum of factor x picture."""
-    return np.asarray(fft.rfft2(_whole(grid, windows, pictures, factors)), complex)
+    return np.asarray(fft.rfft2(_whole(grid, windows, pictures, factors)), np.complex64)

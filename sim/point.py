@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import CubicSpline
-from scipy.signal import convolve2d
 
 from sim.camera import CameraModel
 from sim.detection import check_finite, detected, otf_wavelengths, otf_weight
@@ -208,6 +207,8 @@ def mixed(
     T'_c(f) = sum_n k_n s_n T_n(f) exp(-2 pi i f n) / sum_n k_n s_n, over the offsets n of the kernel k of all moves together; s_n and T_n are of
     the channel from which charge moves by n to a pixel of channel c. Of a channel with several phases in the mosaic, their mean.
     """
+    from scipy.signal import convolve2d  # here: the library takes a while to load
+
     kernel = reduce(convolve2d, charge_of(camera, effects).kernels, np.ones((1, 1)))
     half, step, phases = np.array(kernel.shape) // 2, mosaic.step(camera.cfa), mosaic.phases(camera.cfa)
     channel_at = {place: i for i, name in enumerate(camera.channels) for place in phases[name]}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.special import ndtri
@@ -34,8 +34,22 @@ LEVEL = SHADING | {
     "codes.codes",
 }
 
-#: Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1.
-NOISE_NODES = ndtri((np.arange(48) + 0.5) / 48) / np.std(ndtri((np.arange(48) + 0.5) / 48))
+#: Values that stand for the noise of a level: over all its points, and the most and the least at one point.
+NOISE_VALUES, MOST_AT_A_POINT, LEAST_AT_A_POINT = 480, 48, 6
+GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@cache
+def noise_values(points: int) -> FloatArray:
+    """Values of equal weight that stand for a normal variable of mean 0 and standard deviation 1, (points, values).
+
+    At each point, the quantiles (i + s) / k, i = 0..k - 1. The offset s differs from point to point by the golden ratio, so that points
+    whose levels are alike sample the distribution k x points times.
+    """
+    count = int(np.clip(NOISE_VALUES // points, LEAST_AT_A_POINT, MOST_AT_A_POINT))
+    offset = (0.5 + GOLDEN_RATIO * np.arange(points)) % 1.0
+    values = ndtri((np.arange(count) + offset[:, None]) / count)
+    return np.asarray((values - values.mean()) / values.std())
 
 
 @dataclass(frozen=True)
@@ -315,7 +329,7 @@ class Uniform:
             dn = camera.conversion_gain_dn_per_e * self.response(value)
             if not self.has_even_codes:
                 noise = camera.conversion_gain_dn_per_e * np.sqrt(np.maximum(value, 0.0) + camera.read_noise_e**2)
-                dn = self.codes(camera.black_level_dn + dn[..., None] + noise[..., None] * NOISE_NODES)
+                dn = self.codes(camera.black_level_dn + dn[..., None] + noise[..., None] * noise_values(dn.shape[-1]))
                 dn = dn.mean(axis=-1) - camera.black_level_dn
             means[channel] = dn.mean(axis=-1)
         return means

@@ -371,12 +371,15 @@ def _fourier_sum(samples: FloatArray, pitch_um: float, fx: FloatArray, fy: Float
     fx, fy = np.asarray(fx, float), np.asarray(fy, float)
     y, x = ((np.arange(n) - 0.5 * (n - 1)) * pitch_um for n in samples.shape)
     shape, limit = np.broadcast_shapes(fx.shape, fy.shape), 0.5 / pitch_um * (1 + 1e-9)
-    passed = (np.abs(fx) <= limit) & (np.abs(fy) <= limit)
     if len(shape) == 2 and np.all(fx == fx[:1]) and np.all(fy == fy[:, :1]):
-        # a grid: one product of matrices
+        # a grid: one product of matrices, of the frequencies that pass
         across, down = np.broadcast_to(fx, shape)[0], np.broadcast_to(fy, shape)[:, 0]
-        value = np.exp(-2j * np.pi * np.outer(down, y)) @ samples @ np.exp(-2j * np.pi * np.outer(x, across))
-        return np.where(passed, value, 0.0)
+        in_x, in_y = np.abs(across) <= limit, np.abs(down) <= limit
+        of_rows, of_cols = (np.exp(-2j * np.pi * np.outer(f, at)) for f, at in ((down[in_y], y), (across[in_x], x)))
+        value = np.zeros(shape, complex)
+        value[np.ix_(in_y, in_x)] = of_rows @ samples @ of_cols.T
+        return value
+    passed = (np.abs(fx) <= limit) & (np.abs(fy) <= limit)
     across, down = np.broadcast_to(fx, shape).ravel(), np.broadcast_to(fy, shape).ravel()
     total = np.empty(across.size, complex)
     block = max(1, 500_000 // max(samples.shape))

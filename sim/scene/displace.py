@@ -5,15 +5,20 @@ Import it where it is used, not at the top of a module: the compiler's library t
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from scipy.ndimage import spline_filter
 
 from sim.optics.bspline import spline_weights
 from sim.spectrum import FloatArray
 
 
-def displaced(drawn: FloatArray, from_row_px: FloatArray, from_col_px: FloatArray, oversample: int) -> FloatArray:
+def displaced(
+    drawn: NDArray[np.floating[Any]], from_row_px: FloatArray, from_col_px: FloatArray, oversample: int
+) -> FloatArray:
     """A drawing's samples taken at other places, (n oversample, m oversample) as `drawn`.
 
     `from_row_px`, `from_col_px`: (n + 2, m + 2) places in pixels of the drawing, the first of which has its centre at (0, 0), that the

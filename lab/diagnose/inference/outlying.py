@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, chdtri
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.block import Block, Effects
@@ -48,7 +48,7 @@ def outlying_levels(
     solved = gaussian.solve(np.column_stack([model.value - gaussian.mean, column]))
     normal, right = column.T @ solved[:, 1:], column.T @ solved[:, 0]
     slack = (1.0 + policy.covariance_slack) ** 2
-    least = slack * float(stats.chi2.isf(policy.slice_false_alarm_rate / len(captures), 1))
+    least = slack * float(chdtri(1, policy.slice_false_alarm_rate / len(captures)))
     chosen: list[int] = []
     while True:
         rest = [i for i in range(len(captures)) if i not in chosen]
@@ -83,7 +83,7 @@ def _agrees(
         for where in (model.seen | mine, model.seen & ~mine)
     )
     left = (both - others) / (1.0 + policy.covariance_slack) ** 2
-    return float(stats.chi2.sf(left, max(int(mine.sum()) - freed, 1))) > policy.slice_false_alarm_rate
+    return float(chdtrc(max(int(mine.sum()) - freed, 1), left)) > policy.slice_false_alarm_rate
 
 
 def _by_setting(

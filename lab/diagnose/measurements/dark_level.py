@@ -17,7 +17,7 @@ from lab.diagnose.measurements.reads import DARK_CURRENT, LAG, LINES
 from lab.diagnose.measurements.study import Study
 from lab.errors import NotDetermined
 from sim.spectrum import FloatArray
-from sim.uniform import NOISE_NODES, Uniform
+from sim.uniform import Uniform, noise_values
 
 #: Most points of the grid on which the dark current over the field is evaluated. A grid much coarser than the pixels moves the laws'
 #: origin and the cells' borders: with 50 DN of glow in a corner, a cell's mean is then off by a hundred standard deviations.
@@ -75,7 +75,7 @@ def dark_level_block(study: Study) -> Block:
             mean[i] += offset(capture) + more(capture) + gain * float(lag_e)
         model = Uniform(study.camera, effects)
         if not model.has_even_codes:
-            mean = model.codes(mean[:, None] + gain * study.camera.read_noise_e * NOISE_NODES).mean(axis=1)
+            mean = model.codes(mean[:, None] + gain * study.camera.read_noise_e * noise_values(1)).mean(axis=1)
         return Prediction(mean, study.free_offsets(exposures) | lines.jacobian(effects))
 
     # noise of less than about half a code doesn't dither: rounding moves the mean, by its place between two codes

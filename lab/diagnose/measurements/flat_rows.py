@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import resample
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
@@ -218,6 +217,8 @@ def _added_power(
     model: Uniform, camera_rows: int, levels: Sequence[_Level], bands: Sequence[range], step: int
 ) -> FloatArray:
     """Power (levels x bands,) over that of the noise, of the rows in a light that varies while a frame is taken."""
+    from scipy.signal import resample  # here: the library takes a while to load
+
     factors = []
     for level in levels:
         by_phase = model.row_factors_by_phase(camera_rows, level.captures[0].exposure_s, PHASES)

@@ -11,7 +11,7 @@ from lab.errors import NotDetermined
 from lab.fit.rounding import variance_rounding_std
 from sim.sensor import mosaic
 from sim.spectrum import FloatArray
-from sim.uniform import NOISE_NODES, Uniform
+from sim.uniform import Uniform, noise_values
 
 VARIANCE_FLOOR = 0.002  # relative standard deviation of a variance beside chance: rounding, a few clipped pixels
 GAIN_STD, READ_STD = 0.3, 0.3  # relative prior standard deviations of conversion gain and dark variance
@@ -98,7 +98,7 @@ def behind(signal_e: FloatArray, light: FloatArray, effects: Effects, study: Stu
 
 def coded_variance(dn: FloatArray, dn2: FloatArray, effects: Effects, study: Study) -> FloatArray:
     """Variance (DN^2) of normal variables of means `dn` and variances `dn2`, in a converter's codes, by quadrature."""
-    values = dn[..., None] + np.sqrt(dn2)[..., None] * NOISE_NODES
+    values = dn[..., None] + np.sqrt(dn2)[..., None] * noise_values(1)
     return np.asarray(Uniform(study.camera, effects).codes(values).var(axis=-1))
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from lab.capture_kinds.base import Capture
 from sim.spectrum import FloatArray
@@ -76,7 +76,7 @@ def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
     slope = np.array([float(r.elapsed_s @ r.away) for r in repeats]) / np.where(size > 0, size, 1.0)
     trend = weighted_median(slope, size / (noise + LAMP_FLOOR**2)) if size.any() else 0.0
     square = np.array([float(np.sum(np.square(r.away - trend * r.elapsed_s))) for r in repeats])
-    usual = square / stats.chi2.median(free)
+    usual = square / special.chdtri(free, 0.5)
 
     def excess(variance: float) -> float:
         return float(np.median(usual / np.maximum(noise + variance, 1e-30))) - 1.0
@@ -84,7 +84,7 @@ def steady(repeats: Sequence[RepeatedMeans]) -> list[RepeatedMeans]:
     common = optimize.brentq(excess, 0.0, float(usual.max())) if usual.max() > 0 and excess(0.0) > 0 else 0.0
     ratio = square / free / (noise + max(common, LAMP_FLOOR**2))
     worth = MEDIAN_EFFICIENCY * (free.sum() - free)
-    limit = stats.f.isf(OUT_OF_LINE_PROBABILITY / len(repeats), free, worth)
+    limit = special.fdtri(free, worth, 1.0 - OUT_OF_LINE_PROBABILITY / len(repeats))
     out = ratio > limit
     if out.sum() > OUT_OF_LINE_SHARE * len(repeats):
         return list(repeats)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from lab.diagnose.inference.decide import Verdict
 from lab.diagnose.inference.discrepancy import Discrepancy
@@ -239,7 +239,7 @@ def _nearest(
     index = np.arange(at.start, at.stop)[model.seen[at]]
     others = tuple(e for e in verdict.effects if e.name != name)
     left = _seen_chi2(model, model.gaussian((*others, nearest.effect)), index)
-    least = float(stats.chi2.isf(policy.slice_false_alarm_rate, len(index))) * (1.0 + policy.covariance_slack) ** 2
+    least = float(chdtri(len(index), policy.slice_false_alarm_rate)) * (1.0 + policy.covariance_slack) ** 2
     if left > least:
         told = f"chi2 is {left:.0f} with it, {chi2_without:.0f} without, {len(index)} are expected"
         return f"the nearest law is {name}, and it doesn't hold exactly: {told}"

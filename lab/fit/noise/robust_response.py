@@ -19,7 +19,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
 from lab.fit.weighted_lines import least_squares
 from sim.spectrum import FloatArray
@@ -171,7 +171,7 @@ class _LightLaw:
             leverage = np.einsum("ij,jk,ik->i", self.basis[out], covariance, self.basis[out])
             std = np.sqrt(self.noise[out] ** 2 + scatter**2 + leverage)
             # With `number` levels out, one of `count - number + 1` is the next candidate
-            limit = stats.t.isf(FALSE_ALARM / (2.0 * (count - number + 1)), freedom)
+            limit = -special.stdtrit(freedom, FALSE_ALARM / (2.0 * (count - number + 1)))
             if np.all((rest > limit * std) & (rest > LEAST_DEPARTURE)):
                 return chosen
         return np.ones(count, bool)
