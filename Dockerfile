@@ -8,7 +8,8 @@ COPY drivers drivers
 COPY lab lab
 COPY api api
 COPY mocks mocks
-RUN pip install --no-cache-dir -c constraints.txt '.[postgresql]'
+COPY scripts/compile_loops.py scripts/
+RUN pip install --no-cache-dir -c constraints.txt '.[postgresql]' && python scripts/compile_loops.py
 USER calibench
 ENV CALIBENCH_DATA=/data PYTHONUNBUFFERED=1
 VOLUME /data

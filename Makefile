@@ -17,6 +17,7 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	rm -rf calibench.egg-info  # pytest would rewrite the assertions of every module that it lists
+	$(BIN)/python scripts/compile_loops.py
 	touch $@
 
 # A day in virtual time on a bench whose instruments fail at 1 % of their answers. ARGS as pytest's. Its logging keeps every failed run in memory: off.
