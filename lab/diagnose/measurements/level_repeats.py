@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import digamma, polygamma
 
 from lab.diagnose.measurements.block import Block, Effects, Label, Measurement, Prediction
 from lab.diagnose.measurements.held_out import held_out_flats
@@ -22,11 +21,14 @@ LEAST_FREEDOM, MOST_NUMBERS = 4, 4
 
 
 def level_repeats_block(study: Study) -> Block:
-    """ln((S + s0^2) / (noise + s0^2)) of flat settings with repeats, pooled over neighbouring exposures.
+    """(S / noise)^(1/3) of flat settings with repeats, pooled over neighbouring exposures.
 
-    S is the variance of a setting's relative levels, with n - 1 degrees of freedom; noise its expectation by the noise of pixels; s0 =
-    `STEADY_LAMP`. Image lag adds to S what each repeat's predecessor leaves in it. Settings out of line with the others are left out
-    (`steady`): other measurements find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of freedom.
+    S is the variance of a setting's relative levels, with f = n - 1 degrees of freedom; noise its expectation by the noise of pixels. The
+    cube root of chi2_f / f is all but normal, of mean 1 - 2 / (9 f) and variance 2 / (9 f), also for few degrees of freedom, where a
+    logarithm would hide much of a large variance (Wilson and Hilferty, PNAS 17, 684, 1931). Nuisance parameters: a lamp's usual
+    unsteadiness, whose variance is uncertain by s0^2, s0 = `STEADY_LAMP`; and how much wider S scatters the larger it is. Image lag adds
+    to S what each repeat's predecessor leaves in it. Settings out of line with the others are left out (`steady`): other measurements
+    find those. Raises NotDetermined for fewer than `LEAST_FREEDOM` degrees of freedom.
     """
     groups = _by_exposure(_seen(study))
     if not groups:
@@ -37,13 +39,8 @@ def level_repeats_block(study: Study) -> Block:
     freedom = np.array([sum(len(r.away) - 1 for r in group) for group in groups], float)
     noise = np.array([_weighted(group, [r.noise for r in group]) for group in groups])
     square = np.array([sum(float(np.sum(np.square(r.away))) for r in group) for group in groups]) / freedom
-    value = np.log((square + STEADY_LAMP**2) / (noise + STEADY_LAMP**2))
-    # mean of ln(chi2_f / f), for the share of the variance that isn't the lamp's floor
-    share = noise / (noise + STEADY_LAMP**2)
-    bias = share * (digamma(0.5 * freedom) - np.log(0.5 * freedom))
-    # a lamp's usual unsteadiness is uncertain by its own size, and common to all settings
-    usual = np.log1p(STEADY_LAMP**2 / (noise + STEADY_LAMP**2))
-    covariance = np.diag(polygamma(1, 0.5 * freedom)) + np.outer(usual, usual)
+    value = np.cbrt(square / noise)
+    variance = 2.0 / (9.0 * freedom)
     exposure_s = np.array([_weighted(group, [r.captures[0].exposure_s for r in group]) for group in groups])
 
     def predict(effects: Effects) -> Prediction:
@@ -53,14 +50,18 @@ def level_repeats_block(study: Study) -> Block:
         )
         if acting(effects, LAG):
             more = more + np.array([_of_lag(study, effects, group) for group in groups])
-        return Prediction(np.log((noise + more + STEADY_LAMP**2) / (noise + STEADY_LAMP**2)) + bias, {})
+        root = np.cbrt(1.0 + more / noise)
+        usual = np.cbrt(1.0 + (more + STEADY_LAMP**2) / noise) - root
+        wider = np.diag(np.sqrt(variance * (np.square(root) - 1.0)))
+        scatter = {f"scatter of repeats {number}": column for number, column in enumerate(wider)}
+        return Prediction(root * (1.0 - variance), {"usual unsteadiness of the lamp": usual} | scatter)
 
     labels = tuple(
         Label(float(np.log(t)), "all", f"{t:.4g} s", tuple(c.id for r in group for c in r.captures), held_out=False)
         for t, group in zip(exposure_s, groups, strict=True)
     )
     return Block(
-        measurement=LEVEL_REPEATS, reach=1.0, value=value, covariance=covariance, labels=labels,
+        measurement=LEVEL_REPEATS, reach=1.0, value=value, covariance=np.diag(variance), labels=labels,
         reads=frozenset({"light.unsteadiness"}) | ROW_LIGHT | LAG, predict=predict, scale=np.ones(len(value)),
     )  # fmt: skip
 
@@ -124,5 +125,5 @@ LEVEL_REPEATS = Measurement(
     axis="exposure",
     unit="log s",
     make=level_repeats_block,
-    quantity="variance over noise, ln",
+    quantity="variance over noise, cube root",
 )

@@ -7,20 +7,27 @@ import pytest
 
 from lab.diagnose.inference.decide import decide
 from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.measurements.block import Block, Effects
 from lab.diagnose.measurements.level_repeats import level_repeats_block
 from lab.diagnose.policy import DecisionPolicy
 from mocks.former.laws import ImageLagLaw, LightFlickerLaw, SourceInstabilityLaw
 from sim.effects.image_lag import ImageLag
 from sim.effects.light_flicker import LightFlicker
 from sim.effects.source_instability import SourceInstability
+from sim.spectrum import FloatArray
 from tests.lab.diagnose.on_blocks import former, study
+
+
+def std_of(block: Block, effects: Effects) -> FloatArray:
+    """Standard deviation of each number under these effects."""
+    jacobian = block.predict(effects).jacobian
+    return np.sqrt(np.diag(block.covariance) + sum(np.square(column) for column in jacobian.values()))
 
 
 @pytest.mark.parametrize("seed", [772511, 772512, 772513, 772514])
 def test_a_steady_source_is_no_finding(seed: int) -> None:
     block = level_repeats_block(study(former(seed)))
-    left = block.value - block.predict(()).mean
-    assert np.all(np.abs(left) < 3.0 * np.sqrt(np.diag(block.covariance)))
+    assert np.all(np.abs(block.value - block.predict(()).mean) < 3.0 * std_of(block, ()))
 
 
 def test_an_unsteady_source_is_named_with_its_size() -> None:
@@ -45,24 +52,29 @@ def test_flicker_within_frames_moves_whole_frames_too() -> None:
     law = LightFlickerLaw(20.0, 0, 4)
     block = level_repeats_block(study(former(772531, law)))
     flicker = LightFlicker(modulation_percent=20.0, frequency_hz=100.0, line_time_us=60.0)
-    std = np.sqrt(np.diag(block.covariance))
-    assert np.any(block.value - block.predict(()).mean > 3.0 * std)
-    assert np.all(np.abs(block.value - block.predict((flicker,)).mean) < 3.0 * std)
+    assert np.any(block.value - block.predict(()).mean > 3.0 * std_of(block, ()))
+    assert np.all(np.abs(block.value - block.predict((flicker,)).mean) < 3.0 * std_of(block, (flicker,)))
 
 
 @pytest.mark.parametrize("seed", [772551, 772556])
 def test_image_lag_scatters_repeats_by_what_the_frames_before_left(seed: int) -> None:
-    """5 % of the frame before, exposures up and down, the same noise with and without it. S = (lag + noise)^2 over 4 degrees of freedom:
-    beside a change of ln S by d, the product of both scatters ln S by 2 exp(-d / 2) / sqrt(4). It was called source_instability."""
+    """5 % of the frame before, exposures up and down, the same noise with and without it. Over 4 degrees of freedom, the product of both
+    scatters S / noise by 2 sqrt(R / 4), R the lag's variance over the noise's. It was called source_instability."""
     with_lag = level_repeats_block(study(former(seed, ImageLagLaw(5.0, 0, 9), shuttle=True)))
     without = level_repeats_block(study(former(seed, shuttle=True)))
-    change = with_lag.predict((ImageLag(lag_percent=5.0),)).mean - with_lag.predict(()).mean
-    assert np.all(change > 2.0)
-    assert np.all(np.abs(with_lag.value - without.value - change) < 3.0 * np.exp(-0.5 * change))
+    mean = 1.0 - np.diag(with_lag.covariance)
+    lag = (with_lag.predict((ImageLag(lag_percent=5.0),)).mean / mean) ** 3 - 1.0
+    assert np.all(lag > 6.0)
+    assert np.all(np.abs(with_lag.value**3 - without.value**3 - lag) < 3.0 * np.sqrt(lag))
 
 
 def test_the_law_adds_its_variance() -> None:
-    """log((n + s^2 + s0^2) / (n + s0^2)) grows with s, and is 2 log(s) apart for large s."""
+    """((n + s^2) / n)^(1/3) grows with s, as s^(2/3) for large s; so does its scatter."""
     block = level_repeats_block(study(former(772541)))
-    one, two = (block.predict((SourceInstability(instability_percent=s),)).mean for s in (5.0, 10.0))
-    np.testing.assert_allclose(two - one, 2.0 * np.log(2.0), rtol=1e-3)
+    small, large = (block.predict((SourceInstability(instability_percent=s),)) for s in (5.0, 10.0))
+    np.testing.assert_allclose(large.mean, 2.0 ** (2.0 / 3.0) * small.mean, rtol=1e-3)
+    own = [name for name, column in large.jacobian.items() if np.count_nonzero(column) == 1]
+    wide = np.sqrt(np.diag(block.covariance) + sum(np.square(large.jacobian[name]) for name in own))
+    np.testing.assert_allclose(
+        wide / large.mean, np.sqrt(np.diag(block.covariance)) / block.predict(()).mean, rtol=1e-6
+    )
