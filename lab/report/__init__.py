@@ -34,6 +34,7 @@ from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
 from lab.report.provenance import Provenance, installed_versions, provenance_of
+from lab.report.stills import still
 from sim.camera import Side
 
 __all__ = ["Provenance", "installed_versions", "provenance_of", "render_report", "write_report"]
@@ -137,6 +138,7 @@ def page_environment() -> jinja2.Environment:
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,
+        "still": still,
         "mood": diagnosis_page.mood,
         "check_name": lambda name: words.CHECK_NAMES.get(name, name),
     }

@@ -104,11 +104,12 @@ def meaning(diagnosis: DiagnosisResult | None, validation: ValidationResult | No
     """Sentences: what the effects do to light and signal, and by how much the baseline's predictions are off."""
     for effect in diagnosis.effects[:NAMED] if diagnosis is not None else ():
         yield effect.statement.split(" Seen in ")[0]
+    named = diagnosis is not None and bool(diagnosis.effects)
     for side, worst in _worst(validation.checks if validation is not None else ()).items():
         off = [check for check in worst if not check.passed]
         said = ", ".join(f"{words.CHECK_NAMES[check.name]} by {check.rms_relative_percent:.2g} % rms" for check in off)
         if off:
-            yield f"Without these effects, the {side} camera's prediction misses: {said}."
+            yield f"{'Without these effects, the' if named else 'The'} {side} camera's prediction misses: {said}."
         elif worst:
             names = ", ".join(words.CHECK_NAMES[check.name] for check in worst)
             yield f"The {side} camera is predicted within its uncertainty: {names}."
