@@ -14,6 +14,7 @@ import numpy as np
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.library import measurement_title
+from lab.effect_titles import at_beginning, effect_title
 from lab.errors import InputError
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
@@ -134,7 +135,8 @@ def page_environment() -> jinja2.Environment:
     environment.filters |= {
         "words": lambda text: str(text).replace("_", " "),
         "measurement": measurement_title,
-        "effect_name": words.effect_name,
+        "effect_title": effect_title,
+        "at_beginning": at_beginning,
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,

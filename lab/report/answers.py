@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lab.diagnose.measurements.library import measurement_title
+from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ResidualCurve, ValidationResult
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each
@@ -56,7 +57,7 @@ def effect_line(effect: NamedEffect) -> str:
         if name in fields
     ]
     where = " and ".join(effect.sides)
-    return f"{words.effect_name(effect.name).capitalize()}, {where}: {'; '.join(sizes)}."
+    return f"{at_beginning(effect_title(effect.name))}, {where}: {'; '.join(sizes)}."
 
 
 def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
@@ -65,7 +66,7 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
         return
     yield from (effect_line(effect) for effect in diagnosis.effects[:NAMED])
     if len(diagnosis.effects) > NAMED:
-        more = ", ".join(words.effect_name(effect.name) for effect in diagnosis.effects[NAMED:])
+        more = ", ".join(effect_title(effect.name) for effect in diagnosis.effects[NAMED:])
         yield f"Also: {more}."
     if diagnosis.unexplained:
         places = sorted({f"{measurement_title(item.measurement)} ({item.side})" for item in diagnosis.unexplained})
@@ -78,8 +79,8 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
 
 def _sure_of(effect: NamedEffect) -> str:
     share = f"{100 * effect.probability:.1f} %" if effect.probability < 0.9995 else "above 99.9 %"
-    rivals = ", ".join(f"{words.effect_name(rival.name)} ({rival.probability:.2g})" for rival in effect.rivals)
-    return f"{words.effect_name(effect.name).capitalize()}: probability {share}" + (
+    rivals = ", ".join(f"{effect_title(rival.name)} ({rival.probability:.2g})" for rival in effect.rivals)
+    return f"{at_beginning(effect_title(effect.name))}: probability {share}" + (
         f"; rivals: {rivals}." if rivals else "."
     )
 

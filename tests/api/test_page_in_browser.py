@@ -91,7 +91,7 @@ class Watched:
         self.page.wait_for_selector("#captures img")
         self.page.wait_for_selector("#transfer svg .c1")  # from the process that looks at the captures
         self.page.wait_for_selector("#findings-proofs figure:nth-child(2) svg .c3")
-        assert "infrared cut filter" in self.page.inner_text("#findings-answers").lower()
+        assert "infrared-cut filter" in self.page.inner_text("#findings-answers").lower()
         assert len(self.page.query_selector_all("#findings-pictures canvas")) == 2  # before and after
 
     def serious(self) -> list[str]:
