@@ -69,6 +69,8 @@ ASSETS = {
             "queue.js",
             "watch.js",
             "recordings.js",
+            "models.js",
+            "send.js",
             "calibrations.js",
             "challenges.js",
             "findings.js",

@@ -95,19 +95,20 @@ def serve(
     for file in (tls_certificate, tls_key):
         if file is not None and not os.access(file, os.R_OK):
             raise InputError(f"{file}: can't be read; give a PEM file")
-    from lab.capture.close_shutters import closed_at_start
     from lab.capture.recovery import Recovery
+    from lab.capture.safe_at_start import made_safe_at_start
 
     store = _store(data)
     wanted = is_loopback(host) if create_first_key is None else create_first_key
     makes_key = wanted and not stored_keys(store)
     if not makes_key:
         check_bind(host, stored_keys(store))
-    with _listening(host, port) as line, contextlib.closing(Recovery(store)) as recovery:
-        closed_at_start()
-        recovery.start(
-            RESCUE_FIRST_S
-        )  # before the service itself is loaded, which takes seconds: a shutter may be open
+    with (
+        _listening(host, port) as line,
+        contextlib.closing(Recovery(store, made_safe=made_safe_at_start())) as recovery,
+    ):
+        # Before the service itself is loaded, which takes seconds: an instrument that wasn't reached at once may be unsafe.
+        recovery.start(RESCUE_FIRST_S)
 
         import uvicorn
 

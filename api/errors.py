@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from typing import Any, TypeVar
@@ -94,10 +95,28 @@ def _answer(status: int) -> Callable[[Request, Exception], Response]:
     return handler
 
 
+def _paths_of(request: Request) -> list[str]:
+    """The described paths that a request's path is one of."""
+    return [path for path in request.app.openapi()["paths"] if compile_path(path)[0].match(request.url.path)]
+
+
+def _unknown_in_path(request: Request, name: str) -> Response:
+    """404: what a path names can't be there, as it isn't even formed as such names are. Says which list to look into."""
+    paths = request.app.openapi()["paths"]
+    listed = next(path for path in _paths_of(request) if f"/{{{name}}}" in path).partition(f"/{{{name}}}")[0]
+    where = listed
+    while where and "get" not in paths.get(where, {}):
+        where = where.rpartition("/")[0]
+    said = f"no {request.path_params[name][:60]!r} among the {listed.rpartition('/')[2].replace('-', ' ')}"
+    return problem(404, request.app.state.public(f"{said}; see GET {re.sub('{.*?}', 'ID', where)}"))
+
+
 def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     lines: list[str] = []
     for one in error.errors():
+        if one["loc"][0] == "path" and one["type"] != "literal_error":
+            return _unknown_in_path(request, str(one["loc"][1]))
         if one["type"] == "json_invalid":
             lines.append(f"the body isn't JSON: {one['ctx']['error']}, at character {one['loc'][-1]}")
             continue
@@ -105,7 +124,9 @@ def _invalid(request: Request, error: Exception) -> Response:
         said = str(one["msg"]).removeprefix("Value error, ")
         given = one.get("input")
         # A key that was sent is never repeated. What our own checks say names the value already.
-        if isinstance(given, int | float) and one["type"] != "value_error":
+        if one["type"] == "string_pattern_mismatch":  # ids alone have patterns
+            said = f"{str(given)[:60]!r} is no id: take one that the lists have, of letters, digits and hyphens"
+        elif isinstance(given, int | float) and one["type"] != "value_error":
             said = f"{given!r}: {said}"
         if not any(line.startswith(f"{where}.") for line in lines):  # it follows from what is said of a part of it
             lines.append(f"{where}: {said}" if where else said)
@@ -118,12 +139,7 @@ def _refused(request: Request, error: Exception) -> Response:
     headers = dict(error.headers or {})
     if error.status_code == 405:
         paths = request.app.openapi()["paths"]
-        methods = [
-            method.upper()
-            for path, operations in paths.items()
-            if compile_path(path)[0].match(request.url.path)
-            for method in operations
-        ]
+        methods = [method.upper() for path in _paths_of(request) for method in paths[path]]
         headers["allow"] = ", ".join(dict.fromkeys(methods)) or headers.get("allow", "GET")
         return problem(405, f"{request.method} isn't for this path; use {headers['allow']}", headers)
     said = str(error.detail)

@@ -3,7 +3,7 @@
     .venv/bin/python docs/draw_puzzle.py        (a minute)
 
 A camera of the second image former (`mocks.former`, which shares no code with the models that the diagnosis fits) conceals an optical
-low-pass filter of 1.6 um and an infrared cut filter at 645 nm. Its recordings are diagnosed, and the curves of the result are drawn: the
+low-pass filter of 1.6 um and an infrared-cut filter at 645 nm. Its recordings are diagnosed, and the curves of the result are drawn: the
 measured ones with bars of two standard deviations, the baseline's prediction dashed, the improved model's solid. Open points are captures that the diagnosis
 held out.
 """
@@ -19,6 +19,7 @@ import numpy as np
 
 from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
+from lab.effect_titles import effect_title
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import DiagnosisResult, ResidualCurve
 from mocks.former import ConcealedCamera, Plan
@@ -224,7 +225,7 @@ def named(result: DiagnosisResult, panel: Panel, effect: str, parameters: Sequen
     values = [found.parameters[name] for name in parameters]
     sizes = ", ".join(f"{value.value:.{digits(value.std)}f} ± {value.std:.{digits(value.std)}f}" for value in values)
     unit = values[0].unit.replace("um", "µm")
-    words = f"named: {effect.replace('_', ' ').replace('low pass', 'low-pass')}, {sizes} {unit}"
+    words = f"named: {effect_title(effect)}, {sizes} {unit}"
     return [text(panel.left, TOP - 18, words, fill=MUTED)]
 
 

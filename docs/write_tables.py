@@ -153,6 +153,8 @@ def command_page() -> str:
 def _commands(group: object, prefix: str) -> Iterator[tuple[str, object]]:
     for name, command in group.commands.items():  # type: ignore[attr-defined]
         if hasattr(command, "commands"):
+            if command.invoke_without_command:  # it does something without one of its commands, too
+                yield f"{prefix}{name}", command
             yield from _commands(command, f"{prefix}{name} ")
         else:
             yield f"{prefix}{name}", command

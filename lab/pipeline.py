@@ -94,7 +94,7 @@ class PipelineRequest:
     job_id : the job for which the goal's result is kept
     reuse : take the kept results of a finished session in place of computing the goal's inputs again. Without it a diagnosis is given
         only the fits that it rests on, and these aren't kept
-    fit : a fit to rest on in place of a new one
+    fit, validation, diagnosis : results to rest on in place of new ones
     models : camera files that replace the fitted cameras, by side, in validation and diagnosis
     resolve : after the diagnosis, take the captures that tell the remaining rivals apart
     pictures : draw the residual pictures of the diagnosis
@@ -111,6 +111,8 @@ class PipelineRequest:
     job_id: str | None = None
     reuse: bool = False
     fit: FitResult | None = None
+    validation: ValidationResult | None = None
+    diagnosis: DiagnosisResult | None = None
     models: Mapping[Side, CameraFile] = field(default_factory=dict)
     resolve: bool = False
     pictures: bool = True
@@ -195,7 +197,7 @@ def source_recordings(source: str, open_store: Callable[[], Store | None]) -> Re
     if store is None or not store.has_session(source):
         where = "there is no data folder" if store is None else f"no session in {store.root}"
         raise InputError(
-            f"{source}: no such folder, and {where}; give a recording set's folder or a session's id, and its data folder as CALIBENCH_DATA"
+            f"{source}: no such folder, and {where}; give a recording set's folder or a session's id, and its data folder with --data or as CALIBENCH_DATA"
         )
     return session_recordings(store, source)
 
@@ -418,7 +420,7 @@ class _Pipeline:
         from lab.formats.results import ValidationResult
         from lab.predict.validate import validate
 
-        self._validation = self._kept("validate", ValidationResult)
+        self._validation = self.request.validation or self._kept("validate", ValidationResult)
         if self._validation is None:
             self._validation = validate(
                 self.recordings,
@@ -431,7 +433,7 @@ class _Pipeline:
     def _diagnose_step(self) -> None:
         from lab.formats.results import DiagnosisResult
 
-        self._diagnosis = self._kept("diagnose", DiagnosisResult)
+        self._diagnosis = self.request.diagnosis or self._kept("diagnose", DiagnosisResult)
         if self._diagnosis is None:
             self._examined = self._diagnosed(self.recordings, "diagnose")
             self._diagnosis = self._examined.result

@@ -3,6 +3,7 @@
 import { showCalibrations } from "./calibrations.js";
 import { challengesAre, showChallenges } from "./challenges.js";
 import { showFindings } from "./findings.js";
+import { modelsAre, showModels } from "./models.js";
 import { $, Problem, api, ask, element, post, put, show, time, told } from "./page.js";
 import { asked as planned, showPlan } from "./plan.js";
 import { queueIs, showQueue } from "./queue.js";
@@ -51,7 +52,8 @@ async function enter() {
   challengesAre(me.scope, refresh);
   recordingsAre(me.scope, async () => (await showRecordings(), await refresh()));
   await refresh();
-  await Promise.all([showCalibrations(), showRecordings()]);
+  modelsAre(me.scope);
+  await Promise.all([showCalibrations(), showRecordings(), showModels()]);
 }
 
 // --- starting -------------------------------------------------------------------------------------------------------
@@ -332,7 +334,7 @@ async function refresh() {
   show("jobs", jobs.map((job) => ({ ...job, of: of(job) })), jobRow);
   $("no-jobs").hidden = jobs.length > 0;
   const done = jobs.filter((job) => job.state === "done").length;
-  if (done !== jobsDone) await showCalibrations(); // a fit is a new candidate
+  if (done !== jobsDone) await Promise.all([showCalibrations(), showModels()]); // a fit is a new candidate
   jobsDone = done;
   if (!watches() && live.length) watch(live[0]);
   await showWatched();

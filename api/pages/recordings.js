@@ -1,6 +1,7 @@
 // Recording sets: sent in by drag and drop or by the file chooser, worked on, fetched, deleted.
 
-import { $, Problem, api, ask, element, post, show, told } from "./page.js";
+import { $, api, ask, element, post, show, told } from "./page.js";
+import { takesFiles } from "./send.js";
 
 let after = () => {};
 let mayChange = false;
@@ -11,64 +12,14 @@ export function recordingsAre(scope, changed) {
   $("drop").hidden = !mayChange;
 }
 
-// fetch() tells nothing of how far a body was sent.
-function send(file, tell) {
-  return new Promise((resolve, reject) => {
-    const request = new XMLHttpRequest();
+takesFiles("drop", "recordings-problem", {
+  path: () => {
     const format = $("drop-format").value;
-    request.open("POST", `${api}/recordings${format ? `?format=${format}` : ""}`);
-    request.setRequestHeader("Content-Type", file.name.endsWith(".tar") ? "application/x-tar" : /\.(tgz|gz)$/.test(file.name) ? "application/gzip" : "application/zip");
-    request.upload.addEventListener("progress", (event) => event.lengthComputable && tell(event.loaded / event.total));
-    request.addEventListener("error", () => reject(new Problem(`${file.name}: the connection broke off; send it again`)));
-    request.addEventListener("load", () => {
-      const answer = JSON.parse(request.responseText || "{}");
-      if (request.status === 201) resolve(answer);
-      else reject(new Problem(`${file.name}: ${answer.detail ?? request.status}`));
-    });
-    request.send(file);
-  });
-}
-
-async function sendAll(files) {
-  const bar = $("drop-bar");
-  $("drop-told").textContent = "";
-  const problems = [];
-  bar.hidden = false;
-  for (const file of files) {
-    try {
-      $("drop-told").textContent = `${file.name}: being sent`;
-      const made = await send(file, (part) => {
-        bar.value = part;
-        if (part === 1) $("drop-told").textContent = `${file.name}: being checked`;
-      });
-      $("drop-told").textContent = [`${made.name || made.id}: ${made.captures} captures`, ...made.warnings].join("; ");
-    } catch (error) {
-      $("drop-told").textContent = "";
-      problems.push(error.message);
-    }
-  }
-  bar.hidden = true;
-  await after();
-  if (problems.length) throw new Problem(problems.join("; "));
-}
-
-const zone = $("drop");
-for (const name of ["dragover", "dragleave", "drop"]) {
-  zone.addEventListener(name, (event) => {
-    event.preventDefault();
-    zone.classList.toggle("over", name === "dragover");
-  });
-}
-zone.addEventListener("drop", told("recordings-problem", (event) => {
-  const entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry?.());
-  if (entries.some((entry) => entry?.isDirectory)) throw new Problem("pack the folder as a .zip or .tar and drop that");
-  return sendAll([...event.dataTransfer.files]);
-}));
-$("drop-file").addEventListener("change", told("recordings-problem", async (event) => {
-  const files = [...event.target.files];
-  event.target.value = "";
-  await sendAll(files);
-}));
+    return `/recordings${format ? `?format=${format}` : ""}`;
+  },
+  words: (made) => [`${made.name || made.id}: ${made.captures} captures`, ...made.warnings].join("; "),
+  after: () => after(),
+});
 
 function row(one) {
   const actions = element("td");

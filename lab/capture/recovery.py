@@ -9,11 +9,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 
 from drivers.instrument import Instrument
 from lab.capture.blocking_calls import STOP_S, in_thread
+from lab.capture.file_lock import Lock
 from lab.capture.instruments import stop_complaints
 from lab.capture.records import now
 from lab.capture.station import Drivers, Station, drivers_of
@@ -27,12 +28,12 @@ LOOK_S, LONGEST_PAUSE_S = 5.0, 60.0
 
 
 def make_station_safe(station: Station, connect: Callable[[Station], Drivers] = drivers_of) -> list[str]:
-    """Connect to every instrument of a station and stop it, all at once: shutter closed, screen dark, motion stopped.
+    """Connect to every instrument of a station and stop it, all at once: shutter closed, screen dark, motion stopped. A person at a prompt isn't asked.
 
     Returns one line for each instrument that wasn't reached or didn't stop within `STOP_S`. Raises nothing.
     """
     try:
-        drivers = connect(station).all
+        drivers = connect(station.machines).all
     except (InputError, DeviceError) as error:
         return [str(error)]
 
@@ -64,7 +65,8 @@ class Recovery:
     """Looks for sessions whose process died, makes their stations safe, and resumes those that may be resumed automatically.
 
     It works in a thread from `start` to `close`. `connect` makes a station's drivers. An instrument that doesn't answer is tried
-    again until it does; meanwhile the session's `error` says so.
+    again until it does; meanwhile the session's `error` says so. `made_safe`: sessions whose stations are safe already, with their
+    locks, which are held since.
     """
 
     def __init__(
@@ -72,7 +74,9 @@ class Recovery:
         store: Store,
         connect: Callable[[Station], Drivers] = drivers_of,
         clock: Callable[[], float] = time.monotonic,
+        made_safe: Mapping[str, Lock] | None = None,
     ) -> None:
+        self._made_safe = dict(made_safe or {})
         self._store, self._connect, self._clock = store, connect, clock
         self._resume: Callable[[str], None] | None = None
         self._waiting: list[str] = []  # sessions that are safe and will be resumed automatically
@@ -103,6 +107,8 @@ class Recovery:
         self._wake.set()
         if self._thread.ident is not None:
             self._thread.join(STOP_S)
+        while self._made_safe:  # nobody looked
+            self._made_safe.popitem()[1].release()
 
     def _work(self) -> None:
         while not self._ended.is_set():
@@ -128,15 +134,18 @@ class Recovery:
                 log.warning("session %s: not resumed by itself: %s", session_id, error)
 
     def _recover(self, session_id: str) -> None:
-        lock = self._store.lock(session_id)
-        if not lock.acquire(patience_s=0.0):
-            return  # its process is alive
+        lock = self._made_safe.pop(session_id, None)
+        is_safe = lock is not None
+        if lock is None:
+            lock = self._store.lock(session_id)
+            if not lock.acquire(patience_s=0.0):
+                return  # its process is alive
         try:
             if session_id not in self._store.under_way():
                 return  # it ended in good order, just now
             station = self._store.station(session_id)
             began = f"the process that ran it died (a crash, kill -9, a power cut), found {now():%Y-%m-%d %H:%M:%S} UTC"
-            complaints = make_station_safe(station, self._connect)
+            complaints = [] if is_safe else make_station_safe(station, self._connect)
             if complaints:
                 _, pause_s = self._next_try_s.get(session_id, (0.0, LOOK_S / 2))
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)

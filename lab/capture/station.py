@@ -117,6 +117,12 @@ class Station(Frozen):
         return frozenset(entry.address for entry in entries if entry is not None and entry.address)
 
     @property
+    def machines(self) -> Station:
+        """The station without those instruments that have no address (a person at a prompt), whom nothing reaches or stops."""
+        people = [family for family in _FAMILIES if (entry := getattr(self, family)) is not None and not entry.address]
+        return self.model_copy(update=dict.fromkeys(people))
+
+    @property
     def sides(self) -> tuple[Side, ...]:
         """The sides that have a camera, left first."""
         return tuple(sorted(self.cameras))

@@ -26,9 +26,9 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     if given[:1] == ["serve"] and "--help" not in given:
         # Before anything that takes time is loaded, the command line's own library among it: a shutter may be open.
-        from lab.capture.close_shutters import close_at_start
+        from lab.capture.safe_at_start import make_safe_at_start
 
-        close_at_start(given)
+        make_safe_at_start(given)
     from lab.cli.entry import main as run
 
     return run(arguments)

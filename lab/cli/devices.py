@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from drivers.contract.peer import Peer
 
 devices = typer.Typer(
-    name="devices", help="What is connected, what drives it, and whether it works.", add_completion=False
+    name="devices",
+    help="List what is connected and what drives it. Its commands tell whether it works.",
+    subcommand_metavar="[COMMAND] [ARGS]...",
+    add_completion=False,
 )
 station = typer.Typer(name="station", help="The station file.", no_args_is_help=True, add_completion=False)
 

@@ -16,9 +16,10 @@ from lab.cli.sources import (
     Model,
     Scheduler,
     Source,
+    StoreFolder,
     camera_path,
     existing_store,
-    read_fit,
+    read_given,
     read_models,
     recordings_of,
     run_here,
@@ -34,12 +35,16 @@ commands = typer.Typer()
 
 
 @commands.command()
-def validate(source: Source, json: Json = None, fit_file: FitFile = None, model: Model = None) -> None:
+def validate(
+    source: Source, json: Json = None, fit_file: FitFile = None, model: Model = None, data: StoreFolder = None
+) -> None:
     """Compare predictions with measurements that the fit didn't use. Exit code 4 if a check fails."""
+    from lab.formats.results import FitResult
+
     check_writable(json)
-    recordings = recordings_of(source)
+    recordings = recordings_of(source, data)
     models = read_models(recordings, model)
-    request = PipelineRequest("validate", recordings=recordings, fit=read_fit(fit_file), models=models)
+    request = PipelineRequest("validate", recordings=recordings, fit=read_given(FitResult, fit_file), models=models)
     result = run_here(request).validation
     assert result is not None
     write_json(result, json)
@@ -67,22 +72,24 @@ def diagnose(
         ),
     ] = 0,
     scheduler: Scheduler = None,
+    data: StoreFolder = None,
 ) -> None:
     """Name the physics that the camera model lacks and the recordings show. Exit code 2 if they determine no measurement."""
     if 0 < bootstrap < FEWEST_DRAWS or bootstrap < 0:
         raise InputError(
             f"--bootstrap {bootstrap}: {FEWEST_DRAWS} draws are the fewest that a threshold follows from; give more, or 0"
         )
+    from lab.formats.results import FitResult
     from lab.workers import Workers
 
     check_writable(json)
-    recordings = recordings_of(source)
+    recordings = recordings_of(source, data)
     if save is not None:
         camera_path(recordings, recordings.sides[0], save)
     request = PipelineRequest(
         "diagnose",
         recordings=recordings,
-        fit=read_fit(fit_file),
+        fit=read_given(FitResult, fit_file),
         models=read_models(recordings, model),
         pictures=False,
         bootstrap=bootstrap,
@@ -119,15 +126,43 @@ def report(
     source: Source,
     out_file: Annotated[Path, typer.Option("--out", metavar="FILE", help="the page to write")] = Path("report.html"),
     fit_file: FitFile = None,
+    validation: Annotated[
+        Path | None,
+        typer.Option("--validation", metavar="FILE", help="a validation's JSON, in place of validating again"),
+    ] = None,
+    diagnosis: Annotated[
+        Path | None, typer.Option("--diagnosis", metavar="FILE", help="a diagnosis' JSON, in place of diagnosing again")
+    ] = None,
+    stored: Annotated[
+        bool,
+        typer.Option("--stored", help="take the newest stored results of a finished session, in place of new ones"),
+    ] = False,
+    data: StoreFolder = None,
 ) -> None:
-    """Fit, validate, diagnose, and write one page with pictures."""
+    """Fit, validate, diagnose, and write one page with pictures. What is given, or with --stored is stored, isn't computed again."""
+    from lab.formats.results import DiagnosisResult, FitResult, ValidationResult
+
     check_writable(out_file)
+    store = existing_store(data)
+    given = {"fit": fit_file, "validate": validation, "diagnose": diagnosis}
     request = PipelineRequest(
         "report",
-        recordings=recordings_of(source),
+        recordings=recordings_of(source, data),
         source=source,
         keep=False,
-        fit=read_fit(fit_file),
+        reuse=stored,
+        fit=read_given(FitResult, fit_file),
+        validation=read_given(ValidationResult, validation),
+        diagnosis=read_given(DiagnosisResult, diagnosis),
         report_file=out_file,
     )
-    out.print(f"report: {run_here(request, existing_store()).report}")
+    kept = [kind for kind, file in given.items() if file is None and store is not None and store.results(source, kind)]
+    if kept and not stored:
+        err.print(
+            f"calibench: {escape(source)} has stored results ({', '.join(kept)}), computed again now; --stored takes them"
+        )
+    if stored and not kept:
+        err.print(
+            f"calibench: --stored: nothing of {escape(source)} is stored that isn't given; what is missing is computed"
+        )
+    out.print(f"report: {run_here(request, store).report}")

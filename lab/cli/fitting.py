@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from lab.cli.console import check_writable, err, make_folder, write_json
 from lab.cli.exit_codes import EXIT_CHECK
-from lab.cli.sources import Json, Source, existing_store, recordings_of, run_here
+from lab.cli.sources import Json, Source, StoreFolder, existing_store, recordings_of, run_here
 from lab.cli.tables import print_comparison, print_fit
 from lab.errors import NotDetermined
 from lab.pipeline import PipelineRequest
@@ -37,10 +37,11 @@ def fit(
             help="write every pixel's offset, dark current and gain, and which are defective, into DIR/SIDE (.npy and .png)",
         ),
     ] = None,
+    data: StoreFolder = None,
 ) -> None:
     """Calibrate: noise, spectral sensitivity, MTF, PSF, geometry, stereo."""
     check_writable(json)
-    recordings = recordings_of(source)
+    recordings = recordings_of(source, data)
     result = _fit(recordings)
     write_json(result, json)
     if cameras is not None:
@@ -103,6 +104,7 @@ def compare(
     report_folder: Annotated[
         Path | None, typer.Option("--report", metavar="DIR", help="write DIR/compare.html, one page with pictures")
     ] = None,
+    data: StoreFolder = None,
 ) -> None:
     """Compare two calibrations: figures that changed beyond their uncertainty."""
     from lab.fit.changes_that_fail import FailRule, failing
@@ -110,7 +112,7 @@ def compare(
 
     check_writable(json)
     rules = [FailRule.parse(text) for text in fail_on or ()]
-    result = compared(_calibration(a), _calibration(b))
+    result = compared(_calibration(a, data), _calibration(b, data))
     write_json(result, json)
     if report_folder is not None:
         from lab.report.compare import write_comparison
@@ -125,14 +127,14 @@ def compare(
         raise typer.Exit(EXIT_CHECK)
 
 
-def _calibration(source: str) -> FitResult:
+def _calibration(source: str, data: Path | None) -> FitResult:
     """A fit from the file that `--json` wrote, from the registry of sessions, or made now from recordings."""
     from lab.formats.result_file import read_result
     from lab.formats.results import FitResult
 
     if Path(source).is_file():
         return read_result(FitResult, Path(source))
-    if not Path(source).exists() and (store := existing_store()) is not None:
+    if not Path(source).exists() and (store := existing_store(data)) is not None:
         for kept in store.results(source, "fit")[:1]:
             return FitResult.model_validate(kept.document)
-    return _fit(recordings_of(source))
+    return _fit(recordings_of(source, data))

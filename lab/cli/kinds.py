@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lab.cli.console import out
-from lab.cli.sources import recordings_of
+from lab.cli.sources import StoreFolder, recordings_of
 
 commands = typer.Typer()
 
@@ -20,11 +20,12 @@ def kinds(
     source: Annotated[
         str, typer.Argument(metavar="[SOURCE]", help="count the captures in a recording set or a stored session")
     ] = "",
+    data: StoreFolder = None,
 ) -> None:
     """The kinds of capture: the scene, and the sequence that takes them."""
     from lab.capture_kinds.base import CAPTURES
 
-    counted = Counter(capture.kind for capture in recordings_of(source).captures()) if source else None
+    counted = Counter(capture.kind for capture in recordings_of(source, data).captures()) if source else None
     table = Table(box=None, pad_edge=False)
     for heading in (
         "kind",

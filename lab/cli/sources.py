@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -13,11 +13,14 @@ from lab.errors import InputError
 from lab.pipeline import Capturer, PipelineRequest, PipelineResult, run_pipeline, source_recordings
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from lab.capture.store import Store
     from lab.formats.camera_file import CameraFile
     from lab.formats.recording_set import RecordingSet
-    from lab.formats.results import FitResult
     from sim.camera import Side
+
+M = TypeVar("M", bound="BaseModel")
 
 Source = Annotated[str, typer.Argument(metavar="SOURCE", help="a recording set's folder, or a stored session's id")]
 Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="write the result as JSON ('-': to stdout)")]
@@ -49,16 +52,16 @@ def open_store(folder: Path | None = None) -> Store:
     return Store.open(settings)
 
 
-def existing_store() -> Store | None:
-    """The store of the settings' data folder; None where there is no such folder. Reading never makes one."""
+def existing_store(folder: Path | None = None) -> Store | None:
+    """The store of the data folder, as `open_store` finds it; None where there is no such folder. Reading never makes one."""
     from lab.capture.settings import Settings
 
-    return open_store() if Settings().data.is_dir() else None
+    return open_store(folder) if (folder or Settings().data).is_dir() else None
 
 
-def recordings_of(source: str) -> RecordingSet:
-    """The recording set in a folder, or that of a stored session; its warnings go to stderr."""
-    recordings = source_recordings(source, existing_store)
+def recordings_of(source: str, data: Path | None = None) -> RecordingSet:
+    """The recording set in a folder, or that of a session stored in the data folder; its warnings go to stderr."""
+    recordings = source_recordings(source, lambda: existing_store(data))
     warn(recordings.warnings)
     return recordings
 
@@ -69,14 +72,13 @@ def run_here(request: PipelineRequest, store: Store | None = None, capturer: Cap
         return run_pipeline(request, tell, store=store, capturer=capturer)
 
 
-def read_fit(file: Path | None) -> FitResult | None:
-    """The fit of `--fit FILE`; None without the option: the pipeline fits then."""
+def read_given(model: type[M], file: Path | None) -> M | None:
+    """The result of an option `--fit FILE`, `--validation FILE` or `--diagnosis FILE`; None without it: the pipeline computes one then."""
     if file is None:
         return None
     from lab.formats.result_file import read_result
-    from lab.formats.results import FitResult
 
-    return read_result(FitResult, file)
+    return read_result(model, file)
 
 
 def camera_path(recordings: RecordingSet, side: Side, path: Path) -> Path:

@@ -406,7 +406,7 @@ def fitted_camera(recordings: RecordingSet, side: Side, fit: CameraFit) -> Camer
 def default_camera() -> CameraFile:
     """A plausible RGB machine-vision camera: 1280 x 960 px of 3.45 um, 12 bit, global shutter, f/4, 8 mm.
 
-    Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared cut filter at 650 nm, have typical
+    Its values are like those of data sheets of 1/3 inch sensors. Its curves, with an infrared-cut filter at 650 nm, have typical
     shapes and are of no particular maker.
     """
     wavelength_nm = np.arange(380.0, 721.0, 10.0)

@@ -14,6 +14,7 @@ import numpy as np
 from lab.capture_kinds.chart import ChartCapture
 from lab.capture_kinds.slanted_edge import SlantedEdgeCapture
 from lab.diagnose.measurements.library import measurement_title
+from lab.effect_titles import at_beginning, effect_title
 from lab.errors import InputError
 from lab.formats.raw_file import replacing
 from lab.formats.recording_set import RecordingSet
@@ -34,6 +35,7 @@ from lab.report.emva import data_sheets
 from lab.report.figures import by_side, geometry_figures, measured, stereo_figures
 from lab.report.pictures import difference_picture, frame_picture, kernel_picture, patch_colours, trimmed_margin
 from lab.report.provenance import Provenance, installed_versions, provenance_of
+from lab.report.stills import still
 from sim.camera import Side
 
 __all__ = ["Provenance", "installed_versions", "provenance_of", "render_report", "write_report"]
@@ -133,10 +135,12 @@ def page_environment() -> jinja2.Environment:
     environment.filters |= {
         "words": lambda text: str(text).replace("_", " "),
         "measurement": measurement_title,
-        "effect_name": words.effect_name,
+        "effect_title": effect_title,
+        "at_beginning": at_beginning,
         "parameter_name": words.parameter_name,
         "parameter_value": parameter_value,
         "stated": stated,
+        "still": still,
         "mood": diagnosis_page.mood,
         "check_name": lambda name: words.CHECK_NAMES.get(name, name),
     }

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lab.diagnose.measurements.library import measurement_title
+from lab.effect_titles import at_beginning, effect_title
 from lab.formats.results import Check, DiagnosisResult, FitResult, NamedEffect, ResidualCurve, ValidationResult
 from lab.report import charts, words
 from lab.report.diagnosis import worst_of_each
@@ -56,7 +57,7 @@ def effect_line(effect: NamedEffect) -> str:
         if name in fields
     ]
     where = " and ".join(effect.sides)
-    return f"{words.effect_name(effect.name).capitalize()}, {where}: {'; '.join(sizes)}."
+    return f"{at_beginning(effect_title(effect.name))}, {where}: {'; '.join(sizes)}."
 
 
 def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
@@ -65,7 +66,7 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
         return
     yield from (effect_line(effect) for effect in diagnosis.effects[:NAMED])
     if len(diagnosis.effects) > NAMED:
-        more = ", ".join(words.effect_name(effect.name) for effect in diagnosis.effects[NAMED:])
+        more = ", ".join(effect_title(effect.name) for effect in diagnosis.effects[NAMED:])
         yield f"Also: {more}."
     if diagnosis.unexplained:
         places = sorted({f"{measurement_title(item.measurement)} ({item.side})" for item in diagnosis.unexplained})
@@ -78,8 +79,8 @@ def found(fit: FitResult, diagnosis: DiagnosisResult | None) -> Iterator[str]:
 
 def _sure_of(effect: NamedEffect) -> str:
     share = f"{100 * effect.probability:.1f} %" if effect.probability < 0.9995 else "above 99.9 %"
-    rivals = ", ".join(f"{words.effect_name(rival.name)} ({rival.probability:.2g})" for rival in effect.rivals)
-    return f"{words.effect_name(effect.name).capitalize()}: probability {share}" + (
+    rivals = ", ".join(f"{effect_title(rival.name)} ({rival.probability:.2g})" for rival in effect.rivals)
+    return f"{at_beginning(effect_title(effect.name))}: probability {share}" + (
         f"; rivals: {rivals}." if rivals else "."
     )
 
@@ -104,11 +105,12 @@ def meaning(diagnosis: DiagnosisResult | None, validation: ValidationResult | No
     """Sentences: what the effects do to light and signal, and by how much the baseline's predictions are off."""
     for effect in diagnosis.effects[:NAMED] if diagnosis is not None else ():
         yield effect.statement.split(" Seen in ")[0]
+    named = diagnosis is not None and bool(diagnosis.effects)
     for side, worst in _worst(validation.checks if validation is not None else ()).items():
         off = [check for check in worst if not check.passed]
         said = ", ".join(f"{words.CHECK_NAMES[check.name]} by {check.rms_relative_percent:.2g} % rms" for check in off)
         if off:
-            yield f"Without these effects, the {side} camera's prediction misses: {said}."
+            yield f"{'Without these effects, the' if named else 'The'} {side} camera's prediction misses: {said}."
         elif worst:
             names = ", ".join(words.CHECK_NAMES[check.name] for check in worst)
             yield f"The {side} camera is predicted within its uncertainty: {names}."

@@ -22,6 +22,7 @@
   function draw(box) {
     const colours = { "@fg": colour("--fg"), "@muted": colour("--muted"), "@grid": colour("--grid") };
     const figure = JSON.parse(figures[box.dataset.chart], (key, value) => colours[value] ?? value);
+    box.querySelector(".still")?.remove();
     Plotly.react(box, figure.data, figure.layout, { responsive: true, displaylogo: false, displayModeBar: false });
     drawn.add(box);
   }

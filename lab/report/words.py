@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from lab.formats.results import Check, DiagnosisResult, ParameterValue
-from sim.effects.families import Family
 
 #: Verdict -> (what stands on the badge, its mood, the headline).
 VERDICTS = {
@@ -28,11 +27,6 @@ def headline(diagnosis: DiagnosisResult | None) -> tuple[str, str, str]:
     if diagnosis is None:
         return "not diagnosed", "open", "The recordings were calibrated; they were not diagnosed."
     return VERDICTS[diagnosis.verdict]
-
-
-def effect_name(name: str) -> str:
-    """An effect's or a family's name as words."""
-    return Family(name).words if name in set(Family) else name.replace("_", " ")
 
 
 def parameter_name(name: str, value: ParameterValue) -> str:

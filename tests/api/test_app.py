@@ -53,6 +53,36 @@ def test_errors_are_problem_details_without_a_path_of_the_server(shared: Running
             assert str(shared.store.root) not in found["detail"] and found["detail"]
 
 
+@pytest.mark.parametrize("unknown", ["nope", "Nothing of the kind", "-1", "x" * 120])
+def test_what_a_path_names_and_is_not_there_is_404_in_a_plain_sentence(shared: Running, unknown: str) -> None:
+    asked = 0
+    with shared.client("admin") as client:
+        for method, path, described in operations(shared):
+            if not path.startswith("/api/") or "{" not in path:
+                continue
+            there = re.sub(r"\{\w+\}", unknown, path.replace("{form}", "zip"))
+            kind = "score" if "challenge" in path else "fit"
+            body = {"kind": kind} if path.endswith("/jobs") else {} if "requestBody" in described else None
+            response = client.request(method, there, json=body)
+            assert (response.status_code, response.headers["content-type"]) == (404, "application/problem+json"), there
+            said = response.json()["detail"]
+            assert "pattern" not in said and unknown[:20] in said and "/api/v1/" in said and "{" not in said, (
+                there,
+                said,
+            )
+            assert "404" in described["responses"]
+            asked += 1
+    assert asked > 40
+
+
+def test_an_id_that_is_none_is_told_so_in_a_plain_sentence(shared: Running) -> None:
+    with shared.client("read") as client:
+        for path in ("/api/v1/jobs?after=no_id", "/api/v1/comparisons?a=no_id&b=0"):
+            response = client.get(path)
+            said = response.json()["detail"]
+            assert response.status_code == 422 and "'no_id' is no id" in said and "^" not in said
+
+
 def operations(shared: Running) -> list[tuple[str, str, dict[str, Any]]]:
     paths = shared.app.openapi()["paths"]
     return [(method, path, one) for path, methods in paths.items() for method, one in methods.items()]

@@ -8,12 +8,15 @@ from __future__ import annotations
 import base64
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from api.client import ServiceClient
 from lab.capture.queue import put_into_queue
+from lab.formats.camera_file import CameraFile, default_camera, write_camera
+from lab.formats.recording_set import packed
 from tests.api.conftest import STATION, Running, serving, until_state
 from tests.api.routes.test_findings import diagnosis
 from tests.lab.calibration.test_life import fitted
@@ -23,6 +26,11 @@ PHONE, DESK = {"width": 420, "height": 860}, {"width": 1280, "height": 860}
 READ_NOISE_E = (2.0, 2.01, 2.15)
 LIMITS = 'valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [1.9, 2.05]\nwarn = [1.8, 2.2]\n'
 PATIENCE_MS = 30_000.0
+#: Drops a file of that name and content on a place.
+DROP = """async ([name, content]) => {
+    const data = new DataTransfer();
+    data.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
+    document.getElementById("PLACE").dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true})) }"""
 FINISHED = "#sessions tr:first-child .state.finished"
 
 
@@ -91,7 +99,7 @@ class Watched:
         self.page.wait_for_selector("#captures img")
         self.page.wait_for_selector("#transfer svg .c1")  # from the process that looks at the captures
         self.page.wait_for_selector("#findings-proofs figure:nth-child(2) svg .c3")
-        assert "infrared cut filter" in self.page.inner_text("#findings-answers").lower()
+        assert "infrared-cut filter" in self.page.inner_text("#findings-answers").lower()
         assert len(self.page.query_selector_all("#findings-pictures canvas")) == 2  # before and after
 
     def serious(self) -> list[str]:
@@ -233,10 +241,7 @@ def test_two_stations_a_queue_and_recordings_that_are_dropped(browser: Any, lab:
     there = len(page.query_selector_all("#recordings tr"))
     page.set_input_files("#drop-file", lab.store.root / "nightly.zip")
     page.wait_for_selector(f"#recordings tr:nth-child({there + 1})")
-    code = """async ([name, content]) => {
-        const data = new DataTransfer();
-        data.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
-        document.getElementById("drop").dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true})) }"""
+    code = DROP.replace("PLACE", "drop")
     page.evaluate(code, ["wrong.zip", base64.b64encode(b"no archive").decode()])
     page.wait_for_selector("#recordings-problem:has-text('wrong.zip: archive: can')")
     content = (lab.store.root / "nightly.zip").read_bytes()
@@ -333,4 +338,35 @@ def test_a_challenge_is_made_and_deleted(browser: Any, lab: Running, monkeypatch
     page.on("dialog", lambda asked: asked.accept())
     page.click("#challenges button:has-text('Delete'):not([disabled])")
     page.wait_for_selector("#challenges tr", state="detached")
+    watched.close()
+
+
+def test_a_camera_model_is_sent_in_and_deleted(browser: Any, lab: Running, tmp_path: Path) -> None:
+    """By the keyboard's file chooser, and dropped; an archive that is none is told in a line."""
+    write_camera(tmp_path / "left.toml", CameraFile("from elsewhere", default_camera().camera))
+    content = b"".join(packed([("left.toml", (tmp_path / "left.toml").read_bytes())], "zip"))
+    (tmp_path / "camera.zip").write_bytes(content)
+    watched = Watched(browser, lab)
+    watched.log_in(lab, "calibrate")
+    page = watched.page
+    page.wait_for_selector("#models tr")  # those of the fits
+    page.focus("#model-drop-file")
+    with page.expect_file_chooser() as asked:
+        page.keyboard.press("Enter")
+    asked.value.set_files(tmp_path / "camera.zip")
+    page.wait_for_selector("#model-drop-told:has-text('left camera from elsewhere')")
+    page.wait_for_selector("#models tr:first-child:has-text('sent')")
+    code = DROP.replace("PLACE", "model-drop")
+    page.evaluate(code, ["wrong.zip", base64.b64encode(b"no archive").decode()])
+    page.wait_for_selector("#models-problem:has-text('wrong.zip: archive: can')")
+    assert watched.serious() == [] and watched.sideways_px() == 0
+    page.evaluate(code, ["dropped.zip", base64.b64encode(content).decode()])
+    page.wait_for_selector("#models tr:nth-child(2):has-text('sent')")
+    assert page.inner_text("#models-problem") == ""
+    page.on("dialog", lambda asked: asked.accept())
+    for _ in range(2):
+        page.click("#models tr:first-child button:has-text('Delete')")
+        page.wait_for_selector("#models tr:nth-child(2):has-text('sent')", state="detached")
+    page.wait_for_selector("#models tr:has-text('sent')", state="detached")
+    watched.complaints = [line for line in watched.complaints if "422" not in line]  # the refused one
     watched.close()

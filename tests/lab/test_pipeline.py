@@ -126,6 +126,20 @@ def test_a_finished_sessions_results_are_reused_and_its_goal_is_made_anew(store:
     assert steps[5:] == ["fit", "diagnose"] * 2
 
 
+def test_results_that_are_given_are_not_made_again(
+    small_set: Callable[..., RecordingSet], tmp_path: Path, steps: list[str]
+) -> None:
+    given = {
+        "fit": FitResult(source="given", cameras={}),
+        "validation": ValidationResult(source="given", checks=()),
+        "diagnosis": DiagnosisResult(source="given", verdict="no_mismatch"),
+    }
+    request = PipelineRequest("report", recordings=small_set(), report_file=tmp_path / "page.html", **given)  # type: ignore[arg-type]
+    found = run_pipeline(request)
+    assert steps == ["report"]
+    assert {name: getattr(found, name) for name in given} == given
+
+
 def test_a_diagnosis_that_nothing_is_reused_of_takes_the_fits_it_rests_on_alone(
     small_set: Callable[..., RecordingSet], store: Store, monkeypatch: pytest.MonkeyPatch, steps: list[str]
 ) -> None:

@@ -13,6 +13,7 @@ from lab.diagnose.outcome.effect_sets import set_sentences
 from lab.diagnose.outcome.next_capture import next_sentence
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
+from lab.effect_titles import effect_title
 from lab.formats.results import (
     DiagnosisResult,
     DiagnosisVerdict,
@@ -164,12 +165,14 @@ def _family_statement(
     family: Family, members: Sequence[Member], is_exact: bool, seen: str, values: str, corrections: Sequence[str]
 ) -> str:
     """The sentences about a named family: how well its laws hold, which they are, and the capture that tells them apart."""
-    names = [f"{m.name} ({100 * m.probability:.0f} %)" for m in members[:TOLD_MEMBERS]]
+    names = [f"{effect_title(m.name)} ({100 * m.probability:.0f} %)" for m in members[:TOLD_MEMBERS]]
     told = [family.sentence, f"{seen}."]
     if is_exact:
         told.append(f"The recordings can't tell {' from '.join(names)}; by the first: {values}.")
     else:
-        told.append(f"No listed law of {family.words} fits exactly; the nearest is {members[0].name}: {values}.")
+        told.append(
+            f"No listed law of {family.words} fits exactly; the nearest is {effect_title(members[0].name)}: {values}."
+        )
         if len(names) > 1:
             told.append(f"Of the listed laws: {', '.join(names)}.")
         if corrections:

@@ -55,7 +55,7 @@ def test_findings_are_the_reports_first_screen(shared: Running) -> None:
         found = client.findings(session)
         wanted = answers(fitted(2.0), None, diagnosis())
         assert found.answers == {question: tuple(lines) for question, lines in wanted if lines}
-        assert found.verdict == "explained" and "infrared cut filter" in str(found.answers).lower()
+        assert found.verdict == "explained" and "infrared-cut filter" in str(found.answers).lower()
         # (2 - 1) / 0.1 and (1.5 - 1) / 0.1 standard deviations; the third isn't shown.
         assert ["10 σ" in one.caption for one in found.proofs] == [True, False]
         assert "5 σ" in found.proofs[1].caption

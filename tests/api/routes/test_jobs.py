@@ -146,7 +146,7 @@ def test_unknown_work_is_refused(shared: Running) -> None:
         assert client.post(f"/api/v1/sessions/{session_id}/jobs", json={"kind": "guess"}).status_code == 422
         assert client.post("/api/v1/sessions/none/jobs", json={"kind": "fit"}).status_code == 404
         assert client.get("/api/v1/jobs/" + "0" * 16).status_code == 404
-        assert client.get("/api/v1/jobs/abc").status_code == 422
+        assert client.get("/api/v1/jobs/abc").status_code == 404
 
 
 def test_a_job_on_a_session_that_is_not_finished_is_refused_and_nothing_changes(tmp_path: Path) -> None:

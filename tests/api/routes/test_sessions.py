@@ -322,7 +322,7 @@ def test_a_capture_belongs_to_its_session(shared: Running) -> None:
         for path in (f"other/captures/{one}", f"other/captures/{one}/preview.png", f"{session_id}/captures/99999"):
             assert client.get(f"/api/v1/sessions/{path}").status_code == 404
         for odd in ("0", "-1", "x", str(2**70), "1.5"):
-            assert client.get(f"/api/v1/sessions/{session_id}/captures/{odd}").status_code == 422
+            assert client.get(f"/api/v1/sessions/{session_id}/captures/{odd}").status_code == 404
 
 
 def test_figures_and_curves_of_what_was_captured(shared: Running) -> None:

@@ -16,6 +16,9 @@ import pytest
 import lab.diagnose
 import lab.fit
 from lab import cli
+from lab.capture.plan import CapturePlan
+from lab.capture.session import CaptureSession
+from lab.capture_kinds.dark import DarkSequence
 from lab.cli import bench_process, capturing, diagnosis, fitting
 from lab.cli.sources import open_store
 from lab.diagnose import Diagnosis
@@ -23,6 +26,7 @@ from lab.diagnose.effect_list import EffectList, effect_list
 from lab.errors import DeviceError
 from lab.formats import recording_set as recording
 from lab.formats.recording_set import Manifest, RecordingSet
+from lab.formats.result_file import result_json
 from lab.formats.results import (
     CameraFit,
     Check,
@@ -38,6 +42,7 @@ from lab.formats.results import (
 from lab.pipeline import CaptureRequest, PipelineRequest, PipelineResult
 from lab.predict import validate as validation
 from sim.effects.library import effects
+from tests.lab import fake_bench
 
 
 @pytest.fixture(autouse=True)
@@ -230,6 +235,40 @@ def test_diagnosis_with_a_stored_fit(
     (tmp_path / "fit.json").write_text('{"format": "calibench-fit"}')
     assert cli.main(["diagnose", str(flats), "--fit", str(tmp_path / "fit.json")]) == 2
     assert "not what --json wrote" in capsys.readouterr().err
+
+
+def test_a_report_says_what_is_stored_and_takes_it(
+    flats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[PipelineRequest] = []
+
+    def pipeline(request: PipelineRequest, *_: object) -> PipelineResult:
+        asked.append(request)
+        return PipelineResult(recordings=request.recordings, report=request.report_file)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(diagnosis, "run_here", pipeline)
+    elsewhere = open_store(tmp_path / "elsewhere")
+    plan = CapturePlan((DarkSequence(exposures_s=(0.001,), frames=2),))
+    session = CaptureSession.start(elsewhere, fake_bench.station(), plan, connect=fake_bench.Bench().drivers).run().id
+    for kind in ("fit", "diagnose"):
+        elsewhere.add_result(kind, session, {})
+    elsewhere.close()
+    told = DiagnosisResult(source="x", verdict="no_mismatch")
+    (tmp_path / "told.json").write_text(result_json(told))
+    command = ["report", session, "--out", str(tmp_path / "page.html"), "--data", str(tmp_path / "elsewhere")]
+    for options, said in (
+        ([], "has stored results (fit, diagnose), computed again now; --stored takes them"),
+        (["--diagnosis", str(tmp_path / "told.json")], "has stored results (fit), computed again"),
+        (["--stored"], ""),
+    ):
+        assert cli.main([*command, *options]) == 0
+        assert said in (shown := " ".join(capsys.readouterr().err.split())) and bool(said) == bool(shown)
+    assert [request.reuse for request in asked] == [False, False, True]
+    assert [request.diagnosis for request in asked] == [None, told, None]
+    assert cli.main(["report", str(flats), "--stored", "--out", str(tmp_path / "page.html")]) == 0
+    assert "is stored" in capsys.readouterr().err
+    assert cli.main(["fit", session]) == 2  # not in the data folder of the environment
+    assert "with --data" in capsys.readouterr().err
 
 
 def test_a_result_is_on_disk_before_anything_is_printed(tmp_path: Path) -> None:

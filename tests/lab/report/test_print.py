@@ -24,6 +24,11 @@ def test_charts_are_drawn_anew_for_paper(
     file.write_text(render_report(recordings, *made_up(), provenance_of(recordings, {})))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        # As a print sees it that is made before the script has drawn: the first screen's two charts are there.
+        page = browser.new_page(java_script_enabled=False)
+        page.goto(file.as_uri())
+        stills = [still.bounding_box() for still in page.locator("svg.still").all()]
+        page.close()
         page = browser.new_page(viewport={"width": 420, "height": 900})
         page.goto(file.as_uri())
         page.locator(".chart").first.scroll_into_view_if_needed()
@@ -33,6 +38,9 @@ def test_charts_are_drawn_anew_for_paper(
         paper = page.evaluate(WIDTHS)
         page.evaluate("dispatchEvent(new Event('afterprint'))")
         again = page.evaluate(WIDTHS)
+        left = page.evaluate("() => document.querySelectorAll('.chart:has(.main-svg) .still').length")
         browser.close()
+    assert len(stills) == 2 and all(box is not None and box["width"] > 400 and box["height"] > 200 for box in stills)
+    assert left == 0  # each gave its place to the chart proper
     assert all(drawn <= box < 420 for box, drawn in screen + again)
     assert all(drawn <= box and box > 420 for box, drawn in paper)  # paper has the desk's columns

@@ -50,7 +50,7 @@ def test_an_inexact_family_says_its_nearest_law_and_what_is_left() -> None:
     assert one.nearest_law == "hot_pixels"
     assert one.parameters["excess_e_per_s"].value == 300.0
     assert one.alternatives == ("hot_pixels", "random_telegraph_noise", "unknown")
-    assert "No listed law of defective pixels fits exactly; the nearest is hot_pixels" in one.statement
+    assert "No listed law of defective pixels fits exactly; the nearest is hot pixels" in one.statement
     assert "a factor on the noise" in one.statement
     assert one.corrections == ("a factor on the noise",)
     # what the law leaves is the family's, and the camera isn't fully explained
@@ -60,7 +60,7 @@ def test_an_inexact_family_says_its_nearest_law_and_what_is_left() -> None:
 def test_an_undecided_family_names_the_capture_that_tells_its_members_apart() -> None:
     result = _told(("left", replace(HOT, is_closed=True)))
     assert result.effects[0].law == "exact"
-    assert "can't tell hot_pixels (90 %) from random_telegraph_noise (7 %)" in result.effects[0].statement
+    assert "can't tell hot pixels (90 %) from random telegraph noise (7 %)" in result.effects[0].statement
     assert "dark frames at two exposures" in result.effects[0].statement
     assert result.verdict == "explained"
 
