@@ -77,16 +77,18 @@ def test_wrong_bits_are_named(variant: int) -> None:
 
 
 def test_a_step_at_any_code_is_named() -> None:
-    """A comparator that is off by 4 DN at 1664 codes: no bit stands there, and no response to light does that to histograms."""
+    """A comparator that is off by 4 DN at 1664 codes: no bit stands there, and no response to light does that to histograms. Height and
+    place within three standard deviations; the place is looked for from 64 codes apart, and told to a few."""
     law = AdcNonlinearityLaw(4.0, 4, 7)
     place = 4096.0 * (0.15 + 0.6 * law.uniform[1])
     study = _study(772302, (law,))
     blocks = (linearity_block(study), variance_block(study), code_block(study))
     verdict = decide(MeasurementModel(blocks, study.camera), np.random.default_rng(0), DecisionPolicy())
     assert [c.told_name for c in verdict.named] == ["adc_step"]
-    found = verdict.named[0].effect.model_dump()
-    assert found["code_dn"] == pytest.approx(place, abs=4096 / 128)
-    assert abs(found["step_dn"] - law.signed_strength) < 3.0 * (verdict.named[0].std["step_dn"] or 0.0)
+    found, std = verdict.named[0].effect.model_dump(), verdict.named[0].std
+    assert abs(found["code_dn"] - place) < 3.0 * (std["code_dn"] or 0.0)
+    assert (std["code_dn"] or np.inf) < 4096 / 128
+    assert abs(found["step_dn"] - law.signed_strength) < 3.0 * (std["step_dn"] or 0.0)
 
 
 @pytest.mark.parametrize("law", [DigitalGainLaw(10.0), LossyCodesLaw(0.05)], ids=lambda law: law.name)
