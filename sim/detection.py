@@ -15,7 +15,7 @@ from sim.camera import CameraModel
 from sim.optics.illumination import irradiance_factor
 from sim.scene.render import LitSurface
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, photons_from_energy, quadrature
-from sim.stages import Acts, image_of, light_of
+from sim.stages import Acts, Light, image_of, light_of
 
 
 def responsivity(
@@ -68,8 +68,7 @@ def detected(
     rows = []
     for radiance, reflectance in lights:
         if id(radiance) not in seen:
-            light = np.ones_like(wavelength_nm) if radiance is None else radiance.at(wavelength_nm)
-            light = before_lens.radiance(wavelength_nm, light, kind)
+            light = _at_lens(before_lens, radiance, wavelength_nm, kind)
             _check_radiance(wavelength_nm, light)
             seen[id(radiance)] = light
         light = seen[id(radiance)]
@@ -77,6 +76,20 @@ def detected(
     angles = np.asarray(sin_theta, float)[..., None, None]
     factor = responsivity(camera, channel, wavelength_nm, effects, angles) * width
     return wavelength_nm, photons_from_energy(wavelength_nm, np.stack(rows)) * factor
+
+
+def _at_lens(light: Light, radiance: Spectrum | None, wavelength_nm: FloatArray, kind: str) -> FloatArray:
+    """Radiance in front of the lens. What changes the light does so over the wavelengths at which it is stated, whatever the camera's reach;
+    None: equal energy at all."""
+    if radiance is None:
+        return light.radiance(wavelength_nm, np.ones_like(wavelength_nm), kind)
+    stated, _ = radiance.arrays
+    if len(stated) < 2:  # nothing lies between its ends
+        return np.zeros_like(wavelength_nm)
+    inside = (wavelength_nm >= stated[0]) & (wavelength_nm <= stated[-1])
+    found = np.zeros_like(wavelength_nm)
+    found[inside] = light.radiance(wavelength_nm[inside], radiance.at(wavelength_nm[inside]), kind)
+    return found
 
 
 @lru_cache(maxsize=256)

@@ -37,7 +37,8 @@ class Quantity:
     flat prior between the bounds. `absent` is the value that means that the effect isn't there. `linear_power` says in
     which power of the parameter the prediction has a slope at `absent`: 2 for a displacement d, which acts as d^2.
     `logarithmic`: positive, and fitted as its logarithm, as predictions depend on its product with another. `dispensable`: a
-    refinement, that stays at `absent` where a fit without it is worth nearly as much. Of a tuple, each value is within the bounds.
+    refinement, that stays at `absent` where a fit without it is worth nearly as much. `smooth_over`: predictions follow the parameter
+    smoothly over changes of this size, and unevenly over smaller ones. Of a tuple, each value is within the bounds.
     """
 
     unit: str
@@ -49,6 +50,7 @@ class Quantity:
     linear_power: int = 1
     logarithmic: bool = False
     dispensable: bool = False
+    smooth_over: float = 0.0
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
         def check(value: Any) -> Any:

@@ -14,6 +14,8 @@ from sim.spectrum import FloatArray
 from sim.stages import Codes
 
 PLACES = 64  # parts of the range, at whose borders a step is looked for first
+#: The counts of single codes change with the place within a code, and do so anew in the next one: only over several codes is the place told.
+SMOOTH_OVER_DN = 4.0
 
 
 class AdcStep(Effect):
@@ -40,9 +42,10 @@ class AdcStep(Effect):
     step_dn: Annotated[
         float, Quantity("DN", "height of the step", lower=-50.0, upper=50.0, prior=(0.0, 1.0), absent=0.0)
     ] = 0.0
-    code_dn: Annotated[float, Quantity("DN", "code at which it stands", lower=0.0, upper=65536.0, absent=2048.0)] = (
-        2048.0
-    )
+    code_dn: Annotated[
+        float,
+        Quantity("DN", "code at which it stands", lower=0.0, upper=65536.0, absent=2048.0, smooth_over=SMOOTH_OVER_DN),
+    ] = 2048.0
 
     def log_prior(self) -> float:
         """Bits change at known codes: a step elsewhere may stand at any of the places that histograms tell apart."""

@@ -48,6 +48,7 @@ class SourceDrift(Effect):
             lower=0.5,
             upper=SETTLES_NEVER_MIN,
             absent=SETTLES_NEVER_MIN,
+            dispensable=True,
         ),
     ] = SETTLES_NEVER_MIN
 

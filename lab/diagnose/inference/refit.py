@@ -24,7 +24,8 @@ from sim.spectrum import FloatArray
 PASSES, ROUGH_PASSES = 3, 2
 #: Evaluations of the prediction in the first pass, likewise; and in later ones.
 EVALUATIONS, ROUGH_EVALUATIONS, LATER_EVALUATIONS = 12, 8, 5
-#: The prior's width in a fit, in declared standard deviations: a camera at hand needn't be typical.
+#: Declared standard deviations within which a fit's prior is normal: a camera at hand needn't be typical. Farther out its logarithm
+#: falls as -ln(size), as of a size whose order of magnitude isn't known (`_log_prior`).
 PRIOR_WIDTH = 3.0
 #: A typical size of the logarithm of a parameter, and the least value of which there is one.
 TYPICAL_LOG, LEAST = 0.1, 1e-9
@@ -178,7 +179,7 @@ def _fit(
 
         def residual(at: FloatArray, gaussian: Gaussian = gaussian) -> FloatArray:
             white = gaussian.whiten((model.value - model.mean(moved(effects, coords, at)))[seen])
-            return np.concatenate([white, (at - prior_centre) / prior_std])
+            return np.concatenate([white, _prior_residual((at - prior_centre) / prior_std)])
 
         def residual_jacobian(at: FloatArray, gaussian: Gaussian = gaussian) -> FloatArray:
             # one-sided differences towards the inside of the bounds
@@ -188,13 +189,13 @@ def _fit(
                 if c in known:
                     columns.append(-known[c][seen])
                     continue
-                step = DIFFERENCE_STEP * max(typical[k], DIFFERENCE_STEP * abs(at[k]))
+                step = max(DIFFERENCE_STEP * max(typical[k], DIFFERENCE_STEP * abs(at[k])), c.quantity.smooth_over)
                 step = -step if at[k] + step > high[k] else step
                 shifted = at.copy()
                 shifted[k] += step
                 columns.append((base - model.mean(moved(effects, coords, shifted))[seen]) / step)
             white = gaussian.whiten(np.array(columns).T)
-            return np.vstack([white, np.diag(1.0 / prior_std)])
+            return np.vstack([white, np.diag(_prior_slope((at - prior_centre) / prior_std) / prior_std)])
 
         evaluations = (ROUGH_EVALUATIONS if rough else EVALUATIONS) if turn == 0 else LATER_EVALUATIONS
         result = least_squares(
@@ -212,10 +213,11 @@ def _fit(
         if np.all(np.abs(u - before) < 1e-3 * typical):
             break
     best = moved(effects, coords, u)
-    std = _standard_deviations(jacobian, coords, u, prior_std, len(best))
     gaussian = model.seen_gaussian(best)
     value = gaussian.log_likelihood(model.seen_value)
-    log_prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
+    log_prior = -0.5 * float(np.sum(np.square(_prior_residual((u - prior_centre) / prior_std))))
+    prior_std = np.maximum(prior_std, np.abs(u - prior_centre))  # of the normal prior with the same slope there
+    std = _standard_deviations(jacobian, coords, u, prior_std, len(best))
     log_prior += sum(_usual_log_odds(e, s) for e, s in zip(best, std, strict=True))
     at_best = _prediction_jacobian(model, best, coords, u, typical, high)
     promised = _promised_gain(gaussian, model.seen_value, at_best[seen], (u - prior_centre) / prior_std, prior_std)
@@ -236,15 +238,38 @@ def _prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
     return centre, np.array(of_u)
 
 
+def _prior_residual(t: FloatArray) -> FloatArray:
+    """r with -r^2 / 2 the log prior of coordinates t, in widths from its centre: r = t up to |t| = 1, |r| = sqrt(1 + 2 ln |t|) from there.
+
+    It is the normal prior of the likeliest width that isn't below the declared one: -t^2 / 2, and -1/2 - ln |t|, whose slopes agree at
+    |t| = 1. A normal prior pulls a parameter far out by many of its standard deviations: a lamp's drift of 5 %/min, usual 0.3, to 3.8.
+    """
+    far = np.maximum(np.abs(t), 1.0)
+    return np.asarray(np.where(far > 1.0, np.sign(t) * np.sqrt(1.0 + 2.0 * np.log(far)), t))
+
+
+def _prior_slope(t: FloatArray) -> FloatArray:
+    """Derivative of `_prior_residual`."""
+    far = np.maximum(np.abs(t), 1.0)
+    return np.asarray(1.0 / (far * np.sqrt(1.0 + 2.0 * np.log(far))))
+
+
 def _standard_deviations(
     jacobian: FloatArray, coords: Sequence[Coordinate], u: FloatArray, prior_std: FloatArray, effects: int
 ) -> list[dict[str, float | None]]:
     """Of every effect's parameters, from (J'J + P^-1)^-1. With s the standard deviation of u = p^k, that of p is s / (k
-    |p|^(k - 1)), and at most s^(1/k), which holds at p = 0."""
+    |p|^(k - 1)), and at most s^(1/k), which holds at p = 0. A flat prior between two bounds has their distance over sqrt(12)."""
+    low, high = np.array([c.bounds for c in coords]).T
+    prior_std = np.where(np.isfinite(prior_std), prior_std, (high - low) / np.sqrt(12.0))
     curvature = jacobian.T @ jacobian + np.diag(1.0 / prior_std**2)
-    covariance = np.linalg.pinv(curvature)
+    told = np.diag(curvature) > 0.0  # else the numbers don't depend on it, and nothing bounds it
+    size = np.sqrt(np.where(told, np.diag(curvature), 1.0))
+    covariance = np.linalg.pinv(curvature / np.outer(size, size)) / np.outer(size, size)
     std: list[dict[str, float | None]] = [{} for _ in range(effects)]
     for k, c in enumerate(coords):
+        if not told[k]:
+            std[c.index][c.name] = None
+            continue
         su = float(np.sqrt(max(covariance[k, k], 0.0)))
         if c.quantity.logarithmic:
             std[c.index][c.name] = su * c.to_value(float(u[k]))
@@ -293,7 +318,8 @@ def _prediction_jacobian(
     base = model.mean(effects)
     columns = []
     for k in range(len(u)):
-        step = DIFFERENCE_STEP * typical[k] * (-1 if u[k] + DIFFERENCE_STEP * typical[k] > high[k] else 1)
+        step = max(DIFFERENCE_STEP * typical[k], coords[k].quantity.smooth_over)
+        step = -step if u[k] + step > high[k] else step
         shifted = u.copy()
         shifted[k] += step
         columns.append((model.mean(moved(effects, coords, shifted)) - base) / step)

@@ -93,8 +93,11 @@ def chart_block(study: Study) -> Block:
         electrons = wide_contrast(camera, effects) * electrons + (veil + tail) / noise.gain + ambient
         more = added_dark_dn(study, effects)
         dark = noise.dark_dn_per_s * exposures + np.array([more(p.captures[0]) for p in points])
-        out = model.response(electrons + dark / noise.gain)
-        lit = out * noise.gain - dark
+        read_dn = np.empty(len(points))
+        for name in study.channels:
+            mine = np.array([p.channel == name for p in points])
+            read_dn[mine] = model.mean_dn({name: (electrons + dark / noise.gain)[mine, None]})[name]
+        lit = read_dn - dark
         offset = study.offset(effects)
         shift = np.array([offset(p.captures[0]) for p in points])
         jacobian = study.free_offsets(exposures) | study.free_warmth([p.captures[0] for p in points])
@@ -103,7 +106,7 @@ def chart_block(study: Study) -> Block:
         jacobian["chart:x"] = CHART_GRADIENT_STD * lit * (col / camera.cols - 0.5) * 2
         jacobian["chart:y"] = CHART_GRADIENT_STD * lit * (row / camera.rows - 0.5) * 2
         jacobian |= _row_light(points, model, camera.rows, lit)
-        return Prediction(noise.black + out * noise.gain + shift, jacobian)
+        return Prediction(noise.black + read_dn + shift, jacobian)
 
     return Block(
         measurement=CHART,

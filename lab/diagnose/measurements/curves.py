@@ -1,4 +1,5 @@
-"""Nuisance parameters of the maker's sensitivity curves: scale, tilt, bend, smooth errors of a few per mille, and a constant leak."""
+"""Nuisance parameters of the maker's sensitivity curves: scale, tilt, bend, smooth errors of a few per mille, a constant leak, and what they
+don't state beyond their ends."""
 
 from __future__ import annotations
 
@@ -17,6 +18,9 @@ from sim.uniform import SPECTRAL, Uniform, electron_rate
 
 # Relative prior standard deviations.
 LEAK_STD = 2.0e-4  # of the curve's peak, at all wavelengths: sensitivity where the maker states none
+#: Sensitivity beyond a curve's ends, of what falls from its last value to 0 where silicon turns transparent (band gap of 1.12 eV) and where
+#: glass and oxide turn opaque: any share from none to all, whose root mean square is this.
+BEYOND_STD, SILICON_NM, GLASS_NM = 3.0**-0.5, 1107.0, 330.0
 CURVE_SCALE_STD = 0.2  # errors of gain, aperture and lens included
 LEVEL_STD = 0.5  # of all signals where gain, f-number or pitch aren't known
 CURVE_TILT_STD = 0.05  # per 100 nm
@@ -29,8 +33,8 @@ CURVE_STEP_NM = 2.5  # of a curve that `freed_curve` returns
 class CurveJacobian:
     """Electron rates of n pairs of light and channel, and their Jacobian by nuisance parameters of the maker's curves.
 
-    Parameters of a channel: scale, tilt, bend, smooth errors (squared-exponential prior on knots), a leak, and the unknown course
-    between the maker's samples. The derivative of the rate by a factor 1 + d(w) on the curve is the rate with the curve times d(w):
+    Parameters of a channel: scale, tilt, bend, smooth errors (squared-exponential prior on knots), the unknown course between the
+    maker's samples, a leak, and the sensitivity beyond the curve's ends, which only light that lies there shows. The derivative of the rate by a factor 1 + d(w) on the curve is the rate with the curve times d(w):
     exact, as the rate is linear in the curve. The baseline's rates are those of `sim.uniform.electron_rate`. Effects enter as ratios of sums over
     1 nm, in which the sums' discretisation error cancels.
     """
@@ -59,8 +63,12 @@ class CurveJacobian:
         self._curve = photons * np.array([curve[c] for _, c, *_ in items])
         # the leak: a sensitivity that is the same at all wavelengths
         self._level = photons * np.array([[LEAK_STD * max(camera.quantum_efficiency[c].value)] for _, c, *_ in items])
+        beyond = {c: BEYOND_STD * _beyond(q, self.wavelength) for c, q in camera.quantum_efficiency.items()}
+        self._beyond = photons * np.array([beyond[c] for _, c, *_ in items])
         radiance = np.array([self.radiance[path] for path, *_ in items])
-        self._weight, self._all_level = radiance * self._curve, radiance * self._level
+        self._weight, self._all_level, self._all_beyond = (
+            radiance * w for w in (self._curve, self._level, self._beyond)
+        )
         self._total = self._weight.sum(1)
         self._rate = np.array(
             [electron_rate(camera, c, lights[path], kind=kind, reflectance=r) for path, c, _, kind, r in items]
@@ -109,12 +117,12 @@ class CurveJacobian:
         """Rates (n,) and their derivatives (n, modes) by the modes of the curves, e/s per prior standard deviation."""
         spectral = acting(effects, SPECTRAL)
         if spectral not in self._kept:
-            weight, level = self._weight, self._all_level
+            weight, level, beyond = self._weight, self._all_level, self._all_beyond
             model = Uniform(self.study.camera, spectral)
             if acting(spectral, frozenset({"light.spectrum"})):
                 lit = {path: model.radiance(self.wavelength, r, self.kind) for path, r in self.radiance.items()}
                 changed = np.array([lit[path] for path, *_ in self.items])
-                weight, level = changed * self._curve, changed * self._level
+                weight, level, beyond = changed * self._curve, changed * self._level, changed * self._beyond
             through = model.transmittance(self.wavelength)
             total = weight @ through
             rate = self._rate * total / np.maximum(self._total, 1e-300)
@@ -122,8 +130,9 @@ class CurveJacobian:
             shares = table / np.maximum(total, 1e-300)[:, None]
             if len(self._kept) > 500:
                 self._kept.clear()
-            leak = level @ through * np.array([self._per_weight[c] for _, c, *_ in self.items])
-            self._kept[spectral] = rate, np.column_stack([rate[:, None] * shares, leak])
+            per_weight = np.array([self._per_weight[c] for _, c, *_ in self.items])
+            outside = np.column_stack([level @ through, beyond @ through]) * per_weight[:, None]
+            self._kept[spectral] = rate, np.column_stack([rate[:, None] * shares, outside])
         return self._kept[spectral]
 
     def rates(self, effects: Effects) -> FloatArray:
@@ -169,9 +178,18 @@ def freed_curve(curve: Spectrum, channel: str, quantities: Mapping[str, float]) 
     low, high = curve.wavelength_nm[0], curve.wavelength_nm[-1]
     grid = np.union1d(np.array(curve.wavelength_nm), np.arange(np.ceil(low), high, CURVE_STEP_NM))
     relative = np.vstack([curve_modes(grid), _between_samples(curve, grid)]) * curve.at(grid)
-    changes = np.vstack([relative, np.full_like(grid, LEAK_STD * max(curve.value))])
+    changes = np.vstack([relative, np.full_like(grid, LEAK_STD * max(curve.value)), np.zeros_like(grid)])
     value = curve.at(grid) + sum(quantities[name] * changes[int(name.rsplit(":", 1)[1])] for name in names)
     return Spectrum.of(grid, np.clip(value, 0.0, 1.0))
+
+
+def _beyond(curve: Spectrum, wavelength_nm: FloatArray) -> FloatArray:
+    """Largest sensitivity beyond a curve's samples: from its value at either end linearly to 0 at `SILICON_NM` and `GLASS_NM`; 0 within."""
+    (low, *_, high), (first, *_, last) = curve.wavelength_nm, curve.value
+    above = last * (SILICON_NM - wavelength_nm) / max(SILICON_NM - high, 1.0)
+    below = first * (wavelength_nm - GLASS_NM) / max(low - GLASS_NM, 1.0)
+    outside = np.where(wavelength_nm > high, above, np.where(wavelength_nm < low, below, 0.0))
+    return np.asarray(np.maximum(outside, 0.0))
 
 
 def _last_place(value: FloatArray) -> float:

@@ -106,7 +106,8 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
         for field, quantity in kind.quantities().items():
             if quantity.dispensable and all(c.std.get(field) is None for c in candidates):
                 continue
-            value, std = _mean([(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates])
+            values_of_sides = [(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates]
+            value, std = _mean(values_of_sides, is_shared="light" in kind.stages())
             parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit)
         chosen = [_choices(c.effect) for c in candidates]
         choices = {
@@ -190,14 +191,20 @@ def _number(parameter: ParameterValue) -> str:
     return f"{parameter.value:.{digits}f} ± {parameter.std:.{digits}f}{unit}"
 
 
-def _mean(values: list[tuple[float, float | None]]) -> tuple[float, float | None]:
+def _mean(values: list[tuple[float, float | None]], is_shared: bool) -> tuple[float, float | None]:
     """Mean of (value, standard deviation), weighted by 1 / variance; the first value where a standard deviation isn't
-    known."""
+    known.
+
+    `is_shared`: the values hold the same light, read by the same radiometer, so that their errors are taken as fully correlated: the mean's
+    standard deviation is the weighted mean of theirs, the largest that any correlation allows. Else they are independent.
+    """
     known = [(v, s) for v, s in values if s]
     if len(known) != len(values) or len(values) == 1:
         return values[0]
     weight = np.array([1.0 / s**2 for _, s in known])
-    return float(np.sum(weight * np.array([v for v, _ in known])) / weight.sum()), float(1.0 / np.sqrt(weight.sum()))
+    std = np.array([s for _, s in known])
+    mean = float(np.sum(weight * np.array([v for v, _ in known])) / weight.sum())
+    return mean, float(np.sum(weight * std) / weight.sum() if is_shared else 1.0 / np.sqrt(weight.sum()))
 
 
 def _held_out(found: Sequence[SideFindings]) -> HeldOut | None:

@@ -15,13 +15,14 @@ from sim.effects.screen_gamma import ScreenGamma
 from sim.effects.second_order_light import SecondOrderLight
 from sim.effects.source_drift import SourceDrift
 from sim.effects.source_instability import SourceInstability
+from sim.effects.stray_light import StrayLight
 from sim.effects.vignetting import Vignetting
 from sim.effects.vignetting_decentre import VignettingDecentre
 from sim.frame import screen_light
 from sim.point import optical_transfer
 from sim.spectrum import Spectrum
 from sim.stages import light_of
-from sim.uniform import Uniform
+from sim.uniform import Uniform, electron_rate
 
 WAVELENGTH = np.arange(380.0, 961.0)
 CAMERA = CameraModel(
@@ -131,3 +132,18 @@ def test_another_f_number_has_its_own_diffraction() -> None:
         for camera, effects in ((wide, (OtherFNumber(ratio=1.4),)), (narrow, ()))
     )
     np.testing.assert_allclose(got, wanted, atol=1e-4)  # wavelengths are the same, the kink at a cutoff isn't
+
+
+@pytest.mark.parametrize("reach_nm", [700.0, 1000.0])
+def test_stray_light_lies_where_the_light_is_stated_whatever_the_cameras_reach(reach_nm: float) -> None:
+    """A line in 401 nm of stated range: 2 % of it spread over these, of which a curve of 1 sees those above 650 nm and no others."""
+    wavelength = np.arange(380.0, 781.0)
+    line = Spectrum.of(wavelength, np.exp(-0.5 * ((wavelength - 500.0) / 5.0) ** 2))
+    efficiency = Spectrum.of((650.0, reach_nm), (1.0, 1.0))
+    camera = CAMERA.model_copy(update={"quantum_efficiency": dict.fromkeys("RGB", efficiency)})
+    level = 0.02 * line.integral() / 400.0
+    seen = Spectrum.of((650.0, min(reach_nm, 780.0)), (level, level))
+    assert electron_rate(camera, "G", line, (StrayLight(share_percent=2.0),), "narrowband") == pytest.approx(
+        electron_rate(camera, "G", seen),
+        rel=1e-2,  # half a nanometre of 50 where the curve begins
+    )

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from lab.diagnose.inference.refit import _standard_deviations, coordinates, refit
+from lab.diagnose.inference.measurement_model import MeasurementModel
+from lab.diagnose.inference.refit import _prior_residual, _prior_slope, _standard_deviations, coordinates, refit
+from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
+from sim.effects.base import Effect
 from sim.effects.library import effect
 from sim.effects.light_flicker import LightFlicker
-from tests.lab.diagnose.inference.made_up import contrast_model
+from sim.effects.source_drift import SourceDrift
+from sim.stages import light_of
+from tests.lab.diagnose.inference.made_up import CAMERA, contrast_model
+from tests.lab.diagnose.on_blocks import declared
 
 
 def test_refit_covers_the_truth() -> None:
@@ -43,4 +52,56 @@ def test_a_logarithmic_parameter_is_fitted_as_its_logarithm() -> None:
     assert frequency.to_value(99.0) == 1e6
     jacobian, prior_std = np.array([[10.0]]), np.array([np.inf])
     std = _standard_deviations(jacobian, [frequency], np.array([np.log(100.0)]), prior_std, 1)
-    assert std == [{"frequency_hz": pytest.approx(10.0)}]
+    flat = 12.0 / np.log(1e7) ** 2  # 1 / variance of ln p anywhere between the bounds
+    assert std == [{"frequency_hz": pytest.approx(100.0 / np.sqrt(100.0 + flat))}]
+
+
+def _timed_model(rng: np.random.Generator, drift: float, noise: float) -> MeasurementModel:
+    """30 levels within a minute in a drifting light; white noise."""
+    minutes = np.linspace(0.0, 1.0, 30)
+    labels = tuple(Label(float(t), "Y", "", (f"flat-{i}",), False) for i, t in enumerate(minutes))
+
+    def levels(effects: Sequence[Effect]) -> np.ndarray:
+        light = light_of(CAMERA, effects)
+        return np.array([light.source(60.0 * t) for t in minutes])
+
+    value = levels((SourceDrift(drift_percent_per_min=drift),)) + noise * rng.standard_normal(len(minutes))
+    block = Block(
+        measurement=declared("photon_transfer", "level", "DN"), reach=1.0, value=value, covariance=noise**2 * np.eye(len(minutes)),
+        labels=labels, reads=frozenset({"light.level"}), predict=lambda acting: Prediction(levels(acting), {}), scale=np.ones(len(minutes)),
+    )  # fmt: skip
+    return MeasurementModel((block,), CAMERA)
+
+
+def test_a_size_far_from_the_usual_is_recovered() -> None:
+    """A drift of 5 %/min, usual 0.3, that the numbers tell to s = 0.5: 20 draws, pulls of mean 0 within 3 / sqrt(20) + s / 5, which the slope
+    of -ln(size) leaves. A normal prior of 0.9 would pull by 5 s / (s^2 + 0.81) = 2.4."""
+    drift, noise = 5.0, 0.5e-2 * np.sqrt(np.sum(np.linspace(0.0, 1.0, 30) ** 2))
+    start, pulls = (SourceDrift(drift_percent_per_min=0.1),), []
+    for seed in range(20):
+        fit = refit(_timed_model(np.random.default_rng(300 + seed), drift, noise), start, DecisionPolicy())
+        assert "settling_min" not in fit.std[0]  # a minute doesn't tell how the drift ends
+        std = fit.std[0]["drift_percent_per_min"]
+        assert std is not None
+        pulls.append((fit.effects[0].drift_percent_per_min - drift) / std)  # type: ignore[attr-defined]
+    assert abs(np.mean(pulls)) < 3.0 / np.sqrt(20) + 0.1
+
+
+def test_the_prior_is_normal_near_its_centre_and_logarithmic_beyond() -> None:
+    t = np.array([-3.0, -1.0, 0.0, 0.4, 1.0, 7.0])
+    wanted = np.where(np.abs(t) <= 1.0, 0.5 * t**2, 0.5 + np.log(np.maximum(np.abs(t), 1.0)))
+    np.testing.assert_allclose(0.5 * np.square(_prior_residual(t)), wanted)
+    step = 1e-6
+    slope = (_prior_residual(t + step) - _prior_residual(t - step)) / (2.0 * step)
+    np.testing.assert_allclose(
+        _prior_slope(t), slope, atol=2.0 * step
+    )  # where the pieces meet, the second derivative jumps by 2
+
+
+def test_what_the_numbers_do_not_tell_has_no_standard_deviation() -> None:
+    """Nothing measured and no prior: none, in place of 0. Between two bounds: their distance over sqrt(12)."""
+    drift, settling = coordinates((SourceDrift(drift_percent_per_min=1.0),))
+    flat = replace(drift, quantity=replace(drift.quantity, lower=None))
+    std = _standard_deviations(np.zeros((1, 2)), [flat, settling], np.array([1.0, 8.0]), np.array([np.inf, np.inf]), 1)
+    low, high = settling.bounds
+    assert std == [{"drift_percent_per_min": None, "settling_min": pytest.approx((high - low) / np.sqrt(12.0))}]

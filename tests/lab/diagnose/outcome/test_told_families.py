@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.outcome.merge_sides import merged
 from lab.diagnose.policy import DecisionPolicy
 from lab.diagnose.side import NamedCandidate, SideFindings
 from lab.formats.results import DiagnosisResult
 from sim.camera import Side
+from sim.effects.base import Effect
 from sim.effects.hot_pixels import HotPixels
 from sim.effects.random_telegraph_noise import RandomTelegraphNoise
+from sim.effects.source_drift import SourceDrift
 
 HOT = Candidate(
     HotPixels(excess_e_per_s=300.0),
@@ -75,3 +80,17 @@ def test_sides_of_one_family_are_one_entry_with_the_likelier_law() -> None:
         ("random_telegraph_noise", 0.335),
     ]
     assert "excess_e_per_s" in one[0].parameters
+
+
+def _both(effect: Effect, std: dict[str, float | None]) -> DiagnosisResult:
+    one = replace(HOT, effect=effect, std=std, is_closed=True, members=())
+    return _told(("left", one), ("right", one))
+
+
+def test_what_both_sides_share_is_no_better_told_by_two() -> None:
+    """A drifting lamp is read by one radiometer: both sides hold the same reading's error. Two sensors' hot pixels are independent."""
+    drift = _both(SourceDrift(drift_percent_per_min=4.0), {"drift_percent_per_min": 0.5}).effects[0]
+    assert drift.parameters["drift_percent_per_min"].std == pytest.approx(0.5)
+    assert "settling_min" not in drift.parameters
+    hot = _both(HotPixels(excess_e_per_s=300.0), HOT.std).effects[0]
+    assert hot.parameters["excess_e_per_s"].std == pytest.approx(20.0 / np.sqrt(2.0))
