@@ -215,7 +215,8 @@ def _fit(
     best = moved(effects, coords, u)
     gaussian = model.seen_gaussian(best)
     value = gaussian.log_likelihood(model.seen_value)
-    log_prior = -0.5 * float(np.sum(np.square(_prior_residual((u - prior_centre) / prior_std))))
+    # in the odds of models the prior stays normal: a law of a size far from usual has to earn it
+    log_prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
     prior_std = np.maximum(prior_std, np.abs(u - prior_centre))  # of the normal prior with the same slope there
     std = _standard_deviations(jacobian, coords, u, prior_std, len(best))
     log_prior += sum(_usual_log_odds(e, s) for e, s in zip(best, std, strict=True))
