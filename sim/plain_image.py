@@ -298,13 +298,15 @@ def _blurred_images(
 def _layer_transfers(blur: Blur, nodes: FloatArray, over: FloatArray, grid: Grid) -> list[NDArray[np.complex64]]:
     """What the transform of each layer's picture is multiplied with: sum_k over_lk OTF_k at the nodes (nm), with the pixel."""
     fy, fx, pixel_y, pixel_x = pixel_on_grid(blur.camera, grid)
-    total = np.zeros((len(over), fy.size, fx.size), complex)
+    total = np.zeros((len(over), fy.size, fx.size))
     for node, factors in zip(nodes, over.T, strict=True):
         transfer = blur.at(float(node), fx, fy)
+        total = total.astype(np.result_type(total, transfer), copy=False)  # real of a symmetrical lens
         for index, factor in enumerate(factors):
             total[index] += factor * transfer
-    pixel = pixel_x * pixel_y
-    return [(part * pixel).astype(np.complex64) for part in total]
+    pixel = (pixel_x * pixel_y).astype(np.complex64)
+    single = np.complex64 if np.iscomplexobj(total) else np.float32
+    return [part.astype(single) * pixel for part in total]
 
 
 def _shown(drawing: Drawing, grid: Grid, camera: CameraModel, effects: Sequence[Effect]) -> Drawing:
