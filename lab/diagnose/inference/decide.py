@@ -19,7 +19,7 @@ from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import named_members
 from lab.diagnose.inference.outlying import OutlyingLevel, outlying_levels
-from lab.diagnose.inference.refit import log_likelihood, refit
+from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, refit
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import ModelSet, Search
 from lab.diagnose.inference.weigh import UNKNOWN, Candidate
@@ -97,6 +97,8 @@ def decide(
             refused.append(losing)
             named = _refitted(search, named, losing.candidate)
             continue
+        named = _of_any_size(model, named, policy)
+        effects = tuple(c.effect for c in named)
         after = mismatches(model, model.gaussian(effects), policy)
         left = list(dict.fromkeys(model.blocks.index(s.block) for s in after))
         if abstained and not left:
@@ -155,6 +157,15 @@ def _refitted(search: Search, named: Sequence[Candidate], gone: Candidate | None
     rest = search.fitted(tuple(c.effect for c in named if c is not gone), converged=True)
     kept = {c.effect.name: c for c in named}
     return [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]
+
+
+def _of_any_size(model: MeasurementModel, named: list[Candidate], policy: DecisionPolicy) -> list[Candidate]:
+    """The named candidates with values that aren't drawn towards usual ones, where one lies far from those."""
+    effects = tuple(c.effect for c in named)
+    if is_of_usual_size(effects):
+        return named
+    found = refit(model, effects, policy, of_any_size=True)
+    return [replace(c, effect=e, std=s) for c, e, s in zip(named, found.effects, found.std, strict=True)]
 
 
 def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> VetoedCandidate | None:

@@ -24,8 +24,7 @@ from sim.spectrum import FloatArray
 PASSES, ROUGH_PASSES = 3, 2
 #: Evaluations of the prediction in the first pass, likewise; and in later ones.
 EVALUATIONS, ROUGH_EVALUATIONS, LATER_EVALUATIONS = 12, 8, 5
-#: Declared standard deviations within which a fit's prior is normal: a camera at hand needn't be typical. Farther out its logarithm
-#: falls as -ln(size), as of a size whose order of magnitude isn't known (`_log_prior`).
+#: The prior's width in a fit, in declared standard deviations: a camera at hand needn't be typical.
 PRIOR_WIDTH = 3.0
 #: A typical size of the logarithm of a parameter, and the least value of which there is one.
 TYPICAL_LOG, LEAST = 0.1, 1e-9
@@ -135,21 +134,23 @@ def refit(
     rough: bool = False,
     passes: int | None = None,
     beside: Fit | None = None,
+    of_any_size: bool = False,
 ) -> Fit:
     """Maximum a posteriori of all parameters, from `start`.
 
     Standard deviations follow from the Jacobian and hold form tolerances, as the covariance does. Dispensable
     parameters stay absent in a converged fit unless they gain `dispensable_log_odds`. `rough`: fewer steps, enough to
     rank sets. `beside`: a fit whose Jacobian is reused for members that stand as they do there; it changes little by
-    what joins them.
+    what joins them. `of_any_size`: sizes far from the usual ones aren't drawn towards them (`_wide_residual`), for the values of effects that
+    are named; a law that needs such a size is no likelier by that.
     """
     coords = coordinates(tuple(start))
     known = {} if beside is None else beside.jacobian_columns(start)
-    found = _fit(model, tuple(start), coords, policy, rough, passes, known)
+    found = _fit(model, tuple(start), coords, policy, rough, passes, known, of_any_size)
     spare = [c for c in coords if c.quantity.dispensable]
     if not rough and spare:
         without = moved(found.effects, spare, np.zeros(len(spare)))
-        less = _fit(model, without, [c for c in coords if c not in spare], policy, rough, passes)
+        less = _fit(model, without, [c for c in coords if c not in spare], policy, rough, passes, {}, of_any_size)
         found = less if less.log_posterior >= found.log_posterior - policy.dispensable_log_odds else found
     return found
 
@@ -162,6 +163,7 @@ def _fit(
     rough: bool,
     passes: int | None,
     known: Mapping[Coordinate, FloatArray] = MappingProxyType({}),
+    of_any_size: bool = False,
 ) -> Fit:
     """Fit the coordinates `coords`, other parameters as they are. `known`: columns of the Jacobian that aren't computed
     again."""
@@ -179,7 +181,8 @@ def _fit(
 
         def residual(at: FloatArray, gaussian: Gaussian = gaussian) -> FloatArray:
             white = gaussian.whiten((model.value - model.mean(moved(effects, coords, at)))[seen])
-            return np.concatenate([white, _prior_residual((at - prior_centre) / prior_std)])
+            t = (at - prior_centre) / prior_std
+            return np.concatenate([white, _wide_residual(t) if of_any_size else t])
 
         def residual_jacobian(at: FloatArray, gaussian: Gaussian = gaussian) -> FloatArray:
             # one-sided differences towards the inside of the bounds
@@ -195,7 +198,9 @@ def _fit(
                 shifted[k] += step
                 columns.append((base - model.mean(moved(effects, coords, shifted))[seen]) / step)
             white = gaussian.whiten(np.array(columns).T)
-            return np.vstack([white, np.diag(_prior_slope((at - prior_centre) / prior_std) / prior_std)])
+            t = (at - prior_centre) / prior_std
+            slope = _wide_slope(t) if of_any_size else np.ones_like(t)
+            return np.vstack([white, np.diag(slope / prior_std)])
 
         evaluations = (ROUGH_EVALUATIONS if rough else EVALUATIONS) if turn == 0 else LATER_EVALUATIONS
         result = least_squares(
@@ -215,15 +220,23 @@ def _fit(
     best = moved(effects, coords, u)
     gaussian = model.seen_gaussian(best)
     value = gaussian.log_likelihood(model.seen_value)
-    # in the odds of models the prior stays normal: a law of a size far from usual has to earn it
     log_prior = -0.5 * float(np.sum(np.square((u - prior_centre) / prior_std)))
-    prior_std = np.maximum(prior_std, np.abs(u - prior_centre))  # of the normal prior with the same slope there
+    if of_any_size:
+        prior_std = np.maximum(prior_std, np.abs(u - prior_centre))  # of the normal prior with the same slope there
     std = _standard_deviations(jacobian, coords, u, prior_std, len(best))
     log_prior += sum(_usual_log_odds(e, s) for e, s in zip(best, std, strict=True))
     at_best = _prediction_jacobian(model, best, coords, u, typical, high)
     promised = _promised_gain(gaussian, model.seen_value, at_best[seen], (u - prior_centre) / prior_std, prior_std)
     log_posterior = value + log_prior - policy.parameter_log_odds * len(coords)
     return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised)
+
+
+def is_of_usual_size(effects: Effects) -> bool:
+    """Whether all parameters lie within the width of a fit's prior."""
+    coords = coordinates(effects)
+    centre, std = _prior(coords)
+    u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
+    return bool(np.all(np.abs(u - centre) <= std))
 
 
 def _prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
@@ -239,7 +252,7 @@ def _prior(coords: Sequence[Coordinate]) -> tuple[FloatArray, FloatArray]:
     return centre, np.array(of_u)
 
 
-def _prior_residual(t: FloatArray) -> FloatArray:
+def _wide_residual(t: FloatArray) -> FloatArray:
     """r with -r^2 / 2 the log prior of coordinates t, in widths from its centre: r = t up to |t| = 1, |r| = sqrt(1 + 2 ln |t|) from there.
 
     It is the normal prior of the likeliest width that isn't below the declared one: -t^2 / 2, and -1/2 - ln |t|, whose slopes agree at
@@ -249,8 +262,8 @@ def _prior_residual(t: FloatArray) -> FloatArray:
     return np.asarray(np.where(far > 1.0, np.sign(t) * np.sqrt(1.0 + 2.0 * np.log(far)), t))
 
 
-def _prior_slope(t: FloatArray) -> FloatArray:
-    """Derivative of `_prior_residual`."""
+def _wide_slope(t: FloatArray) -> FloatArray:
+    """Derivative of `_wide_residual`."""
     far = np.maximum(np.abs(t), 1.0)
     return np.asarray(1.0 / (far * np.sqrt(1.0 + 2.0 * np.log(far))))
 

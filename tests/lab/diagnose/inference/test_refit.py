@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import _prior_residual, _prior_slope, _standard_deviations, coordinates, refit
+from lab.diagnose.inference.refit import (
+    _standard_deviations,
+    _wide_residual,
+    _wide_slope,
+    coordinates,
+    is_of_usual_size,
+    refit,
+)
 from lab.diagnose.measurements.block import Block, Label, Prediction
 from lab.diagnose.policy import DecisionPolicy
 from sim.effects.base import Effect
@@ -79,7 +86,9 @@ def test_a_size_far_from_the_usual_is_recovered() -> None:
     drift, noise = 5.0, 0.5e-2 * np.sqrt(np.sum(np.linspace(0.0, 1.0, 30) ** 2))
     start, pulls = (SourceDrift(drift_percent_per_min=0.1),), []
     for seed in range(20):
-        fit = refit(_timed_model(np.random.default_rng(300 + seed), drift, noise), start, DecisionPolicy())
+        model = _timed_model(np.random.default_rng(300 + seed), drift, noise)
+        fit = refit(model, start, DecisionPolicy(), of_any_size=True)
+        assert not is_of_usual_size(fit.effects)
         assert "settling_min" not in fit.std[0]  # a minute doesn't tell how the drift ends
         std = fit.std[0]["drift_percent_per_min"]
         assert std is not None
@@ -90,11 +99,11 @@ def test_a_size_far_from_the_usual_is_recovered() -> None:
 def test_the_prior_is_normal_near_its_centre_and_logarithmic_beyond() -> None:
     t = np.array([-3.0, -1.0, 0.0, 0.4, 1.0, 7.0])
     wanted = np.where(np.abs(t) <= 1.0, 0.5 * t**2, 0.5 + np.log(np.maximum(np.abs(t), 1.0)))
-    np.testing.assert_allclose(0.5 * np.square(_prior_residual(t)), wanted)
+    np.testing.assert_allclose(0.5 * np.square(_wide_residual(t)), wanted)
     step = 1e-6
-    slope = (_prior_residual(t + step) - _prior_residual(t - step)) / (2.0 * step)
+    slope = (_wide_residual(t + step) - _wide_residual(t - step)) / (2.0 * step)
     np.testing.assert_allclose(
-        _prior_slope(t), slope, atol=2.0 * step
+        _wide_slope(t), slope, atol=2.0 * step
     )  # where the pieces meet, the second derivative jumps by 2
 
 
