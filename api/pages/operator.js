@@ -51,8 +51,8 @@ async function enter() {
   queueIs(refresh);
   challengesAre(me.scope, refresh);
   recordingsAre(me.scope, async () => (await showRecordings(), await refresh()));
-  await refresh();
   modelsAre(me.scope);
+  await refresh();
   await Promise.all([showCalibrations(), showRecordings(), showModels()]);
 }
 

@@ -42,7 +42,11 @@ class _Station:
         self.shutter_asked = threading.Event()
         self._document, self._tell = document, tell
         self._threads: list[threading.Thread] = []
-        self._left = 1 + len(list(self._entries(*_OTHERS)))  # instruments that aren't safe yet
+        others = [entry["address"] for _, entry in self._entries(*_OTHERS)]
+        self.addresses = {*others, *(entry["address"] for _, entry in self._entries("monochromator"))}
+        self._left = 1 + len(
+            others
+        )  # instruments that aren't safe yet; a station without a monochromator counts it, too
         self._counting = threading.Lock()
 
     def close_shutter(self) -> None:
@@ -122,11 +126,21 @@ class Rescue:
 
     def __init__(self, data: Path, tell: Callable[[str], None] = lambda _: None) -> None:
         self._stations: list[_Station] = []
+        taken: set[str] = set()
         for session_id, document in _under_way(data / "registry.sqlite"):
             lock = Lock(data / "sessions" / session_id / ".lock")
-            with contextlib.suppress(OSError):
-                if lock.acquire(patience_s=0.0):  # else its process lives
-                    self._stations.append(_Station(session_id, document, lock, tell))
+            try:
+                if not lock.acquire(patience_s=0.0):  # its process lives
+                    continue
+                station = _Station(session_id, document, lock, tell)
+                if taken.isdisjoint(station.addresses):  # two at one instrument would garble each other's words
+                    self._stations.append(station)
+                    taken |= station.addresses
+                else:
+                    lock.release()
+            except Exception:
+                log.debug("session %s: its station wasn't looked after", session_id, exc_info=True)
+                lock.release()
         for station in self._stations:
             station.close_shutter()
 

@@ -19,7 +19,7 @@ from lab.report.charts import Figure, Trace
 
 #: Width (px) of the drawing, as of a chart on a desk; it is scaled to the page's.
 WIDTH = 620.0
-LEFT, RIGHT, TOP, BOTTOM = 66.0, 14.0, 26.0, 46.0
+LEFT, RIGHT, BOTTOM = 66.0, 14.0, 46.0
 #: Mean width of a letter (em), for what has to fit beside something.
 LETTER_EM = 0.56
 DASHES = {"dash": "7 5", "dot": "2 4"}
@@ -67,13 +67,14 @@ def _pairs(trace: Trace, key: str) -> Iterator[tuple[float, float, float]]:
     bars = trace.get(key, {}).get("array") or [0.0] * len(trace["x"])
     for x, y, half in zip(trace["x"], trace["y"], bars, strict=True):
         if x is not None and y is not None and math.isfinite(x) and math.isfinite(y):
-            yield x, y, half or 0.0
+            yield x, y, half if half is not None and math.isfinite(half) else 0.0
 
 
 def _range(axis: dict[str, Any], values: Iterable[float]) -> tuple[float, float]:
     """The range that a figure states, else that of the values with a margin; 0 in it where it is asked for."""
-    if "range" in axis:
-        return axis["range"][0], axis["range"][1]
+    low, high = axis.get("range", (0.0, 0.0))
+    if math.isfinite(high - low) and low < high:
+        return low, high
     every = list(values) or [0.0, 1.0]
     low, high = min(every), max(every)
     margin = 0.05 * (high - low) or 0.5 * abs(high) or 1.0

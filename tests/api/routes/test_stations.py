@@ -143,7 +143,7 @@ def test_a_transcript_is_kept_on_request(running: Running) -> None:
         ("/stations/broken/devices", 422, "TOML"),
         ("/stations/fakes/devices/display", 404, "station 'fakes' has no display; it has monochromator"),
         ("/stations/fakes/devices/cameras.front", 404, "has no cameras.front"),
-        ("/stations/fakes/devices/Stage!", 422, "device"),
+        ("/stations/fakes/devices/Stage!", 404, "among the devices"),
     ],
 )
 def test_missing_stations_and_devices_are_refused_in_one_line(

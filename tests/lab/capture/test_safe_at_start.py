@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -94,6 +95,23 @@ def test_a_session_whose_process_lives_is_left_alone(store: Store, bench: Bench)
     assert rescued(store.root) == []
     assert bench.opened and bench.log == []
     lock.release()
+
+
+def test_of_two_sessions_at_the_same_instruments_one_is_left_to_the_recovery(store: Store, bench: Bench) -> None:
+    both = {left_behind(store), left_behind(store)}
+    assert len(safe := rescued(store.root)) == 1 and set(safe) < both
+    assert bench.log.count("stop monochromator") == 1
+    for session_id in both:
+        assert store.lock(session_id).acquire(patience_s=0.0)
+
+
+def test_a_station_that_cannot_be_read_is_left_to_the_recovery(store: Store, bench: Bench) -> None:
+    session_id = left_behind(store)
+    with sqlite3.connect(store.root / "registry.sqlite") as db:
+        db.execute("UPDATE sessions SET station = '[1]'")
+    db.close()
+    assert rescued(store.root) == [] and bench.log == []
+    assert store.lock(session_id).acquire(patience_s=0.0)
 
 
 def test_a_finished_session_is_left_alone(store: Store, bench: Bench) -> None:

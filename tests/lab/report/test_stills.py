@@ -76,3 +76,11 @@ def test_every_chart_of_the_first_screen_has_one(made_up: Callable[..., Any], di
         named = {trace["name"] for trace in proof.figure["data"] if trace.get("showlegend", True)}
         assert named <= set(texts(svg)) and len(still(proof.figure, 0)) < 40_000
         assert "nan" not in still(proof.figure, 0) and "inf" not in still(proof.figure, 0)
+
+
+@pytest.mark.parametrize("stated", [[1.0, 1.0], [float("nan"), float("nan")], None])
+@pytest.mark.parametrize("values", [[3.0] * 4, [0.0] * 4, [float("nan")] * 4, [None] * 4, [1e-30, 2e-30, 0.0, 1e-30]])
+def test_values_without_a_range_are_drawn_all_the_same(stated: list[float] | None, values: list[float]) -> None:
+    figure = simple(mode="markers", y=values, marker={"color": "@fg", "size": 4}, error_y={"array": [float("nan")] * 4})
+    figure["layout"]["yaxis"] = charts.axis("y") | ({"range": stated} if stated is not None else {})
+    assert "nan" not in (text := still(figure, 0)) and "inf" not in text
