@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, reduce
 
 import numpy as np
 from scipy.special import ndtri
@@ -234,6 +234,19 @@ class Uniform:
                 where[row :: mosaic.step(cfa), col :: mosaic.step(cfa)] = True
             factors[channel] = float(after[inner, inner][where[inner, inner]].mean()) / level if level > 0 else 1.0
         return factors
+
+    def exchanged_e(self, squares: FloatArray) -> FloatArray:
+        """Change (n,) of the middle pixels' electrons by charge that unequal neighbours exchange. `squares`: (n, k, k) of k x k pixels, k
+        odd, that hold all which the middle one exchanges charge with."""
+        count, size, _ = squares.shape
+        row = np.concatenate(list(squares), axis=1)
+        after = reduce(lambda value, law: law(value), self._charge.exchange, row)
+        return np.asarray((after - row).reshape(size, count, size)[size // 2, :, size // 2])
+
+    @property
+    def exchanges_charge(self) -> bool:
+        """Whether unequal neighbours exchange charge."""
+        return bool(self._charge.exchange)
 
     @property
     def changes_dark_current(self) -> bool:

@@ -18,7 +18,7 @@ from lab.diagnose.inference.held_out import VetoedCandidate, held_out_mismatches
 from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.naming import named_members
-from lab.diagnose.inference.outlying import OutlyingLevel, outlying_levels
+from lab.diagnose.inference.outlying import OutlyingLevel, freed, outlying_levels
 from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, refit
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import ModelSet, Search
@@ -139,7 +139,7 @@ def _verdict(told: Verdict, left: Sequence[int], refused: Sequence[VetoedCandida
             one = likely if predicts_held_out(model, effects, index, likely.kernel) else one
         discrepancies.append(one)
     kernels = {d.index: d.kernel for d in discrepancies if d.log_odds > 0}
-    contradicting = held_out_mismatches(model, effects, kernels, policy)
+    contradicting = held_out_mismatches(freed(model, outlying), effects, kernels, policy)
     held_out = tuple(s for s in contradicting if model.blocks.index(s.block) not in left)
     for part in held_out:
         index = model.blocks.index(part.block)

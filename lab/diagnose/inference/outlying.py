@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -70,6 +71,22 @@ def outlying_levels(
     # the measured signal is the factor times what is predicted: shift = 1 - 1 / factor
     factor = 1.0 / (1.0 - shift)
     return _by_setting(block, [captures[i] for i in chosen], factor, np.sqrt(np.diag(covariance)) * factor**2)
+
+
+def freed(model: MeasurementModel, outlying: Mapping[int, Sequence[OutlyingLevel]]) -> MeasurementModel:
+    """The model with the light of outlying captures as nuisance parameters: what is stated of these moves nothing that other measurements
+    share with them, as the black level. `outlying`: by block."""
+    if not outlying:
+        return model
+    columns = dict(model.unstated_jacobian)
+    for index, levels in outlying.items():
+        block, at = model.blocks[index], model.slices[index]
+        for level in levels:
+            mine = np.array([set(label.captures) <= set(level.captures) for label in block.labels])
+            column = np.zeros(len(model.value))
+            column[at] = np.where(mine, block.scale, 0.0)
+            columns[f"outlying:{index}:{level.captures[0]}"] = column
+    return replace(model, unstated_jacobian=columns, _covariances={})
 
 
 def _agrees(

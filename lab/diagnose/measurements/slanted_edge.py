@@ -47,6 +47,7 @@ from sim.point import (
     wavelength_shares,
     wide_contrast,
 )
+from sim.sensor import mosaic
 from sim.spectrum import FloatArray, Spectrum, gauss_rule, lagrange_shares, linear_shares
 from sim.uniform import SHADING, SPECTRAL, Uniform, electron_rate
 
@@ -68,7 +69,7 @@ WAVELENGTHS, FINE_WAVELENGTHS, FINE_NM = 10, 48, 2.0
 HIGHEST_CY_PER_PX = 10.0  # of the quadrature
 KEPT = 64  # most entries of each cache
 #: Quantities of the stages that change an edge's profile otherwise than by the OTF.
-CHANGING = SHADING | {"signal.response", "image.veils"}
+CHANGING = SHADING | {"signal.response", "image.veils", "charge.exchange"}
 KERNELS = frozenset({"charge.kernels"})
 K = TypeVar("K")
 V = TypeVar("V")
@@ -342,7 +343,7 @@ class _Edges:
     # --- what changes a profile beside its transfer ---
 
     def _change(self, effects: tuple[Effect, ...]) -> FloatArray | None:
-        """Change of the profiles (edges, distances) by shading, a nonlinear response and halos; None where there is none."""
+        """Change of the profiles (edges, distances) by shading, a nonlinear response, exchanged charge and halos; None where there is none."""
         changing = acting(effects, CHANGING)
         return _kept(self._changes, changing, lambda: self._changed(changing))
 
@@ -350,7 +351,7 @@ class _Edges:
         model = Uniform(self._camera, effects)
         shading = acting(effects, SHADING)
         spread = halos(self._camera, effects)
-        if not shading and model.is_linear and not spread:
+        if not shading and model.is_linear and not spread and not model.exchanges_charge:
             return None
         light, operators = self._light_profile, self._operators
         change = np.zeros_like(light)
@@ -360,6 +361,8 @@ class _Edges:
                 level = np.linspace(0.0, 1.1, 45) * float(light[i].max())
                 bent = model.response(level * scale)
                 change[i] += np.interp(light[i], level, bent / scale) - light[i]
+        if model.exchanges_charge:
+            change += self._exchanged(model)
         if shading:
             for i in range(len(self.edges)):
                 ratio = self._shade(i, operators.distance, shading) / operators.shade[i]
@@ -367,6 +370,37 @@ class _Edges:
         for share, std_px in spread:
             change += share / wide_contrast(self._camera, effects) * (ndtr(operators.distance / std_px) - 0.5)
         return change
+
+    def _exchanged(self, model: Uniform) -> FloatArray:
+        """Change of the profiles (edges, distances) by charge that unequal neighbours exchange, averaged over the places of each edge's
+        channel in the mosaic."""
+        change = [
+            model.exchanged_e(squares).reshape(-1, len(self._operators.distance)).mean(axis=0) / scale
+            for squares, scale in self._squares
+        ]
+        return np.array(change)
+
+    @cached_property
+    def _squares(self) -> list[tuple[FloatArray, float]]:
+        """Of every edge: the electrons of the 3 x 3 pixels about each distance, (places in the mosaic x distances, 3, 3), and those of the
+        edge's contrast. Neighbours of other colours have the same profile, at the level of their rate in this light."""
+        cfa, distance, found = self._camera.cfa, self._operators.distance, []
+        step, places = mosaic.step(cfa), mosaic.phases(cfa)
+        channel = {place: c for c, mine in places.items() for place in mine}
+        for edge, profile in zip(self.edges, self._light_profile, strict=True):
+            scale = max(edge.measured.light_level - edge.measured.dark_level, 1e-9) / self._study.noise.gain
+            turn, light = np.deg2rad(edge.direction_deg), edge.part[0].light_radiance
+            rates = {c: self._rate(self._sights.index((c, light))) for c in self._camera.channels}
+            own = max(rates[edge.channel], 1e-9)
+            mine = places[edge.channel]
+            squares = np.empty((len(mine), len(distance), 3, 3))
+            for i, j in np.ndindex(3, 3):
+                away = distance + np.sin(turn) * (i - 1) + np.cos(turn) * (j - 1)
+                there = scale * np.interp(away, distance, profile)
+                for k, (row, col) in enumerate(mine):
+                    squares[k, :, i, j] = there * rates[channel[(row + i - 1) % step, (col + j - 1) % step]] / own
+            found.append((squares.reshape(-1, 3, 3), scale))
+        return found
 
     @cached_property
     def _light_profile(self) -> FloatArray:

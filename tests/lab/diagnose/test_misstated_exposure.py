@@ -11,7 +11,8 @@ import pytest
 from lab.challenge.recordings import recordings_of
 from lab.diagnose.inference.held_out import held_out_mismatches
 from lab.diagnose.inference.locate import mismatches
-from lab.diagnose.inference.outlying import outlying_levels
+from lab.diagnose.inference.outlying import freed, outlying_levels
+from lab.diagnose.measurements.dark_level import dark_level_block
 from lab.diagnose.measurements.linearity import linearity_block
 from lab.diagnose.outcome.improved_model import Correction
 from lab.diagnose.outcome.mismatches import located, unexplained
@@ -78,6 +79,18 @@ def test_a_wrong_shutter_is_told_and_not_named(place: str) -> None:
     stated_s = next(c.exposure_s for c in recordings.captures() if c.id == level.captures[0])
     assert f"stated with {stated_s:.6g} s" in told.check
     assert f"{stated_s * level.factor:.6g}" in told.check
+
+
+def test_a_wrong_shutter_disturbs_no_other_measurement() -> None:
+    """The level pulls at the black level that darks share with it: held-out darks contradict the others for that, until it has a factor."""
+    frames, shuttle = PLACES["a seen level"]
+    model = measured_model(_recorded(3, 1.25, frames, shuttle=shuttle, cfa="RGGB"), linearity_block, dark_level_block)
+    policy = DecisionPolicy()
+    outlying = {0: outlying_levels(model, 0, (), policy)}
+    assert outlying[0]
+    dark = model.blocks[1]
+    assert dark in [part.block for part in held_out_mismatches(model, (), {}, policy)]
+    assert not held_out_mismatches(freed(model, outlying), (), {}, policy)
 
 
 def test_healthy_levels_have_no_outlier() -> None:

@@ -31,6 +31,17 @@ def with_exchanged_wavelengths(recordings: RecordingSet, first_nm: float, second
     return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
 
 
+def with_dark_exposures(recordings: RecordingSet, exposure_s: float, factor: float) -> RecordingSet:
+    """The recordings with the darks of one exposure stated as of `factor` times that."""
+
+    def changed(capture: Any) -> Any:
+        mine = capture.kind == "dark" and capture.exposure_s == exposure_s
+        return capture.model_copy(update={"exposure_s": factor * exposure_s}) if mine else capture
+
+    captures = tuple(changed(c) for c in recordings.manifest.captures)
+    return recordings.under(recordings.manifest.model_copy(update={"captures": captures}))
+
+
 def with_cells(recordings: RecordingSet, factor: float) -> RecordingSet:
     """The recordings with the cells of the screen stated `factor` times as large."""
 

@@ -11,10 +11,20 @@ from lab.challenge.draw import DrawnFrame
 from lab.challenge.recordings import recordings_of
 from lab.diagnose import diagnose
 from lab.diagnose.metadata import misstatements, unchecked
+from lab.diagnose.metadata.dark_exposure import misstated_dark_exposure
 from lab.formats.recording_set import RecordingSet
 from mocks.former import ConcealedCamera, Law, Plan
-from mocks.former.laws import BlackLevelDriftLaw, CrosstalkLaw, InfraredCutFilterLaw, StrayLightLaw
-from tests.lab.diagnose.metadata.lies import restated, told, with_cells, with_exchanged_wavelengths
+from mocks.former.laws import (
+    AdcNonlinearityLaw,
+    AmplifierGlowLaw,
+    BlackLevelDriftLaw,
+    CrosstalkLaw,
+    DarkCurrentTemperatureLaw,
+    HotPixelsLaw,
+    InfraredCutFilterLaw,
+    StrayLightLaw,
+)
+from tests.lab.diagnose.metadata.lies import restated, told, with_cells, with_dark_exposures, with_exchanged_wavelengths
 
 MOSAICS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -69,6 +79,29 @@ def test_a_black_level_that_is_not_that_of_the_darks_is_told(off_dn: float) -> N
     assert corrected.camera("left").black_level_dn == pytest.approx(true_dn, abs=0.1)
     assert f"black_level_dn = {true_dn + off_dn:g} is stated" in found.check
     assert told(restated(recordings, black_level_dn=true_dn + 3.0)) == []  # a data sheet's rounding
+
+
+@pytest.mark.parametrize(("exposure_s", "factor"), [(2.0, 0.8), (2.0, 1.25), (0.5, 0.8), (0.5, 1.25)])
+def test_a_wrong_exposure_of_darks_is_told(exposure_s: float, factor: float) -> None:
+    """Of three exposures, two may be the wrong one: the level of the true one is told within three standard deviations."""
+    recordings = _recorded(11, "RGGB", ("dark", "narrowband"))
+    corrected, (found,) = misstatements(with_dark_exposures(recordings, exposure_s, factor), "left")
+    stated = f"those stated with {factor * exposure_s:.6g} s have the level of "
+    fits_s, std_s = found.check.split(stated)[1].split(" s")[0].split(" ± ")
+    assert abs(float(fits_s) - exposure_s) < 3.0 * float(std_s)
+    assert {c.id for c in recordings.captures("dark") if c.exposure_s == exposure_s} <= set(found.captures)
+    assert misstatements(corrected, "left")[1] == ()
+    assert misstatements(recordings, "left")[1] == ()
+
+
+@pytest.mark.parametrize(
+    "law", [BlackLevelDriftLaw, DarkCurrentTemperatureLaw, AmplifierGlowLaw, HotPixelsLaw, AdcNonlinearityLaw]
+)
+def test_what_changes_dark_levels_is_no_wrong_exposure(law: type[Law]) -> None:
+    """Each at four times its nominal strength, in all forms."""
+    for variant in range(law.variants):
+        recordings = _recorded(14, "MONO", ("dark",), law(min(4.0 * law.nominal, law.limits[1]), variant, 3))
+        assert misstated_dark_exposure(recordings, "left") is None
 
 
 @pytest.mark.parametrize("factor", [1.1, 0.9])
