@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, ndtri, stdtrit
 
 from lab.capture_kinds.dark import DarkCapture
 from lab.diagnose.measurements.dark_frames import TEMPERATURE_STEP_C
@@ -123,7 +123,7 @@ def _candidates(
     more = max(float(rest @ rest) / freedom - float(noise.mean()), 0.0)
     # Student's t by the effective degrees of freedom (Welch 1947): few repeats tell their scatter badly
     effective = freedom * ((float(noise.mean()) + more) / more) ** 2 if more > 0.0 else np.inf
-    least = float(stats.t.isf(0.5 * CHANCE, effective))
+    least = -float(stdtrit(effective, 0.5 * CHANCE) if np.isfinite(effective) else ndtri(0.5 * CHANCE))
     white = np.linalg.cholesky(np.diag(noise + more) + (of * np.square(floor_dn)) @ of.T)
     line = np.column_stack([np.ones(len(mean)), exposure / levels.max(), drifts])
 
@@ -142,7 +142,7 @@ def _candidates(
         if stated_s <= 0.0 or signal <= 0.0 or without - chi2 < least**2:
             continue
         factor, std = 1.0 + float(estimate[-1]) / signal, float(np.sqrt(inverse[-1, -1])) / signal
-        agrees = stats.chi2.sf(chi2, max(len(mean) - line.shape[1] - 1, 1)) > LEAST_PROBABILITY
+        agrees = chdtrc(max(len(mean) - line.shape[1] - 1, 1), chi2) > LEAST_PROBABILITY
         if agrees and 1.0 / MOST_FACTOR < factor < MOST_FACTOR and abs(factor - 1.0) > TOLERANCE + 2.0 * std:
             found.append(_Candidate(float(stated_s), factor, std, without, chi2))
     return found
