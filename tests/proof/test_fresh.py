@@ -56,6 +56,8 @@ def fresh_seed() -> int:
 
 SEED = fresh_seed()
 
+pytestmark = pytest.mark.timeout(900)  # among the first that run: several diagnoses each
+
 
 def diagnosed(kind: Kind, index: int, law: type[Law] | None = None) -> tuple[Case, SaltedTruth, str, DiagnosisResult]:
     case = draw(
