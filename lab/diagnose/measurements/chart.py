@@ -82,6 +82,8 @@ def chart_block(study: Study) -> Block:
     )
     names = {n: i for i, n in enumerate(known)}
 
+    of_channel = {name: np.array([p.channel == name for p in points]) for name in study.channels}
+
     def predict(effects: Effects) -> Prediction:
         rates = curves.rates(effects)
         model = Uniform(camera, effects)
@@ -94,8 +96,7 @@ def chart_block(study: Study) -> Block:
         more = added_dark_dn(study, effects)
         dark = noise.dark_dn_per_s * exposures + np.array([more(p.captures[0]) for p in points])
         read_dn = np.empty(len(points))
-        for name in study.channels:
-            mine = np.array([p.channel == name for p in points])
+        for name, mine in of_channel.items():
             read_dn[mine] = model.mean_dn({name: (electrons + dark / noise.gain)[mine, None]})[name]
         lit = read_dn - dark
         offset = study.offset(effects)
