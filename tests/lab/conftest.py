@@ -1,11 +1,13 @@
 """A small recording set that holds every kind of capture, for the tests of `lab`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from lab.capture.store import Store
 from lab.formats.recording_set import Manifest, RecordingSet
 from sim.spectrum import Spectrum
 
@@ -111,3 +113,11 @@ def _small(seed: int = 1, sides: tuple[str, ...] = ("left", "right")) -> Recordi
 def small_set() -> Callable[..., RecordingSet]:
     """`small_set(seed=1, sides=("left", "right"))`: every kind of capture, frames of noise."""
     return _small
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """An empty store in the test's folder."""
+    opened = Store(tmp_path)
+    yield opened
+    opened.close()

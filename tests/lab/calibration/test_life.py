@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,13 +32,6 @@ DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 STATION = fake_bench.station()
 SERIALS = {"left": "L1", "right": "R1"}
 STD = 0.01
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(tmp_path)
-    yield opened
-    opened.close()
 
 
 def fitted(read_noise_e: float, std: float = STD) -> FitResult:

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-
 from lab.capture.plan import CapturePlan
 from lab.capture.records import RunRecord, now
 from lab.capture.recovery import Recovery, make_station_safe
@@ -15,13 +10,6 @@ from lab.capture_kinds.dark import DarkSequence
 from tests.lab.fake_bench import Bench, station
 
 FEW = CapturePlan((DarkSequence(exposures_s=(0.001, 1.0), frames=1),))
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(tmp_path)
-    yield opened
-    opened.close()
 
 
 def left_behind(store: Store, runs: int = 1, **changes: object) -> str:
