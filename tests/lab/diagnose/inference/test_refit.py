@@ -24,7 +24,7 @@ from sim.effects.library import effect
 from sim.effects.light_flicker import LightFlicker
 from sim.effects.source_drift import SourceDrift
 from sim.stages import light_of
-from tests.lab.diagnose.inference.made_up import CAMERA, contrast_model
+from tests.lab.diagnose.inference.made_up import CAMERA, FREQUENCY, contrast_model
 from tests.lab.diagnose.on_blocks import declared
 
 
@@ -47,6 +47,24 @@ def test_refit_covers_the_truth() -> None:
         pulls.append((fit.effects[0].displacement_x_um - 1.5) / std)
     assert abs(np.mean(pulls)) < 3.0 / np.sqrt(40)
     assert 0.6 < np.std(pulls) < 1.35
+
+
+@pytest.mark.parametrize(("departure", "is_exact"), [(0.0, True), (0.02, False)])
+def test_a_law_that_holds_better_than_declared_is_no_less_likely(departure: float, is_exact: bool) -> None:
+    """Of a sinusoidal movement (5 % declared), a part of the tolerance is likelier; where the numbers leave the law's form, the whole is
+    kept. The amplitude's standard deviation holds the whole either way: the change goes as its square, and half of 2.5 % is left by
+    averaging over frequencies at most.
+    """
+    kind = effect("vibration_blur")
+    shape = departure * np.sin(20.0 * FREQUENCY)
+    model = contrast_model(np.random.default_rng(3), (kind(amplitude_x_um=1.3),), extra=shape)
+    fit = refit(model, (kind(amplitude_x_um=1.3),), DecisionPolicy())
+    declared_tolerance = model.seen_gaussian(fit.effects).log_likelihood(model.seen_value)
+    assert (fit.log_likelihood > declared_tolerance + 2.0) == is_exact
+    assert is_exact or fit.log_likelihood == declared_tolerance
+    std = fit.std[0]["amplitude_x_um"]
+    assert std is not None
+    assert std > 0.5 * 0.025 * 1.3
 
 
 def test_a_logarithmic_parameter_is_fitted_as_its_logarithm() -> None:
