@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lab.challenge.live import FoundParameter, LiveRun, every_case, names_of
 from lab.challenge.proof import ABSTAINED, RIGHT, WRONG, placed
+from lab.effect_titles import effect_title
 from sim.effects.library import effects as library
 
 ROW_PX, LABEL_PX, PLOT_PX, HEAD_PX = 18, 400, 380, 40
@@ -82,12 +83,13 @@ def _words(parameter: FoundParameter) -> str:
 def drawing(runs: Mapping[str, LiveRun]) -> str:
     """SVG: the parameters of singles and pairs, found over concealed, with two standard deviations; grey or red where it wasn't named."""
     rows: list[tuple[str, str, FoundParameter | None]] = []
-    for name, run in runs.items():
+    for run in runs.values():
         if run.case.resolve or not run.case.concealed:
             continue
         colour = COLOURS.get(run.outcome, WRONG)
         sized = [p for p in run.parameters if library()[p.effect].quantities()[p.parameter].absent != p.truth]
-        rows += [(f"{name}: {p.parameter}", colour, p) for p in sized] or [(name, colour, None)]
+        words = " + ".join(effect_title(effect) for effect in run.case.effects)
+        rows += [(f"{words}: {p.parameter.replace('_', ' ')}", colour, p) for p in sized] or [(words, colour, None)]
     width, height = LABEL_PX + PLOT_PX + 30, HEAD_PX + ROW_PX * len(rows) + 30
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" font-size="11">',
@@ -104,9 +106,7 @@ def drawing(runs: Mapping[str, LiveRun]) -> str:
         parts.append(f'<text x="{x:.0f}" y="{height - 6}" text-anchor="middle" fill="#222">{ratio:g}</text>')
     for k, (label, colour, parameter) in enumerate(rows):
         y = HEAD_PX + ROW_PX * (k + 0.5)
-        parts.append(
-            f'<text x="{LABEL_PX - 8}" y="{y + 4:.0f}" text-anchor="end" fill="#222">{escape(label.replace("_", " "))}</text>'
-        )
+        parts.append(f'<text x="{LABEL_PX - 8}" y="{y + 4:.0f}" text-anchor="end" fill="#222">{escape(label)}</text>')
         if parameter is None:
             parts.append(f'<text x="{LABEL_PX + 6}" y="{y + 4:.0f}" fill="{colour}">no value</text>')
             continue

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lab.challenge.power_curves import power_curves
 from lab.challenge.score import STRONG, CaseScore, ChallengeScore, Rate
+from lab.effect_titles import effect_title
 from lab.errors import InputError
 
 CELL_PX, LABEL_PX, HEAD_PX = 24, 210, 190
@@ -154,14 +155,14 @@ def confusion(found: ChallengeScore) -> str:
     ]
     for j, column in enumerate(columns):
         x = LABEL_PX + CELL_PX * (j + 0.5)
-        words = escape(column.replace("_", " "))
+        words = escape(effect_title(column))
         parts.append(
             f'<text x="{x + 4:.0f}" y="{HEAD_PX - 6}" transform="rotate(-55 {x + 4:.0f} {HEAD_PX - 6})" fill="#222">{words}</text>'
         )
     for i, row in enumerate(rows):
         y = HEAD_PX + CELL_PX * i
         total = sum(count[row, column] for column in columns)
-        words = escape(row.replace("_", " "))
+        words = escape(effect_title(row))
         parts.append(f'<text x="{LABEL_PX - 8}" y="{y + 16}" text-anchor="end" fill="#222">{words}</text>')
         for j, column in enumerate(columns):
             x, n = LABEL_PX + CELL_PX * j, count[row, column]

@@ -18,6 +18,7 @@ class AdcNonlinearity(Effect):
     gain as without: nothing at codes 0 and 2^bits. Jumps stand at multiples of 2^(bits-3)."""
 
     name: ClassVar[str] = "adc_nonlinearity"
+    title: ClassVar[str] = "ADC nonlinearity"
     family: ClassVar[Family] = Family.CONVERTER
     reference: ClassVar[str] = (
         "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"

@@ -23,6 +23,7 @@ class AdcRipple(Effect):
     turn, by 2 pi sqrt(a^2 + b^2) / p of their width."""
 
     name: ClassVar[str] = "adc_ripple"
+    title: ClassVar[str] = "ADC ripple"
     family: ClassVar[Family] = Family.CONVERTER
     reference: ClassVar[str] = (
         "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"

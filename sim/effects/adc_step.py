@@ -26,6 +26,7 @@ class AdcStep(Effect):
     """
 
     name: ClassVar[str] = "adc_step"
+    title: ClassVar[str] = "ADC step"
     family: ClassVar[Family] = Family.CONVERTER
     reference: ClassVar[str] = (
         "IEEE Std 1241-2010, differential and integral nonlinearity of analogue-to-digital converters"

@@ -37,6 +37,8 @@ class Effect(Frozen):
     """
 
     name: ClassVar[str]
+    #: The name as a laboratory writes it within a sentence, where that isn't `name` with spaces in it.
+    title: ClassVar[str] = ""
     #: The physics that it is one law of: the name where no member's law holds exactly, or several do.
     family: ClassVar[Family]
     reference: ClassVar[str]

@@ -14,6 +14,7 @@ class BlackLevelDrift(Effect):
     """DN added: a t + b (T - 25 C), t from the first capture."""
 
     name: ClassVar[str] = "black_level_drift"
+    title: ClassVar[str] = "black-level drift"
     family: ClassVar[Family] = Family.DARK_SIGNAL
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, dark signal"
     form_tolerance: ClassVar[float] = 0.05

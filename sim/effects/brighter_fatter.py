@@ -30,6 +30,7 @@ class BrighterFatter(Effect):
     """
 
     name: ClassVar[str] = "brighter_fatter"
+    title: ClassVar[str] = "brighter-fatter effect"
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "P. Astier et al., A&A 629, A36 (2019)"
     form_tolerance: ClassVar[float] = 0.15

@@ -23,6 +23,7 @@ class InfraredCutFilter(Effect):
     """
 
     name: ClassVar[str] = "infrared_cut_filter"
+    title: ClassVar[str] = "infrared-cut filter"
     family: ClassVar[Family] = Family.SPECTRAL_FILTER
     reference: ClassVar[str] = "H. A. Macleod, Thin-Film Optical Filters, chapter on edge filters"
     form_tolerance: ClassVar[float] = 0.05

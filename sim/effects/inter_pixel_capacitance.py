@@ -16,6 +16,7 @@ class InterPixelCapacitance(Crosstalk):
     astray, and neighbours' shot noise is correlated, 2 c / (1 - 4 c) at all levels of light; read noise comes after."""
 
     name: ClassVar[str] = "inter_pixel_capacitance"
+    title: ClassVar[str] = "inter-pixel capacitance"
     family: ClassVar[Family] = Family.CHARGE_BETWEEN_NEIGHBOURS
     reference: ClassVar[str] = "A. C. Moore, Z. Ninkov, W. J. Forrest, Optical Engineering 45, 076402 (2006)"
     sentence: ClassVar[str] = (

@@ -18,6 +18,7 @@ class NonUniformIllumination(Effect):
     it as a lamp beside the axis leaves it."""
 
     name: ClassVar[str] = "non_uniform_illumination"
+    title: ClassVar[str] = "non-uniform illumination"
     family: ClassVar[Family] = Family.FIELD_OF_LIGHT
     reference: ClassVar[str] = "EMVA Standard 1288 release 4.0, homogeneity of the source"
     form_tolerance: ClassVar[float] = 0.05

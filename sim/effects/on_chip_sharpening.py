@@ -15,6 +15,7 @@ class OnChipSharpening(OnChipFilter):
     what neighbours have in common is negative."""
 
     name: ClassVar[str] = "on_chip_sharpening"
+    title: ClassVar[str] = "on-chip sharpening"
     family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 12233:2023, annex on sharpening"
     sentence: ClassVar[str] = (

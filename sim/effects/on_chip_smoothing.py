@@ -15,6 +15,7 @@ class OnChipSmoothing(OnChipFilter):
     neighbours have noise in common, in the same proportion at all levels."""
 
     name: ClassVar[str] = "on_chip_smoothing"
+    title: ClassVar[str] = "on-chip smoothing"
     family: ClassVar[Family] = Family.ON_CHIP_PROCESSING
     reference: ClassVar[str] = "ISO 15739:2023, annex on noise filtering"
     sentence: ClassVar[str] = (

@@ -27,6 +27,7 @@ class OpticalLowPassFilter(Effect):
     """
 
     name: ClassVar[str] = "optical_low_pass_filter"
+    title: ClassVar[str] = "optical low-pass filter"
     family: ClassVar[Family] = Family.ISOTROPIC_CONTRAST
     reference: ClassVar[str] = "Walker-Pavlopoulos plate displacement; J. Greivenkamp, Appl. Opt. 29, 676 (1990)"
     form_tolerance: ClassVar[float] = 0.01

@@ -24,6 +24,7 @@ class OtherFNumber(Effect):
     """
 
     name: ClassVar[str] = "other_f_number"
+    title: ClassVar[str] = "other f-number"
     family: ClassVar[Family] = Family.METADATA
     is_candidate: ClassVar[bool] = False
     reference: ClassVar[str] = "J. W. Goodman, Introduction to Fourier Optics, chapter 6"

@@ -17,6 +17,7 @@ class SecondOrderLight(Effect):
     """Narrowband radiance L(w) + 2 r L(2 w): a line read at w0 brings r of its power along at w0 / 2, in half the width."""
 
     name: ClassVar[str] = "second_order_light"
+    title: ClassVar[str] = "second-order light"
     family: ClassVar[Family] = Family.SOURCE_IN_WAVELENGTH
     reference: ClassVar[str] = "C. Palmer, Diffraction Grating Handbook, free spectral range and order sorting"
     form_tolerance: ClassVar[float] = 0.15
