@@ -155,10 +155,17 @@ def _missed(values: Sequence[float], curve: ResidualCurve) -> float:
 
 
 def proof_curves(diagnosis: DiagnosisResult) -> list[ResidualCurve]:
-    """The two measurements that the baseline fits worst; none where nothing was named."""
+    """For each of the first two named effects, the measurement that shows it most, where the baseline fits worst; then the measurements
+    that it fits worst. None where nothing was named."""
     if not diagnosis.effects:
         return []
-    return worst_of_each([curve for curve in diagnosis.curves if len(curve.x) > 3], PROOFS)
+    curves = [curve for curve in diagnosis.curves if len(curve.x) > 3]
+    worst = worst_of_each(curves, len(curves))
+    chosen: list[ResidualCurve] = []
+    for effect in diagnosis.effects[:PROOFS]:
+        mine = [c for name in effect.shown_in for c in worst if c.measurement == name and c not in chosen]
+        chosen += mine[:1]
+    return [*chosen, *(c for c in worst if c not in chosen)][:PROOFS]
 
 
 def proof_words(curve: ResidualCurve) -> tuple[str, str]:
@@ -173,7 +180,7 @@ def proof_words(curve: ResidualCurve) -> tuple[str, str]:
 
 
 def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
-    """Charts: the two measurements that the baseline fits worst, with both models; of a healthy or an undiagnosed camera, its photon
+    """Charts: the two measurements that show the named effects (`proof_curves`), with both models; of a healthy or an undiagnosed camera, its photon
     transfer."""
     shown = []
     for curve in proof_curves(diagnosis) if diagnosis is not None else ():

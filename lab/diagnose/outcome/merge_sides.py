@@ -113,7 +113,8 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
         }
-        shown = sorted({measurement_title(measurement) for _, one in members for measurement in one.shown_in})
+        shown_in = tuple(dict.fromkeys(measurement for _, one in members for measurement in one.shown_in))
+        shown = sorted({measurement_title(measurement) for measurement in shown_in})
         values = ", ".join(
             (
                 *(f"{f.removesuffix('_' + p.unit).replace('_', ' ')} {_number(p)}" for f, p in parameters.items()),
@@ -138,6 +139,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 sides=sides,
                 parameters=parameters,
                 choices=choices,
+                shown_in=shown_in,
                 rivals=tuple(Rival(name=n, probability=p) for n, p in sorted(rivals.items(), key=lambda r: -r[1])),
                 statement=statement,
                 reference=kind.reference,

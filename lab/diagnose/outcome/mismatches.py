@@ -105,7 +105,7 @@ def family_corrections(
 
 
 def shown_in(verdict: Verdict, candidate: Candidate, policy: DecisionPolicy) -> tuple[str, ...]:
-    """Measurements in which an effect's change stands out of the noise; the strongest, where none does."""
+    """Measurements in which an effect's change stands out of the noise, the strongest change first; only that, where none does."""
     model = verdict.model
     changes = {
         b.measurement.name: _change_chi2(verdict, candidate.effect, b)
@@ -113,7 +113,8 @@ def shown_in(verdict: Verdict, candidate: Candidate, policy: DecisionPolicy) -> 
         if b.touched_by(type(candidate.effect))
     }
     least = max(policy.shown_chi2, policy.shown_share * max(changes.values(), default=0.0))
-    return tuple(m for m, c in changes.items() if c > least) or (max(changes, key=lambda m: changes[m]),)
+    strongest = sorted(changes, key=lambda m: -changes[m])
+    return tuple(m for m in strongest if changes[m] > least) or (strongest[0],)
 
 
 def _change_chi2(verdict: Verdict, effect: Effect, block: Block) -> float:

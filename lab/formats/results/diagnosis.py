@@ -50,7 +50,8 @@ class NamedEffect(Frozen):
 
     `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`: where the family is
     named, its effects, likeliest first; `name` is then the family's identifier, and `parameters` are those of the first member. `choices`:
-    which of its alternatives the law is, by field: the corner of a glow.
+    which of its alternatives the law is, by field: the corner of a glow. `shown_in`: measurements in which it stands out of the noise,
+    strongest first.
     """
 
     name: str
@@ -61,6 +62,7 @@ class NamedEffect(Frozen):
     sides: tuple[Side, ...]
     parameters: dict[str, ParameterValue]
     choices: dict[str, str] = {}
+    shown_in: tuple[str, ...] = ()
     rivals: tuple[Rival, ...] = ()
     statement: str
     #: Publication that the effect's law is taken from.

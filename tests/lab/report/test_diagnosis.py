@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lab.formats.results import DiagnosisResult, ExaminedPlace, NamedEffect, ResidualCurve, ResidualPicture, Visibility
+from lab.report.answers import proof_curves
 from lab.report.charts import residual_curve
 from lab.report.diagnosis import context, mood, place_maps, worst_of_each
 
@@ -63,6 +64,31 @@ def test_chi2_is_marked_above_what_noise_leaves() -> None:
 def test_each_measurement_shows_its_worst_curve_of_held_out_captures() -> None:
     curves = [_curve("a", 9.0, False), _curve("a", 2.0, True), _curve("a", 3.0, True), _curve("b", 5.0, False)]
     assert [(c.measurement, c.measured[0]) for c in worst_of_each(curves)] == [("b", 5.0), ("a", 3.0)]
+
+
+def test_the_first_screen_shows_each_effect_in_its_own_measurement() -> None:
+    """A weak effect isn't hidden by the two worst curves of a strong one."""
+
+    def named(name: str, *shown_in: str) -> NamedEffect:
+        return NamedEffect(
+            name=name, family="isotropic_contrast_loss", law="exact", probability=1.0, sides=("left",), parameters={}, statement="",
+            shown_in=shown_in,
+        )  # fmt: skip
+
+    curves = tuple(
+        _curve(name, off, True).model_copy(update={"x": (1.0, 2.0, 3.0, 4.0)})
+        for name, off in (("edges", 9.0), ("patterns", 8.0), ("narrowband", 2.0))
+    )
+    result = RESULT.model_copy(update={"curves": curves})
+    strong, weak = named("defocus", "patterns", "edges"), named("infrared_cut_filter", "narrowband")
+    for effects, wanted in (
+        ((strong, weak), ["patterns", "narrowband"]),
+        ((strong,), ["patterns", "edges"]),
+        ((named("coma"),), ["edges", "patterns"]),  # a result of before `shown_in`
+        ((), []),
+    ):
+        told = proof_curves(result.model_copy(update={"effects": effects}))
+        assert [curve.measurement for curve in told] == wanted
 
 
 def test_tables_and_pictures_are_ready_for_the_page() -> None:
