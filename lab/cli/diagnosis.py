@@ -156,6 +156,18 @@ def report(
         diagnosis=read_given(DiagnosisResult, diagnosis),
         report_file=out_file,
     )
+    assert request.recordings is not None
+    for option, one in (
+        ("--fit", request.fit),
+        ("--validation", request.validation),
+        ("--diagnosis", request.diagnosis),
+    ):
+        if one is not None and Path(one.source).name != Path(request.recordings.source).name:
+            err.print(
+                escape(
+                    f"calibench: {option}: is of {one.source}; on the page of {request.recordings.source}, it is as it stands"
+                )
+            )
     kept = [kind for kind, file in given.items() if file is None and store is not None and store.results(source, kind)]
     if kept and not stored:
         err.print(

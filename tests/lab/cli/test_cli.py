@@ -258,13 +258,17 @@ def test_a_report_says_what_is_stored_and_takes_it(
     command = ["report", session, "--out", str(tmp_path / "page.html"), "--data", str(tmp_path / "elsewhere")]
     for options, said in (
         ([], "has stored results (fit, diagnose), computed again now; --stored takes them"),
+        (
+            ["--diagnosis", str(tmp_path / "told.json")],
+            f"--diagnosis: is of x; on the page of {session}, it is as it stands",
+        ),
         (["--diagnosis", str(tmp_path / "told.json")], "has stored results (fit), computed again"),
         (["--stored"], ""),
     ):
         assert cli.main([*command, *options]) == 0
         assert said in (shown := " ".join(capsys.readouterr().err.split())) and bool(said) == bool(shown)
-    assert [request.reuse for request in asked] == [False, False, True]
-    assert [request.diagnosis for request in asked] == [None, told, None]
+    assert [request.reuse for request in asked] == [False, False, False, True]
+    assert [request.diagnosis for request in asked] == [None, told, told, None]
     assert cli.main(["report", str(flats), "--stored", "--out", str(tmp_path / "page.html")]) == 0
     assert "is stored" in capsys.readouterr().err
     assert cli.main(["fit", session]) == 2  # not in the data folder of the environment
