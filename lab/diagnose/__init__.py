@@ -87,10 +87,11 @@ def examine(
         if progress is not None:
             progress(f"{text} ({side})", sum(shares.values()) / len(shares))
 
+    apart = at_once and len(recordings.sides) > 1
     tasks = {
         side: partial(
             diagnose_side,
-            recordings,
+            recordings.for_one_of(len(recordings.sides)) if apart else recordings,
             side,
             fit,
             cameras.get(side),
@@ -101,7 +102,7 @@ def examine(
         )
         for side in recordings.sides
     }
-    if at_once and len(tasks) > 1:
+    if apart:
         found = [*in_processes(recordings, tasks, report, "diagnose").values()]
     else:
         found = [task(partial(report, side)) for side, task in tasks.items()]

@@ -62,7 +62,7 @@ def fit_recording_set(
                 progress(f"{step} of the {side} camera" if side else step, done / total)
 
     if len(sides) > 1 and _pixels(recordings) > WORTH_PROCESSES_PX:
-        tasks = {side: partial(fit_side, recordings, side, steps) for side in sides}
+        tasks = {side: partial(fit_side, recordings.for_one_of(len(sides)), side, steps) for side in sides}
         fitted = in_processes(recordings, tasks, told, "fit")
     else:
         fitted = {side: fit_side(recordings, side, steps, partial(told, side)) for side in sides}

@@ -143,6 +143,16 @@ class RecordingSet:
                     self._held -= self._cache.popitem(last=False)[1].nbytes
         return frame
 
+    def for_one_of(self, processes: int) -> RecordingSet:
+        """The same set for one of several processes, which together keep as many frames as this set would."""
+        return RecordingSet(
+            self.manifest,
+            source=self.source,
+            warnings=self.warnings,
+            files=self._files,
+            cache_bytes=self.cache_bytes // processes,
+        )
+
     def let_go(self) -> None:
         """Free the cached frames."""
         with self._lock:

@@ -115,6 +115,9 @@ def test_frames_are_read_only_and_the_cache_keeps_to_its_size(folder: Path) -> N
     kept = small.frame(first)
     small.let_go()
     assert small.frame(first) is not kept
+    halved = small.for_one_of(2)  # less than a frame
+    assert halved.frame(first) is not halved.frame(first)
+    np.testing.assert_array_equal(halved.frame(first), small.frame(first))
 
 
 def test_a_set_travels_to_another_process(folder: Path) -> None:
