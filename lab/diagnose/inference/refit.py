@@ -210,15 +210,13 @@ def _fit(
             return np.concatenate([white, _wide_residual(t) if of_any_size else t])
 
         def residual_jacobian(at: FloatArray, gaussian: Gaussian = tolerated.gaussian) -> FloatArray:
-            # one-sided differences towards the inside of the bounds
             base = model.mean(moved(effects, coords, at))[seen]
             columns = []
             for k, c in enumerate(coords):
                 if c in known:
                     columns.append(-known[c][seen])
                     continue
-                step = max(DIFFERENCE_STEP * max(typical[k], DIFFERENCE_STEP * abs(at[k])), c.quantity.smooth_over)
-                step = -step if at[k] + step > high[k] else step
+                step = _difference_step(c, at[k], typical[k], high[k])
                 shifted = at.copy()
                 shifted[k] += step
                 columns.append((base - model.mean(moved(effects, coords, shifted))[seen]) / step)
@@ -346,6 +344,12 @@ def _usual_log_odds(effect: Effect, std: dict[str, float | None]) -> float:
     return max(effect.having(**dict(zip(std, v, strict=True))).log_prior() for v in product(*near))
 
 
+def _difference_step(coordinate: Coordinate, at: float, typical: float, high: float) -> float:
+    """Step of a one-sided difference at u = `at`, towards the inside of the bounds."""
+    step = max(DIFFERENCE_STEP * max(typical, DIFFERENCE_STEP * abs(at)), coordinate.quantity.smooth_over)
+    return -step if at + step > high else step
+
+
 def _prediction_jacobian(
     model: MeasurementModel,
     effects: Effects,
@@ -357,9 +361,8 @@ def _prediction_jacobian(
     """(n, p), by one-sided differences."""
     base = model.mean(effects)
     columns = []
-    for k in range(len(u)):
-        step = max(DIFFERENCE_STEP * typical[k], coords[k].quantity.smooth_over)
-        step = -step if u[k] + step > high[k] else step
+    for k, c in enumerate(coords):
+        step = _difference_step(c, u[k], typical[k], high[k])
         shifted = u.copy()
         shifted[k] += step
         columns.append((model.mean(moved(effects, coords, shifted)) - base) / step)
