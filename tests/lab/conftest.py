@@ -117,7 +117,7 @@ def small_set() -> Callable[..., RecordingSet]:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    """An empty store in the test's folder."""
-    opened = Store(tmp_path)
+    """An empty store in the test's folder `data`."""
+    opened = Store(tmp_path / "data")
     yield opened
     opened.close()

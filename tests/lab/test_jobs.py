@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,13 +22,6 @@ from lab.errors import InputError, NotDetermined
 from lab.jobs import JobInfo, JobRunner, check_scheduler
 from lab.pipeline import CaptureRequest, Goal, PipelineProgress, PipelineRequest, Tell, capture_here
 from tests.lab import fake_bench
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(tmp_path / "data")
-    yield opened
-    opened.close()
 
 
 @pytest.fixture

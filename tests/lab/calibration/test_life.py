@@ -240,7 +240,7 @@ def test_an_older_store_gets_its_calibrations(tmp_path: Path) -> None:
 def test_from_the_command_line(
     store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CALIBENCH_DATA", str(tmp_path))
+    monkeypatch.setenv("CALIBENCH_DATA", str(tmp_path / "data"))
     first, second = calibrated(store, 2.0), calibrated(store, 2.3)
 
     def said(*arguments: str, code: int = 0) -> str:
@@ -249,7 +249,7 @@ def test_from_the_command_line(
         return found.out + found.err
 
     assert "limits" in said("certify", first, "--by", "ada", code=2)
-    file = tmp_path / "limits.toml"
+    file = tmp_path / "data" / "limits.toml"
     file.write_text('valid_days = 90\n[[limit]]\nfigure = "noise read_noise_e"\ngood = [0.0, 2.1]\nwarn = [0.0, 2.5]\n')
     assert read_limits(file).valid_days == 90
     assert f"{first}: certified by ada, 2 figures within limits, until" in said("certify", first, "--by", "ada")

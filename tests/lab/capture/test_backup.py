@@ -22,13 +22,6 @@ from tests.lab import fake_bench
 DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
 
 
-@pytest.fixture
-def store(tmp_path: Path):
-    opened = Store(tmp_path / "data")
-    yield opened
-    opened.close()
-
-
 def captured(store: Store) -> str:
     session = CaptureSession.start(store, fake_bench.station(), DARKS, connect=fake_bench.Bench().drivers)
     session.run()

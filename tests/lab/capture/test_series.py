@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 import usb.core
@@ -33,13 +30,6 @@ def devices() -> tuple[U3vDevice, U3vDevice]:
     numbered = [np.full((24, 32), number, np.uint16) for number in range(64)]
     ready = ReadyFrames({"left": numbered, "right": numbered})
     return U3vDevice(ready, "left", "L", line), U3vDevice(ready, "right", "R", line)
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(tmp_path / "data")
-    yield store
-    store.close()
 
 
 def run(store: Store, devices: tuple[U3vDevice, U3vDevice]) -> tuple[CaptureSession, list[str]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import pickle
 import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +32,6 @@ from tests.lab import fake_bench
 
 STATION = fake_bench.station()
 DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(tmp_path / "data")
-    yield opened
-    opened.close()
 
 
 def started(store: Store, calibration: CapturePlan = DARKS, **keys: Any) -> str:
