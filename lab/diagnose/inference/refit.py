@@ -89,6 +89,7 @@ class Fit:
     `log_posterior` is the log-likelihood and log prior there, less `parameter_log_odds` for every parameter.
     `jacobian` (n, p) is that of the prediction by the coordinates that were fitted.
     `promised_gain`: the log posterior that one more Newton step of all coordinates would gain.
+    `tolerated`: the share of the laws' form tolerances by which the seen numbers are likeliest.
     """
 
     effects: tuple[Effect, ...]
@@ -98,6 +99,7 @@ class Fit:
     jacobian: FloatArray
     converged: bool = True  # False: a rough fit
     promised_gain: float = 0.0
+    tolerated: float = 1.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -252,7 +254,7 @@ def _fit(
         tolerated.gaussian, model.seen_value, at_best[seen], (u - prior_centre) / prior_std, prior_std
     )
     log_posterior = value + log_prior - policy.parameter_log_odds * len(coords)
-    return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised)
+    return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised, tolerated.share)
 
 
 def is_of_usual_size(effects: Effects) -> bool:

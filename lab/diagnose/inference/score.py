@@ -157,11 +157,15 @@ def signatures(
 
 
 def signatures_of(
-    model: MeasurementModel, current: Effects, changes: Changes, jacobian: FloatArray | None = None
+    model: MeasurementModel,
+    current: Effects,
+    changes: Changes,
+    jacobian: FloatArray | None = None,
+    tolerated: float = 1.0,
 ) -> Signatures:
-    """The same of changes that are known, by the covariance that `current` effects give. Those beside a smaller set stand for those
-    beside `current`: an effect's change depends little on what it stands beside."""
-    gaussian = model.seen_gaussian(current)
+    """The same of changes that are known, by the covariance that `current` effects give with a share of their form tolerances. Those beside a
+    smaller set stand for those beside `current`: an effect's change depends little on what it stands beside."""
+    gaussian = model.seen_gaussian(current, tolerated)
     white = gaussian.whiten(model.seen_value - gaussian.mean)
     out = np.zeros((len(white), 0))
     if jacobian is not None and jacobian.size:

@@ -88,7 +88,7 @@ class Search:
         """Residual and signatures about a fitted set, its parameters projected out, of the candidates that aren't in it."""
         if fit.effects not in self._signatures:
             others = [c for c in self.changes if c[0].name not in fit.names]
-            self._signatures[fit.effects] = signatures_of(self.model, fit.effects, others, fit.jacobian)
+            self._signatures[fit.effects] = signatures_of(self.model, fit.effects, others, fit.jacobian, fit.tolerated)
         return self._signatures[fit.effects]
 
     # --- log odds ----------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from lab.diagnose.inference.decide import _with_every_mode, decide
 from lab.diagnose.inference.gaussian import BlockCovariance
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit
-from lab.diagnose.inference.score import prototype_changes
+from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
 from lab.diagnose.measurements.block import Block, Label, Prediction
@@ -149,6 +149,16 @@ def test_a_pair_is_found_that_a_third_effect_hides() -> None:
 
 def test_two_effects_of_different_shapes_are_both_found() -> None:
     assert _best((_Up(size_dn=0.1), _Wave(size_dn=0.05)), 2) == {"up", "wave"}
+
+
+def test_scores_beside_a_law_that_holds_are_by_the_tolerance_that_it_needs() -> None:
+    """A line of 5 DN may be wrong by 0.05 DN, smoothly: with the whole of that, a bend of 0.04 DN beside it scores nothing."""
+    search = _search((_Up(size_dn=5.0), _Bend(size_dn=0.04)), 60)
+    fit = search.fitted((_Up(size_dn=5.0),), converged=True)
+    assert fit.tolerated < 1.0
+    whole = signatures_of(search.model, fit.effects, [c for c in search.changes if c[0] is _Bend], fit.jacobian)
+    needed = {score.effect: score.value for score in search.signatures(fit).scores()}
+    assert needed[_Bend] > 1.0 > 10.0 * whole.scores()[0].value
 
 
 def test_sets_that_the_numbers_cannot_tell_apart_share_the_probability() -> None:
