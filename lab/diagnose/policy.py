@@ -159,6 +159,15 @@ class DecisionPolicy(Frozen):
             "what refits of the same set from different starts differ by",
         ),
     ] = 0.5
+    least_tolerated_share: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "1",
+            "least share of the laws' form tolerances by which sets of effects are compared, each by its likeliest",
+            "a tenth of a declared tolerance is below the noise up to changes of 200 standard deviations (5 %); 1 takes the declared ones as they are",
+        ),
+    ] = 0.1
     misstated_ratio: Annotated[
         float,
         Rule(

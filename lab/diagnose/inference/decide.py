@@ -192,7 +192,7 @@ def _with_every_mode(
     if not signed:
         return candidate
     others = tuple(e for e in effects if e is not effect)
-    least = log_likelihood(model, effects) - policy.equal_mode_log_odds
+    least = log_likelihood(model, effects, policy) - policy.equal_mode_log_odds
     modes = [effect]
     if len(signed) > 1:
         total = float(np.sqrt(np.sum(np.square(list(signed.values())))))
@@ -203,7 +203,7 @@ def _with_every_mode(
             if another and fit.log_likelihood >= least:
                 modes.append(fit.effects[-1])
     mirrored = [one.having(**{n: -float(getattr(one, n)) for n in signed}) for one in modes]
-    modes += [one for one in mirrored if log_likelihood(model, (*others, one)) >= least]
+    modes += [one for one in mirrored if log_likelihood(model, (*others, one), policy) >= least]
     away = {n: np.array([float(getattr(one, n)) for one in modes]) - value for n, value in signed.items()}
     std = {
         n: s if s is None or n not in away else float(np.hypot(s, np.sqrt(np.mean(np.square(away[n])))))

@@ -31,8 +31,8 @@ PRIOR_WIDTH = 3.0
 TYPICAL_LOG, LEAST = 0.1, 1e-9
 #: Step of finite differences, in typical sizes of the coordinate.
 DIFFERENCE_STEP = 0.02
-#: Shares of the declared form tolerances: these are what a law may be wrong by at most, and a law that holds better isn't less likely.
-TOLERATED = (1.0, 0.3, 0.1)
+#: Shares of the declared form tolerances that are tried, from the whole to the policy's least, by equal factors.
+TOLERATED_SHARES = 3
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,9 @@ def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tupl
     return tuple(e.having(**v) for e, v in zip(effects, values, strict=True))
 
 
-def log_likelihood(model: MeasurementModel, effects: Effects) -> float:
+def log_likelihood(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) -> float:
     """Of the seen numbers under the effects as they stand, with the likeliest share of their form tolerances."""
-    return _likeliest_tolerance(model, effects).log_likelihood
+    return _likeliest_tolerance(model, effects, policy).log_likelihood
 
 
 class _Tolerated(NamedTuple):
@@ -139,15 +139,16 @@ class _Tolerated(NamedTuple):
     log_likelihood: float
 
 
-def _likeliest_tolerance(model: MeasurementModel, effects: Effects) -> _Tolerated:
-    """The share of the form tolerances, of `TOLERATED`, by which the seen numbers are likeliest.
+def _likeliest_tolerance(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) -> _Tolerated:
+    """The share of the form tolerances, down to `least_tolerated_share`, by which the seen numbers are likeliest.
 
     By the declared tolerances alone, of two laws that fit equally well the one with the smaller tolerance is far likelier: by 8 in the
     logarithm for a low-pass filter of 1 % beside a vibration of 5 %, even where the numbers meet the vibration's form to a tenth of that.
     """
-    is_exact = all(e.form_tolerance == 0.0 for e in effects)
+    least = policy.least_tolerated_share
+    is_one = least == 1.0 or all(e.form_tolerance == 0.0 for e in effects)
     found = []
-    for share in TOLERATED[:1] if is_exact else TOLERATED:
+    for share in (1.0,) if is_one else np.geomspace(1.0, least, TOLERATED_SHARES).tolist():
         gaussian = model.seen_gaussian(effects, share)
         found.append(_Tolerated(share, gaussian, gaussian.log_likelihood(model.seen_value)))
     return max(found, key=lambda one: one.log_likelihood)
@@ -165,7 +166,7 @@ def refit(
 ) -> Fit:
     """Maximum a posteriori of all parameters, from `start`.
 
-    The covariance has the likeliest share of the form tolerances (`TOLERATED`). Standard deviations follow from the Jacobian and hold the
+    The covariance has the likeliest share of the form tolerances. Standard deviations follow from the Jacobian and hold the
     whole of them: a law's error that has a parameter's own signature moves the parameter, and can't be seen. Dispensable
     parameters stay absent in a converged fit unless they gain `dispensable_log_odds`. `rough`: fewer steps, enough to
     rank sets. `beside`: a fit whose Jacobian is reused for members that stand as they do there; it changes little by
@@ -197,13 +198,13 @@ def _fit(
     again."""
     seen = model.seen
     if not coords:
-        value = log_likelihood(model, effects)
+        value = log_likelihood(model, effects, policy)
         return Fit(effects, (), value, value, np.zeros((len(model.value), 0)))
     u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
     low, high = (np.array(b) for b in zip(*(c.bounds for c in coords), strict=True))
     typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
     prior_centre, prior_std = _prior(coords)
-    tolerated = _likeliest_tolerance(model, moved(effects, coords, u))
+    tolerated = _likeliest_tolerance(model, moved(effects, coords, u), policy)
     for turn in range(passes or (ROUGH_PASSES if rough else PASSES)):
 
         def residual(at: FloatArray, gaussian: Gaussian = tolerated.gaussian) -> FloatArray:
@@ -239,7 +240,7 @@ def _fit(
             ftol=1e-5,
         )
         before, share_before, u = u, tolerated.share, result.x
-        tolerated = _likeliest_tolerance(model, moved(effects, coords, u))
+        tolerated = _likeliest_tolerance(model, moved(effects, coords, u), policy)
         if tolerated.share == share_before and np.all(np.abs(u - before) < 1e-3 * typical):
             break
     best = moved(effects, coords, u)

@@ -259,7 +259,7 @@ class Search:
         if origin.effects or len(linear) < 2 or not any(alone):
             return (*origin.effects, *linear)
         mixed = tuple(e if fit is None else fit.effects[0] for e, fit in zip(linear, alone, strict=True))
-        return max((tuple(linear), mixed), key=lambda start: log_likelihood(self.model, start))
+        return max((tuple(linear), mixed), key=lambda start: log_likelihood(self.model, start, self.policy))
 
     # --- fits --------------------------------------------------------------------------------------------------------
 

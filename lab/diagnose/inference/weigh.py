@@ -97,7 +97,9 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
             common = [i for i in affected if model.blocks[i].touched_by(library()[name])]
             weights[name] += with_discrepancies(model.seen_gaussian(tried.effects), common)
     log_prior = fit.log_posterior - fit.log_likelihood
-    as_they_are = log_likelihood(model, rest) + log_prior + with_discrepancies(model.seen_gaussian(rest), affected)
+    as_they_are = (
+        log_likelihood(model, rest, policy) + log_prior + with_discrepancies(model.seen_gaussian(rest), affected)
+    )
     refitted = without.log_posterior + with_discrepancies(model.seen_gaussian(without.effects), affected)
     weights[UNKNOWN] = max(as_they_are, refitted, misstated)
 
@@ -168,7 +170,7 @@ def _misstated_metadata(search: Search, fit: Fit, index: int) -> tuple[float, st
     if search.is_spent and not search.is_known(starts[0]):
         search.leave(starts[0])
         return -np.inf, ""
-    tried = search.fitted(max(starts, key=lambda s: log_likelihood(model, s)), beside=fit)
+    tried = search.fitted(max(starts, key=lambda s: log_likelihood(model, s, policy)), beside=fit)
     if tried.log_posterior < fit.log_posterior - policy.hopeless_log_odds:
         return -np.inf, ""
     tried = search.fitted(tried.effects, converged=True)
