@@ -165,7 +165,7 @@ def report(
         if one is not None and Path(one.source).name != Path(request.recordings.source).name:
             err.print(
                 escape(
-                    f"calibench: {option}: is of {one.source}; on the page of {request.recordings.source}, it is as it stands"
+                    f"calibench: {option}: computed from {one.source}, shown on the page of {request.recordings.source}"
                 )
             )
     kept = [kind for kind, file in given.items() if file is None and store is not None and store.results(source, kind)]

@@ -180,8 +180,11 @@ def proof_words(curve: ResidualCurve) -> tuple[str, str]:
 
 
 def proofs(fit: FitResult, diagnosis: DiagnosisResult | None) -> list[Proof]:
-    """Charts: the two measurements that show the named effects (`proof_curves`), with both models; of a healthy or an undiagnosed camera, its photon
-    transfer."""
+    """Charts for the first screen.
+
+    The two measurements that show the named effects (`proof_curves`), with both models; of a healthy or an undiagnosed camera, its
+    photon transfer.
+    """
     shown = []
     for curve in proof_curves(diagnosis) if diagnosis is not None else ():
         title, caption = proof_words(curve)

@@ -84,23 +84,15 @@ class RecordingSet:
 
     def with_frames(self, frames: Mapping[str, NDArray[Any]]) -> RecordingSet:
         """The same set with other frames (uint16) at some of its paths."""
-        return RecordingSet(
-            self.manifest,
-            source=self.source,
-            warnings=self.warnings,
-            files=OverlaidFiles(self._files, frames),
-            cache_bytes=self.cache_bytes,
-        )
+        return self._copy(files=OverlaidFiles(self._files, frames))
 
     def joined(self, later: RecordingSet, folder: str) -> RecordingSet:
         """This set with the captures of a later one of the same cameras. The later one's ids, paths and poses begin with `folder/`."""
         captures = (*self.manifest.captures, *(in_folder(capture, folder) for capture in later.manifest.captures))
-        return RecordingSet(
-            self.manifest.model_copy(update={"captures": captures}),
-            source=self.source,
+        return self._copy(
+            manifest=self.manifest.model_copy(update={"captures": captures}),
             warnings=(*self.warnings, *later.warnings),
             files=JoinedFiles(self._files, later._files, folder),
-            cache_bytes=self.cache_bytes,
         )
 
     def without(self, ids: Container[str]) -> RecordingSet:
@@ -110,8 +102,26 @@ class RecordingSet:
 
     def under(self, manifest: Manifest) -> RecordingSet:
         """The same frames, spectra and targets as `manifest` describes them."""
+        return self._copy(manifest=manifest)
+
+    def for_one_of(self, processes: int) -> RecordingSet:
+        """The same set for one of several processes, which together keep as many frames as this set would."""
+        return self._copy(cache_bytes=self.cache_bytes // processes)
+
+    def _copy(
+        self,
+        manifest: Manifest | None = None,
+        warnings: tuple[str, ...] | None = None,
+        files: RecordingFiles | None = None,
+        cache_bytes: int | None = None,
+    ) -> RecordingSet:
+        """A set with an empty cache of frames; what isn't given is this set's."""
         return RecordingSet(
-            manifest, source=self.source, warnings=self.warnings, files=self._files, cache_bytes=self.cache_bytes
+            self.manifest if manifest is None else manifest,
+            source=self.source,
+            warnings=self.warnings if warnings is None else warnings,
+            files=self._files if files is None else files,
+            cache_bytes=self.cache_bytes if cache_bytes is None else cache_bytes,
         )
 
     def capture(self, id: str) -> Capture:
@@ -142,16 +152,6 @@ class RecordingSet:
                 while self._held > self.cache_bytes:
                     self._held -= self._cache.popitem(last=False)[1].nbytes
         return frame
-
-    def for_one_of(self, processes: int) -> RecordingSet:
-        """The same set for one of several processes, which together keep as many frames as this set would."""
-        return RecordingSet(
-            self.manifest,
-            source=self.source,
-            warnings=self.warnings,
-            files=self._files,
-            cache_bytes=self.cache_bytes // processes,
-        )
 
     def let_go(self) -> None:
         """Free the cached frames."""

@@ -260,7 +260,7 @@ def test_a_report_says_what_is_stored_and_takes_it(
         ([], "has stored results (fit, diagnose), computed again now; --stored takes them"),
         (
             ["--diagnosis", str(tmp_path / "told.json")],
-            f"--diagnosis: is of x; on the page of {session}, it is as it stands",
+            f"--diagnosis: computed from x, shown on the page of {session}",
         ),
         (["--diagnosis", str(tmp_path / "told.json")], "has stored results (fit), computed again"),
         (["--stored"], ""),
