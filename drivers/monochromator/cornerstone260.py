@@ -40,6 +40,8 @@ _FAILED = {"20", "32"}
 _NOT_UNDERSTOOD = 1
 #: Seconds between two looks at whether a motion has ended, where the instrument doesn't say so by itself.
 _LOOK_S = 0.1
+#: Lines that a slow instrument still sends after the statements of the first contact, echoes and status bytes, and the most of them.
+_LATE, _LATE_LINES = {"", "ABORT", *_DONE}, 6
 #: Longest time (s) that the status byte of HANDSHAKE itself is waited for.
 _HANDSHAKE_S = 1.0
 #: Reciprocal linear dispersion with 1200 l/mm: 1e6 nm / (1200 per mm x 260 mm) x cos(9.6 deg).
@@ -176,11 +178,17 @@ class Cornerstone260(WireInstrument, Monochromator):
             self._do(f"GRAT {self.grating}")
 
     def _first_answer(self) -> str:
-        """The reply to INFO?, and by what comes with it: whether the instrument echoes, and whether a host before left handshake mode on."""
+        """The reply to INFO?, and by what comes with it: whether the instrument echoes, and whether a host before left handshake mode on.
+
+        Late answers to what was sent before are skipped.
+        """
         line = self._transport
         line.write(b"INFO?\r\n")
         first = self._line("INFO?")
-        self._echoes = first.strip().upper() == "INFO?"
+        for _ in range(_LATE_LINES):
+            if first.upper() in _LATE:
+                first = self._line("INFO?")
+        self._echoes = first.upper() == "INFO?"
         reply = self._line("INFO?") if self._echoes else first
         more = line.drain(quiet_s=0.1).decode("latin-1").split()
         complains = "INFO?" in reply.upper() or reply.upper().startswith(("ER:", "ERROR"))  # another instrument does

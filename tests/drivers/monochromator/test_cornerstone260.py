@@ -100,6 +100,28 @@ def test_a_motion_under_way_is_ended_on_connecting(served: Callable[..., str]) -
     mono.close()
 
 
+class _Slow(Mock):
+    """On a busy computer: what comes first is answered half a second late."""
+
+    delay_s = 0.5
+
+    def receive(self, data: bytes) -> list[bytes]:
+        time.sleep(self.delay_s)
+        self.delay_s = 0.0
+        return super().receive(data)
+
+
+@pytest.mark.parametrize("handshake", [False, True], ids=["off", "on"])
+def test_late_answers_to_the_first_contact_are_skipped(served: Callable[..., str], handshake: bool) -> None:
+    mock = _Slow(Lamp())
+    Mock.receive(mock, b"HANDSHAKE %d\n" % handshake)
+    with Cornerstone260(served(mock, Pty())) as mono:
+        assert mono.identity().serial_number == "0427"
+        mono.move_nm(500)
+        assert mono.wavelength_nm() == 500.0
+    assert Mock.receive(mock, b"WAVE?\r\n")[-1] == b"500\r\n" + b"00\r\n" * handshake
+
+
 def test_two_instruments_on_one_port_are_told_so(served: Callable[..., str]) -> None:
     address = served(Mock(Lamp()), Pty())
     with Cornerstone260(address), pytest.raises(InUse, match="this port is in use, by another program or another"):
