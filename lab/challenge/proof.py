@@ -12,7 +12,7 @@ from lab.challenge.score import STRONG, CaseScore, ChallengeScore, Rate
 from lab.effect_titles import effect_title
 from lab.errors import InputError
 
-CELL_PX, LABEL_PX, HEAD_PX = 24, 210, 190
+CELL_PX, LABEL_PX, HEAD_PX = 24, 210, 225
 RIGHT, WRONG, ABSTAINED = "#2f7d4f", "#b3372f", "#8a8f98"
 SAID_NOTHING = ("unexplained", "no_mismatch", "failed")
 
