@@ -228,6 +228,7 @@ class CaptureSession:
             if interrupted.is_set():
                 raise KeyboardInterrupt
         finally:
+            self._entries.clear()  # what a run held lives on in cycles of its exception and engine, until Python looks for these
             lock.release()
         return self.store.session(self.id)
 
