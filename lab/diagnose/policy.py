@@ -118,7 +118,7 @@ class DecisionPolicy(Frozen):
         Rule(
             "cost of a model",
             "log odds",
-            "against a listed effect being there, in the probabilities of sets of effects; names have to earn more",
+            "prior log odds against a listed effect being there",
             "ln 45: one of the library's effects a camera",
         ),
     ] = 3.8
@@ -140,16 +140,6 @@ class DecisionPolicy(Frozen):
             "logarithm of the number of kernels that differ: 20 amplitudes x 3 lengths x 4 groupings = 240 are tried, of which neighbouring amplitudes are nearly alike: about 150",
         ),
     ] = 5.0
-    added_threshold_factor: Annotated[
-        float,
-        Rule(
-            "cost of a model",
-            "threshold",
-            "gain that an effect has to earn where a stronger one acts on the same measurement",
-            TUNED,
-            off=1.0,
-        ),
-    ] = 1.5
     exchange_log_odds: Annotated[
         float,
         Rule(
@@ -189,6 +179,15 @@ class DecisionPolicy(Frozen):
 
     # --- name ------------------------------------------------------------------------------------------------------------
     least_probability: Annotated[float, Rule("name", "1", "least probability of a name", "likelier than not")] = 0.5
+    least_inclusion_probability: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "least probability that a named effect is there, against the same set without it and with `included_log_odds` as its prior",
+            "odds of 9 to 1; with `parameter_log_odds`, one parameter has to gain 17 in chi2, which noise reaches in one of 27 000 effects that are tried",
+        ),
+    ] = 0.9
     family_probability: Annotated[
         float,
         Rule(

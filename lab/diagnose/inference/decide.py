@@ -80,11 +80,12 @@ def decide(
     known = candidates()
     changes = prototype_changes(model, model.camera, (), known)
     first = signatures_of(model, (), changes)
-    threshold = max(first.threshold(rng, 1.0 - policy.false_alarm_rate, policy.threshold_draws), least_threshold)
+    drawn = first.threshold(rng, 1.0 - policy.false_alarm_rate, policy.threshold_draws)
+    threshold = max(drawn, least_threshold)
     scores = first.scores()
     top = scores[0].value if scores else 0.0
     before = mismatches(model, model.gaussian(), policy)
-    search = Search(model, known, changes, threshold, policy)
+    search = Search(model, known, changes, threshold, policy, above_noise=max(least_threshold - drawn, 0.0))
     named, abstained = named_members(search, search.best(report), report)
     if top > threshold + policy.lone_score_margin and not named and not before and not abstained:
         abstained.append(Candidate(scores[0].start, {}, 0.0, ((UNKNOWN, 1.0),), 0.5 * top))

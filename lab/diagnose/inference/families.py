@@ -36,7 +36,7 @@ def family_claim(search: Search, named: Sequence[Candidate], candidate: Candidat
     without = search.fitted(others, converged=True)
     fit = search.fitted((*others, start), converged=True)
     log_odds = fit.log_posterior - without.log_posterior
-    if 2.0 * log_odds < search.threshold * policy.added_threshold_factor:
+    if log_odds < search.needed_log_odds:
         return None
     share, is_closed = explained(model, fit, without, model.affected_blocks(start), policy)
     if share < policy.family_least_share:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
@@ -77,24 +77,8 @@ def _too_weak(search: Search, fit: Fit) -> int | None:
     """The weakest member that can't be named whatever its rivals. Tested before anything is weighed, as that fits every rival of every
     member."""
     log_odds = [fit.log_posterior - search.without(fit, i).log_posterior for i in range(len(fit.effects))]
-    members = [Candidate(e, s, 0.0, (), odds) for e, s, odds in zip(fit.effects, fit.std, log_odds, strict=True)]
-
-    def needed(candidate: Candidate) -> float:
-        factor = search.policy.added_threshold_factor if _is_beside_stronger(candidate, members, search) else 1.0
-        return search.threshold * factor
-
-    weak = [c for c in members if 2.0 * c.log_odds < needed(c)]
-    return members.index(min(weak, key=lambda c: c.log_odds)) if weak else None
-
-
-def _is_beside_stronger(candidate: Candidate, members: Sequence[Candidate], search: Search) -> bool:
-    """Whether a stronger member acts on the block that the candidate changes most."""
-    stronger = [c for c in members if c.log_odds > candidate.log_odds]
-    if not stronger:
-        return False
-    model = search.model
-    block = model.blocks[model.strongest_block(candidate.effect, [c.effect for c in members])]
-    return any(block.touched_by(type(c.effect)) for c in stronger)
+    weak = [odds for odds in log_odds if odds < search.needed_log_odds]
+    return log_odds.index(min(weak)) if weak else None
 
 
 def _replaced_by_a_discrepancy(search: Search, fit: Fit) -> list[int]:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, zip_longest
 
+from scipy import special
+
 from lab.diagnose.inference.closed_form import LinearProblem, LinearSet, posterior, smallest_set
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.inference.refit import Fit, log_likelihood, refit
@@ -60,7 +62,8 @@ class _Proposal:
 class Search:
     """The sets that were fitted so far, by their effects' names, and the search over further ones.
 
-    `threshold` is that of the scores: twice the log odds that every effect has to earn. `changes`: of the candidates' prototypes, beside
+    `threshold` is that of the scores, which one healthy camera in a hundred reaches; `above_noise`: by how much drawn healthy cameras have
+    raised it. `changes`: of the candidates' prototypes, beside
     no effect. `clock` gives the CPU time (s) that the budget is counted in, from the search's beginning. `not_weighed`: what the budget
     left.
     """
@@ -70,6 +73,7 @@ class Search:
     changes: Changes
     threshold: float
     policy: DecisionPolicy = field(default_factory=DecisionPolicy)
+    above_noise: float = 0.0
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
     clock: Callable[[], float] = time.process_time
     not_weighed: dict[frozenset[str], tuple[str, ...]] = field(default_factory=dict)
@@ -94,26 +98,23 @@ class Search:
     # --- log odds ----------------------------------------------------------------------------------------------------
 
     def log_odds(self, fit: Fit) -> float:
-        """Log posterior of a set, less half the threshold for every effect: one healthy camera in a hundred reaches
-        that."""
-        return fit.log_posterior - 0.5 * self.threshold * len(fit.effects)
+        """Log posterior of a set, less what each of its effects has to earn."""
+        return fit.log_posterior - self.needed_log_odds * len(fit.effects)
+
+    @cached_property
+    def needed_log_odds(self) -> float:
+        """Gain in log posterior that an effect has to earn: it is there with `least_inclusion_probability`, by how often effects occur."""
+        policy = self.policy
+        likely = policy.included_log_odds + float(special.logit(policy.least_inclusion_probability))
+        return likely + 0.5 * self.above_noise
+
+    def _parameters_cost(self, kind: type[Effect]) -> float:
+        return self.policy.parameter_log_odds * sum(not q.dispensable for q in kind.quantities().values())
 
     @cached_property
     def _cost(self) -> dict[str, float]:
-        """Log odds that each effect has to earn."""
-        kinds = {e.name: [q for q in e.quantities().values() if not q.dispensable] for e in self.candidates}
-        return {n: 0.5 * self.threshold + self.policy.parameter_log_odds * len(q) for n, q in kinds.items()}
-
-    def _added_cost(self, fit: Fit, grown_from: Fit) -> float:
-        """Log odds that an added effect has to earn beyond its own, where it shows most in a block on which an earlier
-        member acts."""
-        new = [e for e in fit.effects if e.name not in grown_from.names]
-        if not grown_from.effects or len(new) != len(fit.effects) - len(grown_from.effects):
-            return 0.0
-        strongest = [self.model.blocks[self.model.strongest_block(e, fit.effects)] for e in new]
-        old = [type(e) for e in fit.effects if e.name in grown_from.names]
-        overlap = any(block.touched_by(e) for block in strongest for e in old)
-        return 0.5 * (self.policy.added_threshold_factor - 1.0) * self.threshold if overlap else 0.0
+        """Gain in log-likelihood that each effect has to earn."""
+        return {e.name: self.needed_log_odds + self._parameters_cost(e) for e in self.candidates}
 
     # --- search ------------------------------------------------------------------------------------------------------
 
@@ -150,7 +151,7 @@ class Search:
             whole = self.fitted(fit.effects, converged=True)
             gain = self.log_odds(whole) - self.log_odds(current)
             is_better = best is None or self.log_odds(whole) > self.log_odds(best)
-            if is_better and gain > self.policy.exchange_log_odds and gain > self._added_cost(whole, current):
+            if is_better and gain > self.policy.exchange_log_odds:
                 best = whole
         return best
 
@@ -237,11 +238,12 @@ class Search:
         return self.fitted((*fit.effects[:index], *fit.effects[index + 1 :]), converged=True)
 
     def _seen_sets(self, origin: Fit, size: int) -> list[LinearSet]:
-        """The sets of `size` effects beside `origin` in which every member is above the threshold, best first."""
+        """The sets of `size` effects beside `origin` that promise what they have to earn, or whose score, as refits may gain more, is above
+        the threshold for every member; best first."""
         if len(origin.effects) + size > self.policy.most_effects:
             return []
         sets = self.problem(origin).best(size)
-        return [one for one in sets if one.score > self.threshold * size]
+        return [one for one in sets if one.log_odds > 0.0 or one.score > self.threshold * size]
 
     def problem(self, fit: Fit) -> LinearProblem:
         """The linear problem about a fitted set."""
@@ -316,7 +318,7 @@ class Search:
         that has most of their effects."""
         prior, near = self.policy.included_log_odds, math.log(self.policy.least_rival_probability)
         found = {frozenset(f.names): f.log_posterior - prior * len(f.effects) for f in self._listed()}
-        cost = {n: c - 0.5 * self.threshold + prior for n, c in self._cost.items()}
+        cost = {e.name: prior + self._parameters_cost(e) for e in self.candidates}
         likely = sorted(self._listed(), key=lambda f: -found[frozenset(f.names)])
         least = found[frozenset(likely[0].names)] + near
         beside: dict[frozenset[str], tuple[int, float]] = {}

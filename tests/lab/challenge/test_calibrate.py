@@ -104,7 +104,7 @@ def test_a_table_has_a_row_for_each_rule() -> None:
     by_case = {case: {name: _answer() for name in policies_without()} for case in CASES}
     rows = rule_table(CASES, by_case).splitlines()
     assert len(rows) == 2 + len(policies_without())
-    assert "| `added_threshold_factor` | 1 | 1.5 | 0 of 3 | 0 | 0 | 1 of 1 | 0 of 3 |" in "\n".join(rows)
+    assert "| `covariance_slack` | 0 | 0.15 | 0 of 3 | 0 | 0 | 1 of 1 | 0 of 3 |" in "\n".join(rows)
 
 
 def test_either_each_rule_or_one(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from scipy.stats import norm
+from scipy.special import logit
+from scipy.stats import chi2, norm
 
 from lab.diagnose import DecisionPolicy, diagnose, examine
 from lab.diagnose.outcome.detectability import detectable
@@ -40,6 +41,8 @@ def test_stated_probabilities_follow_from_their_formulas() -> None:
     policy = DecisionPolicy()
     assert norm.cdf(0.5 * np.sqrt(25.0 * (1.0 - policy.rival_cosine**2))) == pytest.approx(0.951, abs=0.001)
     assert norm.cdf(np.sqrt(0.5 * policy.next_capture_distance)) == pytest.approx(0.841, abs=0.001)
+    needed = policy.included_log_odds + logit(policy.least_inclusion_probability) + policy.parameter_log_odds
+    assert chi2.isf(1.0 / 27000.0, 1) == pytest.approx(2.0 * needed, abs=0.05)
     assert detectable(12.0, policy.detection_probability) == pytest.approx(detectable(12.0))
 
 

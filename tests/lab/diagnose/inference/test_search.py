@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 from lab.diagnose.inference.decide import _with_every_mode, decide
 from lab.diagnose.inference.gaussian import BlockCovariance
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.score import prototype_changes, signatures_of
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate
@@ -274,13 +272,13 @@ def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> N
     np.testing.assert_allclose(BlockCovariance(positive).lower @ BlockCovariance(positive).lower.T, positive)
 
 
-def test_what_is_added_beside_a_stronger_effect_has_to_earn_more() -> None:
-    """Half as much again as the threshold, where both act on the same measurement; a first effect earns the threshold
-    alone."""
-    model = contrast_model(np.random.default_rng(24))
-    search = Search(model, candidates(), (), 18.0)
-    alone = Fit((effect("defocus")(defocus_um=3.0),), ({},), 0.0, 0.0, np.zeros((len(model.value), 0)))
-    both = replace(alone, effects=(*alone.effects, effect("charge_diffusion")(length_um=0.3)))
-    none = replace(alone, effects=())
-    assert search._added_cost(alone, none) == 0.0
-    assert search._added_cost(both, alone) == pytest.approx(0.25 * 18.0)
+def test_what_a_name_needs_is_a_probability() -> None:
+    """Odds of 9 to 1 against its absence, of which the prior takes 45; and half of what drawn healthy cameras have raised the threshold
+    by."""
+    model, policy = contrast_model(np.random.default_rng(24)), DecisionPolicy()
+    search = Search(model, candidates(), (), 16.0)
+    odds = np.exp(search.needed_log_odds - policy.included_log_odds)
+    assert odds / (1.0 + odds) == pytest.approx(policy.least_inclusion_probability)
+    assert search.needed_log_odds == pytest.approx(np.log(45.0 * 9.0), abs=0.01)
+    raised = Search(model, candidates(), (), 40.0, above_noise=24.0)
+    assert raised.needed_log_odds == pytest.approx(search.needed_log_odds + 12.0)
