@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Compiled code is kept, whatever the shell says: the tests start hundreds of commands.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: aravis chromium soak kills setup run test serve bench proof proof-live slow lint clean
+.PHONY: aravis chromium names soak kills setup run test serve bench proof proof-live slow lint clean
 
 setup: $(STAMP)
 
@@ -64,6 +64,12 @@ proof: $(STAMP)
 LIVE ?= calibench-data/proof-live
 proof-live: $(STAMP)
 	$(BIN)/python -m lab.challenge.live --out $(LIVE) --page docs/proof.md $(ARGS)
+
+# False names: quick sessions of the default bench, healthy cameras, strong effects and blurs of the second former. Goes on where it
+# stopped; ARGS="--only bench --most 5" runs a part.
+NAMES ?= calibench-data/names
+names: $(STAMP)
+	$(BIN)/python -m lab.challenge.names --out $(NAMES) $(ARGS)
 
 # The tests that the everyday suite leaves out: recovery and coverage over many draws.
 slow: $(STAMP)

@@ -26,7 +26,8 @@ WEAK, STRONG = (10.0, 50.0), (50.0, 2000.0)  # ranges of the target non-centrali
 INVISIBLE = 1.0  # non-centrality below which the strength isn't adjusted
 SIZING_ROUNDS, SIZING_FACTOR = 3, 1.6  # most adjustments of the strength; tolerated factor to the target non-centrality
 FAULT_SHARE = 0.35  # share of faults among the cases outside the library
-Sizing = Literal["aimed", "nominal", "unmeasured"]
+MUCH = (1500.0, 30000.0)  # the same of laws that nobody overlooks
+Sizing = Literal["aimed", "strong", "nominal", "unmeasured"]
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ def draw(
     """Case number `index` of a challenge; the same arguments give the same case.
 
     cfa, kind, law    None: drawn
-    sizing            "aimed": laws get the strength that gives a drawn non-centrality. "nominal": they have their nominal strength, and the
+    sizing            "aimed": laws get the strength that gives a drawn non-centrality. "strong": the same of one draw of the noise, far
+                      above what is needed to see them. "nominal": they have their nominal strength, and the
                       non-centrality is taken from one draw of the noise, which is quick and too high. "unmeasured": they have their
                       nominal strength, and 0 stands for the non-centrality
     """
@@ -118,6 +120,8 @@ def draw(
     found = _Sized(laws, [0.0] * len(laws), [FairStrength(None, None, None) for _ in laws], None)
     if sizing == "nominal":
         found = _sized(take, laws, [], (0, 0), None)
+    elif sizing == "strong":
+        found = _sized(take, laws, [float(np.exp(rng.uniform(*np.log(MUCH)))) for _ in laws], (0, 0), None)
     elif sizing == "aimed":
         found = _sized(take, laws, targets, (0, 1), (accepted, np.random.default_rng([seed, index, 1])))
     session = take(tuple(found.laws), 0)

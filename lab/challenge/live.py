@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -250,6 +251,16 @@ def run_case(case: LiveCase, folder: Path) -> LiveRun:
     return judged(case, found).model_copy(update={"wall_s": time.monotonic() - began_s})
 
 
+def session_of(options: Sequence[str], folder: Path) -> DiagnosisResult:
+    """Capture a quick session of a mock bench over the wire, started with these options, and diagnose it. It lies in `folder`."""
+    shutil.rmtree(folder, ignore_errors=True)
+    with mock_bench((), options) as station:
+        _command("capture", "--quick", "--station", str(station), "--out", str(folder))
+    session, file = next((folder / "sessions").iterdir()), folder / "diagnose.json"
+    _command("diagnose", session.name, "--json", str(file), data=folder)
+    return DiagnosisResult.model_validate_json(file.read_text(encoding="utf-8"))
+
+
 def _command(*arguments: str, data: Path | None = None) -> None:
     environment = dict(os.environ) | ({} if data is None else {"CALIBENCH_DATA": str(data)})
     command = [sys.executable, "-m", "lab.cli", *arguments]
@@ -333,7 +344,7 @@ def _reaches(name: str, sides: tuple[Side, ...], wanted: dict[str, frozenset[Sid
     return name not in wanted or set(sides) <= wanted[name]
 
 
-def _commit() -> str:
+def commit() -> str:
     """Abbreviated hash of the checkout's commit, with `+` where files differ from it; empty where there is no checkout."""
     command = ["git", "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+"]
     done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
@@ -342,7 +353,7 @@ def _commit() -> str:
 
 def run_all(cases: dict[str, LiveCase], out: Path) -> dict[str, LiveRun]:
     """Case -> result: from OUT/results where it exists, else run now, in order."""
-    runs, commit = {}, _commit()
+    runs, now = {}, commit()
     for name, case in cases.items():
         file = out / "results" / f"{name}.json"
         if file.exists():
@@ -350,7 +361,7 @@ def run_all(cases: dict[str, LiveCase], out: Path) -> dict[str, LiveRun]:
             if kept.case == case and kept.outcome != "failed":
                 runs[name] = kept
                 continue
-        runs[name] = run_case(case, out / "session" / name).model_copy(update={"commit": commit})
+        runs[name] = run_case(case, out / "session" / name).model_copy(update={"commit": now})
         store(runs[name], file)
         print(f"{name}: {runs[name].outcome}, {runs[name].wall_s:.0f} s", flush=True)
     return runs

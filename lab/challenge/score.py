@@ -369,7 +369,8 @@ def _covered(truth: CaseTruth, found: DiagnosisResult | None) -> Iterable[bool]:
         for name, value in hidden.parameters.items() if effect is not None else ():
             said = effect.parameters.get(name)  # type: ignore[union-attr]
             if said is not None and said.std is not None:
-                yield abs(said.value - value) <= INTERVAL_SIGMAS * said.std
+                away = said.value - value if said.sign_known else abs(said.value) - abs(value)
+                yield abs(away) <= INTERVAL_SIGMAS * said.std
 
 
 # --- sums ----------------------------------------------------------------------------------------------------------------

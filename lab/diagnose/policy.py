@@ -188,6 +188,15 @@ class DecisionPolicy(Frozen):
             "odds of 9 to 1; with `parameter_log_odds`, one parameter has to gain 17 in chi2, which noise reaches in one of 27 000 effects that are tried",
         ),
     ] = 0.9
+    least_size_sigma: Annotated[
+        float,
+        Rule(
+            "name",
+            "standard deviations",
+            "distance from absence that at least one parameter which sizes a named effect has",
+            "95 % of a normal distribution: what is within it isn't told as a size",
+        ),
+    ] = 2.0
     family_probability: Annotated[
         float,
         Rule(
@@ -227,6 +236,15 @@ class DecisionPolicy(Frozen):
             off=0.8,
         ),
     ] = 0.98
+    near_share: Annotated[
+        float,
+        Rule(
+            "name",
+            "1",
+            "least share of the excess chi2 of a measurement that a law explains which is told as the nearest",
+            "chosen: it explains more than it leaves",
+        ),
+    ] = 0.5
     noise_sigma: Annotated[
         float,
         Rule(

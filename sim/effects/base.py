@@ -6,6 +6,7 @@ A first-order camera model leaves physics out. Each effect is one such piece: a 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -34,6 +35,8 @@ class Effect(Frozen):
     - `on_codes`: it changes the converter.
     - `prototypes`: a small change of a parameter from `absent` isn't its signature.
     - `log_prior`: some combinations of its parameters are unusual.
+    - `limits`: hardware bounds a parameter by what the camera is.
+    - `other_forms`: physics has several forms of its law.
     """
 
     name: ClassVar[str]
@@ -100,7 +103,7 @@ class Effect(Frozen):
         `absent`, within its bounds.
         """
         steps: list[Self] = []
-        for field, quantity in cls.quantities().items():
+        for field, quantity in cls.quantities_of(camera).items():
             if field in cls.shapes:
                 continue
             absent = quantity.absent or 0.0
@@ -112,6 +115,31 @@ class Effect(Frozen):
                 ):
                     steps.append(cls(**{field: value}))
         return (tuple(steps),)
+
+    @classmethod
+    def limits(cls, camera: CameraModel) -> dict[str, tuple[float, float]]:
+        """Return bounds (lower, upper) that hardware sets to parameters of this camera, by field name, in the field's unit.
+
+        They lie within the declared ones. The default sets none.
+        """
+        return {}
+
+    @classmethod
+    def quantities_of(cls, camera: CameraModel) -> dict[str, Quantity]:
+        """Return the declared parameters, by field name, with the bounds that hardware sets for this camera."""
+        limits = cls.limits(camera)
+        return {
+            name: replace(q, lower=limits[name][0], upper=limits[name][1]) if name in limits else q
+            for name, q in cls.quantities().items()
+        }
+
+    def other_forms(self) -> tuple[Self, ...]:
+        """Return this effect by other forms of its law, each one standard deviation away from this form.
+
+        A diagnosis marginalises over the difference of each form from this one, with a standard normal coefficient. It is part of the
+        law's error beside `form_tolerance`, and unlike that has the form's own shape. The default has none.
+        """
+        return ()
 
     def on_light(self, light: Light) -> Light:
         """What reaches the lens, given what the radiometer and the screen were told."""

@@ -7,7 +7,7 @@ The effects of these names act through these functions. A camera that is known t
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 
 from sim.optics.pupil import Wavefront, seidel
@@ -49,11 +49,23 @@ def birefringent_spots(displacement_x_um: float, displacement_y_um: float) -> tu
 
 
 def birefringent_otf(
-    fx_cy_per_um: ArrayLike, fy_cy_per_um: ArrayLike, displacement_x_um: float, displacement_y_um: float
-) -> FloatArray:
-    """Transfer function of those spots: cos(pi fx dx) cos(pi fy dy), first zero at f = 1 / (2 d)."""
-    fx, fy = np.asarray(fx_cy_per_um, float), np.asarray(fy_cy_per_um, float)
-    return np.asarray(np.cos(np.pi * fx * displacement_x_um) * np.cos(np.pi * fy * displacement_y_um))
+    fx_cy_per_um: ArrayLike,
+    fy_cy_per_um: ArrayLike,
+    displacement_x_um: float,
+    displacement_y_um: float,
+    beam_share: float = 0.5,
+) -> NDArray[np.float64] | NDArray[np.complex128]:
+    """Return the transfer function of those spots: cos(pi fx dx) cos(pi fy dy), first zero at f = 1 / (2 d).
+
+    `beam_share` (0..0.5) is that of the weaker of a plate's two beams, s: each factor is then cos(phi) - i (1 - 2 s) sin(phi), phi = pi f d,
+    whose modulus has no zero.
+    """
+    total: NDArray[np.float64] | NDArray[np.complex128] = np.ones(())
+    for f, d in ((fx_cy_per_um, displacement_x_um), (fy_cy_per_um, displacement_y_um)):
+        phase = np.pi * np.asarray(f, float) * d
+        unequal = 0.0 if beam_share == 0.5 else -1j * (1.0 - 2.0 * beam_share) * np.sin(phase)
+        total = total * (np.cos(phase) + unequal)
+    return np.asarray(total)
 
 
 def plate_focus_shift_um(thickness_mm: float, index: float) -> float:

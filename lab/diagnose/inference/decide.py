@@ -17,7 +17,7 @@ from lab.diagnose.inference.families import family_claim, tied_family
 from lab.diagnose.inference.held_out import VetoedCandidate, held_out_mismatches, predicts_held_out, vetoed
 from lab.diagnose.inference.locate import Slice, mismatches
 from lab.diagnose.inference.measurement_model import MeasurementModel
-from lab.diagnose.inference.naming import named_members
+from lab.diagnose.inference.naming import excludes_rivals, named_members
 from lab.diagnose.inference.outlying import OutlyingLevel, freed, outlying_levels
 from lab.diagnose.inference.refit import is_of_usual_size, log_likelihood, refit
 from lab.diagnose.inference.score import prototype_changes, signatures_of
@@ -90,13 +90,15 @@ def decide(
     if top > threshold + policy.lone_score_margin and not named and not before and not abstained:
         abstained.append(Candidate(scores[0].start, {}, 0.0, ((UNKNOWN, 1.0),), 0.5 * top))
     refused: list[VetoedCandidate] = []
+    vetoed_sets: set[frozenset[str]] = set()
     while True:
         named.sort(key=lambda c: -c.log_odds)
         effects = tuple(c.effect for c in named)
         losing = next((v for c in reversed(named) for v in (_veto(search, named, c),) if v is not None), None)
         if losing is not None:
             refused.append(losing)
-            named = _refitted(search, named, losing.candidate)
+            named, lost = _weighed_anew(search, named, losing.candidate, vetoed_sets, report)
+            abstained += lost
             continue
         named = _of_any_size(model, named, policy)
         effects = tuple(c.effect for c in named)
@@ -116,6 +118,11 @@ def decide(
             strongest, claimed = max(claims, key=lambda claim: claim[1].log_odds)
             abstained.remove(strongest)
             named = _refitted(search, [*named, claimed])
+            continue
+        sizeless = [c for c in named if c.is_compatible_with_absence(policy.least_size_sigma)] if not parts else []
+        if sizeless:
+            # what it explains is told where it is a mismatch without it
+            named = _refitted(search, named, sizeless[-1])
             continue
         if not parts:
             told = tuple(_with_every_mode(model, tied_family(c, policy), effects, policy) for c in named)
@@ -160,10 +167,28 @@ def _refitted(search: Search, named: Sequence[Candidate], gone: Candidate | None
     return [replace(kept[e.name], effect=e, std=s) for e, s in zip(rest.effects, rest.std, strict=True)]
 
 
+def _weighed_anew(
+    search: Search,
+    named: Sequence[Candidate],
+    vetoed_one: Candidate,
+    barred: set[frozenset[str]],
+    report: Callable[[str], None],
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Return what stood beside a vetoed name, weighed again with the vetoed effect among the rivals, and what lost by that. `barred`: sets
+    whose names were vetoed; they aren't returned to, and the set at hand is added."""
+    names = frozenset(c.effect.name for c in named)
+    without = _refitted(search, named, vetoed_one)
+    if not without or names in barred:
+        return without, []
+    barred.add(names)
+    rest = search.fitted(tuple(c.effect for c in without), converged=True)
+    return named_members(search, rest, report, barred)
+
+
 def _of_any_size(model: MeasurementModel, named: list[Candidate], policy: DecisionPolicy) -> list[Candidate]:
     """The named candidates with values that aren't drawn towards usual ones, where one lies far from those."""
     effects = tuple(c.effect for c in named)
-    if is_of_usual_size(effects):
+    if is_of_usual_size(effects, model.camera):
         return named
     found = refit(model, effects, policy, of_any_size=True)
     return [replace(c, effect=e, std=s) for c, e, s in zip(named, found.effects, found.std, strict=True)]
@@ -178,11 +203,12 @@ def _veto(search: Search, named: Sequence[Candidate], candidate: Candidate) -> V
 def _with_every_mode(
     model: MeasurementModel, candidate: Candidate, effects: tuple[Effect, ...], policy: DecisionPolicy
 ) -> Candidate:
-    """The candidate with standard deviations about the values told, v, that hold the posterior's other modes v_m, where the recordings
-    don't tell them apart: sqrt(s^2 + mean over modes of (v_m - v)^2), the mode told among them.
+    """Return the candidate with the posterior's other modes, where the recordings don't tell them apart from the one told.
 
-    Parameters that act by their square have such modes: both signs, and, where an effect has several, any of them in the place of all
-    (a bowed and a tilted image are as far out of focus at one place). Those are looked for by a refit from each alone.
+    Parameters that act by their square have such modes: all signs turned, and, where an effect has several, any of them in the place of
+    all (a bowed and a tilted image are as far out of focus at one place); those are looked for by a refit from each alone. Turned signs
+    are told as a sign that is unknown. Other modes are told beside the one that is told; each is a size of its own, so that none is a
+    standard deviation of another.
     """
     effect = candidate.effect
     signed = {
@@ -200,17 +226,20 @@ def _with_every_mode(
         alone = [effect.having(**{n: total if n == name else 0.0 for n in signed}) for name in signed]
         for fit in (refit(model, (*others, start), policy) for start in alone):
             place = np.array([[getattr(one, n) for n in signed] for one in (fit.effects[-1], *modes)], float)
-            another = bool(np.all(np.linalg.norm(place[1:] - place[0], axis=1) > SAME_MODE * total))
-            if another and fit.log_likelihood >= least:
+            unsigned_distance = np.minimum(
+                np.linalg.norm(place[1:] - place[0], axis=1), np.linalg.norm(place[1:] + place[0], axis=1)
+            )
+            if np.all(unsigned_distance > SAME_MODE * total) and fit.log_likelihood >= least:
                 modes.append(fit.effects[-1])
-    mirrored = [one.having(**{n: -float(getattr(one, n)) for n in signed}) for one in modes]
-    modes += [one for one in mirrored if log_likelihood(model, (*others, one), policy) >= least]
-    away = {n: np.array([float(getattr(one, n)) for one in modes]) - value for n, value in signed.items()}
-    std = {
-        n: s if s is None or n not in away else float(np.hypot(s, np.sqrt(np.mean(np.square(away[n])))))
-        for n, s in candidate.std.items()
-    }
-    return replace(candidate, std=std)
+    turned = effect.having(**{n: -v for n, v in signed.items()})
+    is_unsigned = log_likelihood(model, (*others, turned), policy) >= least
+    if is_unsigned and max(signed.values(), key=abs) < 0.0:
+        effect, candidate = turned, replace(candidate, effect=turned)
+    return replace(
+        candidate,
+        unsigned=frozenset(signed) if is_unsigned else frozenset(),
+        modes=tuple({n: float(getattr(one, n)) for n in signed} for one in modes[1:]),
+    )
 
 
 def _is_part_of_unknown(
@@ -220,8 +249,10 @@ def _is_part_of_unknown(
     discrepancies: Iterable[Discrepancy],
     policy: DecisionPolicy,
 ) -> bool:
-    """Whether the measurement that an effect changes most holds a discrepancy that is strong beside it: both may have one unknown
-    cause."""
+    """Say whether the measurement that an effect changes most holds a discrepancy that is strong beside it: both may have one unknown
+    cause. An effect whose rivals are excluded, and whose law holds in another measurement, has no part in what one measurement leaves."""
+    if excludes_rivals(candidate, policy):
+        return False
     strongest = model.strongest_block(candidate.effect, effects)
     least = max(policy.remainder_share * candidate.log_odds, policy.remainder_log_odds)
     return any(d.index == strongest and d.log_odds > least for d in discrepancies)

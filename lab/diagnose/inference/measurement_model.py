@@ -42,6 +42,11 @@ class _NumberedEffect(NamedTuple):
     effect: Effect
 
 
+def form_name(effect: Effect, number: int) -> str:
+    """Return the name of the nuisance parameter that mixes another form of an effect's law with the one that stands."""
+    return f"form {number} of {effect.name}"
+
+
 @dataclass
 class MeasurementModel:
     """The blocks of one side, stacked into one vector of n numbers.
@@ -147,14 +152,18 @@ class MeasurementModel:
 
     def mean(self, effects: Effects = ()) -> FloatArray:
         """m(effects), (n,), at the first guess of the nuisance parameters."""
-        acting = self._numbered((*self.always, *effects))
-        return np.concatenate([self._prediction(i, acting).mean for i in range(len(self.blocks))])
+        return self._mean_of((*self.always, *effects))
+
+    def _mean_of(self, acting: Effects) -> FloatArray:
+        numbered = self._numbered(acting)
+        return np.concatenate([self._prediction(i, numbered).mean for i in range(len(self.blocks))])
 
     def nuisance_jacobian(self, effects: Effects = (), without: frozenset[str] = frozenset()) -> dict[str, FloatArray]:
         """Columns (n,) of the Jacobian by every nuisance parameter that isn't in `without`, per prior standard
         deviation. One that several blocks name is one column."""
         columns = {name: column for name, column in self.unstated_jacobian.items() if name not in without}
         acting = self._numbered((*self.always, *effects))
+        columns |= self._form_changes((*self.always, *effects))
         for index, at in enumerate(self.slices):
             for name, column in self._prediction(index, acting).jacobian.items():
                 if name in without:
@@ -163,6 +172,18 @@ class MeasurementModel:
                     columns[name] = np.zeros(len(self.value))
                 columns[name][at] = column
         return columns
+
+    def _form_changes(self, acting: Effects) -> dict[str, FloatArray]:
+        """Changes (n,) of the prediction by the other forms of the acting effects' laws, by `form_name`: columns of the Jacobian by
+        coefficients that are 0 for the form as it stands, and 1 for the other, per standard deviation."""
+        base, found = None, {}
+        for i, effect in enumerate(acting):
+            for number, other in enumerate(effect.other_forms()):
+                base = self._mean_of(acting) if base is None else base
+                change = self._mean_of((*acting[:i], other, *acting[i + 1 :])) - base
+                if change.any():
+                    found[form_name(effect, number)] = change
+        return found
 
     @cached_property
     def _single_block_nuisances(self) -> frozenset[str]:

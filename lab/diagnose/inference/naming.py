@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from lab.diagnose.inference.discrepancy import likeliest_discrepancy
 from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.search import Search
-from lab.diagnose.inference.weigh import Candidate, explained, weigh
+from lab.diagnose.inference.weigh import Candidate, closes_somewhere, explained, weigh
 from lab.diagnose.policy import DecisionPolicy
 
 
-def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> tuple[list[Candidate], list[Candidate]]:
-    """The members of a set whose names hold, and those that were given up, in that order.
+def named_members(
+    search: Search, best: Fit, report: Callable[[str], None], barred: Collection[frozenset[str]] = ()
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Return the members of a set whose names hold, and those that were given up, in that order. `barred`: sets that aren't returned to,
+    by their effects' names.
 
     One at a time: the weakest member that is too weak for any name; then the member for which a rival is likelier; then
     members that one discrepancy replaces, or whose name doesn't hold. After each change the rest is fitted and weighed
@@ -22,7 +25,7 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
     model, policy = search.model, search.policy
     current = best
     given_up: list[Candidate] = []
-    weighed: set[frozenset[str]] = set()
+    weighed = set(barred)
     certain: dict[str, Candidate] = {}
     while current.effects:
         weighed.add(frozenset(current.names))
@@ -33,18 +36,25 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
             if better is not None and frozenset(better.names) not in weighed:
                 current = search.fitted(better.effects, converged=True)
                 continue
-            given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
-            current = search.without(current, index)
+            without = search.without(current, index)
+            if current.log_posterior - without.log_posterior < search.needed_log_odds:
+                given_up.append(replace(candidate, among_listed=()))  # no claim, of its family neither
+            # else it explains no more than what the other members' laws may lack: a mismatch beyond that is located without it
+            current = without
             continue
         members, likelier = [], None
         for index, e in enumerate(current.effects):
             if e.name in certain:
                 # when a weaker member leaves, this name stays as certain; what is left to explain changes
-                share, is_closed = explained(
-                    model, current, search.without(current, index), model.affected_blocks(e), policy
-                )
+                without = search.without(current, index)
+                share, is_closed = explained(model, current, without, model.affected_blocks(e), policy)
                 kept = replace(
-                    certain[e.name], effect=e, std=current.std[index], explained_share=share, is_closed=is_closed
+                    certain[e.name],
+                    effect=e,
+                    std=current.std[index],
+                    explained_share=share,
+                    is_closed=is_closed,
+                    is_closed_somewhere=is_closed or closes_somewhere(model, current, index, policy),
                 )
                 members.append(kept)
                 continue
@@ -69,14 +79,28 @@ def named_members(search: Search, best: Fit, report: Callable[[str], None]) -> t
 
 def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:
     """Whether a name is likely enough and explains enough."""
-    least_share = policy.least_explained_share if candidate.is_closed else policy.least_explained_share_open
+    is_held = candidate.is_closed or excludes_rivals(candidate, policy)
+    least_share = policy.least_explained_share if is_held else policy.least_explained_share_open
     return candidate.probability >= policy.least_probability and candidate.explained_share >= least_share
+
+
+def excludes_rivals(candidate: Candidate, policy: DecisionPolicy) -> bool:
+    """Say whether rivals and an unknown cause are excluded, a discrepancy allowed beside each, and the law holds in a measurement that
+    shows it: what another measurement leaves is then told beside the name."""
+    first = candidate.among_listed[0] if candidate.among_listed else None
+    return (
+        candidate.is_closed_somewhere
+        and candidate.probability >= policy.certain_probability
+        and first is not None
+        and first[0] == candidate.effect.name
+        and first[1] >= policy.certain_probability
+    )
 
 
 def _too_weak(search: Search, fit: Fit) -> int | None:
     """The weakest member that can't be named whatever its rivals. Tested before anything is weighed, as that fits every rival of every
     member."""
-    log_odds = [fit.log_posterior - search.without(fit, i).log_posterior for i in range(len(fit.effects))]
+    log_odds = [search.member_log_odds(fit, i) for i in range(len(fit.effects))]
     weak = [odds for odds in log_odds if odds < search.needed_log_odds]
     return log_odds.index(min(weak)) if weak else None
 

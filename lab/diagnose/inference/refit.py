@@ -16,6 +16,7 @@ from lab.diagnose.inference.gaussian import Gaussian
 from lab.diagnose.inference.measurement_model import MeasurementModel
 from lab.diagnose.measurements.block import Effects
 from lab.diagnose.policy import DecisionPolicy
+from sim.camera import CameraModel
 from sim.effects.base import Effect
 from sim.parameters import Quantity
 from sim.spectrum import FloatArray
@@ -106,16 +107,16 @@ class Fit:
         """Names of the effects."""
         return tuple(e.name for e in self.effects)
 
-    def jacobian_columns(self, effects: Effects) -> dict[Coordinate, FloatArray]:
-        """Columns of the Jacobian for those of `effects` that are members of this set with the same parameters."""
+    def jacobian_columns(self, effects: Effects, coords: Sequence[Coordinate]) -> dict[Coordinate, FloatArray]:
+        """Columns of the Jacobian for the coordinates of those of `effects` that are members of this set with the same parameters."""
         fitted = [(e, name) for e, std in zip(self.effects, self.std, strict=True) for name in std]
         column = dict(zip(fitted, self.jacobian.T, strict=True))
-        return {c: column[key] for c in coordinates(effects) if (key := (effects[c.index], c.name)) in column}
+        return {c: column[key] for c in coords if (key := (effects[c.index], c.name)) in column}
 
 
-def coordinates(effects: Effects) -> list[Coordinate]:
-    """All coordinates of a set of effects."""
-    return [Coordinate(i, name, q) for i, e in enumerate(effects) for name, q in type(e).quantities().items()]
+def coordinates(effects: Effects, camera: CameraModel) -> list[Coordinate]:
+    """Return all coordinates of a set of effects, within the bounds that hardware sets for this camera."""
+    return [Coordinate(i, name, q) for i, e in enumerate(effects) for name, q in type(e).quantities_of(camera).items()]
 
 
 def moved(effects: Effects, coords: Sequence[Coordinate], u: FloatArray) -> tuple[Effect, ...]:
@@ -173,8 +174,8 @@ def refit(
     what joins them. `of_any_size`: sizes far from the usual ones aren't drawn towards them (`_wide_residual`), for the values of effects that
     are named; a law that needs such a size is no likelier by that.
     """
-    coords = coordinates(tuple(start))
-    known = {} if beside is None else beside.jacobian_columns(start)
+    coords = coordinates(start, model.camera)
+    known = {} if beside is None else beside.jacobian_columns(start, coords)
     found = _fit(model, tuple(start), coords, policy, rough, passes, known, of_any_size)
     spare = [c for c in coords if c.quantity.dispensable]
     if not rough and spare:
@@ -258,9 +259,9 @@ def _fit(
     return Fit(best, tuple(std), value, log_posterior, at_best, not rough, promised, tolerated.share)
 
 
-def is_of_usual_size(effects: Effects) -> bool:
-    """Whether all parameters lie within the width of a fit's prior."""
-    coords = coordinates(effects)
+def is_of_usual_size(effects: Effects, camera: CameraModel) -> bool:
+    """Say whether all parameters lie within the width of a fit's prior."""
+    coords = coordinates(effects, camera)
     centre, std = _prior(coords)
     u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
     return bool(np.all(np.abs(u - centre) <= std))

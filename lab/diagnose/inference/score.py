@@ -55,6 +55,7 @@ class Signatures:
     (n, prototypes). `whitened_changes` gives the signatures of any effects as they stand, (n, effects).
     """
 
+    camera: CameraModel
     white: FloatArray
     columns: list[tuple[type[Effect], tuple[Effect, ...], FloatArray]]
     whitened_changes: Callable[[Sequence[Effect]], FloatArray]
@@ -66,7 +67,7 @@ class Signatures:
         for effect, prototypes, table in self.columns:
             value, share = _cone_score(table, self.white)
             if effect.name not in best or value > best[effect.name][0]:
-                best[effect.name] = value, _combined(effect, prototypes, share)
+                best[effect.name] = value, _combined(effect, prototypes, share, self.camera)
             if len(prototypes) == 1:
                 single.setdefault(effect.name, []).append((self._chi2_taken(table[:, 0]), prototypes[0]))
         found = [
@@ -95,7 +96,7 @@ class Signatures:
         found = []
         for member, share in zip(one.members, one.share, strict=True):
             effect, prototypes, _ = self.columns[member]
-            found.append(_combined(effect, prototypes, share))
+            found.append(_combined(effect, prototypes, share, self.camera))
         if len(found) == 1:
             name = found[0].name
             single = [(self._chi2_taken(t[:, 0]), p[0]) for e, p, t in self.columns if e.name == name and len(p) == 1]
@@ -188,7 +189,7 @@ def signatures_of(
             # smaller ones are rounding: scaled to unit length, they would count in the threshold as any other
             if np.linalg.norm(table, axis=0).max(initial=0.0) > LEAST_SIGNATURE:
                 columns.append((effect, prototypes, table))
-    return Signatures(white, columns, whitened_changes)
+    return Signatures(model.camera, white, columns, whitened_changes)
 
 
 def _span(table: FloatArray) -> FloatArray:
@@ -210,11 +211,11 @@ def _cone_score(table: FloatArray, white: FloatArray) -> tuple[float, FloatArray
     return max(float(white @ white - rest**2), 0.0), share / np.where(size > 0, size, 1.0)
 
 
-def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray) -> Effect:
+def _combined(effect: type[Effect], prototypes: tuple[Effect, ...], share: FloatArray, camera: CameraModel) -> Effect:
     """The effect whose coordinates u are the sum of the prototypes', each times its share, within bounds."""
     likeliest = prototypes[int(np.argmax(share))]
     values: dict[str, float] = {}
-    for name, quantity in effect.quantities().items():
+    for name, quantity in effect.quantities_of(camera).items():
         if name in effect.shapes:
             continue
         absent = quantity.absent or 0.0

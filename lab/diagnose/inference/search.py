@@ -77,6 +77,7 @@ class Search:
     fits: dict[frozenset[str], Fit] = field(default_factory=dict)
     clock: Callable[[], float] = time.process_time
     not_weighed: dict[frozenset[str], tuple[str, ...]] = field(default_factory=dict)
+    _whole: dict[frozenset[str], float] = field(default_factory=dict)
     _signatures: dict[tuple[Effect, ...], Signatures] = field(default_factory=dict)
     _problems: dict[tuple[Effect, ...], LinearProblem] = field(default_factory=dict)
 
@@ -285,6 +286,29 @@ class Search:
         """The set fitted without one of its members."""
         rest = (*fit.effects[:index], *fit.effects[index + 1 :])
         return self.fitted(rest, converged=True)
+
+    def member_log_odds(self, fit: Fit, index: int) -> float:
+        """Return the log posterior of a fitted set over that without one of its members; beside others, the lesser of that with the
+        likeliest share of the laws' form tolerances and that with the whole.
+
+        What a strong effect's law may lack is no second effect: a set with one more effect fits with a small share where the set without
+        it needs the whole, and would be likelier by the whole's cost alone.
+        """
+        without = self.without(fit, index)
+        odds = fit.log_posterior - without.log_posterior
+        if not without.effects or odds < self.needed_log_odds:
+            return odds
+        return min(odds, self._by_whole_tolerances(fit) - self._by_whole_tolerances(without))
+
+    def _by_whole_tolerances(self, fit: Fit) -> float:
+        """Log posterior of a fitted set with the whole of its laws' form tolerances."""
+        if fit.tolerated == 1.0:
+            return fit.log_posterior
+        key = frozenset(fit.names)
+        if key not in self._whole:
+            whole = self.policy.model_copy(update={"least_tolerated_share": 1.0})
+            self._whole[key] = refit(self.model, fit.effects, whole, passes=1).log_posterior
+        return self._whole[key]
 
     # --- what it says ------------------------------------------------------------------------------------------------
 

@@ -34,9 +34,12 @@ class Candidate:
 
     `log_odds`: log posterior of its set over that of the set without it.
     `explained_share`: of the excess chi2 in the measurements that it acts on.
-    `is_closed`: what is left there is within noise and the form tolerances of the named laws.
+    `is_closed`: what is left there is within noise and the form tolerances of the named laws. `is_closed_somewhere`: it is in one of the
+    measurements that show the effect.
     `remark`: metadata that would explain the recordings as well, in words.
     `among_listed`: probabilities of the effect and its rivals if the cause is one of them, likeliest first; empty where none was weighed.
+    `unsigned`: parameters whose sign, turned together, the recordings don't tell. `modes`: values of the parameters in other modes of the
+    posterior that are as likely.
     `members`: where the family is named and not the effect, the family's effects with their probabilities, likeliest first.
     """
 
@@ -47,6 +50,9 @@ class Candidate:
     log_odds: float
     explained_share: float = 1.0
     is_closed: bool = True
+    is_closed_somewhere: bool = True
+    unsigned: frozenset[str] = frozenset()
+    modes: tuple[dict[str, float], ...] = ()
     remark: str = ""
     among_listed: tuple[tuple[str, float], ...] = ()
     members: tuple[tuple[str, float], ...] = ()
@@ -61,6 +67,19 @@ class Candidate:
         """What may be meant besides the effect, likeliest first: the other members of a family that is named, and rivals."""
         others = [(n, p) for n, p in self.members if n != self.effect.name]
         return tuple(sorted([*others, *self.rivals], key=lambda item: -item[1]))
+
+    def is_compatible_with_absence(self, sigma: float) -> bool:
+        """Say whether every parameter that sizes the effect lies within `sigma` standard deviations of its value without it. A parameter
+        whose standard deviation isn't known isn't compatible."""
+        kind = type(self.effect)
+        absent = {name: q.absent for name, q in kind.quantities().items() if q.absent is not None and name in self.std}
+        sizes = {name: value for name, value in absent.items() if name not in kind.shapes} or absent
+
+        def is_near(name: str, value: float) -> bool:
+            std = self.std[name]
+            return std is not None and abs(float(getattr(self.effect, name)) - value) < sigma * std
+
+        return bool(sizes) and all(is_near(name, value) for name, value in sizes.items())
 
     @property
     def holds_a_remainder(self) -> bool:
@@ -118,8 +137,9 @@ def weigh(search: Search, fit: Fit, index: int) -> tuple[Candidate, Fit | None]:
         log_odds,
         share,
         is_closed,
-        remark if misstated >= top else "",
-        _among_listed(
+        is_closed or closes_somewhere(model, fit, index, policy),
+        remark=remark if misstated >= top else "",
+        among_listed=_among_listed(
             {n: weights[n] for n in fits}
             if is_closed
             else {
@@ -211,3 +231,20 @@ def explained(
     if after - n < policy.noise_sigma * sigma:
         return 1.0, is_closed
     return max(before - after, 0.0) / max(before - n, 1e-9), is_closed
+
+
+def closes_somewhere(model: MeasurementModel, fit: Fit, index: int, policy: DecisionPolicy) -> bool:
+    """Say whether the law of a member holds in one of the measurements that show it: chi2 of its seen numbers there, by the covariance
+    with form tolerances, is within `noise_sigma` of their count. A measurement shows it as `shown_chi2` and `shown_share` say."""
+    effect = fit.effects[index]
+    others = tuple(e for e in fit.effects if e is not effect)
+    changes = {i: model.change_chi2(effect, others, i) for i in model.affected_blocks(effect)}
+    least = max(policy.shown_chi2, policy.shown_share * max(changes.values(), default=0.0))
+    for block, change in changes.items():
+        where = model.mask(block) & model.seen
+        n = int(where.sum())
+        if n and change > least:
+            left = model.gaussian(fit.effects, where).chi2(model.value[where]) / (1.0 + policy.covariance_slack) ** 2
+            if left - n < policy.noise_sigma * np.sqrt(2.0 * n):
+                return True
+    return False

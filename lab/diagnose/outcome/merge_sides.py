@@ -108,7 +108,8 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 continue
             values_of_sides = [(float(getattr(c.effect, field)), c.std.get(field)) for c in candidates]
             value, std = _mean(values_of_sides, is_shared="light" in kind.stages())
-            parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit)
+            is_signed = all(field not in c.unsigned for c in candidates)
+            parameters[field] = ParameterValue(value=value, std=std, unit=quantity.unit, sign_known=is_signed)
         chosen = [_choices(c.effect) for c in candidates]
         choices = {
             field: " and ".join(dict.fromkeys(one[field] for one in chosen if field in one)) for field in chosen[0]
@@ -117,10 +118,16 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
         shown = sorted({measurement_title(measurement) for measurement in shown_in})
         values = ", ".join(
             (
-                *(f"{f.removesuffix('_' + p.unit).replace('_', ' ')} {_number(p)}" for f, p in parameters.items()),
+                *(f"{_plain_name(f, p.unit)} {_number(p)}" for f, p in parameters.items()),
                 *(f"{f} {value}".replace("_", " ") for f, value in choices.items()),
             )
         )
+        if any(not p.sign_known for p in parameters.values()):
+            values += "; sign unknown"
+        modes = candidates[0].modes if len(candidates) == 1 else ()
+        for mode in modes:
+            told = ", ".join(f"{_plain_name(f, parameters[f].unit)} {v:.3g}" for f, v in mode.items())
+            values += f"; {told} fits as well"
         sides = tuple(side for side, _ in members)
         is_exact = all(one.candidate.is_closed for _, one in members)
         corrections = tuple(dict.fromkeys(c for _, one in members for c in one.corrections))
@@ -139,6 +146,7 @@ def _named(found: Sequence[SideFindings], policy: DecisionPolicy) -> list[NamedE
                 sides=sides,
                 parameters=parameters,
                 choices=choices,
+                modes=modes,
                 shown_in=shown_in,
                 rivals=tuple(Rival(name=n, probability=p) for n, p in sorted(rivals.items(), key=lambda r: -r[1])),
                 statement=statement,
@@ -183,6 +191,11 @@ def _family_statement(
     if len(names) > 1 and family.told_apart_by:
         told.append(f"What tells them apart: {family.told_apart_by}.")
     return " ".join(told)
+
+
+def _plain_name(field: str, unit: str) -> str:
+    """Return a parameter's name in words, without its unit."""
+    return field.removesuffix("_" + unit).replace("_", " ")
 
 
 def _number(parameter: ParameterValue) -> str:

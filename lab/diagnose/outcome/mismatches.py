@@ -222,7 +222,8 @@ def _shape(
     if outlying:
         return _held_out_shape(outlying)
     block = verdict.model.blocks[one.index]
-    law = f"; {_nearest(one, verdict, near, chi2_without, policy)}" if near else ""
+    nearest = _nearest(one, verdict, near, chi2_without, policy)
+    law = f"; {nearest}" if nearest else ""
     if one.log_odds > 0:
         unit = block.measurement.unit
         kind = f"smooth over {one.length:.3g} {unit}, {one.grouping}" if one.length > 0 else one.grouping
@@ -233,13 +234,18 @@ def _shape(
 def _nearest(
     one: Discrepancy, verdict: Verdict, near: Sequence[Candidate], chi2_without: float, policy: DecisionPolicy
 ) -> str:
-    """The nearest law of the library, and why it isn't named, in words: it leaves too much, or others fit as well."""
+    """Return the nearest law of the library, and why it isn't named, in words: it leaves too much, or others fit as well. Empty where no law
+    explains `near_share` of the excess of chi2 here."""
     model, at = verdict.model, verdict.model.slices[one.index]
-    nearest = max(near, key=lambda c: c.log_odds)
+    nearest = max(near, key=lambda c: c.log_odds, default=None)
+    if nearest is None:
+        return ""
     name = nearest.effect.name
     index = np.arange(at.start, at.stop)[model.seen[at]]
     others = tuple(e for e in verdict.effects if e.name != name)
     left = _seen_chi2(model, model.gaussian((*others, nearest.effect)), index)
+    if chi2_without - left < policy.near_share * (chi2_without - len(index)):
+        return ""
     least = float(chdtri(len(index), policy.slice_false_alarm_rate)) * (1.0 + policy.covariance_slack) ** 2
     if left > least:
         told = f"chi2 is {left:.0f} with it, {chi2_without:.0f} without, {len(index)} are expected"

@@ -24,11 +24,12 @@ class Mismatch(Frozen):
 
 
 class ParameterValue(Frozen):
-    """An estimated parameter of an effect."""
+    """An estimated parameter of an effect. `sign_known`: False where the recordings show its size only, as it acts by its square."""
 
     value: float
     std: float | None
     unit: str
+    sign_known: bool = True
 
 
 class Rival(Frozen):
@@ -50,7 +51,8 @@ class NamedEffect(Frozen):
 
     `law`: `exact` where what the effects leave is within noise and the laws' tolerances, else `inexact`. `members`: where the family is
     named, its effects, likeliest first; `name` is then the family's identifier, and `parameters` are those of the first member. `choices`:
-    which of its alternatives the law is, by field: the corner of a glow. `shown_in`: measurements in which it stands out of the noise,
+    which of its alternatives the law is, by field: the corner of a glow. `modes`: other values of the parameters, in their units, that fit
+    as well. `shown_in`: measurements in which it stands out of the noise,
     strongest first.
     """
 
@@ -62,6 +64,7 @@ class NamedEffect(Frozen):
     sides: tuple[Side, ...]
     parameters: dict[str, ParameterValue]
     choices: dict[str, str] = {}
+    modes: tuple[dict[str, float], ...] = ()
     shown_in: tuple[str, ...] = ()
     rivals: tuple[Rival, ...] = ()
     statement: str

@@ -50,10 +50,10 @@ def test_a_refit_begins_at_the_prototype_that_lies_nearest() -> None:
         return np.array([[100.0, 100.0] for _ in prototypes]).T
 
     columns = [(type(few), (one,), table[:, None]) for one, table in ((few, promised), (many, near))]
-    (score,) = Signatures(white, columns, table_of).scores()
+    (score,) = Signatures(CAMERA, white, columns, table_of).scores()
     assert score.value == pytest.approx(51.0**2 / 26.0)
     assert score.start == many
-    (score,) = Signatures(white, columns, lambda one: white[:, None]).scores()  # the scaled one is all of it
+    (score,) = Signatures(CAMERA, white, columns, lambda one: white[:, None]).scores()  # the scaled one is all of it
     assert score.start.having(excess_e_per_s=100.0) == many
     assert score.start != many
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -227,15 +228,18 @@ class _Lopsided(_Squared):
     skew: ClassVar[float] = 0.3
 
 
-def test_an_uncertainty_holds_both_signs_where_only_the_square_acts() -> None:
-    """Distances 0 and 2 v from the value told, as likely: sqrt(2) v. A sign that the numbers tell stays as it is
-    known."""
-    for kind, widened in ((_Squared, True), (_Lopsided, False)):
+def test_a_sign_is_unknown_where_only_the_square_acts() -> None:
+    """The size keeps its own standard deviation, and is told positive. A sign that the numbers tell stays as it is known."""
+    for kind, is_unsigned in ((_Squared, True), (_Lopsided, False)):
         truth = kind(size_dn=0.5)
         model = _model((truth,), np.random.default_rng(6))
-        candidate = Candidate(truth, {"size_dn": 0.01}, 1.0, (), 50.0)
-        std = _with_every_mode(model, candidate, (truth,), DecisionPolicy()).std["size_dn"]
-        assert std == pytest.approx(np.hypot(0.01, np.sqrt(2.0) * 0.5) if widened else 0.01)
+        told = truth.having(size_dn=-0.5) if is_unsigned else truth
+        candidate = Candidate(told, {"size_dn": 0.01}, 1.0, (), 50.0)
+        found = _with_every_mode(model, candidate, (told,), DecisionPolicy())
+        assert found.std["size_dn"] == 0.01
+        assert found.effect.size_dn == 0.5  # type: ignore[attr-defined]
+        assert found.unsigned == (frozenset({"size_dn"}) if is_unsigned else frozenset())
+        assert found.modes == ()
 
 
 class _Either(_Curve):
@@ -253,14 +257,25 @@ class _Either(_Curve):
         return ((self.size_dn + self.other_dn) ** 2 + (self.size_dn - self.other_dn) ** 2 * elapsed_s) * elapsed_s
 
 
-def test_an_uncertainty_holds_other_modes_where_one_parameter_acts_as_another() -> None:
-    """Modes (v, 0), (0, v), (-v, 0) and (0, -v), as likely: mean squares of the distances from the first of 1.5 and 0.5 v^2."""
+def test_other_modes_are_told_beside_the_size() -> None:
+    """Modes (v, 0), (0, v), (-v, 0) and (0, -v), as likely: the second is told beside the first, and the signs are unknown."""
     truth = _Either(size_dn=0.5)
     model = _model((truth,), np.random.default_rng(6))
     candidate = Candidate(truth, {"size_dn": 0.01, "other_dn": 0.01}, 1.0, (), 50.0)
-    std = _with_every_mode(model, candidate, (truth,), DecisionPolicy()).std
-    assert std["size_dn"] == pytest.approx(0.5 * np.sqrt(1.5), rel=0.1)
-    assert std["other_dn"] == pytest.approx(0.5 * np.sqrt(0.5), rel=0.1)
+    found = _with_every_mode(model, candidate, (truth,), DecisionPolicy())
+    assert found.std == candidate.std
+    assert found.unsigned == frozenset({"size_dn", "other_dn"})
+    (mode,) = found.modes
+    assert abs(mode["other_dn"]) == pytest.approx(0.5, rel=0.1)
+    assert abs(mode["size_dn"]) < 0.1
+
+
+def test_a_size_that_may_be_absent_is_none() -> None:
+    """Within two standard deviations of absence in every parameter that sizes the effect; shapes and unknown deviations don't count."""
+    known = Candidate(_Either(size_dn=0.5, other_dn=0.1), {"size_dn": 0.2, "other_dn": 0.1}, 1.0, (), 50.0)
+    assert not known.is_compatible_with_absence(2.0)
+    assert replace(known, std={"size_dn": 0.3, "other_dn": 0.1}).is_compatible_with_absence(2.0)
+    assert not replace(known, std={"size_dn": 0.3, "other_dn": None}).is_compatible_with_absence(2.0)
 
 
 def test_a_covariance_that_came_out_negative_somewhere_still_has_a_factor() -> None:
