@@ -158,6 +158,15 @@ class DecisionPolicy(Frozen):
             "a tenth of a declared tolerance is below the noise up to changes of 200 standard deviations (5 %); 1 takes the declared ones as they are",
         ),
     ] = 0.1
+    beside_tolerance: Annotated[
+        float,
+        Rule(
+            "cost of a model",
+            "1",
+            "least share of its own change by which any law may be wrong where a further effect beside it is weighed",
+            "chosen: 0.5 % of the transfer, as lenses depart from any law, of a filter that takes a quarter of it",
+        ),
+    ] = 0.02
     misstated_ratio: Annotated[
         float,
         Rule(

@@ -16,7 +16,11 @@ from mocks.former.camera import ConcealedCamera
 from mocks.former.law import WAVELENGTH_NM, Array
 from mocks.former.transfer import HIGHEST_CY_PX
 
-FINE, PARTS = 4, 3  # samples a pixel of a pattern's image; parts along a side that each sample averages
+FINE = 4  # samples a pixel of a pattern's image
+BOARD_PARTS, SCREEN_PARTS = (
+    2,
+    14,
+)  # parts along a side that a sample averages, of a board, and where a screen's cells meet
 PERIOD_PX, STEP_PX = 204.8, 0.025  # of the line spread function
 TURN_DEG = 0.6  # of a screen pattern
 
@@ -60,7 +64,7 @@ def board(
     # the position on the board is a smooth function of the pixel: computed every few pixels, interpolated by splines
     coarse = _coarse_grid(camera)
     fine_row, fine_col = ((np.arange(n * FINE) + 0.5) / FINE - 0.5 for n in (camera.rows, camera.cols))
-    inside = (np.arange(2) + 0.5) / 2 / FINE - 0.5 / FINE
+    inside = (np.arange(BOARD_PARTS) + 0.5) / BOARD_PARTS / FINE - 0.5 / FINE
     images: dict[str, Array] = {}
     for channel in camera.quantum_efficiency:
         if images and not camera.lens.shifts_image:
@@ -103,8 +107,6 @@ def pattern(
     r = ((np.arange(camera.rows * FINE) + 0.5) / FINE - 0.5 - (camera.rows - 1) / 2)[:, None]
     c = ((np.arange(camera.cols * FINE) + 0.5) / FINE - 0.5 - (camera.cols - 1) / 2)[None, :]
     t = np.deg2rad(turn_deg)
-    # each fine sample is a mean over its square: else the cells' turned borders would be jagged
-    inside = (np.arange(PARTS) + 0.5) / PARTS / FINE - 0.5 / FINE
     middle = (camera.rows - 1) / 2, (camera.cols - 1) / 2
     coarse = _coarse_grid(camera)
     shifted = camera.lens.shifts_image
@@ -113,16 +115,14 @@ def pattern(
         if images and not shifted:
             images[channel] = next(iter(images.values()))
             continue
-        fine = np.zeros((camera.rows * FINE, camera.cols * FINE))
-        sources = camera.lens.unshifted(coarse[0][:, None], coarse[1][None, :], channel, radiance) if shifted else ()
-        for y, x in itertools.product(inside, inside):
-            down, right = r + y, c + x
-            if shifted:
-                at = down[:, 0] + middle[0], right[0] + middle[1]
-                down, right = (RectBivariateSpline(*coarse, m)(*at) - o for m, o in zip(sources, middle, strict=True))
-            i = (down * np.cos(t) - right * np.sin(t)) / cell_px + target.shape[0] / 2
-            j = (down * np.sin(t) + right * np.cos(t)) / cell_px + target.shape[1] / 2
-            fine += squares_at(target, i, j) / PARTS**2
+        down, right = r, c
+        if shifted:
+            sources = camera.lens.unshifted(coarse[0][:, None], coarse[1][None, :], channel, radiance)
+            at = r[:, 0] + middle[0], c[0] + middle[1]
+            down, right = (RectBivariateSpline(*coarse, m)(*at) - o for m, o in zip(sources, middle, strict=True))
+        i = (down * np.cos(t) - right * np.sin(t)) / cell_px + target.shape[0] / 2
+        j = (down * np.sin(t) + right * np.cos(t)) / cell_px + target.shape[1] / 2
+        fine = _mean_of_squares(target, i, j, t, 1.0 / (FINE * cell_px))
         for law in camera.laws:
             fine = law.screen_pattern(fine, r, c)
         images[channel] = fine
@@ -153,6 +153,24 @@ def chart(camera: ConcealedCamera, light: Array, box: tuple[int, int, int, int])
             image[rows, cols] = camera.rate(reflectance * light, channel)
         images[channel] = image
     return camera.lens.filtered(images, light, 1)
+
+
+def _mean_of_squares(picture: Array, row: Array, col: Array, turn_rad: float, side: float) -> Array:
+    """Means of a picture's unit squares over squares of `side`, turned by `turn_rad`, about positions.
+
+    One that lies within a single unit square has its value; others average parts, so that turned borders aren't jagged.
+    """
+    out = squares_at(picture, row, col)
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+    reach = 0.5 * side * (abs(cos) + abs(sin))
+    meets = (np.abs(row - np.round(row)) < reach) | (np.abs(col - np.round(col)) < reach)
+    row, col = row[meets], col[meets]
+    inside = ((np.arange(SCREEN_PARTS) + 0.5) / SCREEN_PARTS - 0.5) * side
+    total = np.zeros(row.shape)
+    for y, x in itertools.product(inside, inside):
+        total += squares_at(picture, row + y * cos - x * sin, col + y * sin + x * cos)
+    out[meets] = total / SCREEN_PARTS**2
+    return out
 
 
 def squares_at(picture: Array, row: Array, col: Array) -> Array:

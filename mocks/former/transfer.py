@@ -43,8 +43,8 @@ class Transfer:
     def filtered(self, images: dict[str, Array], radiance: Array, over: int) -> dict[str, Array]:
         """Images on a grid `over` times finer than the pixels, filtered by the OTF, at the pixels' centres. The borders are continued."""
         out: dict[str, Array] = {}
-        table_f = np.linspace(0, 2.9, 88)
-        table_angle = np.linspace(-np.pi / 2, np.pi / 2, 13 if self._aberrated else 2)
+        table_f = np.linspace(0, 2.9, 881)  # linear interpolation errs by 1e-5
+        table_angle = np.linspace(-np.pi / 2, np.pi / 2, 25 if self._aberrated else 2)
         pad = 24 * over
         spectra: dict[int, Array] = {}
         for channel, image in images.items():

@@ -60,12 +60,14 @@ def birefringent_otf(
     `beam_share` (0..0.5) is that of the weaker of a plate's two beams, s: each factor is then cos(phi) - i (1 - 2 s) sin(phi), phi = pi f d,
     whose modulus has no zero.
     """
-    total: NDArray[np.float64] | NDArray[np.complex128] = np.ones(())
-    for f, d in ((fx_cy_per_um, displacement_x_um), (fy_cy_per_um, displacement_y_um)):
-        phase = np.pi * np.asarray(f, float) * d
-        unequal = 0.0 if beam_share == 0.5 else -1j * (1.0 - 2.0 * beam_share) * np.sin(phase)
-        total = total * (np.cos(phase) + unequal)
-    return np.asarray(total)
+    across, along = (
+        np.pi * np.asarray(f, float) * d
+        for f, d in ((fx_cy_per_um, displacement_x_um), (fy_cy_per_um, displacement_y_um))
+    )
+    if beam_share == 0.5:
+        return np.asarray(np.cos(across) * np.cos(along))
+    unequal = 1j * (1.0 - 2.0 * beam_share)
+    return np.asarray((np.cos(across) - unequal * np.sin(across)) * (np.cos(along) - unequal * np.sin(along)))
 
 
 def plate_focus_shift_um(thickness_mm: float, index: float) -> float:

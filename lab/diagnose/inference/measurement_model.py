@@ -61,7 +61,9 @@ class MeasurementModel:
     always: tuple[Effect, ...] = ()
     unstated_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
     _predictions: dict[tuple[int, ...], Prediction] = field(default_factory=dict)
-    _covariances: dict[tuple[bytes, tuple[int, ...], float], BlockCovariance] = field(default_factory=dict)
+    _covariances: dict[tuple[bytes, tuple[int, ...], tuple[float, float]], BlockCovariance] = field(
+        default_factory=dict
+    )
     _numbers: dict[Effect, int] = field(default_factory=dict)
 
     # --- the numbers -------------------------------------------------------------------------------------------------
@@ -214,24 +216,39 @@ class MeasurementModel:
             found.append(kernel)
         return tuple(found)
 
-    def gaussian(self, effects: Effects = (), where: np.ndarray | None = None, tolerated: float = 1.0) -> Gaussian:
+    def gaussian(
+        self,
+        effects: Effects = (),
+        where: np.ndarray | None = None,
+        tolerated: float = 1.0,
+        least_tolerance: float = 0.0,
+    ) -> Gaussian:
         """The distribution under these effects, of all numbers or of those that `where` (n,) marks. `tolerated`: share of the declared form
-        tolerances."""
+        tolerances; each is `least_tolerance` at least."""
         where = np.ones(len(self.value), bool) if where is None else where
         acting = self._numbered((*self.always, *effects))
-        blocks = tuple(self._block_covariance(index, acting, where, tolerated) for index in range(len(self.blocks)))
+        blocks = tuple(
+            self._block_covariance(index, acting, where, tolerated, least_tolerance)
+            for index in range(len(self.blocks))
+        )
         return Gaussian(self.mean(effects)[where], blocks, self._shared_jacobian(effects)[where])
 
-    def seen_gaussian(self, effects: Effects = (), tolerated: float = 1.0) -> Gaussian:
-        """The distribution of the seen numbers."""
-        return self.gaussian(effects, self.seen, tolerated)
+    def seen_gaussian(self, effects: Effects = (), tolerated: float = 1.0, least_tolerance: float = 0.0) -> Gaussian:
+        """The distribution of the seen numbers; arguments as of `gaussian`."""
+        return self.gaussian(effects, self.seen, tolerated, least_tolerance)
 
     def _block_covariance(
-        self, index: int, acting: list[_NumberedEffect], where: np.ndarray, tolerated: float
+        self,
+        index: int,
+        acting: list[_NumberedEffect],
+        where: np.ndarray,
+        tolerated: float,
+        least_tolerance: float,
     ) -> BlockCovariance:
         only = where[self.slices[index]]
         here = [e for e in acting if e.acts[index]]
-        key = only.tobytes(), (index, *(e.number for e in here)), tolerated if here else 1.0
+        shares = (tolerated, least_tolerance) if here else (1.0, 0.0)
+        key = only.tobytes(), (index, *(e.number for e in here)), shares
         if key not in self._covariances:
             if sum(c.covariance.size for c in self._covariances.values()) > CACHED_ENTRIES:
                 self._covariances.clear()
@@ -243,7 +260,7 @@ class MeasurementModel:
                 covariance += np.transpose(own) @ np.array(own)
             for i, one in enumerate(here):
                 change = prediction.mean - self._prediction(index, [*here[:i], *here[i + 1 :]]).mean
-                error = tolerated * one.effect.form_tolerance * change[only]
+                error = max(tolerated * one.effect.form_tolerance, least_tolerance) * change[only]
                 if error.any():
                     covariance += error[:, None] * self._correlation_kernels[index][both] * error
             # measurements of the same frames leave directions whose variance rounding could make negative

@@ -10,6 +10,7 @@ from lab.diagnose.inference.refit import Fit
 from lab.diagnose.inference.search import Search
 from lab.diagnose.inference.weigh import Candidate, closes_somewhere, explained, weigh
 from lab.diagnose.policy import DecisionPolicy
+from sim.effects.base import Effect
 
 
 def named_members(
@@ -27,8 +28,11 @@ def named_members(
     given_up: list[Candidate] = []
     weighed = set(barred)
     certain: dict[str, Candidate] = {}
+    before = current
     while current.effects:
         weighed.add(frozenset(current.names))
+        certain = _still_certain(search, certain, before, current)
+        before = current
         index = _too_weak(search, current)
         if index is not None:
             report(f"weighing {current.effects[index].name} against its rivals")
@@ -45,7 +49,7 @@ def named_members(
         members, likelier = [], None
         for index, e in enumerate(current.effects):
             if e.name in certain:
-                # when a weaker member leaves, this name stays as certain; what is left to explain changes
+                # what is left to explain changes
                 without = search.without(current, index)
                 share, is_closed = explained(model, current, without, model.affected_blocks(e), policy)
                 kept = replace(
@@ -75,6 +79,25 @@ def named_members(
         given_up += lost
         current = search.fitted(tuple(c.effect for c in members if c not in lost), converged=True)
     return [], [c for c in given_up if c.explained_share > 0.0]
+
+
+def _still_certain(search: Search, certain: dict[str, Candidate], before: Fit, now: Fit) -> dict[str, Candidate]:
+    """Return the certain names that stay so when members leave or come: those that share no measurement that shows both. What was certain
+    beside an effect which took up what its law lacks has to be weighed again without that."""
+    changed = [e for e in (*before.effects, *now.effects) if (e.name in before.names) != (e.name in now.names)]
+    if not changed or not certain:
+        return certain
+    by_name = {e.name: e for e in before.effects}
+    measured = {e.name: _shown_blocks(search, e, before if e.name in by_name else now) for e in changed}
+    moved = set().union(*measured.values())
+    return {n: c for n, c in certain.items() if n in by_name and not moved & _shown_blocks(search, by_name[n], before)}
+
+
+def _shown_blocks(search: Search, effect: Effect, fit: Fit) -> set[int]:
+    """Indices of the blocks that show a member of a fitted set, by `shown_chi2`."""
+    others = tuple(e for e in fit.effects if e.name != effect.name)
+    model = search.model
+    return {i for i in model.affected_blocks(effect) if model.change_chi2(effect, others, i) > search.policy.shown_chi2}
 
 
 def holds(candidate: Candidate, policy: DecisionPolicy) -> bool:

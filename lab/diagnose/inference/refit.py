@@ -140,12 +140,18 @@ class _Tolerated(NamedTuple):
     log_likelihood: float
 
 
-def _likeliest_tolerance(model: MeasurementModel, effects: Effects, policy: DecisionPolicy) -> _Tolerated:
-    """The share of the form tolerances, down to `least_tolerated_share`, by which the seen numbers are likeliest.
+def _likeliest_tolerance(
+    model: MeasurementModel, effects: Effects, policy: DecisionPolicy, tolerance: float | None = None
+) -> _Tolerated:
+    """The share of the form tolerances, down to `least_tolerated_share`, by which the seen numbers are likeliest; the whole, and `tolerance`
+    at least, where that is given.
 
     By the declared tolerances alone, of two laws that fit equally well the one with the smaller tolerance is far likelier: by 8 in the
     logarithm for a low-pass filter of 1 % beside a vibration of 5 %, even where the numbers meet the vibration's form to a tenth of that.
     """
+    if tolerance is not None:
+        gaussian = model.seen_gaussian(effects, 1.0, tolerance)
+        return _Tolerated(1.0, gaussian, gaussian.log_likelihood(model.seen_value))
     least = policy.least_tolerated_share
     is_one = least == 1.0 or all(e.form_tolerance == 0.0 for e in effects)
     found = []
@@ -164,6 +170,7 @@ def refit(
     passes: int | None = None,
     beside: Fit | None = None,
     of_any_size: bool = False,
+    tolerance: float | None = None,
 ) -> Fit:
     """Maximum a posteriori of all parameters, from `start`.
 
@@ -172,15 +179,18 @@ def refit(
     parameters stay absent in a converged fit unless they gain `dispensable_log_odds`. `rough`: fewer steps, enough to
     rank sets. `beside`: a fit whose Jacobian is reused for members that stand as they do there; it changes little by
     what joins them. `of_any_size`: sizes far from the usual ones aren't drawn towards them (`_wide_residual`), for the values of effects that
-    are named; a law that needs such a size is no likelier by that.
+    are named; a law that needs such a size is no likelier by that. `tolerance`: the whole of the form tolerances, and this at least, in
+    place of the likeliest share.
     """
     coords = coordinates(start, model.camera)
     known = {} if beside is None else beside.jacobian_columns(start, coords)
-    found = _fit(model, tuple(start), coords, policy, rough, passes, known, of_any_size)
+    found = _fit(model, tuple(start), coords, policy, rough, passes, known, of_any_size, tolerance)
     spare = [c for c in coords if c.quantity.dispensable]
     if not rough and spare:
         without = moved(found.effects, spare, np.zeros(len(spare)))
-        less = _fit(model, without, [c for c in coords if c not in spare], policy, rough, passes, {}, of_any_size)
+        less = _fit(
+            model, without, [c for c in coords if c not in spare], policy, rough, passes, {}, of_any_size, tolerance
+        )
         found = less if less.log_posterior >= found.log_posterior - policy.dispensable_log_odds else found
     return found
 
@@ -194,18 +204,19 @@ def _fit(
     passes: int | None,
     known: Mapping[Coordinate, FloatArray] = MappingProxyType({}),
     of_any_size: bool = False,
+    tolerance: float | None = None,
 ) -> Fit:
     """Fit the coordinates `coords`, other parameters as they are. `known`: columns of the Jacobian that aren't computed
     again."""
     seen = model.seen
     if not coords:
-        value = log_likelihood(model, effects, policy)
+        value = _likeliest_tolerance(model, effects, policy, tolerance).log_likelihood
         return Fit(effects, (), value, value, np.zeros((len(model.value), 0)))
     u = np.array([c.to_u(float(getattr(effects[c.index], c.name))) for c in coords])
     low, high = (np.array(b) for b in zip(*(c.bounds for c in coords), strict=True))
     typical = np.array([c.typical(float(getattr(effects[c.index], c.name))) for c in coords])
     prior_centre, prior_std = _prior(coords)
-    tolerated = _likeliest_tolerance(model, moved(effects, coords, u), policy)
+    tolerated = _likeliest_tolerance(model, moved(effects, coords, u), policy, tolerance)
     for turn in range(passes or (ROUGH_PASSES if rough else PASSES)):
 
         def residual(at: FloatArray, gaussian: Gaussian = tolerated.gaussian) -> FloatArray:
@@ -241,7 +252,7 @@ def _fit(
             ftol=1e-5,
         )
         before, share_before, u = u, tolerated.share, result.x
-        tolerated = _likeliest_tolerance(model, moved(effects, coords, u), policy)
+        tolerated = _likeliest_tolerance(model, moved(effects, coords, u), policy, tolerance)
         if tolerated.share == share_before and np.all(np.abs(u - before) < 1e-3 * typical):
             break
     best = moved(effects, coords, u)

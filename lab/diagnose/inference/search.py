@@ -289,7 +289,7 @@ class Search:
 
     def member_log_odds(self, fit: Fit, index: int) -> float:
         """Return the log posterior of a fitted set over that without one of its members; beside others, the lesser of that with the
-        likeliest share of the laws' form tolerances and that with the whole.
+        likeliest share of the laws' form tolerances and that with the whole, and `beside_tolerance` at least.
 
         What a strong effect's law may lack is no second effect: a set with one more effect fits with a small share where the set without
         it needs the whole, and would be likelier by the whole's cost alone.
@@ -301,13 +301,12 @@ class Search:
         return min(odds, self._by_whole_tolerances(fit) - self._by_whole_tolerances(without))
 
     def _by_whole_tolerances(self, fit: Fit) -> float:
-        """Log posterior of a fitted set with the whole of its laws' form tolerances."""
-        if fit.tolerated == 1.0:
-            return fit.log_posterior
+        """Log posterior of a fitted set with the whole of its laws' form tolerances, and `beside_tolerance` at least."""
         key = frozenset(fit.names)
         if key not in self._whole:
-            whole = self.policy.model_copy(update={"least_tolerated_share": 1.0})
-            self._whole[key] = refit(self.model, fit.effects, whole, passes=1).log_posterior
+            self._whole[key] = refit(
+                self.model, fit.effects, self.policy, passes=1, tolerance=self.policy.beside_tolerance
+            ).log_posterior
         return self._whole[key]
 
     # --- what it says ------------------------------------------------------------------------------------------------
