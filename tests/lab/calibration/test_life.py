@@ -182,10 +182,10 @@ def test_an_unchanged_camera_rarely_drifts(store: Store) -> None:
     alarms = 0
     threshold = life.sigma_of_probability(life.sidak_part(FALSE_ALARM_RATE, 19))
     kept = {"calibration_id": "x", "created": now(), "certified": None, "superseded": None, "expires": None, "std": STD}
-    figure = Figure(name="n", value=0.0, std=STD)
+    kept |= {"name": "n", "side": None, "place": "", "temperature_c": None, "doubling_c": None}
     for _ in range(400):
         rows = [SimpleNamespace(value=value, **kept) for value in 2.0 + STD * rng.standard_normal(20)]
-        alarms += any(point.drifted for point in life._points(rows, figure, None, threshold))
+        alarms += any(point.drifted for point in life._points(rows, None, threshold))
     assert alarms <= 10
 
 

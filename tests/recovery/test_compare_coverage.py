@@ -1,0 +1,71 @@
+"""An unchanged camera, calibrated again and again: `compare` tells a drift in at most 1 % of the comparisons, and what changed is told.
+
+Fifteen sessions of one stereo pair, recorded in this process by the second image former: 105 comparisons. From session to session the
+noise is new, the sensors are warmer or cooler, the lamp swings and the radiometer reads with its repeatability, as on the mock bench
+(`mocks.bench`: 0.15 % and 2e-9 W sr^-1 m^-2 nm^-1 a sample of 2 nm, a swing of 0.04 % in 2400 s).
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from lab.challenge.recordings import recording_set
+from lab.fit import fit_recording_set
+from lab.fit.compare import FALSE_ALARM_RATE, compare
+from lab.formats.results import FitResult
+from mocks.former import ConcealedCamera, DrawnSession, Law, Plan, record_pair
+
+SESSIONS = 15
+SEED = 3
+DOUBLING_C = 7.0
+SPREAD_C = 0.5  # of the sensors' temperature from session to session, one standard deviation
+WITHIN_C = 0.05  # within a session
+READING_SHARE, READING_FLOOR = 1.5e-3, 2e-9  # of the radiometer, a sample of 2 nm
+PLAN = Plan(kinds=("dark", "flat", "narrowband", "slanted_edge", "charuco", "screen"))
+
+
+class SwingingLamp(Law):
+    """The light swings by 0.04 % in 2400 s, in another phase in each session; the sensor's temperature by `WITHIN_C`."""
+
+    name = "swing"
+
+    def source_factor(self, elapsed_s: float) -> float:
+        return 1.0 + 4e-4 * float(np.sin(2.0 * np.pi * (elapsed_s / 2400.0 + self.uniform[0])))
+
+
+def session(number: int) -> DrawnSession:
+    """The session of this number of the unchanged pair."""
+    rng = np.random.default_rng([SEED, number])
+    warmer_c = SPREAD_C * rng.standard_normal()
+    cameras = []
+    for seed, side, offset_mm in ((SEED, "left", 0.0), (SEED + 1, "right", 20.0)):
+        camera = ConcealedCamera(
+            seed, (SwingingLamp(1.0, seed=number),), cfa="RGGB", f_number=4.0, rows=240, cols=320, noise_draw=number,
+            side=side, offset_mm=offset_mm, pair_middle_mm=10.0,
+        )  # fmt: skip
+        camera.dark_e_per_s *= 2.0 ** (warmer_c / DOUBLING_C)
+        cameras.append(camera)
+    drawn = record_pair(cameras[0], cameras[1], PLAN, f"session {number}")
+    for capture in drawn.manifest["captures"]:
+        capture["temperature_c"] = 25.0 + warmer_c + WITHIN_C * float(rng.standard_normal())
+    stated = {path for sheet in drawn.manifest["cameras"].values() for path in sheet["quantum_efficiency"].values()}
+    read = {
+        path: spectrum
+        if path in stated
+        # samples of 1 nm have twice the variance of those of 2 nm
+        else np.maximum(
+            spectrum * (1.0 + np.sqrt(2.0) * READING_SHARE * rng.standard_normal(spectrum.size))
+            + np.sqrt(2.0) * READING_FLOOR * rng.standard_normal(spectrum.size),
+            0.0,
+        )
+        for path, spectrum in drawn.spectra.items()
+    }
+    return DrawnSession(drawn.manifest, drawn.frames, read, drawn.targets)
+
+
+def fitted(number: int) -> FitResult:
+    """The calibration of the session of this number."""
+    return fit_recording_set(recording_set(session(number)))
