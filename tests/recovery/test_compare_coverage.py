@@ -1,7 +1,7 @@
-"""An unchanged pair of cameras, calibrated again and again: `compare` tells a drift in at most 1 % of the comparisons.
+"""An unchanged camera, calibrated again and again: `compare` tells a drift in at most 1 % of the comparisons.
 
-Fifteen sessions of one stereo pair, recorded in this process by the second image former: 105 comparisons. From session to session the
-noise is new, the sensors are warmer or cooler, the lamp swings and the radiometer reads with its repeatability, as on the mock bench
+Fifteen sessions of one camera, recorded in this process by the second image former: 105 comparisons. From session to session the
+noise is new, the sensor is warmer or cooler, the lamp swings and the radiometer reads with its repeatability, as on the mock bench
 (`mocks.bench`: 0.15 % and 2e-9 W sr^-1 m^-2 nm^-1 a sample of 2 nm, a swing of 0.04 % in 2400 s). What changed is told:
 `tests/lab/fit/test_compare.py`.
 
@@ -19,12 +19,12 @@ from lab.challenge.recordings import recording_set
 from lab.fit import fit_recording_set
 from lab.fit.compare import FALSE_ALARM_RATE, compare
 from lab.formats.results import FitResult
-from mocks.former import ConcealedCamera, DrawnSession, Law, Plan, record_pair
+from mocks.former import ConcealedCamera, DrawnSession, Law, Plan, record
 
 SESSIONS = 15
 SEED = 3
 DOUBLING_C = 7.0
-SPREAD_C = 0.5  # of the sensors' temperature from session to session, one standard deviation
+SPREAD_C = 0.5  # of the sensor's temperature from session to session, one standard deviation
 WITHIN_C = 0.05  # within a session
 READING_SHARE, READING_FLOOR = 1.5e-3, 2e-9  # of the radiometer, a sample of 2 nm
 PLAN = Plan(kinds=("dark", "flat", "narrowband", "slanted_edge", "charuco", "screen"))
@@ -40,18 +40,14 @@ class SwingingLamp(Law):
 
 
 def session(number: int) -> DrawnSession:
-    """The session of this number of the unchanged pair."""
+    """The session of this number of the unchanged camera."""
     rng = np.random.default_rng([SEED, number])
     warmer_c = SPREAD_C * rng.standard_normal()
-    cameras = []
-    for seed, side, offset_mm in ((SEED, "left", 0.0), (SEED + 1, "right", 20.0)):
-        camera = ConcealedCamera(
-            seed, (SwingingLamp(1.0, seed=number),), cfa="RGGB", f_number=4.0, rows=192, cols=256, noise_draw=number,
-            side=side, offset_mm=offset_mm, pair_middle_mm=10.0,
-        )  # fmt: skip
-        camera.dark_e_per_s *= 2.0 ** (warmer_c / DOUBLING_C)
-        cameras.append(camera)
-    drawn = record_pair(cameras[0], cameras[1], PLAN, f"session {number}")
+    camera = ConcealedCamera(
+        SEED, (SwingingLamp(1.0, seed=number),), cfa="RGGB", f_number=4.0, rows=192, cols=256, noise_draw=number
+    )
+    camera.dark_e_per_s *= 2.0 ** (warmer_c / DOUBLING_C)
+    drawn = record(camera, PLAN, f"session {number}")
     for capture in drawn.manifest["captures"]:
         capture["temperature_c"] = 25.0 + warmer_c + WITHIN_C * float(rng.standard_normal())
     stated = {path for sheet in drawn.manifest["cameras"].values() for path in sheet["quantum_efficiency"].values()}
@@ -76,7 +72,7 @@ def fitted(number: int) -> FitResult:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_an_unchanged_pair_is_told_to_drift_in_one_percent_of_comparisons() -> None:
+def test_an_unchanged_camera_is_told_to_drift_in_one_percent_of_comparisons() -> None:
     fits = [fitted(number) for number in range(SESSIONS)]
     pairs = list(combinations(range(SESSIONS), 2))
     alarms: list[str] = []
