@@ -211,11 +211,13 @@ class Comparison(Schema):
 
 
 class FigureName(Schema):
-    """A figure of a camera, or of the pair, that has a history."""
+    """A figure of a camera, or of the pair, that has a history. `title`, `unit`: as a lab reads them."""
 
     camera: str
     figure: str
     place: str
+    title: str = ""
+    unit: str = "1"
 
 
 class SessionResume(Schema):

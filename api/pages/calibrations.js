@@ -66,8 +66,8 @@ async function openCertify(one) {
       element(
         "tr",
         {},
-        element("td", { textContent: [j.side, j.figure, j.place].filter(Boolean).join(" ") }),
-        element("td", { textContent: measured(j.value, j.std) }),
+        element("td", { textContent: [j.side, j.title || j.figure].filter(Boolean).join(" "), title: j.figure }),
+        element("td", { textContent: `${measured(j.value, j.std)}${unitText(j.unit)}` }),
         element("td", { textContent: bandText(j.limit.good) }),
         element("td", {}, element("span", { className: `mark ${j.mark}`, textContent: j.mark })),
       ),
@@ -93,6 +93,8 @@ $("certify").addEventListener("keydown", (event) => event.key === "Escape" && $(
 
 let figures = [];
 const keyOf = (one) => JSON.stringify([one.figure, one.place]);
+const titleOf = (one) => one.title || [one.figure, one.place].filter(Boolean).join(" ");
+const unitText = (unit) => (unit === "1" ? "" : ` ${unit}`);
 const rangeOf = (from, to) => (to > from ? [from, to] : [from - 1, to + 1]);
 
 function options(select, values, text) {
@@ -103,9 +105,11 @@ function options(select, values, text) {
 
 function chooseFigures() {
   const form = $("history-form").elements;
-  const of = figures.filter((one) => one.camera === form.camera.value).map(keyOf);
+  const own = figures.filter((one) => one.camera === form.camera.value);
+  const of = own.map(keyOf);
+  const titles = new Map(own.map((one) => [keyOf(one), titleOf(one)]));
   const first = form.figure.options.length === 0;
-  options(form.figure, of, (key) => JSON.parse(key).filter(Boolean).join(" "));
+  options(form.figure, of, (key) => titles.get(key));
   if (first) form.figure.value = of.find((key) => JSON.parse(key)[0] === "noise read_noise_e") ?? of[0];
 }
 
@@ -132,8 +136,9 @@ function draw(history) {
     svg("rect", { class: `band ${name}`, x: LEFT, width: width - LEFT - RIGHT, y: y(high ?? top), height: y(low ?? bottom) - y(high ?? top) });
   const newest = points.at(-1);
   const drifted = points.filter((p) => p.drifted).length;
-  const title = [history.figure, history.place].filter(Boolean).join(" ");
-  const summary = `${title} of ${history.camera}: ${points.length} calibrations, the newest ${measured(newest.value, newest.std)}${newest.mark ? `, ${newest.mark}` : ""}, ${drifted || "none"} drifted`;
+  const title = titleOf(history);
+  const valueText = (p) => `${measured(p.value, p.std)}${unitText(history.unit)}${p.temperature_c == null ? "" : ` at ${number(p.temperature_c, 3)} °C`}`;
+  const summary = `${title} of ${history.camera}: ${points.length} calibrations, the newest ${valueText(newest)}${newest.mark ? `, ${newest.mark}` : ""}, ${drifted || "none"} drifted`;
   const picture = svg("svg", { viewBox: `0 0 ${width} ${HEIGHT}`, role: "img", "aria-label": summary });
   if (bands.length) picture.append(band(bands[1], "warn"), band(bands[0], "good"));
   for (const value of ticks(bottom, top)) {
@@ -142,7 +147,7 @@ function draw(history) {
   }
   const every = Math.ceil(points.length / 8);
   points.forEach((p, at) => {
-    const mark = svg("g", { class: `point ${p.mark ?? ""} ${p.state}` }, svg("title", {}, `${time(p.created)}: ${measured(p.value, p.std)}`));
+    const mark = svg("g", { class: `point ${p.mark ?? ""} ${p.state}` }, svg("title", {}, `${time(p.created)}: ${valueText(p)}`));
     mark.append(svg("line", { x1: x(at), x2: x(at), y1: y(p.value - 2 * p.std), y2: y(p.value + 2 * p.std) }));
     // A drift has another shape, not only another colour.
     const [cx, cy] = [x(at), y(p.value)];
@@ -160,7 +165,7 @@ function draw(history) {
         {},
         element("td", { textContent: time(p.created) }),
         element("td", { textContent: p.state }),
-        element("td", { textContent: measured(p.value, p.std) }),
+        element("td", { textContent: valueText(p) }),
         element("td", { textContent: p.mark ?? "" }),
         element("td", { textContent: p.drifted ? `drifted, ${number(p.significance_sigma, 3)} sigma` : "" }),
       ),

@@ -16,6 +16,7 @@ from lab.calibration import life
 from lab.calibration.life import CalibrationRecord, History
 from lab.calibration.limits import judged, standing_limits
 from lab.errors import InputError
+from lab.formats.results.figure_names import plain_name, unit_of
 
 router = APIRouter(tags=["calibrations"])
 
@@ -69,7 +70,7 @@ def certify_calibration(
 def list_figures(service: Here) -> list[FigureName]:
     """What there is a history of."""
     return [
-        FigureName(camera=camera, figure=figure, place=place)
+        FigureName(camera=camera, figure=figure, place=place, title=plain_name(figure, place), unit=unit_of(figure))
         for camera, figure, place in life.figure_names(service.store)
     ]
 

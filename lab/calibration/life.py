@@ -8,11 +8,11 @@ same cameras is certified, and **expired** when its time is over.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
 
+import numpy as np
 import sqlalchemy as sa
 from scipy import special
 
@@ -23,8 +23,10 @@ from lab.capture.station import Station
 from lab.capture.store import Store
 from lab.capture.tables import CalibrationRow, FigureRow, ResultRow, SessionRow
 from lab.errors import InputError
-from lab.fit.compare import FALSE_ALARM_RATE, sidak_part, sigma_of_probability
+from lab.fit.compare import FALSE_ALARM_RATE, Numbers, sidak_part, sigma_of_probability
+from lab.fit.noise.temperature_law import SensorTemperature
 from lab.formats.results import FitResult
+from lab.formats.results.figure_names import plain_name
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -52,7 +54,7 @@ class CalibrationRecord(Frozen):
 
 
 class HistoryPoint(Frozen):
-    """A figure in one calibration. `mark`: by the limits, None without one. `significance_sigma`: of its difference from the
+    """A figure in one calibration. `temperature_c`: of a dark current, the sensor's as it was measured. `mark`: by the limits, None without one. `significance_sigma`: of its difference from the
     reference, the calibration before it that was certified last, or the first of all; `drifted`: beyond the limit of the false-alarm rate."""
 
     calibration_id: str
@@ -60,6 +62,7 @@ class HistoryPoint(Frozen):
     state: CalibrationState
     value: float
     std: float
+    temperature_c: float | None = None
     mark: Mark | None
     reference_id: str | None
     significance_sigma: float | None
@@ -67,11 +70,14 @@ class HistoryPoint(Frozen):
 
 
 class History(Frozen):
-    """A figure of a camera over its calibrations, oldest first. `threshold_sigma`: beyond it a change is called a drift."""
+    """A figure of a camera over its calibrations, oldest first, one entry each. `title`, `unit`: as a lab reads them. `threshold_sigma`:
+    beyond it a change is called a drift."""
 
     camera: str
     figure: str
     place: str
+    title: str = ""
+    unit: str = "1"
     limit: Limit | None
     false_alarm_rate: float
     threshold_sigma: float
@@ -185,6 +191,7 @@ def _entry(
             "place": figure.place[:60],
             "value": figure.value,
             "std": figure.std,
+            **(dict.fromkeys(SensorTemperature.model_fields) if figure.sensor is None else figure.sensor.model_dump()),
         }
         for figure in figures_of(FitResult.model_validate(document))
     ]
@@ -262,8 +269,12 @@ def calibration(store: Store, id: str) -> CalibrationRecord:
     return _calibration(*found)
 
 
-def _figure(row: FigureRow) -> Figure:
-    return Figure(name=row.name, side=row.side, place=row.place, value=row.value, std=row.std)  # type: ignore[arg-type]
+def _figure(row: Any) -> Figure:
+    """The figure of a row, which has the columns of `FigureRow`."""
+    sensor = None
+    if row.doubling_c is not None:
+        sensor = SensorTemperature.model_validate({name: getattr(row, name) for name in SensorTemperature.model_fields})
+    return Figure(name=row.name, side=row.side, place=row.place, value=row.value, std=row.std, sensor=sensor)
 
 
 def figures(store: Store, calibration_id: str) -> tuple[Figure, ...]:
@@ -347,22 +358,24 @@ def history(
     limits: CalibrationLimits | None = None,
     false_alarm_rate: float = FALSE_ALARM_RATE,
 ) -> History:
-    """A figure of a camera over its calibrations.
+    """A figure of a camera over its calibrations. A session that was fitted again with the same outcome is entered once: by its newest fit, or
+    by that which was certified.
 
-    Each is compared with its reference as `compare` does, by the standard deviation of the difference. The threshold is that at which
+    Each is compared with its reference as `compare` does, by the standard deviation of the difference, dark currents at the sensor
+    temperature of the reference. The threshold is that at which
     an unchanged camera has any drift called in its whole history with the probability `false_alarm_rate` (Sidak). `limits`: by
     default those of the camera's newest certificate. Raises InputError where the camera or the figure isn't known.
     """
     register(store)
     of_figure = (FigureRow.camera == camera, FigureRow.name == figure, FigureRow.place == place)
-    columns = (FigureRow.calibration_id, FigureRow.side, FigureRow.value, FigureRow.std)
     life = (CalibrationRow.created, CalibrationRow.certified, CalibrationRow.superseded, CalibrationRow.expires)
-    asked = sa.select(*columns, *life).join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
+    columns = (*FigureRow.__table__.columns, CalibrationRow.session_id, *life)
+    asked = sa.select(*columns).join(CalibrationRow, CalibrationRow.id == FigureRow.calibration_id)
     asked = asked.where(*of_figure).order_by(CalibrationRow.created, CalibrationRow.id)
     certificates = sa.select(CalibrationRow.limits).join(FigureRow, CalibrationRow.id == FigureRow.calibration_id)
     certificates = certificates.where(*of_figure, CalibrationRow.certified.is_not(None))
     with store.reading() as db:
-        rows = db.execute(asked).all()
+        rows = _once_a_session(db.execute(asked).all())
         stated = None if limits else db.scalars(certificates.order_by(CalibrationRow.certified.desc()).limit(1)).first()
     if not rows:
         raise InputError(
@@ -371,33 +384,47 @@ def history(
         )
     if stated is not None:
         limits = CalibrationLimits.model_validate(stated)
-    one = Figure(name=figure, side=rows[-1].side, place=place, value=0.0, std=0.0)
+    one = _figure(rows[-1])
     limit = next((found for found in (limits.limit if limits else ()) if found.concerns(one)), None)
     threshold = sigma_of_probability(sidak_part(false_alarm_rate, len(rows) - 1))
     return History(
         camera=camera,
         figure=figure,
         place=place,
+        title=plain_name(figure, place),
+        unit=one.unit,
         limit=limit,
         false_alarm_rate=false_alarm_rate,
         threshold_sigma=threshold,
-        points=tuple(_points(rows, one, limit, threshold)),
+        points=tuple(_points(rows, limit, threshold)),
     )
 
 
-def _points(rows: Sequence[Any], figure: Figure, limit: Limit | None, threshold_sigma: float) -> Iterator[HistoryPoint]:
+def _once_a_session(rows: Sequence[Any]) -> list[Any]:
+    """The rows, oldest first, less those that a later fit of the same session found again; what was certified stays."""
+    newest = {(row.session_id, row.value, row.std): row.calibration_id for row in rows}
+    return [
+        row
+        for row in rows
+        if row.certified is not None or newest[row.session_id, row.value, row.std] == row.calibration_id
+    ]
+
+
+def _points(rows: Sequence[Any], limit: Limit | None, threshold_sigma: float) -> Iterator[HistoryPoint]:
     """A point for each row, oldest first. The reference is the last one before that was ever certified, else the first."""
     at = now()
     reference = None
     for row in rows:
-        significance = None if reference is None else _significance(reference, row)
+        figure = _figure(row)
+        significance = None if reference is None else _significance(_figure(reference), figure)
         yield HistoryPoint(
             calibration_id=row.calibration_id,
             created=_aware(row.created) or at,
             state=_state(row, at),
             value=row.value,
             std=row.std,
-            mark=None if limit is None else limit.judge(figure.model_copy(update={"value": row.value, "std": row.std})),
+            temperature_c=row.temperature_c,
+            mark=None if limit is None else limit.judge(figure),
             reference_id=None if reference is None else reference.calibration_id,
             significance_sigma=significance,
             drifted=significance is not None and significance > threshold_sigma,
@@ -406,9 +433,14 @@ def _points(rows: Sequence[Any], figure: Figure, limit: Limit | None, threshold_
             reference = row
 
 
-def _significance(a: Any, b: Any) -> float:
+def _significance(a: Figure, b: Figure) -> float:
     """Of the difference of two figures in standard deviations, two-sided."""
-    std = math.hypot(a.std, b.std)
-    if std == 0.0:
-        return 0.0 if a.value == b.value else sigma_of_probability(0.0)
-    return sigma_of_probability(2.0 * float(special.ndtr(-abs(b.value - a.value) / std)))
+    one, two = (
+        Numbers(figure.name, np.array([figure.value]), np.array([figure.std]), sensor=figure.sensor)
+        for figure in (a, b)
+    )
+    beside, std = two.beside(one)
+    difference = float(beside.value[0]) - a.value
+    if std[0] == 0.0:
+        return 0.0 if difference == 0.0 else sigma_of_probability(0.0)
+    return sigma_of_probability(2.0 * float(special.ndtr(-abs(difference) / std[0])))

@@ -23,6 +23,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from lab.calibration.figures import Figure
 from lab.errors import InputError
+from lab.formats.results.figure_names import plain_name, unit_of
 from lab.formats.toml_file import read_toml
 from sim.camera import Side
 from sim.parameters import Frozen
@@ -91,9 +92,11 @@ class CalibrationLimits(Frozen):
 
 
 class Judgement(Frozen):
-    """One figure against one limit. `value` None: the calibration doesn't have it."""
+    """One figure against one limit. `value` None: the calibration doesn't have it. `title`, `unit`: as a lab reads them."""
 
     figure: str
+    title: str = ""
+    unit: str = "1"
     side: Side | None
     place: str
     value: float | None
@@ -110,6 +113,8 @@ def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judg
         found += [
             Judgement(
                 figure=figure.name,
+                title=figure.title,
+                unit=figure.unit,
                 side=figure.side,
                 place=figure.place,
                 value=figure.value,
@@ -123,6 +128,8 @@ def judged(figures: tuple[Figure, ...], limits: CalibrationLimits) -> tuple[Judg
             found.append(
                 Judgement(
                     figure=limit.figure,
+                    title=plain_name(limit.figure, limit.place),
+                    unit=unit_of(limit.figure),
                     side=limit.side,
                     place=limit.place,
                     value=None,

@@ -137,10 +137,13 @@ class CalibrationRow(Base):
 
 class FigureRow(Base):
     """A figure of a calibration, in a table of its own so that a history reads no documents. `camera`: its name, or the rig for a figure of
-    the pair."""
+    the pair. `temperature_c`, `doubling_c`: of a dark current, the sensor's temperature and by how much a rise doubles it."""
 
     __tablename__ = "figures"
-    __table_args__ = (sa.Index("ix_figures_history", "camera", "name", "place"),)
+    __table_args__ = (
+        sa.Index("ix_figures_history", "camera", "name", "place"),
+        sa.Index("ix_figures_once", "calibration_id", "camera", "side", "name", "place", unique=True),
+    )
 
     id: Mapped[int] = mapped_column(primary_key=True)
     calibration_id: Mapped[str] = mapped_column(sa.ForeignKey("calibrations.id", ondelete="CASCADE"), index=True)
@@ -150,6 +153,9 @@ class FigureRow(Base):
     place: Mapped[str] = mapped_column(sa.String(60))
     value: Mapped[float]
     std: Mapped[float]
+    temperature_c: Mapped[float | None]
+    doubling_c: Mapped[float | None]
+    doubling_c_std: Mapped[float | None]
 
 
 class KeyRow(Base):

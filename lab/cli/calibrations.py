@@ -69,6 +69,7 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
     """One calibration: its state, and its figures against the limits. Exit code 4 if a figure is bad or missing."""
     from lab.calibration.life import calibration, figures
     from lab.calibration.limits import judged
+    from lab.report.figures import shown_unit
 
     check_writable(json)
     store = open_store(data)
@@ -79,15 +80,14 @@ def show(id: Id, limits: LimitsFile = None, json: Json = None, data: StoreFolder
     if str(json) != "-":
         who = f" by {found.certified_by} at {found.certified:%Y-%m-%d %H:%M}" if found.certified else ""
         out.print(escape(f"{found.id} of {found.name}: {found.state}{who}"))
-        table = _table("figure", "side", "", "value", "std", "good", "mark")
+        table = _table("quantity", "side", "value", "std", "unit", "good", "mark", "figure")
         for one in by_limit:
             value, std = (
                 ("" if one.value is None else f"{one.value:.6g}"),
                 ("" if one.std is None else f"{one.std:.2g}"),
             )
-            table.add_row(
-                escape(one.figure), one.side or "", escape(one.place), value, std, one.limit.good_text, one.mark
-            )
+            numbers = (value, std, shown_unit(one.unit), one.limit.good_text)
+            table.add_row(escape(one.title or one.figure), one.side or "", *numbers, one.mark, escape(one.figure))
         if table.row_count:
             out.print(table)
     if any(one.mark in ("bad", "missing") for one in by_limit):
@@ -136,23 +136,31 @@ def history(
     """A figure of a camera over all its calibrations: bands and drift. Exit code 4 where the newest is bad or drifted."""
     from lab.calibration.life import figure_names
     from lab.calibration.life import history as looked_up
+    from lab.formats.results.figure_names import plain_name, unit_of
+    from lab.report.figures import shown_unit
 
     check_writable(json)
     store = open_store(data)
     if not figure:
         for name, one, where in figure_names(store):
             if camera in ("", name):
-                out.print(escape("  ".join(part for part in (name, one, where) if part)))
+                read_as = ", ".join(part for part in (plain_name(one, where), shown_unit(unit_of(one))) if part)
+                out.print(escape("  ".join(part for part in (name, one, where, f"({read_as})") if part)))
         return
     found = looked_up(store, camera, figure, place, _standing(store, limits))
     write_json(found, json)
     if str(json) != "-":
-        table = _table("calibration", "begun (UTC)", "state", "value", "std", "mark", "sigma", "drift")
+        warm = any(point.temperature_c is not None for point in found.points)
+        unit = shown_unit(found.unit)
+        out.print(escape(f"{found.title or found.figure}{f', {unit}' if unit else ''}, of {found.camera}"))
+        at = ("sensor, °C",) if warm else ()
+        table = _table("calibration", "begun (UTC)", "state", "value", "std", *at, "mark", "sigma", "drift")
         for point in found.points:
             sigma = "" if point.significance_sigma is None else f"{point.significance_sigma:.1f}"
             values = (
                 f"{point.value:.6g}",
                 f"{point.std:.2g}",
+                *((("" if point.temperature_c is None else f"{point.temperature_c:.1f}"),) if warm else ()),
                 point.mark or "",
                 sigma,
                 "yes" if point.drifted else "no",

@@ -149,17 +149,17 @@ def print_diagnosis(diagnosis: DiagnosisResult) -> None:
 
 
 def print_comparison(comparison: ComparisonResult, every: bool) -> None:
-    from lab.report.figures import measured
+    from lab.report.figures import measured, shown_unit
 
     shown = [row for row in comparison.changes if every or row.changed]
     table = Table(box=None, pad_edge=False)
-    for heading in ("quantity", "side", "where", "A", "B", "B - A", "sigma", "changed"):
+    for heading in ("quantity", "side", "where", "A", "B", "B - A", "unit", "sigma", "changed", "figure"):
         table.add_column(heading)
     for row in sorted(shown, key=lambda row: -row.significance_sigma):
         values = (measured(row.a, row.a_std), measured(row.b, row.b_std), measured(row.difference, row.difference_std))
         of = f"{row.where} (worst of {row.n})" if row.n > 1 else row.where
-        marks = (f"{row.significance_sigma:.1f}", "yes" if row.changed else "no")
-        table.add_row(escape(row.name), row.side or "", escape(of), *values, *marks)
+        marks = (shown_unit(row.unit), f"{row.significance_sigma:.1f}", "yes" if row.changed else "no")
+        table.add_row(escape(row.title or row.name), row.side or "", escape(of), *values, *marks, escape(row.name))
     if table.row_count:
         out.print(table)
     for item in comparison.projection:

@@ -2,15 +2,16 @@
 
 Every number that a fit states with a standard deviation is compared, found by its name: `x` beside `x_std`. The
 numbers of a curve or a kernel share one row: that of the point with the largest difference, corrected for the number
-of points (Sidak). The geometry of cameras is also compared by its effect: both calibrations project the same points,
+of points (Sidak). Dark currents are compared at the sensor temperature of A (`lab.fit.noise.temperature_law`). The geometry of cameras is also compared by its effect: both calibrations project the same points,
 after the rigid motion that they imply between each other is removed (`lab.fit.geometry.projection_errors`). Parameters
 that differ much may project alike, and the reverse.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,18 +21,25 @@ from scipy.spatial.transform import Rotation
 
 from lab.fit.geometry.pinhole import COUNT, NAMES, intrinsics_of_fit, project, unproject
 from lab.fit.geometry.projection_errors import difference, grid, grid_points, implied_motion, seen_points
+from lab.fit.noise.temperature_law import SensorTemperature
 from lab.fit.tuples import triple
 from lab.formats.results import (
+    CameraFit,
     Change,
     ComparisonResult,
+    DarkCurrentLaws,
     Emva1288Points,
     FitResult,
     GeometryFit,
+    MakerDeparture,
+    MtfCurve,
+    NoiseFit,
     PhotonTransfer,
     ProjectionChange,
     Skipped,
     StereoFit,
 )
+from lab.formats.results.figure_names import plain_name, unit_of
 from sim.camera import Side
 from sim.parameters import Frozen
 
@@ -41,28 +49,55 @@ FALSE_ALARM_RATE = 0.01
 MIN_SEEN = 20  # fewest corners that determine an implied motion
 ROUNDING = 1e-9  # relative standard deviation below which a value counts as exact
 FEW = 9  # most numbers under one name with a row each; more are a curve
-POINTS = (PhotonTransfer, Emva1288Points)  # points of plots, which aren't compared
-OF_THE_SET_UP = {"angle_deg"}  # properties of the set-up, which aren't compared
+#: Models that aren't compared: points of plots, and the bands in which a curve departs from the maker's. Those are chosen where the
+#: departure is largest, so that each session has others; the curves that they rest on are compared.
+NOT_COMPARED = (PhotonTransfer, Emva1288Points, MakerDeparture)
+#: Fields that aren't compared: properties of the set-up, and dark currents at the temperatures that a session happened to have.
+NOT_COMPARED_FIELDS = {(MtfCurve, "angle_deg")} | {
+    (DarkCurrentLaws, field) for field in ("dark_current_e_per_s", "reference_current_e_per_s")
+}
+#: Standard deviation, percent, by which a calibration's curvature of the response differs from the last beyond what its fit states: a
+#: stabilised lamp drifts by about a thousandth during a series of levels. No repeat of a level shows it, and it bends the means of an
+#: ascending series by as much at saturation. `brighter_fatter_percent` has three times the bend of the response in it.
+LAMP_DRIFT_PERCENT = {"response_bend_percent": 0.1, "linearity_error_percent": 0.1, "brighter_fatter_percent": 0.3}
+INTEGRAL = "integrated_efficiency_nm"
 AXES = ("wavelength_nm", "frequency_cy_per_px", "radius_px")
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """Values and standard deviations under one name, along `axis` where there is one."""
+    """Values and standard deviations under one name, along `axis` where there is one. `sensor`: of a dark current."""
 
     name: str
     value: Array
     std: Array
     axis_name: str = ""
     axis: Array | None = None
-    labels: tuple[str, ...] = ()
+    sensor: SensorTemperature | None = None
+
+    def beside(self, reference: Numbers) -> tuple[Numbers, Array]:
+        """The numbers as they would be at the sensor temperature of the reference, and the standard deviation of their difference
+        from it: by the fits, by the lamps' drifts and by the conversion.
+
+        The conversion's part is a share of the larger of both, so that it is as wide for a fall as for a rise.
+        """
+        found, share = self, 0.0
+        if self.sensor is not None and reference.sensor is not None:
+            doublings, std = self.sensor.doublings(reference.sensor)
+            factor, share = 2.0**doublings, float(np.log(2.0)) * std
+            found = replace(self, value=factor * self.value, std=factor * self.std, sensor=reference.sensor)
+        larger = np.maximum(np.abs(found.value), np.abs(reference.value))
+        drift = np.sqrt(2.0) * LAMP_DRIFT_PERCENT.get(self.name.rpartition(" ")[2], 0.0)
+        return found, np.sqrt(found.std**2 + reference.std**2 + (share * larger) ** 2 + drift**2)
 
 
 def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RATE) -> ComparisonResult:
     """Differences between two fits of one rig, number by number.
 
-    `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. Numbers are taken as
-    independent. They are not; the true rate is lower.
+    `false_alarm_rate`: probability of any `changed` between two calibrations of an unchanged rig. It is shared among the n
+    rows of the comparison (Sidak): each is `changed` beyond z sigma with 2 (1 - Phi(z)) = 1 - (1 - rate)^(1/n), 4.1 for
+    the 239 rows of a session with eight edges, 4.4 for 1000. Rows are taken as independent. They are not; the true rate is
+    lower. `tests/recovery/test_compare_coverage.py` measures it on 105 comparisons of an unchanged pair.
     """
     skipped: list[Skipped] = []
     rows: list[Change] = []
@@ -73,7 +108,14 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
             skipped.append(Skipped(step="camera", reason=f"only {only} has this side", side=side))
             continue
         one, two = a.cameras[side], b.cameras[side]
-        rows += _compared(dict(numbers_of(one, "")), dict(numbers_of(two, "")), side, skipped)
+        skipped += _without_temperature(one, two, side)
+        numbers_a, numbers_b = dict(numbers_of(one, "")), dict(numbers_of(two, ""))
+        if one.spectral and two.spectral and one.spectral.wavelength_nm != two.spectral.wavelength_nm:
+            numbers_a = {name: of for name, of in numbers_a.items() if INTEGRAL not in name}
+            numbers_b = {name: of for name, of in numbers_b.items() if INTEGRAL not in name}
+            reason = "the curves of A and B end at different wavelengths: their integrals aren't of one band"
+            skipped.append(Skipped(step="integrated quantum efficiency", reason=reason, side=side))
+        rows += _compared(numbers_a, numbers_b, side, skipped)
         if one.geometry is not None and two.geometry is not None:
             found = _projection(one.geometry, two.geometry, side)
             if isinstance(found, Skipped):
@@ -99,6 +141,25 @@ def compare(a: FitResult, b: FitResult, false_alarm_rate: float = FALSE_ALARM_RA
     )
 
 
+def _without_temperature(a: CameraFit, b: CameraFit, side: Side) -> Iterator[Skipped]:
+    """That dark currents are compared without their temperature, where one of both doesn't state it."""
+    if (
+        a.noise is None
+        or b.noise is None
+        or a.noise.dark_current_e_per_s is None
+        or b.noise.dark_current_e_per_s is None
+    ):
+        return
+    if unknown := [which for which, noise in (("A", a.noise), ("B", b.noise)) if noise.dark_temperature_c is None]:
+        share = math.log(2.0) * sensor_temperature(a.noise).doublings(sensor_temperature(b.noise))[1]
+        yield Skipped(
+            step="dark current's temperature",
+            reason=f"{' and '.join(unknown)} without a stated sensor temperature: the dark currents are taken as uncertain by {100 * share:.0f} % "
+            "for it; state temperature_c of the darks",
+            side=side,
+        )
+
+
 # --- significance ----------------------------------------------------------------------------------------------------
 
 
@@ -121,11 +182,12 @@ def _sidak_whole(p_value: float, number: int) -> float:
 
 
 def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
-    """Every fitted number under `model`, by name. A model in a list is named by its text fields: capture, channel,
-    board.
+    """Every fitted number under `model`, by name, each name once. A model in a list is named by its text fields: capture,
+    channel, board; by its number, too, where others have the same.
     """
-    if isinstance(model, POINTS):
+    if isinstance(model, NOT_COMPARED):
         return
+    sensor = sensor_temperature(model) if isinstance(model, NoiseFit) else None
     axis_name = next((name for name in AXES if name in type(model).model_fields), "")
     axis = np.array(getattr(model, axis_name), dtype=float) if axis_name else None
     for field in type(model).model_fields:
@@ -134,21 +196,38 @@ def numbers_of(model: Frozen, prefix: str) -> Iterator[tuple[str, Numbers]]:
         if isinstance(value, Frozen):
             yield from numbers_of(value, f"{name} ")
         elif isinstance(value, tuple) and value and isinstance(value[0], Frozen):
-            for item in value:
-                yield from numbers_of(item, f"{name} {_identity(item)} ")
-        elif std is None or value is None or field in OF_THE_SET_UP:
+            of = [_identity(item) for item in value]
+            for k, item in enumerate(value):
+                number = f"part {of[:k].count(of[k]) + 1} " if of.count(of[k]) > 1 else ""
+                yield from numbers_of(item, f"{name} {of[k]} {number}")
+        elif std is None or value is None or (type(model), field) in NOT_COMPARED_FIELDS:
             continue
         elif isinstance(value, dict):
-            for key in value.keys() & std.keys():
-                yield _listed(f"{name} {key}", value[key], std[key], axis_name, axis)
+            for key in value:
+                if key in std:
+                    yield _listed(f"{name} {key}", value[key], std[key], axis_name, axis)
         else:
-            yield _listed(name, value, std, axis_name, axis)
+            yield _listed(name, value, std, axis_name, axis, sensor if field.startswith("dark_current") else None)
 
 
-def _listed(name: str, value: Any, std: Any, axis_name: str, axis: Array | None) -> tuple[str, Numbers]:
+def sensor_temperature(noise: NoiseFit) -> SensorTemperature:
+    """At which temperature the dark currents were measured, and their doubling temperature, fitted or else silicon's."""
+    law = noise.dark_current_temperature
+    if law is None or law.doubling_temperature_c is None or law.doubling_temperature_c_std is None:
+        return SensorTemperature(temperature_c=noise.dark_temperature_c)
+    return SensorTemperature(
+        temperature_c=noise.dark_temperature_c,
+        doubling_c=law.doubling_temperature_c,
+        doubling_c_std=law.doubling_temperature_c_std,
+    )
+
+
+def _listed(
+    name: str, value: Any, std: Any, axis_name: str, axis: Array | None, sensor: SensorTemperature | None = None
+) -> tuple[str, Numbers]:
     values, stds = np.atleast_1d(np.array(value, dtype=float)), np.atleast_1d(np.array(std, dtype=float))
     along = axis if axis is not None and values.shape == axis.shape else None
-    return name, Numbers(name, values, stds, axis_name if along is not None else "", along)
+    return name, Numbers(name, values, stds, axis_name if along is not None else "", along, sensor)
 
 
 def _identity(model: Frozen) -> str:
@@ -185,9 +264,10 @@ def _aligned(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
     )
 
 
-def _rows(a: Numbers, b: Numbers, side: Side | None) -> Iterator[Change]:
-    value_a, value_b, std_a, std_b = (np.ravel(part) for part in (a.value, b.value, a.std, b.std))
-    std = np.hypot(std_a, std_b)
+def _rows(a: Numbers, as_measured: Numbers, side: Side | None) -> Iterator[Change]:
+    b, std_of_difference = as_measured.beside(a)
+    parts = (a.value, b.value, a.std, b.std, std_of_difference)
+    value_a, value_b, std_a, std_b, std = (np.ravel(part) for part in parts)
     # A normalised curve is 1 at frequency 0 by definition; its uncertainty and its difference there are rounding
     least = ROUNDING * np.maximum(np.abs(value_a), np.abs(value_b))
     known = np.flatnonzero(np.isfinite(value_a + value_b) & np.isfinite(std) & (std > least))
@@ -201,10 +281,14 @@ def _rows(a: Numbers, b: Numbers, side: Side | None) -> Iterator[Change]:
         k = int(known[at])
         n = len(known) if several else 1
         p_value = _sidak_whole(float(chances[at]), n)
+        where = place_of(a, k)
         yield Change(
             name=a.name,
+            title=title_of(a, k),
+            unit=unit_of(a.name),
             side=side,
-            where=place_of(a, k),
+            where=where,
+            temperature_c=None if a.sensor is None else a.sensor.temperature_c,
             n=n,
             a=value_a[k],
             a_std=std_a[k],
@@ -215,6 +299,12 @@ def _rows(a: Numbers, b: Numbers, side: Side | None) -> Iterator[Change]:
             significance_sigma=sigma_of_probability(p_value),
             changed=False,
         )
+
+
+def title_of(numbers: Numbers, at: int) -> str:
+    """The plain name of a number; of a curve or kernel, that of the whole."""
+    name = plain_name(numbers.name, place_of(numbers, at) if numbers.value.size <= FEW else "")
+    return name if numbers.sensor is None else f"{name} {numbers.sensor.text}"
 
 
 def place_of(numbers: Numbers, at: int) -> str:

@@ -20,7 +20,9 @@ LEAST_SIGMA = 0.02  # where a logarithmic axis ends
 
 
 def _label(row: Change) -> str:
-    return " ".join(part for part in (row.side, row.name, row.where) if part)
+    """The quantity as the chart's axis names it."""
+    where = row.where if row.n > 1 else ""
+    return " ".join(part for part in (row.side, row.title or row.name, where) if part)
 
 
 def most_significant(comparison: ComparisonResult) -> tuple[Change, ...]:
@@ -89,7 +91,7 @@ def render_comparison(comparison: ComparisonResult) -> str:
                 "change": row,
                 "a": measured(row.a, row.a_std),
                 "b": measured(row.b, row.b_std),
-                "difference": measured(row.difference, row.difference_std),
+                "difference": measured(row.difference, row.difference_std, row.unit),
             }
             for row in sorted(comparison.changes, key=lambda row: -row.significance_sigma)
         ],

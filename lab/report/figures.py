@@ -8,46 +8,35 @@ from dataclasses import dataclass
 
 from lab.formats.recording_set import DataSheet
 from lab.formats.results import CameraFit, FitResult, GeometryFit, MtfCurve, NoiseFit, StereoFit
-from sim.camera import CameraModel, Side
-from sim.parameters import declared
+from lab.formats.results.figure_names import plain_name, unit_of
+from sim.camera import Side
 
-_NAMES = {
-    "conversion_gain_dn_per_e": "system gain K",
-    "read_noise_e": "temporal dark noise (read noise)",
-    "black_level_dn": "black level",
-    "dark_current_e_per_s": "dark current",
-    "full_well_e": "saturation capacity (full well)",
-    "dsnu_e": "DSNU",
-    "prnu_percent": "PRNU",
-    "linearity_error_percent": "linearity error",
-    "response_bend_percent": "response curvature at saturation",
-    "brighter_fatter_percent": "variance loss at saturation",
-    "neighbour_covariance_percent": "noise covariance with neighbours",
-    "quantum_efficiency": "quantum efficiency",
-}
-#: Units of those that the camera model doesn't declare as a quantity.
-_UNITS = {
-    "linearity_error_percent": "%",
-    "response_bend_percent": "%",
-    "brighter_fatter_percent": "%",
-    "neighbour_covariance_percent": "%",
-    "quantum_efficiency": "1",
-}
-_DECLARED = {field: quantity.unit for field, quantity in declared(CameraModel).items()}
-#: Field of `NoiseFit` -> (name, unit), in the order of the table; the maker's value has the same field name.
-NOISE = {field: (name, _UNITS[field] if field in _UNITS else _DECLARED[field]) for field, name in _NAMES.items()}
-
-
-#: Names of the distortion's coefficients, in OpenCV's order.
-DISTORTION = (
-    "radial distortion k1",
-    "radial distortion k2",
-    "tangential distortion p1",
-    "tangential distortion p2",
-    "radial distortion k3",
+#: Fields of `NoiseFit` in the order of the table; the maker's value has the same field name.
+_NOISE = (
+    "conversion_gain_dn_per_e",
+    "read_noise_e",
+    "black_level_dn",
+    "dark_current_e_per_s",
+    "full_well_e",
+    "dsnu_e",
+    "prnu_percent",
+    "linearity_error_percent",
+    "response_bend_percent",
+    "brighter_fatter_percent",
+    "neighbour_covariance_percent",
+    "quantum_efficiency",
 )
+#: Field of `NoiseFit` -> (name, unit).
+NOISE = {field: (plain_name(field), unit_of(field)) for field in _NOISE}
+#: Names of the distortion's coefficients, in OpenCV's order.
+DISTORTION = tuple(plain_name("distortion", place) for place in ("k1", "k2", "p1", "p2", "k3"))
 #: Units whose printed form differs from their form in names.
-SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "percent": "%"}
+SHOWN_UNITS = {"um": "µm", "us": "µs", "deg": "°", "C": "°C", "percent": "%"}
+
+
+def shown_unit(unit: str) -> str:
+    """A unit as it is printed; empty for a ratio."""
+    return "" if unit == "1" else SHOWN_UNITS.get(unit, unit)
 
 
 @dataclass(frozen=True)
@@ -80,7 +69,7 @@ def measured(value: float, std: float | None = None, unit: str = "") -> str:
             power = math.floor(math.log10(max(abs(value), std)))
             digits = max(place + power, 0)
             number = f"({value / 10**power:.{digits}f} ± {std / 10**power:.{digits}f})e{power:+03d}"
-    return number if unit in ("", "1") else f"{number} {SHOWN_UNITS.get(unit, unit)}"
+    return f"{number} {shown_unit(unit)}".rstrip()
 
 
 def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[KeyFigure]:
@@ -92,6 +81,8 @@ def noise_figures(noise: NoiseFit, camera: DataSheet | None = None) -> Iterator[
         stated = getattr(camera, field, None) if field != "quantum_efficiency" else None
         at_nm = noise.quantum_efficiency_wavelength_nm if field == "quantum_efficiency" else None
         note = f"at {at_nm:g} nm" if at_nm is not None else ""
+        if field == "dark_current_e_per_s" and noise.dark_temperature_c is not None:
+            note = f"at {noise.dark_temperature_c:.1f} °C"
         yield KeyFigure(name, unit, value, getattr(noise, f"{field}_std"), stated, note)
 
 
@@ -136,13 +127,10 @@ def camera_figures(fit: CameraFit, camera: DataSheet | None = None) -> Iterator[
 def geometry_figures(geometry: GeometryFit) -> Iterator[KeyFigure]:
     """Pinhole camera matrix and distortion."""
     matrix, matrix_std = geometry.camera_matrix, geometry.camera_matrix_std
-    for name, row, col in (
-        ("focal length x", 0, 0),
-        ("focal length y", 1, 1),
-        ("principal point x", 0, 2),
-        ("principal point y", 1, 2),
-    ):
-        yield KeyFigure(name, "px", matrix[row][col], matrix_std[row][col] if matrix_std else None)
+    for place, row, col in (("fx", 0, 0), ("fy", 1, 1), ("cx", 0, 2), ("cy", 1, 2)):
+        yield KeyFigure(
+            plain_name("camera_matrix", place), "px", matrix[row][col], matrix_std[row][col] if matrix_std else None
+        )
     for number, value in enumerate(geometry.distortion):
         name = DISTORTION[number] if number < len(DISTORTION) else f"distortion {number}"
         yield KeyFigure(name, "1", value, geometry.distortion_std[number] if geometry.distortion_std else None)

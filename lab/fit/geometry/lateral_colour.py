@@ -17,6 +17,11 @@ from lab.formats.results import ChannelGeometry
 
 Array = NDArray[np.floating[Any]]
 
+HUBER_STD = (
+    1.5  # standard deviations of a coordinate from which residuals lose weight: 95 % efficient where they are normal
+)
+MOST_ITERATIONS = 50
+
 
 def channel_geometry(calibration: Calibration, corners: Sequence[dict[str, CornerFits]]) -> tuple[ChannelGeometry, ...]:
     """The camera of each colour from its corners, one entry of `corners` for each view.
@@ -82,24 +87,38 @@ def _colour_parameters(intrinsics: Array) -> Array:
 
 
 def _fitted_shift(shift: Array, jacobian: Array, trusted: NDArray[np.bool_]) -> tuple[Array, Array, float, int] | None:
-    """Least squares of shift (n, 2) = jacobian (n, 2, p) values, without outliers.
+    """Robust least squares of shift (n, 2) = jacobian (n, 2, p) values: Huber's, with the spread of the residuals by their median.
 
-    Returns values (p,), covariance (p, p), rms (px) and number of corners; None where too few corners are trusted.
+    Corners have errors by the demosaicing that aren't normal. Cut off at some residual, another set of them counts in each session, and
+    the values jump by more than their standard deviation; Huber's weights change smoothly. Returns values (p,), covariance (p, p) by
+    Huber's sandwich formula, rms (px) and number of corners, outliers left out; None where too few corners are trusted.
     """
-    used = trusted.copy()
-    for _ in range(4):
-        if used.sum() < 4 * MIN_CORNERS:
-            return None
-        design = jacobian[used].reshape(-1, jacobian.shape[2])
-        scale = np.maximum(np.linalg.norm(design, axis=0), 1e-12)
-        values = np.linalg.lstsq(design / scale, shift[used].ravel(), rcond=1e-12)[0] / scale
-        rest = shift - jacobian @ values
+    if trusted.sum() < 4 * MIN_CORNERS:
+        return None
+    jacobian, shift = jacobian[trusted], shift[trusted]
+    scale = np.maximum(np.linalg.norm(jacobian, axis=(0, 1)), 1e-12)
+    design = jacobian / scale
+    weight = np.ones(len(shift))
+    values = np.zeros(len(scale))
+    for _ in range(MOST_ITERATIONS):
+        root = np.sqrt(weight)[:, None]
+        before, values = (
+            values,
+            np.linalg.lstsq((design * root[..., None]).reshape(-1, len(scale)), (shift * root).ravel(), rcond=1e-12)[0],
+        )
+        rest = shift - design @ values
         away = np.linalg.norm(rest, axis=1)
-        std = 1.4826 * float(np.median(np.abs(rest[used])))
-        kept = trusted & (away < OUTLYING_CORNER_STD * max(std, 1e-6))
-        if np.array_equal(kept, used):
+        std = max(1.4826 * float(np.median(np.abs(rest))), 1e-6)
+        weight = np.minimum(1.0, HUBER_STD * std / np.maximum(away, 1e-12))
+        if (
+            np.max(np.abs(values - before)) < 1e-3 * std
+        ):  # the design's columns have norm 1: a share of the error of a value
             break
-        used = kept
-    variance = float(np.sum(rest[used] ** 2)) / max(2 * used.sum() - len(values), 1)
-    covariance = variance * np.linalg.pinv((design / scale).T @ (design / scale)) / np.outer(scale, scale)
-    return values, covariance, float(np.sqrt(np.mean(away[used] ** 2))), int(used.sum())
+    # Beyond the bend, Huber's influence has no slope along the residual and that of its weight across
+    slope = np.where(weight < 1.0, 0.5 * weight, 1.0)
+    bread = np.linalg.pinv(np.einsum("n,nij,nik->jk", slope, design, design))
+    influence = np.einsum("n,nij,ni->nj", weight, design, rest)
+    freedom = len(shift) * 2 / max(len(shift) * 2 - len(values), 1)
+    covariance = freedom * bread @ (influence.T @ influence) @ bread / np.outer(scale, scale)
+    near = away < OUTLYING_CORNER_STD * std
+    return values / scale, covariance, float(np.sqrt(np.mean(away[near] ** 2))), int(near.sum())

@@ -64,6 +64,20 @@ def dark_current_from_variance(e: Evaluation) -> tuple[float | None, float | Non
     return rate / flats.gain**2, std_of_rate / flats.gain**2
 
 
+def dark_temperature_c(e: Evaluation) -> float | None:
+    """Sensor temperature (deg C) at which the dark currents were measured; None where the darks don't state it.
+
+    It is the mean over the darks, weighted by exposure: a dark moves the slope of signal against exposure the more, the longer it is.
+    """
+    darks = [
+        (level.exposure_s, level.temperature_c if level.sensor_c is None else level.sensor_c)
+        for level in e.levels.darks
+    ]
+    known = [(exposure_s, sensor_c) for exposure_s, sensor_c in darks if sensor_c is not None]
+    total_s = sum(exposure_s for exposure_s, _ in known)
+    return sum(exposure_s * sensor_c for exposure_s, sensor_c in known) / total_s if total_s > 0 else None
+
+
 def dark_current_temperature(e: Evaluation) -> DarkCurrentLaws | None:
     """Dark current at every temperature with darks of two exposures, and the laws through those significantly above
     0.

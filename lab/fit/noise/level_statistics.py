@@ -151,6 +151,7 @@ class MeasuredLevel:
 
     `light` is proportional to the photons among the levels of the same `lamp`. `captures`: ids of the frames. `light_std`,
     `light_calibration_std`: relative standard uncertainties of `light`, of its own, and common to all levels of the lamp.
+    `temperature_c`: to a degree where it groups darks; `sensor_c`: the frames' mean, not rounded.
     """
 
     exposure_s: float
@@ -161,6 +162,7 @@ class MeasuredLevel:
     captures: tuple[str, ...] = ()
     light_std: float = 0.0
     light_calibration_std: float = 0.0
+    sensor_c: float | None = None
 
     @property
     def repeats(self) -> int:

@@ -8,7 +8,12 @@ import numpy as np
 from scipy import special
 
 from lab.errors import NotDetermined
-from lab.fit.noise.dark_current import dark_current, dark_current_from_variance, dark_current_temperature
+from lab.fit.noise.dark_current import (
+    dark_current,
+    dark_current_from_variance,
+    dark_current_temperature,
+    dark_temperature_c,
+)
 from lab.fit.noise.dark_pixels import DarkPixels, read_noise_distribution
 from lab.fit.noise.emva1288 import EmvaInput, emva1288_figures
 from lab.fit.noise.evaluation import Evaluation, evaluate
@@ -65,6 +70,7 @@ def _result(e: Evaluation, pixels: DarkPixels | None) -> NoiseFit:
         **variance_curvature_figures(e),
         dark_current_from_variance_e_per_s=from_variance,
         dark_current_from_variance_e_per_s_std=from_variance_std,
+        dark_temperature_c=dark_temperature_c(e),
         dark_current_temperature=dark_current_temperature(e),
         read_noise_distribution=read_noise_distribution(pixels, t.gain) if dark and pixels is not None else None,
         defects=pixels.defects(t.gain) if dark and pixels is not None else None,

@@ -69,6 +69,12 @@ def fit_noise(recordings: RecordingSet, side: Side) -> NoiseFit:
     return fitted if reason is None else fitted.model_copy(update={"remarks": (*fitted.remarks, reason)})
 
 
+def _mean_c(captures: Sequence[Capture]) -> float | None:
+    """Mean of the temperatures that the captures state, deg C; None where none does."""
+    known = [capture.temperature_c for capture in captures if capture.temperature_c is not None]
+    return float(np.mean(known)) if known else None
+
+
 def _grouped(captures: Sequence[C], key: Callable[[C], Hashable]) -> list[list[C]]:
     groups: dict[Hashable, list[C]] = {}
     for capture in captures:
@@ -116,6 +122,13 @@ def _dark_levels(
                 stack = stack_of(recordings, group, bad)
         pixels.take(stack, group[0].exposure_s)
         levels.append(
-            MeasuredLevel(group[0].exposure_s, 0.0, "dark", stack.statistics(), rounded_c(group[0].temperature_c))
+            MeasuredLevel(
+                group[0].exposure_s,
+                0.0,
+                "dark",
+                stack.statistics(),
+                rounded_c(group[0].temperature_c),
+                sensor_c=_mean_c(group),
+            )
         )
     return levels, pixels

@@ -13,7 +13,13 @@ from lab.fit.spectral.bounds import LowerBounds
 from lab.fit.spectral.captures import ChannelSignals, SpectralCaptures
 from lab.fit.spectral.maker_departures import compare_curves
 from lab.fit.spectral.maker_prior import solved_with_maker
-from lab.fit.spectral.sensitivity import COVERAGE_FACTOR, RADIOMETER_RELATIVE_STD, Sensitivity, solved_sensitivity
+from lab.fit.spectral.sensitivity import (
+    COVERAGE_FACTOR,
+    RADIOMETER_RELATIVE_STD,
+    Sensitivity,
+    solved_sensitivity,
+    trapezoid_weights,
+)
 from lab.formats.recording_set import RecordingSet
 from lab.formats.results import MakerDeparture, NoiseFit, SpectralFit
 from lab.one_blas_thread import one_blas_thread
@@ -144,6 +150,7 @@ def _result(
     def by_channel(array: FloatArray) -> dict[str, tuple[float, ...]]:
         return {c: tuple(row.tolist()) for c, row in zip(channels, array.reshape(len(channels), -1), strict=True)}
 
+    integral, integral_std = _integrals(out, value, joint, captures.gain_std / captures.gain)
     scale, departures = _departures(captures, out, channels, value, joint) if not maker_is_prior else (None, ())
     return SpectralFit(
         wavelength_nm=tuple(out.tolist()),
@@ -151,12 +158,27 @@ def _result(
         quantum_efficiency_std=by_channel(absolute),
         relative_sensitivity=by_channel(ratio),
         relative_sensitivity_std=by_channel(relative),
+        integrated_efficiency_nm=dict(zip(channels, integral, strict=True)),
+        integrated_efficiency_nm_std=dict(zip(channels, integral_std, strict=True)),
         not_determined_nm={c: runs for c, runs in gaps.items() if runs},
         maker_scale=scale,
         maker_departures=departures,
         coverage_factor=COVERAGE_FACTOR,
         remarks=tuple(captures.remarks),
     )
+
+
+def _integrals(
+    out: FloatArray, value: FloatArray, joint: FloatArray, gain_error: float
+) -> tuple[list[float], list[float]]:
+    """Integrals over wavelength of the curves `value` (channels x k,) at `out` (k,), nm, and their standard deviations, by channel.
+
+    `joint`: covariance of `value` without the relative error of the gain, `gain_error`.
+    """
+    weights = np.kron(np.eye(value.size // out.size), trapezoid_weights(out))
+    total = weights @ value
+    std = np.sqrt(np.diag(weights @ joint @ weights.T) + (gain_error * total) ** 2)
+    return total.tolist(), std.tolist()
 
 
 def _departures(

@@ -13,12 +13,16 @@ class Change(Frozen):
     """One fitted number in two calibrations, or the point of a curve of `n` points at which they differ most.
 
     `difference` is B less A. `significance_sigma`: two-sided, in standard deviations of a normal distribution, corrected for the
-    number of points.
+    number of points. `title`, `unit`: as a lab reads them; "1": a ratio. `temperature_c`: of a dark current, the sensor's temperature in A,
+    to which B is converted; `difference_std` has the uncertainty of that conversion.
     """
 
     name: str
+    title: str = ""
+    unit: str = "1"
     side: Side | None = None
     where: str = ""
+    temperature_c: float | None = None
     n: int = 1
     a: float
     a_std: float

@@ -57,6 +57,8 @@ class NoiseFit(ChannelNoise):
     #: From the growth of the dark variance with exposure.
     dark_current_from_variance_e_per_s: float | None = None
     dark_current_from_variance_e_per_s_std: float | None = None
+    #: Sensor temperature at which the dark currents were measured: the mean over the darks, weighted by exposure.
+    dark_temperature_c: float | None = None
     dark_current_temperature: DarkCurrentLaws | None = None
     read_noise_distribution: ReadNoiseDistribution | None = None
     defects: PixelDefects | None = None

@@ -31,6 +31,10 @@ class SpectralFit(Frozen):
     #: Scaled so that the highest value of all channels is 1; its uncertainty excludes that of the common scale.
     relative_sensitivity: dict[str, tuple[float, ...]] = {}
     relative_sensitivity_std: dict[str, tuple[float, ...]] = {}
+    #: Integral of the quantum efficiency over `wavelength_nm`, by channel: the sensitivity to light that has as many photons at each. Errors
+    #: of single lights average out in it.
+    integrated_efficiency_nm: dict[str, float] = {}
+    integrated_efficiency_nm_std: dict[str, float] = {}
     #: Bands (first, last) by channel without light: the curve and its uncertainty there are the prior's.
     not_determined_nm: dict[str, tuple[tuple[float, float], ...]] = {}
     #: Factor from the data sheet's curves to the fitted ones, and the bands in which they differ beyond it. None: the data sheet

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args, get_origin
 
 import numpy as np
 import pytest
@@ -24,8 +25,10 @@ from lab.capture.tables import Base, CalibrationRow
 from lab.capture_kinds.dark import DarkSequence
 from lab.cli import main
 from lab.errors import InputError
-from lab.fit.compare import FALSE_ALARM_RATE
-from lab.formats.results import CameraFit, FitResult, MtfCurve, NoiseFit
+from lab.fit.compare import FALSE_ALARM_RATE, NOT_COMPARED, NOT_COMPARED_FIELDS
+from lab.formats.results import CameraFit, FitResult, MtfCurve, NoiseFit, StereoFit
+from lab.formats.results.figure_names import NAMES, plain_name, unit_of
+from sim.parameters import Frozen
 from tests.lab import fake_bench
 
 DARKS = CapturePlan((DarkSequence(exposures_s=(0.001, 0.1), frames=2),))
@@ -176,16 +179,64 @@ def test_drift_is_told_as_compare_tells_it(store: Store) -> None:
     assert ("m c L1", "noise read_noise_e", "") in life.figure_names(store)
 
 
+def test_a_warmer_sensor_is_no_drift_and_a_figure_is_entered_once(store: Store) -> None:
+    """Dark currents are compared at the temperature of the reference; a session that is fitted again is one calibration of the history."""
+    for dark_e_per_s, temperature_c in ((5.0, 31.0), (5.05, 31.1), (5.5, 32.0), (6.5, 31.0)):
+        noise = NoiseFit(
+            dark_current_e_per_s=dark_e_per_s, dark_current_e_per_s_std=0.005, dark_temperature_c=temperature_c
+        )
+        document = FitResult(source="s", cameras={"left": CameraFit(noise=noise)}).model_dump(mode="json")
+        session = store.create_session(STATION, DARKS.steps(STATION))
+        identity = {"maker": "m", "model": "c", "serial_number": "L1", "firmware": ""}
+        store.set_state(
+            session, "finished", run=RunRecord(started=now(), instruments={"camera left": identity}, versions={})
+        )
+        for _ in range(2):
+            newest = store.add_result("fit", session, document)
+    found = life.history(store, "m c L1", "noise dark_current_e_per_s")
+    assert [point.drifted for point in found.points] == [False, False, False, True]
+    assert [point.temperature_c for point in found.points] == [31.0, 31.1, 32.0, 31.0]
+    assert found.points[-1].calibration_id == newest and (found.title, found.unit) == ("dark current", "e/s")
+
+
+def test_every_figure_has_a_plain_name_and_its_unit() -> None:
+    """Every field with a standard deviation that `compare` reads is declared."""
+    models = [CameraFit, StereoFit]
+    for model in models:
+        for name, field in model.model_fields.items():
+            inside = [one for one in _models_in(field.annotation) if one not in (*models, *NOT_COMPARED)]
+            models += inside
+            if f"{name}_std" in model.model_fields and (model, name) not in NOT_COMPARED_FIELDS and not inside:
+                assert name in NAMES, (model, name)
+    for figure, place, name, unit in (
+        ("mtf edge-1 G mtf50_cy_per_px", "", "MTF50, edge-1 G", "cy/px"),
+        ("geometry camera_matrix", "fx", "focal length x", "px"),
+        ("geometry channels R centre_shift_px", "[0]", "shift of the centre from green [0], R", "px"),
+        ("spectral quantum_efficiency R", "", "quantum efficiency, R", "1"),
+        ("stereo translation_mm", "x", "stereo translation x", "mm"),
+        ("mtf * mtf50_cy_per_px", "", "MTF50, *", "cy/px"),
+        ("some thing_e", "", "some thing e", "1"),
+    ):
+        assert (plain_name(figure, place), unit_of(figure)) == (name, unit)
+
+
+def _models_in(annotation: object) -> list[type]:
+    """The models that a field's type names, but those of its dictionaries: their figures are by channel, and not compared."""
+    if isinstance(annotation, type) and issubclass(annotation, Frozen):
+        return [annotation]
+    return [] if get_origin(annotation) is dict else [one for part in get_args(annotation) for one in _models_in(part)]
+
+
 def test_an_unchanged_camera_rarely_drifts(store: Store) -> None:
     """Over a history of 20, an alarm in one of a hundred cameras. 400 cameras of the binomial law: 4 +- 2 expected, 3 sigma = 10."""
     rng = np.random.default_rng(5)
     alarms = 0
     threshold = life.sigma_of_probability(life.sidak_part(FALSE_ALARM_RATE, 19))
     kept = {"calibration_id": "x", "created": now(), "certified": None, "superseded": None, "expires": None, "std": STD}
-    figure = Figure(name="n", value=0.0, std=STD)
+    kept |= {"name": "n", "side": None, "place": "", "temperature_c": None, "doubling_c": None}
     for _ in range(400):
         rows = [SimpleNamespace(value=value, **kept) for value in 2.0 + STD * rng.standard_normal(20)]
-        alarms += any(point.drifted for point in life._points(rows, figure, None, threshold))
+        alarms += any(point.drifted for point in life._points(rows, None, threshold))
     assert alarms <= 10
 
 

@@ -9,10 +9,21 @@ import numpy as np
 import pytest
 
 from lab.cli import main
-from lab.fit.compare import compare
+from lab.fit.compare import compare, numbers_of
 from lab.fit.geometry.calibration import calibrate_robustly
 from lab.fit.geometry.recordings import geometry_result
-from lab.formats.results import CameraFit, ComparisonResult, FitResult, MtfCurve, NoiseFit, SpectralFit, StereoFit
+from lab.formats.results import (
+    CameraFit,
+    ComparisonResult,
+    DarkCurrentLaws,
+    FitResult,
+    MakerDeparture,
+    MtfCurve,
+    NoiseFit,
+    PsfKernel,
+    SpectralFit,
+    StereoFit,
+)
 from tests.lab.fit.projected import SHAPE, poses, seen
 
 
@@ -84,6 +95,106 @@ def test_what_changed_is_found_and_nothing_else():
     assert (row.name, row.side) == ("noise read_noise_e", "left")
     assert row.difference == pytest.approx(0.03, abs=0.01)
     assert row.difference_std == pytest.approx(0.002 * np.sqrt(2))
+
+
+def known(number: int, dark_e_per_s: float = 5.0, temperature_c: float | None = 31.0, **change: float) -> FitResult:
+    """A fit with the standard deviations that a quick session has; `change`: factors on gain, sensitivity and MTF50."""
+    rng = np.random.default_rng(number)
+
+    def drawn(value: float, relative_std: float) -> float:
+        return value * (1.0 + relative_std * rng.standard_normal())
+
+    gain, total, mtf50 = (change.get(name, 1.0) for name in ("gain", "sensitivity", "mtf50"))
+    edges = tuple(
+        MtfCurve(
+            capture=f"edge-{k}", channel="G", angle_deg=5.0, frequency_cy_per_px=(0.0, 0.5), mtf=(1.0, 0.2), mtf_std=(0.0, 0.01),
+            mtf50_cy_per_px=drawn(0.3 * mtf50, 0.008), mtf50_cy_per_px_std=0.0024,
+        )
+        for k in range(8)
+    )  # fmt: skip
+    camera = CameraFit(
+        noise=NoiseFit(
+            conversion_gain_dn_per_e=drawn(0.4 * gain, 0.0008), conversion_gain_dn_per_e_std=0.00032,
+            dark_current_e_per_s=drawn(dark_e_per_s, 0.001), dark_current_e_per_s_std=0.005, dark_temperature_c=temperature_c,
+        ),
+        spectral=SpectralFit(
+            wavelength_nm=(400.0, 700.0), quantum_efficiency={"G": (0.5, 0.5)}, quantum_efficiency_std={"G": (0.01, 0.01)},
+            integrated_efficiency_nm={"G": drawn(64.0 * total, 0.0025)}, integrated_efficiency_nm_std={"G": 0.16},
+        ),
+        mtf=edges,
+    )  # fmt: skip
+    return FitResult(source=f"known {number}", cameras={"left": camera})
+
+
+@pytest.mark.parametrize(
+    ("later", "title"),
+    [
+        (known(2, dark_e_per_s=6.5), "dark current at 31.0 °C"),
+        (known(2, gain=1.02), "system gain K"),
+        (known(2, sensitivity=0.97), "quantum efficiency, integrated over wavelength, G"),
+        (known(2, mtf50=0.95), "MTF50, edge-"),
+    ],
+    ids=["dark current +30 %", "gain +2 %", "sensitivity -3 %", "MTF50 -5 %"],
+)
+def test_a_real_change_is_told_by_its_plain_name(later: FitResult, title: str):
+    found = compare(known(1), later)
+    changed = [row.title for row in found.changes if row.changed]
+    assert changed and all(name.startswith(title) for name in changed)
+
+
+@pytest.mark.parametrize("warmer_c", [-6.0, -0.5, 0.1, 0.5, 6.0])
+def test_a_warmer_sensor_is_no_drift(warmer_c: float):
+    """Silicon's dark current doubles in 7.2 +- 1.4 degrees; this one in 6.5."""
+    found = compare(known(1), known(2, dark_e_per_s=5.0 * 2.0 ** (warmer_c / 6.5), temperature_c=31.0 + warmer_c))
+    (row,) = [row for row in found.changes if row.name == "noise dark_current_e_per_s"]
+    assert not found.changed and row.temperature_c == 31.0 and row.unit == "e/s"
+    # 0.1 degrees of each thermometer, and the law's 19 % of the doublings
+    expected = 5.0 * np.log(2.0) * np.hypot(np.sqrt(2.0) * 0.1 / 7.2, warmer_c * 1.4 / 7.2**2)
+    assert row.difference_std == pytest.approx(expected, rel=0.2)
+
+
+def test_a_fitted_doubling_temperature_converts_in_place_of_silicons():
+    laws = DarkCurrentLaws(
+        temperature_c=(31.0,), dark_current_e_per_s=(5.0,), dark_current_e_per_s_std=(0.005,),
+        doubling_temperature_c=5.0, doubling_temperature_c_std=0.05,
+    )  # fmt: skip
+    one = known(1)
+    noise = one.cameras["left"].noise.model_copy(update={"dark_current_temperature": laws})
+    one = FitResult(source="a", cameras={"left": CameraFit(noise=noise)})
+    row = compare(one, known(2, dark_e_per_s=10.0, temperature_c=36.0)).changes[1]
+    assert row.name == "noise dark_current_e_per_s" and row.b == pytest.approx(5.0, rel=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.4, 2.5])
+def test_a_dark_current_of_unknown_temperature_is_no_drift_and_that_is_said(factor: float):
+    found = compare(known(1, temperature_c=None), known(2, dark_e_per_s=5.0 * factor))
+    assert not found.changed
+    assert ["A without a stated sensor temperature" in item.reason for item in found.skipped] == [True]
+    assert "at an unknown temperature" in found.changes[1].title
+
+
+def test_bands_that_each_fit_chooses_are_not_compared():
+    """Two fits of one camera name other bands in which it departs from its maker's curve."""
+    fits = []
+    for bands in ([(400.0, 450.0, -0.02)], [(400.0, 500.0, -0.04), (600.0, 700.0, -0.45)]):
+        departures = tuple(
+            MakerDeparture(
+                channel="R", from_nm=low, to_nm=high, difference=value, difference_std=3e-4, difference_percent=-5.0, significance_sigma=9.0,
+            )
+            for low, high, value in bands
+        )  # fmt: skip
+        spectral = SpectralFit(
+            wavelength_nm=(), quantum_efficiency={}, quantum_efficiency_std={}, maker_departures=departures
+        )
+        fits.append(FitResult(source="x", cameras={"left": CameraFit(spectral=spectral)}))
+    assert compare(*fits).changes == ()
+
+
+def test_each_number_has_a_name_of_its_own():
+    """Kernels of parts of the pattern are told apart by their numbers."""
+    kernel = PsfKernel(capture="b", channel="G", sample_pitch_px=1.0, psf=((1.0,),), psf_std=((0.1,),))
+    names = [name for name, _ in numbers_of(CameraFit(psf=(kernel,), psf_field=(kernel, kernel)), "")]
+    assert names == ["psf b G psf", "psf_field b G part 1 psf", "psf_field b G part 2 psf"]
 
 
 def test_one_point_of_a_curve_is_found_with_its_place():

@@ -36,7 +36,7 @@ RESULT = ComparisonResult(
     false_alarm_rate=0.01,
     threshold_sigma=3.9,
     changes=(
-        change("noise read_noise_e", 7.25, True, side="left"),
+        change("noise read_noise_e", 7.25, True, side="left", title="temporal dark noise (read noise)", unit="e"),
         change("mtf edge-1 mtf", 0.4, False, side="left", n=26, where="frequency 0.25 cy/px"),
     ),
     projection=(MOVED,),
@@ -48,7 +48,7 @@ def test_the_page_says_what_the_result_says() -> None:
     page = Page(render_comparison(RESULT))
     text = " ".join(page.words)
     assert "2 of 3 changed" in text and "3.9 sigma" in text and "1 % of all comparisons" in text
-    assert "noise read noise e" in text and "7.2" in text and "worst of 26" in text
+    assert "temporal dark noise (read noise)" in text and "7.2" in text and "worst of 26" in text
     assert "0.0500 px rms difference" in text and "-1.200" in text
     assert "only A has it" in text
     assert "before<b>.json" in text  # as text, not as an element
